@@ -1,0 +1,19 @@
+FROM python:3.13-slim
+
+# A home of its own: compiled kernels are kept there. /recordings is made here so that a new volume belongs to the user.
+RUN useradd --create-home --uid 1000 reactorwatch \
+    && install --directory --owner=reactorwatch /recordings
+
+WORKDIR /app
+COPY pyproject.toml README.md LICENSE ./
+COPY reactorwatch ./reactorwatch
+COPY plant_node ./plant_node
+COPY monitor_node ./monitor_node
+COPY recorder ./recorder
+COPY diagnosis ./diagnosis
+RUN pip install --no-cache-dir .
+
+USER reactorwatch
+WORKDIR /home/reactorwatch
+STOPSIGNAL SIGTERM
+ENTRYPOINT ["reactorwatch"]

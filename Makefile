@@ -1,0 +1,47 @@
+# make demo and make test set everything up by themselves; make setup does only that.
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint bench pictures protobuf clean
+
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+
+help: ## what there is to make
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / \t/' | expand -t 12
+
+setup: $(READY) ## create .venv with everything in it
+
+$(READY): pyproject.toml
+	@if command -v uv >/dev/null 2>&1; then \
+		uv venv --quiet --allow-existing --python $(PYTHON) .venv && \
+		uv pip install --quiet --python $(BIN)/python --editable . --group dev; \
+	else \
+		$(PYTHON) -m venv .venv && \
+		$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1' && \
+		$(BIN)/python -m pip install --quiet --editable . --group dev; \
+	fi
+	@touch $@
+
+demo: $(READY) ## run a reactor with a fault in it, watch, record and draw it
+	@$(BIN)/reactorwatch demo
+
+test: $(READY) ## all tests
+	@$(BIN)/python -m pytest --numprocesses auto --dist loadgroup
+
+lint: $(READY) ## style, types, and who may import whom
+	@$(BIN)/ruff format --check .
+	@$(BIN)/ruff check .
+	@$(BIN)/mypy
+	@$(BIN)/lint-imports
+
+bench: $(READY) ## speed, as ratios measured in one run
+	@for file in benchmarks/[a-z]*.py; do echo "== $$file"; $(BIN)/python $$file || exit 1; done
+
+pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
+	@$(BIN)/python docs/pictures/make.py
+
+protobuf: $(READY) ## generate the message classes from messages.proto
+	@cd reactorwatch/contract && ../../$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --pyi_out=. messages.proto
+
+clean: ## remove what was made
+	@rm -rf .venv .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache

@@ -1,0 +1,43 @@
+"""Which model of the DaISy CSTR record runs best on its held-out half, and how long does finding it take?
+
+ARX and output-error models of orders 1 to 3, and the neural predictor where its extra is installed, of C and T. The
+record is not part of the repository: name the folder that holds data/daisy_cstr.csv in REACTORWATCH_SHARED.
+"""
+
+import importlib.util
+import os
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from monitor_node.identification.families import LINEAR_FAMILIES, Family
+from monitor_node.identification.neural import Neural
+from monitor_node.identification.selection import select
+from monitor_node.identification.structure import Structure
+
+
+def main() -> None:
+    """Measure and print."""
+    beside_repository = Path(__file__).resolve().parents[2] / "shared"
+    file = Path(os.environ.get("REACTORWATCH_SHARED", beside_repository)) / "data" / "daisy_cstr.csv"
+    if not file.is_file():
+        print(f"skipped: no DaISy record at {file}")
+        return
+    time, qc, *outputs = np.loadtxt(file, delimiter=",", skiprows=1).T
+    families: tuple[Family, ...] = LINEAR_FAMILIES
+    if importlib.util.find_spec("sklearn") is not None:
+        families = (*families, Neural())
+    for family in LINEAR_FAMILIES:
+        family.fit(Structure.of_order(1), qc[:200], outputs[0][:200])  # compiles, or loads what was compiled
+    for name, output in zip("CT", outputs, strict=True):
+        selection = select(qc, output, time, families)
+        print(f"{name}\n{selection.table()}\n{selection.reason}")
+        for family in families:
+            start = perf_counter()
+            family.fit(Structure.of_order(3), qc[:3750], output[:3750], time[:3750])
+            print(f"  fitting {family.name} of order 3 to 3,750 rows: {1e3 * (perf_counter() - start):.0f} ms")
+
+
+if __name__ == "__main__":
+    main()

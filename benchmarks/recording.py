@@ -1,0 +1,204 @@
+"""Does the recorder keep up, and what does it cost over the bare MCAP library?
+
+Printed are ratios measured in one run, because the machine's speed is not ours: recorded over published at 20,000
+messages/s through a real router; writing and reading over the bare library's; drawing in seconds a million samples.
+
+    python benchmarks/recording.py
+"""
+
+import contextlib
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from reactorwatch.contract import keys
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import Encoded, Publication, decode, encode
+from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.records.record import Record
+from reactorwatch.runtime import logs
+from reactorwatch.runtime.bus_zenoh import connect, router
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.serve import StopSignal
+from recorder.core import Recorder
+from recorder.entry import Entry
+from recorder.mcap_file import RecordingWriter, read_messages, read_metadata, read_record
+from recorder.rerun_file import write_rrd
+from recorder.run import read_run
+
+RATE_PER_S = 20_000
+SECONDS = 5
+MESSAGES = 200_000
+SIGNALS = ("qc", "C", "T")
+
+
+def samples(count: int) -> list[Encoded]:
+    """So many samples, a tenth of a minute apart, signal by signal."""
+    out = []
+    for number in range(count):
+        row, signal_number = divmod(number, len(SIGNALS))
+        sample = messages.Sample(
+            time_ns=row * 6_000_000_000,
+            sequence=row,
+            value=number / 7,
+            unit="K",
+            quality=messages.QUALITY_GOOD,
+        )
+        out.append(encode(Publication(keys.key("cstr", keys.SAMPLE, SIGNALS[signal_number]), sample)))
+    return out
+
+
+@contextlib.contextmanager
+def recorder_process(folder: Path, endpoint: str) -> Iterator[Path]:
+    """A recorder of its own process; it is stopped, and its file whole, when the context ends."""
+    path = folder / f"{time.monotonic_ns()}.mcap"
+    settings = folder / "settings.toml"
+    settings.write_text(f'[bus]\nendpoint = "{endpoint}"\n[recorder]\nout = "{path}"\nlinger_s = 1.0\n')
+    process = subprocess.Popen([sys.executable, "-m", "recorder", str(settings)], stderr=subprocess.DEVNULL)
+    try:
+        yield path
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(60)
+
+
+def through_a_router(folder: Path, sent: list[Encoded], rate_per_s: float | None) -> tuple[float, float, float]:
+    """(messages/s at which was published, share of them recorded, longest lag in s that the recorder reports)."""
+    config = BusConfig(endpoint=free_endpoint())
+    hub = router(config)
+    with recorder_process(folder, config.endpoint) as path:
+        plant = connect(config, "benchmark", StopSignal())
+        assert plant is not None
+        ready = threading.Event()
+        plant.watch_alive(keys.all_of("cstr", keys.ALIVE), lambda _, alive: ready.set() if alive else None)
+        assert ready.wait(30), "no recorder"
+        start = time.perf_counter()
+        for number, message in enumerate(sent):
+            if rate_per_s and number % 20 == 0:
+                time.sleep(max(0.0, start + number / rate_per_s - time.perf_counter()))
+            plant.publish(message)
+        plant.close()
+        rate = len(sent) / (time.perf_counter() - start)
+    hub.close()
+    entries = list(read_messages(path))
+    lags = [decode(entry.payload, entry.encoding) for entry in entries if keys.HEALTH in entry.key]
+    longest_s = max(report.lag_ms for report in lags if isinstance(report, messages.Health)) / 1e3
+    return rate, sum("/sample/" in entry.key for entry in entries) / len(sent), longest_s
+
+
+def bare_write(path: Path, entries: list[Entry]) -> None:
+    """The library alone: one schema, a channel a key."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("reactorwatch.v1.Sample", "protobuf", b"")
+        channels: dict[str, int] = {}
+        for entry in entries:
+            if entry.key not in channels:
+                channels[entry.key] = writer.register_channel(entry.key, "protobuf", schema)
+            writer.add_message(channels[entry.key], entry.log_time_ns, entry.payload, entry.publish_time_ns)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def record(path: Path, sent: list[Encoded]) -> None:
+    """What the recorder does with each message between the bus and the file."""
+    core = Recorder("cstr", 0)
+    with RecordingWriter(path, {}) as writer:
+        for number, message in enumerate(sent):
+            kept = core.on_message(message, number)
+            assert kept is not None
+            writer.write(kept.entry, readable=kept.readable)
+
+
+def exhaust(items: Iterable[Any]) -> None:
+    """Read to the end."""
+    for _ in items:
+        pass
+
+
+def rate_of(work: Any) -> float:
+    """Messages/s, the best of two."""
+    best = 0.0
+    for _ in range(2):
+        start = time.perf_counter()
+        work()
+        best = max(best, MESSAGES / (time.perf_counter() - start))
+    return best
+
+
+def files(folder: Path) -> None:
+    """Writing and reading, over the bare library."""
+    sent = samples(MESSAGES)
+    entries = [Entry(*item[:3], number, number) for number, item in enumerate(sent)]
+    bare, ours = folder / "bare.mcap", folder / "ours.mcap"
+
+    def write_ours() -> None:
+        ours.unlink(missing_ok=True)
+        record(ours, sent)
+
+    def read_bare(*, in_order: bool) -> None:
+        with ours.open("rb") as stream:
+            exhaust(make_reader(stream).iter_messages(log_time_order=in_order))
+
+    bare_rate, ours_rate = rate_of(lambda: bare_write(bare, entries)), rate_of(write_ours)
+    print(f"recording / bare writer                  {ours_rate / bare_rate:5.2f}   ({ours_rate:,.0f} messages/s)")
+    ordered, unordered = rate_of(lambda: read_bare(in_order=True)), rate_of(lambda: read_bare(in_order=False))
+    reading = rate_of(lambda: exhaust(read_messages(ours)))
+    decoded = rate_of(lambda: exhaust(decode(entry.payload, entry.encoding) for entry in read_messages(ours)))
+    record_rate = rate_of(lambda: read_record(ours))
+    print(f"reading / bare reader, in order          {reading / ordered:5.2f}   ({reading:,.0f} messages/s)")
+    print(f"reading / bare reader, in file order     {reading / unordered:5.2f}")
+    print(f"reading decoded / bare reader, in order  {decoded / ordered:5.2f}   ({decoded:,.0f} messages/s)")
+    print(f"reading as a record / bare, in order     {record_rate / ordered:5.2f}   ({record_rate:,.0f} messages/s)")
+    assert read_metadata(ours)
+    start = time.perf_counter()
+    write_rrd(read_run(read_messages(ours)), folder / "ours.rrd")
+    seconds = time.perf_counter() - start
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    per_million_s = seconds * 1e6 / MESSAGES
+    print(f"dashboard of a million samples           {per_million_s:5.1f} s (this process peaks at {peak_mb:.0f} MB)")
+
+
+def csv(folder: Path) -> None:
+    """Reading a million rows, over NumPy's own parser."""
+    path, rows = folder / "run.csv", 1_000_000
+    values = np.random.default_rng(1).normal(size=(rows, len(SIGNALS)))
+    columns = {signal: values[:, number] for number, signal in enumerate(SIGNALS)}
+    write_csv(path, Record(np.arange(rows) / 10, columns, "run"))
+    start = time.perf_counter()
+    np.loadtxt(path, delimiter=",", skiprows=1)
+    bare_s = time.perf_counter() - start
+    start = time.perf_counter()
+    read_csv(path)
+    seconds = time.perf_counter() - start
+    print(f"CSV, numpy.loadtxt / ours                {bare_s / seconds:5.2f}   ({seconds:.1f} s a million rows)")
+
+
+def main() -> None:
+    """Print the table."""
+    logs.configure()  # to standard error
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        sent = samples(RATE_PER_S * SECONDS)
+        for rate in (float(RATE_PER_S), None):
+            got, share, lag_s = through_a_router(folder, sent, rate)
+            asked = f"at {rate:,.0f}/s" if rate else "flat out"
+            print(f"recorded / published, {asked:18s} {share:5.3f}   ({got:,.0f} messages/s, lag up to {lag_s:.2f} s)")
+        files(folder)
+        csv(folder)
+
+
+if __name__ == "__main__":
+    main()

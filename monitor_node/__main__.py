@@ -1,0 +1,113 @@
+"""The monitor as a process: configuration, bus, core, loop.
+
+python -m monitor_node [settings.toml]
+"""
+
+import sys
+import time
+from pathlib import Path
+
+import structlog
+
+from monitor_node.alarm_commands import COMMANDS
+from monitor_node.alarm_file import AlarmFile
+from monitor_node.config import MonitorConfig
+from monitor_node.core import NODE, Monitor
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+from reactorwatch.errors import InputError
+from reactorwatch.runtime import bus_zenoh
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.entry import main
+from reactorwatch.runtime.serve import serve, stop_on_signals
+
+log = structlog.get_logger()
+
+LINGER_S = 0.5
+"""Silence on the bus after which a monitor that was asked to stop takes everything as heard."""
+
+
+class MonitorNode(Monitor):
+    """A monitor that keeps the state of its alarms in a file, and says in its log what an operator wants to read there.
+
+    Args:
+        config: how the plant is watched.
+        start_ns: now.
+
+    Raises:
+        InputError: the file that the settings name is damaged or cannot be used.
+    """
+
+    def __init__(self, config: MonitorConfig, start_ns: int) -> None:
+        super().__init__(config, start_ns)
+        self._file: AlarmFile | None = None
+        self._said = ""
+        if config.alarm_state_file is not None:
+            self._file = AlarmFile(Path(config.alarm_state_file), self.alarms)
+            self._file.load()
+
+    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
+        """See `Monitor`; alarms are stored and logged."""
+        publications = super().on_message(message, now_ns)
+        self._keep(publications)
+        return publications
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
+        """See `Monitor`; alarms are stored, before the answer goes out, and logged."""
+        reply, publications = super().on_command(question, now_ns)
+        self._keep(publications)
+        return reply, publications
+
+    def on_tick(self, now_ns: int) -> list[Publication]:
+        """See `Monitor`; what was refused is logged, at most once a minute; what could not be stored is tried again."""
+        report = self.refusals.report(now_ns)
+        if report is not None:
+            log.warning(report)
+        self._keep([])
+        return super().on_tick(now_ns)
+
+    def _keep(self, publications: list[Publication]) -> None:
+        for publication in publications:
+            alarm = publication.message
+            if isinstance(alarm, Alarm):
+                log.info("alarm", alarm=alarm.alarm, change=alarm.event, by=alarm.by, text=alarm.text)
+        if self._file is None:
+            return
+        try:
+            self._file.store()
+            self._said = ""
+        except InputError as error:  # a full disk is no reason to stop watching the plant
+            if str(error) != self._said:
+                self._said = str(error)
+                log.warning(self._said)
+
+
+def run(config: MonitorConfig, bus_config: BusConfig) -> None:
+    """Watch until SIGINT or SIGTERM.
+
+    Raises:
+        InputError: settings that the bus cannot use, or a damaged file of alarm states.
+    """
+    node = MonitorNode(config, time.time_ns())
+    with stop_on_signals() as stop:
+        bus = bus_zenoh.connect(bus_config, NODE, stop)
+        if bus is None:
+            return
+        try:
+            log.info("watching", plant=config.plant, training_min=config.training_min)
+            serve(
+                node,
+                bus,
+                stop,
+                subscriptions=(keys.all_of(config.plant, keys.SAMPLE),),
+                commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
+                on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
+                linger_s=LINGER_S,
+            )
+        finally:
+            bus.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main("monitor_node", "monitor", MonitorConfig, run))

@@ -1,0 +1,259 @@
+"""The alarms of one plant together: their states, incidents and figures, and all that they remember as one structure.
+
+Alarms change when samples come, when a person says so, and when a shelf's time is over. All times are those of samples,
+so what is said of alarms that nobody touched follows from the samples alone.
+"""
+
+from math import isfinite
+from typing import Literal
+
+import msgspec
+
+from monitor_node.alarm_kpis import Counted, KpiCounter, KpiState
+from monitor_node.alarm_states import Event, State, fits
+from monitor_node.alarms import LAST_NS, AlarmMemory, ChartAlarm, TimeNs
+from monitor_node.charts.base import Judgement
+from monitor_node.config import MonitorConfig
+from monitor_node.incidents import Incident, Incidents
+from monitor_node.persistence import Persistence
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.errors import InputError
+from reactorwatch.records.record import MINUTE_NS
+
+KPIS = "monitor"
+"""The name in the key of the figures."""
+
+
+class BoardState(msgspec.Struct, forbid_unknown_fields=True):
+    """Everything that is remembered of a plant's alarms.
+
+    Attributes:
+        version: of this structure.
+        plant: whose.
+        time_ns: time of the newest row; None before the first.
+        alarms: by name.
+        incident: the latest.
+        kpis: what the figures are made of.
+    """
+
+    version: Literal[1]
+    plant: str
+    time_ns: TimeNs | None
+    alarms: dict[str, AlarmMemory]
+    incident: Incident
+    kpis: KpiState
+
+
+class AlarmBoard:
+    """The alarms of one plant.
+
+    Args:
+        config: of the monitor.
+
+    Attributes:
+        time_ns: time of the newest row; None before the first.
+        changes: counts up whenever there is something that a restart must not forget.
+    """
+
+    def __init__(self, config: MonitorConfig) -> None:
+        self._config = config
+        self._alarms: dict[str, ChartAlarm] = {}
+        self._incidents = Incidents(config.incident_min)
+        self._kpis = KpiCounter()
+        self._kpi_key = keys.key(config.plant, keys.ALARM_KPIS, KPIS)
+        self._kpi_minute: int | None = None
+        self._kpis_changed = False
+        self.time_ns: int | None = None
+        self.changes = 0
+
+    def declare(self, chart: str, signal: str) -> ChartAlarm:
+        """A new alarm, for a chart of a signal."""
+        config = self._config
+        rule = Persistence(config.raise_count, config.window, config.clear_count)
+        alarm = ChartAlarm(chart, signal, config.priorities.get(signal, "medium"), rule, config.dead_band)
+        self._alarms[alarm.name] = alarm
+        return alarm
+
+    # --- what samples do -------------------------------------------------------------------------------------
+
+    def judge(self, alarm: ChartAlarm, time_ns: int, judgement: Judgement, unit: str) -> list[Publication]:
+        """Take the point of an alarm's chart in; returns the alarm if it changes.
+
+        Args:
+            alarm: one that was declared here.
+            time_ns: of the sample.
+            judgement: of the chart.
+            unit: of the statistic.
+        """
+        event = alarm.judge(time_ns, judgement, unit)
+        if event is None:
+            return []
+        self._change(alarm, event, time_ns)
+        return [self._publication(alarm, event, time_ns)]
+
+    def end_row(self, time_ns: int) -> list[Publication]:
+        """End shelves whose time is over, and tell the figures after a change and each minute.
+
+        Args:
+            time_ns: of the row that all charts have now judged.
+        """
+        self.time_ns = time_ns
+        publications: list[Publication] = []
+        for alarm in self._alarms.values():
+            memory = alarm.memory
+            # A clock that was set back ends a shelf as well, which otherwise would last as much longer.
+            if memory.state is State.SHELVED and not memory.shelved_ns <= time_ns < memory.shelved_until_ns:
+                self._change(alarm, Event.SHELF_TIME_OVER, time_ns)
+                publications.append(self._publication(alarm, Event.SHELF_TIME_OVER, time_ns))
+        minute = time_ns // MINUTE_NS
+        if self._kpis_changed or minute != self._kpi_minute:
+            publications.append(self._figures(time_ns))
+        return publications
+
+    # --- what people do --------------------------------------------------------------------------------------
+
+    def act(self, name: str, event: Event, by: str, comment: str) -> list[Publication]:
+        """Let a person do something to an alarm, other than shelve it.
+
+        Args:
+            name: of the alarm.
+            event: what.
+            by: who.
+            comment: why; empty: the last comment stays.
+
+        Raises:
+            InputError: there is no such alarm, no sample has come yet, or the table of states refuses it.
+        """
+        alarm, time_ns = self._named(name), self._now_ns()
+        self._change_by(alarm, event, time_ns, by, comment)
+        return [self._publication(alarm, event, time_ns), self._figures(time_ns)]
+
+    def shelve(self, name: str, minutes: float, by: str, comment: str) -> list[Publication]:
+        """Let a person put an alarm out of sight for a time, or change the time.
+
+        Args:
+            name: of the alarm.
+            minutes: how long, of plant time.
+            by: who.
+            comment: why; empty: the last comment stays.
+
+        Raises:
+            InputError: as `act`, or the time is not positive or too long.
+        """
+        alarm, time_ns = self._named(name), self._now_ns()
+        longest = self._config.longest_shelf_min
+        if not (isfinite(minutes) and 0 < minutes <= longest):
+            raise InputError(f"minutes must be in (0, {longest:g}], which longest_shelf_min sets, got {minutes:g}")
+        self._change_by(alarm, Event.SHELVE, time_ns, by, comment)
+        alarm.memory.shelved_ns = time_ns
+        alarm.memory.shelved_until_ns = min(time_ns + round(minutes * MINUTE_NS), LAST_NS)
+        return [self._publication(alarm, Event.SHELVE, time_ns), self._figures(time_ns)]
+
+    def comment(self, name: str, by: str, comment: str) -> list[Publication]:
+        """Let a person say something about an alarm.
+
+        Raises:
+            InputError: there is no such alarm, no sample has come yet, or the comment is empty.
+        """
+        alarm, time_ns = self._named(name), self._now_ns()
+        if not comment:
+            raise InputError("comment must say something, got ''")
+        self.changes += 1
+        alarm.memory.by, alarm.memory.comment = by, comment
+        return [self._publication(alarm, "comment", time_ns)]
+
+    def alarm(self, name: str) -> Alarm:
+        """An alarm as it is.
+
+        Raises:
+            InputError: there is no such alarm.
+        """
+        return self._named(name).message(self.time_ns or 0, "")
+
+    def all_alarms(self) -> list[Alarm]:
+        """All alarms as they are."""
+        return [self.alarm(name) for name in self._alarms]
+
+    # --- what survives a restart -----------------------------------------------------------------------------
+
+    def to_bytes(self) -> bytes:
+        """Everything that is remembered, as MessagePack."""
+        state = BoardState(
+            version=1,
+            plant=self._config.plant,
+            time_ns=self.time_ns,
+            alarms={name: alarm.memory for name, alarm in self._alarms.items()},
+            incident=self._incidents.state,
+            kpis=self._kpis.state,
+        )
+        return msgspec.msgpack.encode(state)
+
+    def from_bytes(self, data: bytes) -> None:
+        """Go on from what `to_bytes` returned. Alarms that are not declared here are left out.
+
+        Raises:
+            InputError: the bytes are not that, or of another plant; everything is as before.
+        """
+        try:
+            state = msgspec.msgpack.decode(data, type=BoardState)
+        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            raise InputError(f"is no alarm state: {error}") from error
+        if state.plant != self._config.plant:
+            raise InputError(f"is the alarm state of plant {state.plant!r}, not of {self._config.plant!r}")
+        for name, memory in state.alarms.items():
+            if not fits(memory.state, standing=memory.rule.standing):
+                stands = "stands" if memory.rule.standing else "does not stand"
+                raise InputError(f"is no alarm state: {name} is {memory.state}, but its condition {stands}")
+        for name, memory in state.alarms.items():
+            if name in self._alarms:
+                self._alarms[name].memory = memory
+        self.time_ns = state.time_ns
+        self._incidents.state = state.incident
+        self._kpis.state = state.kpis
+
+    # --- within ----------------------------------------------------------------------------------------------
+
+    def _named(self, name: str) -> ChartAlarm:
+        alarm = self._alarms.get(name)
+        if alarm is None:
+            raise InputError(f"there is no alarm {name!r} (there are: {', '.join(self._alarms)})")
+        return alarm
+
+    def _now_ns(self) -> int:
+        if self.time_ns is None:
+            raise InputError("no sample has come yet, and alarms change at the time of a sample; wait for the plant")
+        return self.time_ns
+
+    def _change_by(self, alarm: ChartAlarm, event: Event, time_ns: int, by: str, comment: str) -> None:
+        try:
+            self._change(alarm, event, time_ns)
+        except InputError as error:
+            raise InputError(f"alarm {alarm.name} {error}") from error
+        alarm.memory.by, alarm.memory.comment = by, comment or alarm.memory.comment
+
+    def _change(self, alarm: ChartAlarm, event: Event, time_ns: int) -> None:
+        memory = alarm.memory
+        before = memory.state
+        alarm.apply(event)
+        if event is Event.CLEARED:
+            self._incidents.cleared(time_ns, memory.incident)
+        if memory.state is State.UNACKNOWLEDGED and before is not State.UNACKNOWLEDGED:
+            self._kpis.came_up(time_ns, alarm.name, alarm.priority)
+            if not memory.incident:
+                memory.incident = self._incidents.came_up(time_ns, alarm.name)
+                memory.first_in = self._incidents.state.first_in == alarm.name
+        self.changes += 1
+        self._kpis_changed = True
+
+    def _publication(self, alarm: ChartAlarm, event: str, time_ns: int) -> Publication:
+        return Publication(keys.key(self._config.plant, keys.ALARM, alarm.name), alarm.message(time_ns, event))
+
+    def _figures(self, time_ns: int) -> Publication:
+        self._kpi_minute, self._kpis_changed = time_ns // MINUTE_NS, False
+        counted = (
+            Counted(alarm.name, alarm.priority, alarm.memory.state, alarm.memory.raised_ns)
+            for alarm in self._alarms.values()
+        )
+        return Publication(self._kpi_key, self._kpis.figures(time_ns, counted, self._incidents.state.number))

@@ -1,0 +1,199 @@
+"""The life of an alarm as a table: the alarm states of ANSI/ISA-18.2 (2016) and IEC 62682 (2014).
+
+An alarm has a *condition*, which stands or does not and which only samples change, and a *state*, which is what the
+operator sees. Four states are in sight: normal; unacknowledged (it stands, nobody has said that he saw it);
+acknowledged (it stands, and somebody has); returned unacknowledged (it is over, and nobody has). Three are out of
+sight: shelved, by an operator and for a time; suppressed by design, while it means nothing, as in a start-up; out of
+service, for maintenance.
+
+Out of sight an alarm's condition is still followed. So when it comes back in sight it is unacknowledged if its
+condition stands then, whoever had acknowledged it before, and normal if not.
+
+The table has an entry for every pair of a state and an event: the next state, or why the event is refused there. The
+diagram of docs/alarms.md is drawn from it.
+"""
+
+from collections.abc import Mapping
+from enum import StrEnum
+from types import MappingProxyType
+from typing import NamedTuple, TypeAlias
+
+from reactorwatch.errors import InputError
+
+
+class State(StrEnum):
+    """What the operator sees; the names are those of `AlarmState` in messages.proto."""
+
+    NORMAL = "normal"
+    UNACKNOWLEDGED = "unacknowledged"
+    ACKNOWLEDGED = "acknowledged"
+    RETURNED_UNACKNOWLEDGED = "returned unacknowledged"
+    SHELVED = "shelved"
+    SUPPRESSED_BY_DESIGN = "suppressed by design"
+    OUT_OF_SERVICE = "out of service"
+
+
+class Event(StrEnum):
+    """What happens to an alarm: the first two by samples, the shelf's end by their time, the others by people."""
+
+    RAISED = "raised"
+    CLEARED = "cleared"
+    ACKNOWLEDGE = "acknowledge"
+    SHELVE = "shelve"
+    UNSHELVE = "unshelve"
+    SHELF_TIME_OVER = "shelf time over"
+    SUPPRESS = "suppress"
+    UNSUPPRESS = "unsuppress"
+    TAKE_OUT_OF_SERVICE = "take out of service"
+    RETURN_TO_SERVICE = "return to service"
+
+
+class ByCondition(NamedTuple):
+    """The next state depends on the condition.
+
+    Attributes:
+        standing: where it goes if the condition stands.
+        over: where it goes if not.
+    """
+
+    standing: State
+    over: State
+
+
+class Refused(NamedTuple):
+    """The event is not possible in this state.
+
+    Attributes:
+        reason: to be read after "the alarm": "is not shelved".
+    """
+
+    reason: str
+
+
+Outcome: TypeAlias = State | ByCondition | Refused
+
+OUT_OF_SIGHT = frozenset({State.SHELVED, State.SUPPRESSED_BY_DESIGN, State.OUT_OF_SERVICE})
+"""Where the operator is not bothered."""
+
+_IN_SIGHT_AGAIN = ByCondition(State.UNACKNOWLEDGED, State.NORMAL)
+_NOT_SHELVED = Refused("is not shelved")
+_NOT_SUPPRESSED = Refused("is not suppressed")
+_IN_SERVICE = Refused("is in service")
+_STANDS = Refused("stands already")
+_OVER = Refused("does not stand")
+
+_FROM_SIGHT: Mapping[Event, Outcome] = {
+    Event.SHELVE: State.SHELVED,
+    Event.UNSHELVE: _NOT_SHELVED,
+    Event.SHELF_TIME_OVER: _NOT_SHELVED,
+    Event.SUPPRESS: State.SUPPRESSED_BY_DESIGN,
+    Event.UNSUPPRESS: _NOT_SUPPRESSED,
+    Event.TAKE_OUT_OF_SERVICE: State.OUT_OF_SERVICE,
+    Event.RETURN_TO_SERVICE: _IN_SERVICE,
+}
+
+TABLE: Mapping[State, Mapping[Event, Outcome]] = MappingProxyType(
+    {
+        State.NORMAL: {
+            Event.RAISED: State.UNACKNOWLEDGED,
+            Event.CLEARED: _OVER,
+            Event.ACKNOWLEDGE: Refused("is normal, there is nothing to acknowledge"),
+            **_FROM_SIGHT,
+        },
+        State.UNACKNOWLEDGED: {
+            Event.RAISED: _STANDS,
+            Event.CLEARED: State.RETURNED_UNACKNOWLEDGED,
+            Event.ACKNOWLEDGE: State.ACKNOWLEDGED,
+            **_FROM_SIGHT,
+        },
+        State.ACKNOWLEDGED: {
+            Event.RAISED: _STANDS,
+            Event.CLEARED: State.NORMAL,
+            Event.ACKNOWLEDGE: Refused("is acknowledged already"),
+            **_FROM_SIGHT,
+        },
+        State.RETURNED_UNACKNOWLEDGED: {
+            Event.RAISED: State.UNACKNOWLEDGED,
+            Event.CLEARED: _OVER,
+            Event.ACKNOWLEDGE: State.NORMAL,
+            **_FROM_SIGHT,
+        },
+        State.SHELVED: {
+            Event.RAISED: State.SHELVED,
+            Event.CLEARED: State.SHELVED,
+            Event.ACKNOWLEDGE: Refused("is shelved; unshelve it first"),
+            Event.SHELVE: State.SHELVED,  # with a new time
+            Event.UNSHELVE: _IN_SIGHT_AGAIN,
+            Event.SHELF_TIME_OVER: _IN_SIGHT_AGAIN,
+            Event.SUPPRESS: Refused("is shelved; unshelve it first"),
+            Event.UNSUPPRESS: _NOT_SUPPRESSED,
+            Event.TAKE_OUT_OF_SERVICE: State.OUT_OF_SERVICE,
+            Event.RETURN_TO_SERVICE: _IN_SERVICE,
+        },
+        State.SUPPRESSED_BY_DESIGN: {
+            Event.RAISED: State.SUPPRESSED_BY_DESIGN,
+            Event.CLEARED: State.SUPPRESSED_BY_DESIGN,
+            Event.ACKNOWLEDGE: Refused("is suppressed by design; unsuppress it first"),
+            Event.SHELVE: Refused("is suppressed by design, nobody sees it anyway"),
+            Event.UNSHELVE: _NOT_SHELVED,
+            Event.SHELF_TIME_OVER: _NOT_SHELVED,
+            Event.SUPPRESS: Refused("is suppressed already"),
+            Event.UNSUPPRESS: _IN_SIGHT_AGAIN,
+            Event.TAKE_OUT_OF_SERVICE: State.OUT_OF_SERVICE,
+            Event.RETURN_TO_SERVICE: _IN_SERVICE,
+        },
+        State.OUT_OF_SERVICE: {
+            Event.RAISED: State.OUT_OF_SERVICE,
+            Event.CLEARED: State.OUT_OF_SERVICE,
+            Event.ACKNOWLEDGE: Refused("is out of service; return it to service first"),
+            Event.SHELVE: Refused("is out of service, nobody sees it anyway"),
+            Event.UNSHELVE: _NOT_SHELVED,
+            Event.SHELF_TIME_OVER: _NOT_SHELVED,
+            Event.SUPPRESS: Refused("is out of service, nobody sees it anyway"),
+            Event.UNSUPPRESS: _NOT_SUPPRESSED,
+            Event.TAKE_OUT_OF_SERVICE: Refused("is out of service already"),
+            Event.RETURN_TO_SERVICE: _IN_SIGHT_AGAIN,
+        },
+    }
+)
+
+
+def next_state(state: State, event: Event, *, standing: bool) -> State:
+    """Where an alarm goes.
+
+    Args:
+        state: where it is.
+        event: what happens to it.
+        standing: whether its condition stands, after the event.
+
+    Raises:
+        InputError: the table refuses the event in this state; the text is the reason.
+    """
+    outcome = TABLE[state][event]
+    if isinstance(outcome, Refused):
+        raise InputError(outcome.reason)
+    if isinstance(outcome, ByCondition):
+        return outcome.standing if standing else outcome.over
+    return outcome
+
+
+def fits(state: State, *, standing: bool) -> bool:
+    """Whether an alarm can be in this state while its condition stands, or does not."""
+    if state in OUT_OF_SIGHT:
+        return True
+    return standing == (state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED))
+
+
+def diagram() -> str:
+    """The table as a Mermaid state diagram, arrows between the same two states drawn as one."""
+    arrows: dict[tuple[State, State], list[str]] = {}
+    for state, row in TABLE.items():
+        for event, outcome in row.items():
+            if isinstance(outcome, ByCondition):
+                arrows.setdefault((state, outcome.standing), []).append(f"{event}, stands")
+                arrows.setdefault((state, outcome.over), []).append(f"{event}, over")
+            elif isinstance(outcome, State):
+                arrows.setdefault((state, outcome), []).append(event)
+    names = [f'    state "{state}" as {state.name}' for state in State]
+    lines = [f"    {start.name} --> {end.name}: {' / '.join(events)}" for (start, end), events in arrows.items()]
+    return "\n".join(["stateDiagram-v2", *names, f"    [*] --> {State.NORMAL.name}", *lines])

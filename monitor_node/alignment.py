@@ -1,0 +1,210 @@
+"""Signals arrive one by one; a model needs rows. This lines them up by the time of the sample.
+
+The policy, in sample times alone, so that a replay does exactly what the live run did:
+
+- A row leaves when every signal of it has come and no older row is waited for. One is waited for that has begun, and
+  one that has not while the sequence numbers say that it is missing.
+- Nothing is waited for longer than until `reorder_rows` newer rows have begun. Then a row leaves with NaN for what is
+  missing in it, and is counted as incomplete.
+- A sample for a row that has left is late: counted, and dropped. The same sample twice counts as duplicated.
+- A sample older than one of its signal that came before it is out of order: counted, and used if its row is waiting.
+- Sequence numbers that jump forward mean lost samples (until they turn up). One that falls back by more than the
+  reordering could explain means that the publisher was restarted: what was waiting leaves, and the clock starts anew.
+"""
+
+from dataclasses import dataclass, field
+from math import nan
+from typing import NamedTuple
+
+REMEMBERED = 4  # times the reordering: rows that a duplicate is known by, numbers that a restart falls back by
+
+
+class Row(NamedTuple):
+    """What was measured at one time.
+
+    Attributes:
+        time_ns: of the samples.
+        values: one a signal, in the order of the aligner's signals; NaN: missing.
+        restarted: whether this is the first row of a new run of the publisher.
+    """
+
+    time_ns: int
+    values: tuple[float, ...]
+    restarted: bool
+
+
+@dataclass
+class Counts:
+    """What happened to samples on their way into rows."""
+
+    rows: int = 0
+    incomplete_rows: int = 0
+    late: int = 0
+    duplicated: int = 0
+    out_of_order: int = 0
+    lost: int = 0
+    restarts: int = 0
+
+
+@dataclass
+class Sequence:
+    """Where one signal's numbering is.
+
+    Attributes:
+        expected: the number after the highest that has come; None before the first.
+        next_to_leave: the number after that of the row which left last; None before the first.
+        newest_ns: the latest time that has come.
+    """
+
+    expected: int | None = None
+    next_to_leave: int | None = None
+    newest_ns: int = 0
+
+
+@dataclass
+class Waiting:
+    """A row that waits: a value and a sequence number a signal, None where the signal has not come."""
+
+    values: list[float | None]
+    numbers: list[int | None]
+
+
+@dataclass
+class AlignmentState:
+    """Everything that an aligner remembers.
+
+    Attributes:
+        pending: rows that wait, by time.
+        left: rows that left last, oldest first: by time, whether each signal had come.
+        newest_left_ns: time of the row that left last; None before the first.
+        sequences: by signal.
+        restarted: whether the next row is the first of a new run.
+        counts: of what happened so far.
+    """
+
+    pending: dict[int, Waiting] = field(default_factory=dict)
+    left: dict[int, tuple[bool, ...]] = field(default_factory=dict)
+    newest_left_ns: int | None = None
+    sequences: list[Sequence] = field(default_factory=list)
+    restarted: bool = True
+    counts: Counts = field(default_factory=Counts)
+
+
+class Aligner:
+    """Lines samples up into rows.
+
+    Args:
+        signals: names, in the order that rows have.
+        reorder_rows: how many newer rows may begin before an incomplete one is given up.
+
+    Raises:
+        ValueError: `reorder_rows` is less than 1.
+    """
+
+    def __init__(self, signals: tuple[str, ...], reorder_rows: int) -> None:
+        if reorder_rows < 1:
+            raise ValueError(f"reorder_rows must be at least 1, got {reorder_rows}")
+        self._index = {signal: index for index, signal in enumerate(signals)}
+        self._reorder_rows = reorder_rows
+        self.state = AlignmentState(sequences=[Sequence() for _ in signals])
+
+    def update(self, signal: str, time_ns: int, sequence: int, value: float) -> list[Row]:
+        """Take a sample in; returns the rows that leave because of it, oldest first.
+
+        Args:
+            signal: one of the aligner's.
+            time_ns: of the sample.
+            sequence: the publisher's number of it.
+            value: finite.
+        """
+        index = self._index[signal]
+        rows = self._restart(index, time_ns, sequence)
+        state, counts = self.state, self.state.counts
+        waiting = state.pending.get(time_ns)
+        gone = waiting is None and state.newest_left_ns is not None and time_ns <= state.newest_left_ns
+        if (waiting is not None and waiting.values[index] is not None) or (
+            gone and state.left.get(time_ns, ())[index : index + 1] == (True,)
+        ):
+            counts.duplicated += 1
+            return rows
+        self._count_sequence(state.sequences[index], time_ns, sequence)
+        if gone:
+            counts.late += 1
+            return rows
+        if waiting is None:
+            empty = len(self._index)
+            waiting = state.pending[time_ns] = Waiting([None] * empty, [None] * empty)
+        waiting.values[index] = value
+        waiting.numbers[index] = sequence
+        return rows + self._release()
+
+    def flush(self) -> list[Row]:
+        """Let everything leave that still waits, as at the end of a record."""
+        return [self._leave(time_ns) for time_ns in sorted(self.state.pending)]
+
+    def _release(self) -> list[Row]:
+        pending = self.state.pending
+        rows: list[Row] = []
+        times = sorted(pending) if len(pending) > 1 else list(pending)
+        for position, time_ns in enumerate(times):
+            newer = len(times) - 1 - position
+            if newer < self._reorder_rows and not self._may_leave(pending[time_ns]):
+                break
+            rows.append(self._leave(time_ns))
+        return rows
+
+    def _may_leave(self, waiting: Waiting) -> bool:
+        """Whether a row is complete, and follows by any of its numbers the row that left last."""
+        if None in waiting.values:
+            return False
+        return any(
+            position.next_to_leave in (None, number)
+            for position, number in zip(self.state.sequences, waiting.numbers, strict=True)
+        )
+
+    def _leave(self, time_ns: int) -> Row:
+        state = self.state
+        waiting = state.pending.pop(time_ns)
+        values = waiting.values
+        for position, number in zip(state.sequences, waiting.numbers, strict=True):
+            if number is not None:
+                position.next_to_leave = number + 1
+            elif position.next_to_leave is not None:
+                position.next_to_leave += 1
+        state.left[time_ns] = tuple(value is not None for value in values)
+        if len(state.left) > REMEMBERED * self._reorder_rows:
+            del state.left[next(iter(state.left))]
+        state.newest_left_ns = time_ns
+        state.counts.rows += 1
+        if None in values:
+            state.counts.incomplete_rows += 1
+        row = Row(time_ns, tuple(nan if value is None else value for value in values), state.restarted)
+        state.restarted = False
+        return row
+
+    def _restart(self, index: int, time_ns: int, sequence: int) -> list[Row]:
+        """If the publisher was restarted, begin anew; returns the rows that were waiting."""
+        position = self.state.sequences[index]
+        if position.expected is None or sequence >= position.expected:
+            return []
+        fell_back = sequence < position.expected - REMEMBERED * self._reorder_rows
+        began_again = sequence == 0 and time_ns > position.newest_ns
+        if not (fell_back or began_again):
+            return []
+        rows = self.flush()
+        self.state.counts.restarts += 1
+        self.state.left = {}
+        self.state.newest_left_ns = None
+        self.state.restarted = True
+        self.state.sequences = [Sequence() for _ in self._index]
+        return rows
+
+    def _count_sequence(self, position: Sequence, time_ns: int, sequence: int) -> None:
+        counts = self.state.counts
+        if position.expected is None or sequence >= position.expected:
+            counts.lost += 0 if position.expected is None else sequence - position.expected
+            position.expected = sequence + 1
+        elif time_ns < position.newest_ns:
+            counts.out_of_order += 1
+            counts.lost -= 1 if counts.lost else 0  # it was counted when it was overtaken
+        position.newest_ns = max(position.newest_ns, time_ns)

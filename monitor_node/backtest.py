@@ -1,0 +1,74 @@
+"""The monitor's core over a recording, as fast as it goes: what it would have said, or did say."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
+
+
+@dataclass
+class Backtest:
+    """What came of it.
+
+    Attributes:
+        rows: of samples.
+        first_ns: time of the first sample; 0 without rows.
+        last_ns: time of the last sample.
+        watching_since_ns: time of the first row that was judged; None if the record is shorter than the training.
+        expected_false_alarms: see `Monitor.expected_false_alarms`.
+        alarm_messages: every change of an alarm, in order.
+        refused: counts by reason.
+    """
+
+    rows: int
+    first_ns: int
+    last_ns: int
+    watching_since_ns: int | None
+    expected_false_alarms: float
+    alarm_messages: list[Alarm]
+    refused: dict[str, int]
+
+    @property
+    def raised(self) -> list[tuple[Alarm, int | None]]:
+        """Each alarm as it was raised, and when it was cleared (None: it still stands)."""
+        found: list[tuple[Alarm, int | None]] = []
+        for index, alarm in enumerate(self.alarm_messages):
+            if alarm.state != AlarmState.ALARM_STATE_UNACKNOWLEDGED:
+                continue
+            later = (other for other in self.alarm_messages[index + 1 :] if other.alarm == alarm.alarm)
+            cleared = next((other.cleared_ns for other in later if other.cleared_ns), None)
+            found.append((alarm, cleared))
+        return found
+
+
+def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
+    """Run the monitor over messages in the order they were received; those that are no samples are passed over.
+
+    Args:
+        messages: of any plant; only samples of `config.plant` are looked at.
+        config: of the monitor.
+    """
+    prefix = keys.key(config.plant, keys.SAMPLE, "")
+    monitor = Monitor(config, start_ns=0)
+    alarms: list[Alarm] = []
+
+    def keep(publications: list[Publication]) -> None:
+        alarms.extend(item.message for item in publications if isinstance(item.message, Alarm))
+
+    for message in messages:
+        if message.key.startswith(prefix):
+            keep(monitor.on_message(message, message.received_ns))
+    keep(monitor.finish())
+    return Backtest(
+        rows=monitor.rows,
+        first_ns=monitor.first_ns or 0,
+        last_ns=monitor.last_ns or 0,
+        watching_since_ns=monitor.watching_since_ns,
+        expected_false_alarms=monitor.expected_false_alarms,
+        alarm_messages=alarms,
+        refused=dict(monitor.refusals.by_reason),
+    )

@@ -1,0 +1,86 @@
+"""The monitor's settings."""
+
+from typing import Literal
+
+import msgspec
+
+from monitor_node.persistence import check_rule
+from reactorwatch.contract.keys import checked_plant
+
+PriorityName = Literal["low", "medium", "high", "critical"]
+
+
+class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a plant is watched.
+
+    Attributes:
+        plant: its name.
+        input: the signal that drives the plant.
+        outputs: the signals that are predicted and watched.
+        order: of the ARX models.
+        delay: of the input, in samples; 1 means that it acts on the next sample.
+        forgetting: of the model that adapts, in (0, 1]; 1 forgets nothing.
+        training_min: how long it learns before it watches, in minutes of the plant.
+        identification_share: the part of the training that the model learns in; the rest teaches the limits.
+        width: of the limits, in standard deviations of the residual.
+        raise_count: an alarm is raised when this many of the last `window` points are out ...
+        window: ... of so many ...
+        clear_count: ... and cleared after this many in a row are back in ...
+        dead_band: ... which they are within (1 - dead_band) of the limit, in [0, 0.9].
+        incident_min: how long after the last change of an incident's alarms another one still belongs to it, in minutes
+            of the plant.
+        longest_shelf_min: how long an alarm may be shelved at most, in minutes of the plant.
+        alarm_state_file: where the state of the alarms is kept, so that it survives a restart; None: nowhere.
+        reorder_rows: how many newer rows may begin before an incomplete one is given up.
+        snapshot_min: how often the models are published, in minutes of the plant.
+        health_period_s: how often health is published, in seconds.
+        priorities: of the alarms, by signal; those not named are medium.
+    """
+
+    plant: str = "cstr"
+    input: str = "qc"
+    outputs: tuple[str, ...] = ("C", "T")
+    order: int = 3
+    delay: int = 1
+    forgetting: float = 0.999
+    training_min: float = 100.0
+    identification_share: float = 0.6
+    width: float = 3.0
+    raise_count: int = 3
+    window: int = 5
+    clear_count: int = 20
+    dead_band: float = 0.1
+    incident_min: float = 60.0
+    longest_shelf_min: float = 480.0
+    alarm_state_file: str | None = None
+    reorder_rows: int = 8
+    snapshot_min: float = 5.0
+    health_period_s: float = 5.0
+    priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: {"T": "high"})
+
+    def __post_init__(self) -> None:
+        checked_plant(self.plant)
+        check_rule(self.raise_count, self.window, self.clear_count)
+        if not self.outputs or self.input in self.outputs or len(set(self.outputs)) != len(self.outputs):
+            raise ValueError(
+                f"outputs must be at least one signal, each once, without the input {self.input!r}, got {self.outputs}"
+            )
+        for what, value, low, high in (
+            ("order", self.order, 1, 20),
+            ("delay", self.delay, 1, 100),
+            ("forgetting", self.forgetting, 0.5, 1.0),
+            ("training_min", self.training_min, 1e-3, 1e6),
+            ("identification_share", self.identification_share, 0.1, 0.9),
+            ("width", self.width, 0.5, 20.0),
+            ("dead_band", self.dead_band, 0.0, 0.9),
+            ("incident_min", self.incident_min, 0.0, 1e6),
+            ("longest_shelf_min", self.longest_shelf_min, 1e-3, 1e6),
+            ("reorder_rows", self.reorder_rows, 1, 1000),
+            ("snapshot_min", self.snapshot_min, 1e-3, 1e6),
+            ("health_period_s", self.health_period_s, 0.05, 3600.0),
+        ):
+            if not low <= value <= high:
+                raise ValueError(f"{what} must be in [{low:g}, {high:g}], got {value:g}")
+        for signal in self.priorities:
+            if signal not in self.outputs:
+                raise ValueError(f"priorities are by output, {self.outputs}, got {signal!r}")

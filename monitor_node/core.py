@@ -1,0 +1,236 @@
+"""The watch over one plant: samples in; estimates, chart points, models, alarms and health out.
+
+A plant's life with its monitor has three phases, told by the time of the samples alone:
+
+- *training*, first part: an ARX model of each output is identified by recursive least squares.
+- *training*, second part: the model is held as the reference, and its residuals on rows that it has not learned from
+  give the mean and the spread that limits are made of.
+- *watching*: every residual of the reference is charted. A model goes on adapting beside it, and is published;
+  but it judges nothing, because a model that adapts would learn the fault and call it normal.
+
+Nothing here reads a clock: `now_ns` only counts up-time and says when health is due. What is published about the
+plant follows from the samples and from what people said of its alarms, so a replay of a run in which nobody said
+anything says the same, value for value.
+"""
+
+from math import isfinite
+
+from monitor_node.alarm_board import AlarmBoard
+from monitor_node.alarm_commands import obey
+from monitor_node.alignment import Aligner, Row
+from monitor_node.config import MonitorConfig
+from monitor_node.output_watch import OutputWatch
+from monitor_node.refusals import Refusals
+from monitor_node.sampling import SamplingPeriod
+from reactorwatch import __version__
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.messages_pb2 import CommandReply, Health, Quality, Sample
+from reactorwatch.errors import InputError
+from reactorwatch.records.record import MINUTE_NS
+
+NODE = "monitor"
+
+UNSPECIFIED, BAD = Quality.QUALITY_UNSPECIFIED, Quality.QUALITY_BAD  # looked up once, not at every sample
+
+
+class Monitor:
+    """The monitor of one plant.
+
+    Args:
+        config: how it is watched.
+        start_ns: now.
+
+    Attributes:
+        refusals: what could not be used.
+        alarms: of the plant; `to_bytes` and `from_bytes` carry them over a restart.
+        first_ns: time of the first row; None before it.
+        last_ns: time of the last row; None before the first.
+    """
+
+    def __init__(self, config: MonitorConfig, start_ns: int) -> None:
+        self.config = config
+        self.refusals = Refusals()
+        self._signals = (config.input, *config.outputs)
+        self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
+        self._aligner = Aligner(self._signals, config.reorder_rows)
+        self._sampling = SamplingPeriod()
+        self.alarms = AlarmBoard(config)
+        self._watches = [OutputWatch(config, signal, self.alarms) for signal in config.outputs]
+        self._units = dict.fromkeys(self._signals, "")
+        self.first_ns: int | None = None
+        self.last_ns: int | None = None
+        self._watching_since_ns: int | None = None
+        self._rows_watched = 0
+        self._received = 0
+        self._published = 0
+        self._lag_ns = 0
+        self._start_ns = start_ns
+        self._health_due_ns = start_ns
+        self._snapshot_due_ns: int | None = None
+
+    # --- what the loop calls ---------------------------------------------------------------------------------
+
+    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
+        """Take in whatever was published on a key of the plant's samples."""
+        self._received += 1
+        if message.received_ns:
+            self._lag_ns = max(self._lag_ns, now_ns - message.received_ns)
+        signal = self._signal_by_key.get(message.key)
+        if signal is None:
+            self.refusals.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
+            return []
+        try:
+            sample = decode(message.payload, message.encoding)
+        except DecodeError as error:
+            self.refusals.add(error.reason, f"{message.key}: {error}")
+            return []
+        if not isinstance(sample, Sample):
+            self.refusals.add("encoding", f"{message.key}: a Sample was expected, got {message.encoding}")
+            return []
+        return self.on_sample(signal, sample, now_ns)
+
+    def on_sample(self, signal: str, sample: Sample, now_ns: int) -> list[Publication]:
+        """Take in a sample of one of the plant's signals.
+
+        Returns:
+            What is to be published because of it.
+        """
+        if sample.quality == UNSPECIFIED:
+            self.refusals.add("payload", f"{signal}: the sample has no quality, so it is no Sample of ours")
+            return []
+        if not isfinite(sample.value):
+            self.refusals.add("not_finite", f"{signal} is {sample.value} at {sample.time_ns} ns")
+            return []
+        if sample.quality == BAD:
+            self.refusals.add("bad_quality", f"{signal} is marked bad at {sample.time_ns} ns")
+            return []
+        self._units[signal] = sample.unit
+        publications: list[Publication] = []
+        for row in self._aligner.update(signal, sample.time_ns, sample.sequence, sample.value):
+            self._on_row(row, publications)
+        self._published += len(publications)
+        return publications
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
+        """Let a person act on the alarms, at the time of the newest row; or say why not."""
+        self._received += 1
+        try:
+            reply, publications = obey(self.alarms, question)
+        except (InputError, DecodeError) as error:
+            reason = error.reason if isinstance(error, DecodeError) else "command"
+            self.refusals.add(reason, f"{question.key}: {error}")
+            return CommandReply(accepted=False, text=str(error)), []
+        self._published += len(publications)
+        return reply, publications
+
+    def on_tick(self, now_ns: int) -> list[Publication]:
+        """Publish health."""
+        self._health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
+        return [self._health(now_ns, self.phase)]
+
+    def next_tick_ns(self) -> int:
+        """When health is due."""
+        return self._health_due_ns
+
+    @property
+    def finished(self) -> bool:
+        """Never: a monitor watches until it is stopped."""
+        return False
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        """Publish health for the last time."""
+        return [self._health(now_ns, "stopped")]
+
+    # --- what others may ask ---------------------------------------------------------------------------------
+
+    @property
+    def phase(self) -> str:
+        """`waiting` for the first row, `training` or `watching`."""
+        if self.first_ns is None:
+            return "waiting"
+        return "training" if self._watching_since_ns is None else "watching"
+
+    @property
+    def rows(self) -> int:
+        """Rows that have been lined up so far, incomplete ones too."""
+        return self._aligner.state.counts.rows
+
+    @property
+    def watching_since_ns(self) -> int | None:
+        """Time of the first row that was judged; None while there is none."""
+        return self._watching_since_ns
+
+    @property
+    def expected_false_alarms(self) -> float:
+        """Alarms that chance alone would have raised by now, were the residuals independent and normal."""
+        return sum(watch.false_alarm_rate for watch in self._watches) * self._rows_watched
+
+    # --- rows ------------------------------------------------------------------------------------------------
+
+    def finish(self) -> list[Publication]:
+        """Judge the rows that still wait for samples, as at the end of a record."""
+        publications: list[Publication] = []
+        for row in self._aligner.flush():
+            self._on_row(row, publications)
+        return publications
+
+    def _on_row(self, row: Row, publications: list[Publication]) -> None:
+        config = self.config
+        follows = self._sampling.follows(row.time_ns) and not row.restarted
+        if self.first_ns is None or row.time_ns < self.first_ns:
+            self.first_ns = row.time_ns
+        self.last_ns = row.time_ns
+        trained_min = (row.time_ns - self.first_ns) / MINUTE_NS
+        identifying = trained_min < config.identification_share * config.training_min
+        training = trained_min < config.training_min
+        input_value = row.values[0]
+        watching = self._watching_since_ns is not None
+        for watch, value in zip(self._watches, row.values[1:], strict=True):
+            watch.update(
+                row.time_ns,
+                input_value,
+                value,
+                self._units[watch.signal],
+                follows=follows,
+                identifying=identifying,
+                training=training,
+                publications=publications,
+            )
+            watching = watching or watch.watching
+        publications.extend(self.alarms.end_row(row.time_ns))
+        if watching:
+            self._rows_watched += 1
+            if self._watching_since_ns is None:
+                self._watching_since_ns = row.time_ns
+        if (
+            self._snapshot_due_ns is None
+            or not 0 <= self._snapshot_due_ns - row.time_ns <= config.snapshot_min * MINUTE_NS
+        ):
+            if self._snapshot_due_ns is not None:
+                for watch in self._watches:
+                    publications.extend(watch.snapshots(row.time_ns))
+            self._snapshot_due_ns = row.time_ns + int(config.snapshot_min * MINUTE_NS)
+
+    def _health(self, now_ns: int, phase: str) -> Publication:
+        counts = self._aligner.state.counts
+        health = Health(
+            time_ns=now_ns,
+            node=NODE,
+            version=__version__,
+            phase=phase,
+            uptime_s=(now_ns - self._start_ns) / 1e9,
+            received=self._received,
+            lost=counts.lost,
+            late=counts.late,
+            refused=self.refusals.total,
+            refused_by_reason=self.refusals.by_reason,
+            lag_ms=self._lag_ns / 1e6,
+            duplicated=counts.duplicated,
+            out_of_order=counts.out_of_order,
+            published=self._published,
+            rows=counts.rows,
+            incomplete_rows=counts.incomplete_rows,
+        )
+        self._lag_ns = 0
+        return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

@@ -1,0 +1,166 @@
+"""ARX models from a record, by least squares.
+
+The regressors X, scaled, are factored, X = Q R, and R p = Q' y solved: the normal equations X'X p = X'y would square
+the condition number (Golub and Van Loan, Matrix Computations, 4th ed., section 5.3). With N rows,
+n parameters and residuals r, the noise variance is r'r / (N - n) and the parameters' covariance that times (R'R)^-1
+(Ljung, System Identification, 2nd ed., appendix II).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monitor_node.identification.linear_model import LinearModel
+from monitor_node.identification.regressor import Rows, rows_of
+from monitor_node.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
+from reactorwatch.errors import InputError
+
+SINGULAR_CONDITION = 1e13
+"""Beyond this the parameters are rounding."""
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """A least squares solution for one or several outputs.
+
+    Attributes:
+        parameters: shape (outputs, parameters).
+        inverse: shape (parameters, parameters), (X'X)^-1.
+        noise_variance: shape (outputs,), r'r / (rows - parameters); inf for as many rows as parameters.
+        condition: of the regressors.
+    """
+
+    parameters: NDArray[np.float64]
+    inverse: NDArray[np.float64]
+    noise_variance: NDArray[np.float64]
+    condition: float
+
+
+def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
+    """The parameters that leave the smallest sum of squares.
+
+    Args:
+        regressors: shape (rows, parameters).
+        outputs: shape (rows,) or (rows, outputs).
+
+    Raises:
+        InputError: fewer rows than parameters, values that are not finite, or regressors that don't determine the
+            parameters.
+    """
+    x, y = as_columns(regressors, "regressors"), as_columns(outputs, "outputs")
+    rows, parameters = x.shape
+    if len(y) != rows:
+        raise InputError(f"regressors and outputs must have equally many rows, got {rows} and {len(y)}")
+    if rows < parameters:
+        raise InputError(f"{parameters} parameters need at least {parameters} complete rows, got {rows}")
+    for name, values in (("regressors", x), ("outputs", y)):
+        if not np.all(np.isfinite(values)):
+            row = int(np.argmin(np.isfinite(values).all(axis=1)))
+            raise InputError(f"{name} must be finite, got {values[row]} in row {row + 1}")
+    q, r = np.linalg.qr(x)
+    values = np.linalg.svd(r, compute_uv=False)
+    condition = float(values[0] / values[-1]) if values[-1] > 0.0 else np.inf
+    if condition > SINGULAR_CONDITION:
+        raise InputError(
+            f"the rows don't determine {parameters} parameters: condition number {condition:.1e}, at most "
+            f"{SINGULAR_CONDITION:.0e} can be solved; try a lower order, slower sampling, other rows, a livelier input"
+        )
+    inverse_factor = np.linalg.inv(r)
+    theta = np.linalg.solve(r, q.T @ y)
+    rest = y - x @ theta
+    free = rows - parameters
+    squares = np.sum(rest * rest, axis=0)
+    variance = squares / free if free > 0 else np.full(y.shape[1], np.inf)
+    return LeastSquares(theta.T, inverse_factor @ inverse_factor.T, variance, condition)
+
+
+def fit_arx(
+    structure: Structure,
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    time: ArrayLike | None = None,
+    choice: RowChoice = ALL_ROWS,
+) -> LinearModel:
+    """The ARX model that predicts the next row best.
+
+    Rows with a missing value, or just after a gap in time, are left out.
+
+    Args:
+        structure: its terms.
+        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
+        outputs: shape (rows,) or (rows, outputs), likewise.
+        time: shape (rows,), increasing, in any unit; without it no gap is looked for.
+        choice: which rows are fitted.
+
+    Raises:
+        InputError: too few rows, an output that is constant, or rows that don't determine the parameters.
+    """
+    u = as_columns(inputs, "inputs", structure.inputs)
+    y = as_columns(outputs, "outputs", structure.outputs)
+    refuse_constant(y)
+    scaling = Scaling.of(u, y, centred=structure.offset)
+    rows = enough_rows(rows_of(structure, scaling.inputs(u), scaling.outputs(y), time, choice), len(y))
+    return linear_model(structure, scaling, least_squares(rows.regressors, rows.outputs), rows.position.size)
+
+
+def linear_model(
+    structure: Structure,
+    scaling: Scaling,
+    solution: LeastSquares,
+    rows: int,
+    simulates: bool = False,
+    first_output: int = 0,
+) -> LinearModel:
+    """A model in the signals' own units from a solution in scaled ones.
+
+    Args:
+        structure: its terms.
+        scaling: of the signals.
+        solution: of one or several of the outputs.
+        rows: how many rows it was fitted to.
+        simulates: whether it was fitted by its free run.
+        first_output: the output that the solution's first one is.
+    """
+    solved, size = solution.parameters.shape
+    parameters = np.empty((solved, size))
+    covariance = np.full((solved, size, size), np.inf)
+    for i in range(solved):
+        matrix, shift = scaling.undoing(structure, first_output + i)
+        parameters[i] = matrix @ solution.parameters[i] + shift
+        if np.isfinite(solution.noise_variance[i]) and np.all(np.isfinite(solution.inverse)):
+            covariance[i] = solution.noise_variance[i] * matrix @ solution.inverse @ matrix.T
+    spreads = np.array(scaling.output_spreads[first_output : first_output + solved])
+    noise_sd = np.sqrt(solution.noise_variance) * spreads
+    return LinearModel(structure, parameters, covariance, noise_sd, solution.condition, rows, simulates)
+
+
+def refuse_constant(outputs: NDArray[np.float64]) -> None:
+    """Raise if an output never changes.
+
+    Raises:
+        InputError: an output whose measured values are all equal.
+    """
+    for o, column in enumerate(outputs.T):
+        values = column[np.isfinite(column)]
+        if values.size and np.ptp(values) == 0.0:
+            raise InputError(f"output {o + 1} is constant, {values[0]:g} in all rows: there is nothing to identify")
+
+
+def enough_rows(rows: Rows, of: int) -> Rows:
+    """The rows, if they can determine the parameters.
+
+    Args:
+        rows: what can be used of a record.
+        of: how many rows the record has.
+
+    Raises:
+        InputError: fewer rows than parameters.
+    """
+    usable, parameters = rows.regressors.shape
+    if usable < parameters:
+        raise InputError(
+            f"{parameters} parameters need at least {parameters} rows that are complete and follow complete rows "
+            f"without a gap, got {usable} of {of}"
+        )
+    return rows

@@ -1,0 +1,271 @@
+"""Is a record good enough to learn a model from? Each check is a result, with the reason and the cure if it fails.
+
+Persistence of excitation (Ljung, System Identification, 2nd ed., chapter 13): a linear model of n
+parameters on past outputs and m on past inputs needs an input of order n + m, one whose n + m lagged copies, less
+their means, are linearly independent. A sinusoid excites 2, a sum of k sinusoids 2k, however long it lasts; a square
+wave or random steps many more. Measured here as the smallest over the largest singular value of the lagged copies.
+As independence in itself does not depend on the spacing of the lags, but its size does (neighbouring samples of a slow
+input are nearly equal), the best of several spacings counts; how fast the samples come is another check's affair.
+
+The sampling rate is judged by the plant's response to a step, T95 in samples: 5 to 15 are advised (Isermann and
+Munchhof, Identification of Dynamic Systems, 2011, section 23.2). Above that neighbouring rows are nearly equal, the
+regressors become singular, and noise outweighs what a sample adds; below it the response is over between two
+samples. The step response is that of the instrumental variable model: least squares would take the noise for fast
+dynamics, and find every sampling rate good.
+"""
+
+import math
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monitor_node.identification.instrumental_variable import instrumental_variable
+from monitor_node.identification.linear_model import RunPlan, free_run, plan_run
+from monitor_node.identification.regressor import rows_of, unbroken
+from monitor_node.identification.structure import Scaling, Structure, as_columns
+from reactorwatch.errors import InputError
+
+INDEPENDENT = 0.01
+"""The weakest direction of the input's lagged copies must have this share of the strongest one's size."""
+LARGEST_CONDITION = 1e4
+SLOWEST_SAMPLES, BEST_SAMPLES, FASTEST_SAMPLES = 3.0, 10.0, 30.0
+"""T95 in samples: fewer is too slow, more too fast."""
+LEAST_AMPLITUDE = 3.0
+
+_LONGEST_STEP = 20_000
+
+
+class Check(msgspec.Struct, frozen=True):
+    """What a check found.
+
+    Attributes:
+        name: of the check.
+        result: "ok", or what is wrong and what to do about it.
+        value: what was measured.
+        limit: what it was held against.
+    """
+
+    name: str
+    result: str
+    value: float
+    limit: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether all is well."""
+        return self.result == "ok"
+
+
+class SamplingCheck(Check, frozen=True):
+    """A check of the sampling rate.
+
+    Attributes:
+        decimation: take one row of so many; 1 if the rate is good, or too slow already.
+    """
+
+    decimation: int = 1
+
+
+def check_record(
+    structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
+) -> tuple[Check, ...]:
+    """All checks of a record for a structure, in the order in which they should be cured.
+
+    Args:
+        structure: of the model that is to be learned; one output.
+        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
+        outputs: shape (rows,) or (rows, 1), likewise.
+        time: shape (rows,); without it no gap is looked for.
+
+    Raises:
+        InputError: shapes that don't fit, times that don't increase, or too few rows.
+    """
+    varied = variation(outputs)
+    if not varied.passed:
+        return (varied,)
+    excited = persistence(inputs, structure.output_lags + structure.input_lags, time)
+    conditioned = conditioning(structure, inputs, outputs, time)
+    if not excited.passed or conditioned.value == math.inf:
+        return varied, excited, conditioned
+    return (
+        varied,
+        excited,
+        sampling(structure, inputs, outputs, time),
+        conditioned,
+        amplitude(structure, inputs, outputs, time),
+    )
+
+
+def variation(outputs: ArrayLike) -> Check:
+    """Whether the output moves at all, by more than its own rounding."""
+    values = np.asarray(outputs, dtype=np.float64)
+    values = values[np.isfinite(values)]
+    if values.size == 0:
+        return Check("variation", "the output has no measured value", 0.0, 0.0)
+    spread, limit = float(np.std(values)), 1e-12 * float(np.max(np.abs(values)))
+    constant = f"the output is constant, {values[0]:g}: there is nothing to identify"
+    return Check("variation", "ok" if spread > limit else constant, spread, limit)
+
+
+def persistence(inputs: ArrayLike, order: int, time: ArrayLike | None = None) -> Check:
+    """Whether the input excites a model of a given number of parameters.
+
+    Args:
+        inputs: shape (rows,) or (rows, inputs).
+        order: parameters on past outputs and past inputs together (for each input).
+        time: shape (rows,); without it no gap is looked for.
+    """
+    u = as_columns(inputs, "inputs")
+    run = unbroken(u, time)
+    found, spacing = 0, 1
+    while found < order and spacing * (order - 1) <= max(len(u) // 4, order - 1):
+        rows = np.flatnonzero(run > spacing * (order - 1))
+        if rows.size >= 2 * order * u.shape[1]:
+            found = max(found, _excited_order([u[rows - lag * spacing] for lag in range(order)]))
+        spacing *= 2
+    if found >= order:
+        return Check("excitation", "ok", float(found), float(order))
+    kind = {0: " (a constant input excites none)", 2: " (as a single sinusoid does)"}.get(found, "")
+    reason = (
+        f"the input excites order {found}{kind}, order {order} is needed: move it in steps at irregular times, "
+        f"or by a sum of at least {-(-order // 2)} sinusoids"
+    )
+    return Check("excitation", reason, float(found), float(order))
+
+
+def _excited_order(copies: list[NDArray[np.float64]]) -> int:
+    """How many of the first lagged copies are independent."""
+    centred = [copy - copy.mean(axis=0) for copy in copies]
+    size = np.linalg.norm(centred[0], axis=0)
+    if np.any(size <= 1e-12 * np.max(np.abs(copies[0]), axis=0) * math.sqrt(len(copies[0]))):
+        return 0
+    inputs = centred[0].shape[1]
+    triangle = np.asarray(np.linalg.qr(np.concatenate([copy / size for copy in centred], axis=1), mode="r"))
+    for lags in range(len(copies), 0, -1):
+        values = np.linalg.svd(triangle[: lags * inputs, : lags * inputs], compute_uv=False)
+        if values[-1] >= INDEPENDENT * values[0]:
+            return lags
+    return 0
+
+
+def conditioning(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Check:
+    """Whether the scaled regressors determine the parameters.
+
+    Raises:
+        InputError: shapes that don't fit, times that don't increase, or fewer rows than parameters.
+    """
+    u = as_columns(inputs, "inputs", structure.inputs)
+    y = as_columns(outputs, "outputs", structure.outputs)
+    scaling = Scaling.of(u, y, centred=structure.offset)
+    regressors = rows_of(structure, scaling.inputs(u), scaling.outputs(y), time).regressors
+    if len(regressors) < structure.parameters:
+        raise InputError(f"{structure.parameters} parameters need as many complete rows, got {len(regressors)}")
+    return condition_check(float(np.linalg.cond(regressors)))
+
+
+def condition_check(condition: float) -> Check:
+    """The condition number of scaled regressors, from a record or from a recursive estimator, against its limit."""
+    value = condition if math.isfinite(condition) and condition < 1e16 else math.inf
+    reason = (
+        f"the regressors are nearly dependent, condition number {value:.1e}: "
+        "lower the order, sample more slowly or excite more"
+    )
+    return Check("conditioning", "ok" if value <= LARGEST_CONDITION else reason, value, LARGEST_CONDITION)
+
+
+def sampling(
+    structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
+) -> SamplingCheck:
+    """Whether the samples come neither too fast nor too slowly for the plant.
+
+    Args:
+        structure: of the model that is to be learned; one output.
+        inputs: shape (rows,) or (rows, inputs).
+        outputs: shape (rows,) or (rows, 1).
+        time: shape (rows,); without it no gap is looked for.
+
+    Raises:
+        InputError: too few rows, or rows that don't determine the parameters.
+    """
+    u = as_columns(inputs, "inputs", structure.inputs)
+    y = as_columns(outputs, "outputs", 1)
+    scaling = Scaling.of(u, y, centred=structure.offset)
+    scaled_u, scaled_y = scaling.inputs(u), scaling.outputs(y)
+    plan = plan_run(structure, scaled_u, scaled_y, time)
+    samples = response_samples(structure, instrumental_variable(structure, scaled_u, scaled_y, plan, time))
+    if math.isnan(samples):
+        reason = "cannot tell: the model found has no settled step response; a longer or livelier record would help"
+        return SamplingCheck("sampling", reason, math.nan, FASTEST_SAMPLES)
+    if samples > FASTEST_SAMPLES:
+        decimation = round(samples / BEST_SAMPLES)
+        reason = (
+            f"too fast: the response takes {samples:.0f} samples, {BEST_SAMPLES:.0f} suffice: take one of {decimation}"
+        )
+        return SamplingCheck("sampling", reason, samples, FASTEST_SAMPLES, decimation)
+    if samples < SLOWEST_SAMPLES:
+        reason = (
+            f"too slow: the response is over within {samples:.0f} samples: sample at least "
+            f"{BEST_SAMPLES / samples:.0f} times faster"
+        )
+        return SamplingCheck("sampling", reason, samples, SLOWEST_SAMPLES)
+    return SamplingCheck("sampling", "ok", samples, FASTEST_SAMPLES)
+
+
+def response_samples(structure: Structure, parameters: NDArray[np.float64]) -> float:
+    """How many samples a step response takes to 95 % of its final value for the first time, beyond the delay.
+
+    Of several inputs the one with the largest effect counts. NaN if there is no effect, or it does not settle.
+
+    Args:
+        structure: of the model; one output.
+        parameters: shape (parameters,), for scaled signals.
+    """
+    lags = structure.output_lags
+    rest = 1.0 - float(np.sum(parameters[:lags]))
+    gains = parameters[lags : lags + structure.input_lags * structure.inputs].reshape(-1, structure.inputs).sum(axis=0)
+    strongest = int(np.argmax(np.abs(gains)))
+    if rest <= 0.0 or gains[strongest] == 0.0:
+        return math.nan
+    final = gains[strongest] / rest
+    length = _LONGEST_STEP + structure.history
+    step = np.zeros((length, structure.inputs))
+    step[structure.history :, strongest] = 1.0
+    starts = np.arange(length) == structure.history
+    plan = RunPlan(starts, np.arange(length) >= structure.history)
+    theta = parameters.copy()
+    if structure.offset:
+        theta[-1] = 0.0
+    response = free_run(structure, theta[None, :], step, np.zeros((length, 1)), plan)[structure.history :, 0]
+    reached = np.flatnonzero(response / final >= 0.95)
+    return float(reached[0] - structure.delay + 1) if reached.size else math.nan
+
+
+def amplitude(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Check:
+    """Whether the output moves by more than its noise: the residual of an ARX model of twice the order.
+
+    Raises:
+        InputError: too few rows, or rows that don't determine the parameters.
+    """
+    rich = Structure(
+        2 * structure.output_lags,
+        2 * structure.input_lags,
+        structure.delay,
+        structure.inputs,
+        1,
+        structure.offset,
+    )
+    u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
+    scaling = Scaling.of(u, y, centred=structure.offset)
+    rows = rows_of(rich, scaling.inputs(u), scaling.outputs(y), time)
+    # Nearly dependent columns leave the residual well determined, so they are no obstacle here.
+    theta = np.linalg.lstsq(rows.regressors, rows.outputs)[0]
+    rest = rows.outputs - rows.regressors @ theta
+    free = max(len(rest) - rich.parameters, 1)
+    noise = math.sqrt(float(np.sum(rest * rest)) / free)
+    value = float(np.std(rows.outputs)) / noise if noise > 0.0 else math.inf
+    reason = (
+        f"the output moves by only {value:.1f} times its noise, {LEAST_AMPLITUDE:.0f} are needed: "
+        "move the input further or average samples"
+    )
+    return Check("amplitude", "ok" if value >= LEAST_AMPLITUDE else reason, value, LEAST_AMPLITUDE)

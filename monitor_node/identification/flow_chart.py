@@ -1,0 +1,161 @@
+"""From data to verdict: the report's flow chart, with the branch that was taken at each question and why.
+
+    data -> is the sampling rate good? -no-> sample again
+                 | yes
+            model, from the rows that are trusted; limits: mean +- 3 sigma of its residual there (SPC)
+                 |
+            is there a mismatch in the other rows? -no-> fault free
+                 | yes
+            are the parameters accurate there? -no-> identify again
+                 | yes
+               fault
+
+A residual outside its limits happens, to a model that is true, in 0.27 % of rows; the share seen while training, if it
+is larger, is taken instead. There is a mismatch if the number outside is improbable under that share (binomial).
+Parameters are accurate for a row if their uncertainty adds less to its prediction than noise does, phi' cov phi <
+sigma^2: not so where the plant has gone where the model has never been.
+"""
+
+import math
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from monitor_node.identification.batch import fit_arx
+from monitor_node.identification.excitation import Check, check_record, sampling
+from monitor_node.identification.linear_model import LinearModel
+from monitor_node.identification.regressor import rows_of
+from monitor_node.identification.structure import Structure, as_columns
+from reactorwatch.errors import InputError
+
+OUTSIDE_THREE_SIGMA = 0.0027
+MISMATCH_MINUS_LOG10_P = 6.0
+
+
+class Branch(msgspec.Struct, frozen=True):
+    """One question of the chart.
+
+    Attributes:
+        question: as it stands in the chart.
+        answer: "yes" or "no".
+        why: the numbers.
+    """
+
+    question: str
+    answer: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """Where the chart ended.
+
+    Attributes:
+        verdict: "sample again", "fault free", "identify again" or "fault".
+        branches: the questions asked, in order.
+        model: None if the chart ended before it.
+        lower_limit: of the residual, in the output's unit; NaN likewise.
+        upper_limit: likewise.
+    """
+
+    verdict: str
+    branches: tuple[Branch, ...]
+    model: LinearModel | None = None
+    lower_limit: float = math.nan
+    upper_limit: float = math.nan
+
+
+def follow(
+    structure: Structure,
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    time: ArrayLike | None = None,
+    trusted_rows: int | None = None,
+) -> Conclusion:
+    """Go through the chart with a record.
+
+    Args:
+        structure: of the ARX model; one output.
+        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
+        outputs: shape (rows,) or (rows, 1), likewise.
+        time: shape (rows,); without it no gap is looked for.
+        trusted_rows: how many rows at the start are known to be fault free; the first half, if not given.
+
+    Raises:
+        InputError: a record that does not determine the model, or no rows on one side.
+    """
+    u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
+    t = np.arange(len(y), dtype=np.float64) if time is None else np.asarray(time, dtype=np.float64)
+    trusted = len(y) // 2 if trusted_rows is None else trusted_rows
+    if not 0 < trusted < len(y):
+        raise InputError(f"trusted_rows must be between 1 and {len(y) - 1}, got {trusted}")
+    training, watched = (u[:trusted], y[:trusted], t[:trusted]), (u[trusted:], y[trusted:], t[trusted:])
+
+    for check in check_record(structure, *training):
+        if check.name in ("variation", "excitation") and not check.passed:
+            raise InputError(check.result)
+    rate = sampling(structure, *training)
+    branches = [_asked("is the sampling rate good?", rate.passed, _sampling_text(rate))]
+    if not rate.passed:
+        return Conclusion("sample again", tuple(branches))
+
+    model = fit_arx(structure, *training)
+    known = _present(model.residuals(*training))
+    centre, sigma = float(np.mean(known)), float(np.std(known, ddof=structure.parameters))
+    lower, upper = centre - 3.0 * sigma, centre + 3.0 * sigma
+    usual = max(OUTSIDE_THREE_SIGMA, float(np.mean((known < lower) | (known > upper))))
+    residuals = model.residuals(*watched)[:, 0]
+    present = np.isfinite(residuals)
+    if not np.any(present):
+        raise InputError(f"none of the {len(residuals)} rows after the trusted ones can be predicted")
+    outside = present & ((residuals < lower) | (residuals > upper))
+    improbable = _minus_log10_tail(int(outside.sum()), int(present.sum()), usual)
+    mismatch = improbable >= MISMATCH_MINUS_LOG10_P
+    why = (
+        f"{outside.sum()} of {present.sum()} residuals are outside {lower:.3g} to {upper:.3g}, "
+        f"{100 * usual:.2g} % are usual: -log10 p = {improbable:.1f}"
+    )
+    branches.append(_asked("is there a mismatch?", mismatch, why))
+    if not mismatch:
+        return Conclusion("fault free", tuple(branches), model, lower, upper)
+
+    rows = rows_of(structure, *watched)
+    regressors = rows.regressors[np.isin(rows.position, np.flatnonzero(outside))]
+    added = np.einsum("ij,jk,ik->i", regressors, model.covariance[0], regressors)
+    ratio = math.sqrt(float(np.median(added))) / sigma if sigma > 0.0 else 0.0
+    accurate = ratio < 1.0
+    why = (
+        f"uncertain parameters add {ratio:.2g} of the noise's standard deviation to those predictions, at most 1 may be"
+    )
+    branches.append(_asked("are the parameters accurate?", accurate, why))
+    return Conclusion("fault" if accurate else "identify again", tuple(branches), model, lower, upper)
+
+
+def _asked(question: str, answer: bool, why: str) -> Branch:
+    return Branch(question, "yes" if answer else "no", why)
+
+
+def _sampling_text(rate: Check) -> str:
+    return f"a step response takes {rate.value:.0f} samples" if rate.passed else rate.result
+
+
+def _present(residuals: ArrayLike) -> "np.ndarray[tuple[int], np.dtype[np.float64]]":
+    values = np.asarray(residuals, dtype=np.float64).ravel()
+    return values[np.isfinite(values)]
+
+
+def _minus_log10_tail(count: int, of: int, share: float) -> float:
+    """-log10 of the probability of at least `count` among `of` rows, each with the probability `share`."""
+    from scipy.stats import binom
+
+    if count == 0:
+        return 0.0
+    logarithm = float(binom.logsf(count - 1, of, share))
+    if math.isfinite(logarithm):
+        return abs(logarithm) / math.log(10.0)
+    # Chernoff's bound, where the probability itself underflows: -log p >= of D(count / of || share).
+    seen = count / of
+    rest = (1.0 - seen) * math.log((1.0 - seen) / (1.0 - share)) if seen < 1.0 else 0.0
+    return of * (seen * math.log(seen / share) + rest) / math.log(10.0)

@@ -1,0 +1,226 @@
+"""What `reactorwatch identify` tells: a model of one output from the first half of a record, judged by the second."""
+
+import math
+from collections.abc import Iterable
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monitor_node.identification.batch import SINGULAR_CONDITION, fit_arx, refuse_constant
+from monitor_node.identification.excitation import check_record
+from monitor_node.identification.linear_model import LinearModel, fit_percent
+from monitor_node.identification.output_error import fit_oe
+from monitor_node.identification.recursive_arx import model_of
+from monitor_node.identification.recursive_output_error import RecursiveOutputError
+from monitor_node.identification.regressor import rows_of, unbroken
+from monitor_node.identification.residual_tests import independence, whiteness
+from monitor_node.identification.rls import RecursiveLeastSquares
+from monitor_node.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
+from reactorwatch.errors import InputError
+
+MODELS = ("arx", "oe")
+WORST_MINUS_LOG10_P = 6.0
+
+
+class Deviations(msgspec.Struct, frozen=True):
+    """Standard deviations of the parameters; inf where the rows don't tell."""
+
+    a: tuple[float, ...]
+    b: tuple[float, ...]
+    offset: float
+
+
+class FitPercent(msgspec.Struct, frozen=True):
+    """Fits on the held-out half, 100 (1 - |y - yhat| / |y - mean y|).
+
+    Attributes:
+        one_step: of the recursion on the measured rows before each row, whatever the model was fitted for.
+        free_run: of the recursion on its own output from the half's first rows on; -inf if it leaves for good.
+    """
+
+    one_step: float
+    free_run: float
+
+
+class Identification(msgspec.Struct, frozen=True):
+    """A model and how good it is.
+
+    y[k] = a1 y[k-1] + ... + an y[k-n] + b1 u[k-d] + ... + bn u[k-d-n+1] + offset, d the delay, in the signals' own
+    units; in an output-error model y stands for the model's own output.
+
+    Attributes:
+        model: "arx" or "oe".
+        order: n.
+        delay: samples.
+        output: name of the output.
+        rows: of the fitted half.
+        recursive: whether it was learned row by row.
+        a: n numbers.
+        b: n numbers.
+        offset: the constant.
+        sd: their standard deviations.
+        fit_percent: on the held-out half; the free run starts from its first rows.
+        whiteness_minus_log10_p: of the residuals of the fitted half: one-step errors of an ARX model, errors of the
+            run of an output-error model.
+        checks: by name, "ok" or what is wrong.
+    """
+
+    model: str
+    order: int
+    delay: int
+    output: str
+    rows: int
+    recursive: bool
+    a: tuple[float, ...]
+    b: tuple[float, ...]
+    offset: float
+    sd: Deviations
+    fit_percent: FitPercent
+    whiteness_minus_log10_p: float
+    checks: dict[str, str]
+
+
+def identify(
+    time: ArrayLike,
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    *,
+    model: str = "arx",
+    order: int = 3,
+    delay: int = 1,
+    output: str = "y",
+    recursive: bool = False,
+    forgetting: float = 1.0,
+    choice: RowChoice = ALL_ROWS,
+    missing: Literal["refuse", "leave out"] = "refuse",
+) -> Identification:
+    """Fit a model to the first half of a record and measure it on the second.
+
+    Args:
+        time: shape (rows,), increasing, in any unit. Rows after a gap are not predicted from rows before it.
+        inputs: shape (rows,); the input of a row is held until the next one.
+        outputs: shape (rows,).
+        model: "arx" or "oe".
+        order: n, lags of output and input.
+        delay: samples from a move of the input to its first effect, at least 1.
+        output: name of the output, to be told.
+        recursive: learn row by row instead of from all rows at once.
+        forgetting: of the recursive methods, in (0, 1].
+        choice: which rows of the first half are fitted; `REPORT_ROWS` is the report's.
+        missing: what to do with values that are NaN.
+
+    Raises:
+        InputError: anything that keeps the model from being found, with the cause: an unknown model, an order or delay
+            below 1, too few rows, missing values, a constant output, an input that does not excite the order.
+    """
+    t, u, y = _checked(time, inputs, outputs, missing)
+    if model not in MODELS:
+        raise InputError(f"model must be one of {', '.join(MODELS)}, got {model!r}")
+    structure = Structure.of_order(order, delay)
+    if recursive and model == "oe" and choice != ALL_ROWS:
+        raise InputError("a recursive output-error model runs through every row: it cannot choose rows")
+    half = len(y) // 2
+    if half <= structure.history + structure.parameters:
+        raise InputError(
+            f"order {order} with delay {delay} needs more than {structure.history + structure.parameters} rows in each "
+            f"half, got {len(y)} rows in all"
+        )
+    fitted, held_out = (u[:half], y[:half], t[:half]), (u[half:], y[half:], t[half:])
+    refuse_constant(y[:half])
+    checks = {check.name: check.result for check in check_record(structure, *fitted)}
+    try:
+        found = _fit(structure, model, fitted, recursive, forgetting, choice)
+    except InputError as refusal:
+        # Where the input is to blame, that is the cause to name.
+        excitation = checks.get("excitation", "ok")
+        raise refusal if excitation == "ok" else InputError(excitation) from refusal
+    rest = found.residuals(*fitted)[:, 0]
+    white = whiteness(rest, fitted=order if model == "arx" else 0) if _testable(rest) else None
+    if white is not None:
+        free = independence(rest, u[:half], delay, time=t[:half])
+        checks["whiteness"] = _verdict(white.minus_log10_p, "the residuals are correlated with each other")
+        checks["independence"] = _verdict(free.minus_log10_p, "the residuals are correlated with past inputs")
+    values, deviations = found.parameters[0], found.standard_deviations[0]
+    return Identification(
+        model,
+        order,
+        delay,
+        output,
+        half,
+        recursive,
+        _floats(values[:order]),
+        _floats(values[order:-1]),
+        float(values[-1]),
+        Deviations(_floats(deviations[:order]), _floats(deviations[order:-1]), float(deviations[-1])),
+        FitPercent(
+            fit_percent(y[half:, 0], found.one_step(*held_out)[:, 0]),
+            fit_percent(y[half:, 0], found.free_run(*held_out)[:, 0]),
+        ),
+        math.nan if white is None else white.minus_log10_p,
+        checks,
+    )
+
+
+def _checked(
+    time: ArrayLike, inputs: ArrayLike, outputs: ArrayLike, missing: str
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    t = as_columns(time, "time", 1)
+    u, y = as_columns(inputs, "inputs", 1), as_columns(outputs, "outputs", 1)
+    if not len(t) == len(u) == len(y):
+        raise InputError(f"time, inputs and outputs must have equally many rows, got {len(t)}, {len(u)} and {len(y)}")
+    for name, values in (("time", t), ("inputs", u), ("outputs", y)):
+        infinite = np.flatnonzero(np.isinf(values[:, 0]))
+        absent = np.flatnonzero(np.isnan(values[:, 0]))
+        if infinite.size:
+            raise InputError(f"{name} must be finite, got {values[infinite[0], 0]} in row {infinite[0] + 1}")
+        if absent.size and (missing == "refuse" or name == "time"):
+            cure = "" if name == "time" else ": fill it in, or leave such rows out"
+            raise InputError(f"{name} must have a value in every row, got NaN in row {absent[0] + 1}{cure}")
+    return t[:, 0], u, y
+
+
+def _fit(
+    structure: Structure,
+    model: str,
+    record: tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]],
+    recursive: bool,
+    forgetting: float,
+    choice: RowChoice,
+) -> LinearModel:
+    u, y, t = record
+    if not recursive:
+        fit = fit_arx if model == "arx" else fit_oe
+        return fit(structure, u, y, t, choice)
+    scaling = Scaling.of(u, y)
+    if model == "oe":
+        running = RecursiveOutputError(structure, scaling, forgetting)
+        for k, unbroken_rows in enumerate(unbroken(np.concatenate([u, y], axis=1), t)):
+            if unbroken_rows <= 1:
+                running.restart()
+            if unbroken_rows:
+                running.update(u[k], float(y[k, 0]))
+        return running.model
+    rows = rows_of(structure, scaling.inputs(u), scaling.outputs(y), t, choice)
+    estimator = RecursiveLeastSquares(structure.parameters, forgetting)
+    for regressor, value in zip(rows.regressors, rows.outputs[:, 0], strict=True):
+        estimator.update(regressor, value)
+    if not estimator.condition < SINGULAR_CONDITION:
+        raise InputError(f"the rows don't determine {structure.parameters} parameters")
+    return model_of(structure, scaling, [estimator], simulates=False)
+
+
+def _testable(residuals: NDArray[np.float64]) -> bool:
+    """Whether there are enough residuals for the tests with their 20 lags."""
+    return int(np.isfinite(residuals).sum()) >= 100
+
+
+def _verdict(minus_log10_p: float, wrong: str) -> str:
+    if minus_log10_p < WORST_MINUS_LOG10_P:
+        return "ok"
+    return f"{wrong}, -log10 p = {minus_log10_p:.1f}: the model leaves something out, and its sd are too small"
+
+
+def _floats(values: Iterable[float]) -> tuple[float, ...]:
+    return tuple(float(value) for value in values)

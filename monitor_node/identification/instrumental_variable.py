@@ -1,0 +1,74 @@
+"""Parameters that measurement noise does not bias, in closed form.
+
+Least squares on noisy lagged outputs is biased: the noise is in the regressors too. The instrumental variable method
+replaces them, on one side of the equations, by a free run of the last model, which no noise has touched: Z'X p = Z'y
+with Z the regressors of that run (Soderstrom and Stoica, System Identification, 1989, chapter 8; the iteration of
+Young, Automatica 6 (1970) 271). Z = Q S, so Q'X p = Q'y is solved, whose condition is not squared.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monitor_node.identification.batch import least_squares
+from monitor_node.identification.linear_model import RunPlan, free_run
+from monitor_node.identification.regressor import rows_of
+from monitor_node.identification.structure import Structure
+
+_ITERATIONS = 5
+
+
+def instrumental_variable(
+    structure: Structure,
+    inputs: NDArray[np.float64],
+    outputs: NDArray[np.float64],
+    plan: RunPlan,
+    time: ArrayLike | None = None,
+) -> NDArray[np.float64]:
+    """The instrumental variable estimate, its poles inside the unit circle.
+
+    Args:
+        structure: of the model; one output.
+        inputs: shape (rows, inputs), scaled.
+        outputs: shape (rows, 1), scaled.
+        plan: of the free runs.
+        time: shape (rows,); without it no gap is looked for.
+
+    Returns:
+        Shape (parameters,).
+
+    Raises:
+        InputError: too few rows, or rows that don't determine the parameters.
+    """
+    rows = rows_of(structure, inputs, outputs, time)
+    theta = stabilised(structure, least_squares(rows.regressors, rows.outputs).parameters[0])
+    for _ in range(_ITERATIONS):
+        run = free_run(structure, theta[None, :], inputs, outputs, plan)
+        # The rows that a run starts from are measured ones.
+        clean = np.where(np.isfinite(run), run, outputs)
+        instruments = rows_of(structure, inputs, clean, time)
+        both = np.intersect1d(rows.position, instruments.position, assume_unique=True)
+        x, y = (part[np.searchsorted(rows.position, both)] for part in (rows.regressors, rows.outputs[:, 0]))
+        q, _ = np.linalg.qr(instruments.regressors[np.searchsorted(instruments.position, both)])
+        equations = q.T @ x
+        if np.linalg.cond(equations) > 1e12:
+            break
+        theta = stabilised(structure, np.asarray(np.linalg.solve(equations, q.T @ y)))
+    return theta
+
+
+def stabilised(structure: Structure, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The parameters with poles on or outside the unit circle mirrored into it, and a little further.
+
+    Args:
+        structure: of the model; one output.
+        parameters: shape (parameters,).
+    """
+    lags = structure.output_lags
+    poles = np.roots([1.0, *-parameters[:lags]])
+    outside = np.abs(poles) >= 1.0
+    if not np.any(outside):
+        return parameters
+    poles[outside] = 0.98 / np.conj(poles[outside])
+    inside = parameters.copy()
+    inside[:lags] = -np.real(np.poly(poles))[1:]
+    return inside

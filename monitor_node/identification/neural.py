@@ -1,0 +1,167 @@
+"""A neural network as predictor: NARX, y[k] = f(y[k-1], ..., y[k-n], u[k-d], ..., u[k-d-m+1]).
+
+f is a linear combination of the regressors plus a network with one hidden layer of tanh (Narendra and Parthasarathy,
+IEEE Trans. Neural Networks 1 (1990) 4, the series-parallel model). The network learns only what the ARX model of the
+same structure leaves over, so that it never has to imitate a straight line with bent ones, and does no harm to a plant
+that is linear. Its weights are found by scikit-learn's MLPRegressor (L-BFGS, an explicit seed); the prediction is
+computed here, because the free run needs one row at a time.
+
+A network that predicts the next row well may still run away by itself. Of several networks from different starting
+weights the one is taken that runs best over the fitted rows.
+"""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monitor_node.identification.batch import enough_rows, fit_arx
+from monitor_node.identification.linear_model import LinearModel, fit_percent, plan_run
+from monitor_node.identification.regressor import Rows, rows_of
+from monitor_node.identification.structure import Scaling, Structure, as_columns
+from reactorwatch.errors import InputError
+
+_AWAY = 1e6  # scaled outputs beyond this, a million times their usual spread, have left for good
+
+
+@dataclass(frozen=True)
+class NeuralModel:
+    """A fitted network beside the linear model whose residual it learned.
+
+    Attributes:
+        linear: what the network corrects.
+        scaling: of the signals.
+        residual_sd: what the network's output is multiplied by, in the output's unit.
+        hidden: shape (regressors, neurons), weights into the hidden layer.
+        hidden_bias: shape (neurons,).
+        output: shape (neurons,), weights out of it.
+        output_bias: the last constant.
+    """
+
+    linear: LinearModel
+    scaling: Scaling
+    residual_sd: float
+    hidden: NDArray[np.float64]
+    hidden_bias: NDArray[np.float64]
+    output: NDArray[np.float64]
+    output_bias: float
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of parameters, the linear model's included."""
+        return self.linear.parameter_count + self.hidden.size + self.hidden_bias.size + self.output.size + 1
+
+    def one_step(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+        """See `LinearModel.one_step`."""
+        predicted = self.linear.one_step(inputs, outputs, time)
+        rows = _network_rows(self.linear.structure, self.scaling, inputs, outputs, time)
+        predicted[rows.position, 0] += self._correction(rows.regressors)
+        return predicted
+
+    def free_run(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+        """See `LinearModel.free_run`."""
+        structure, scaling = self.linear.structure, self.scaling
+        u = scaling.inputs(as_columns(inputs, "inputs", structure.inputs))
+        y = scaling.outputs(as_columns(outputs, "outputs", 1))
+        plan = plan_run(structure, u, y, time)
+        theta = scaling.redoing(structure, self.linear.parameters[0])
+        weights, constant = (theta[:-1], theta[-1]) if structure.offset else (theta, 0.0)
+        spread = scaling.output_spreads[0]
+        own, run = y[:, 0].copy(), np.full(y.shape, np.nan)
+        first = structure.delay - 1
+        for k in np.flatnonzero(plan.running):
+            if plan.starts[k]:
+                own[k - structure.history : k] = y[k - structure.history : k, 0]
+            past_outputs = own[k - structure.output_lags : k][::-1]
+            past_inputs = u[k - first - structure.input_lags : k - first][::-1].ravel()
+            regressor = np.concatenate([past_outputs, past_inputs])
+            value = float(weights @ regressor) + constant + self._correction(regressor) / spread
+            own[k] = min(max(float(value), -_AWAY), _AWAY)
+            run[k] = own[k] if abs(own[k]) < _AWAY else np.inf
+        return run * spread + scaling.output_centres[0]
+
+    def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+        """Measured minus one-step prediction, shape (rows, 1)."""
+        return as_columns(outputs, "outputs") - self.one_step(inputs, outputs, time)
+
+    def _correction(self, regressors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What the network adds, in the output's unit; the last axis counts the regressors."""
+        hidden = np.tanh(regressors @ self.hidden + self.hidden_bias)
+        return np.asarray((hidden @ self.output + self.output_bias) * self.residual_sd)
+
+
+@dataclass(frozen=True)
+class Neural:
+    """The family of these models.
+
+    Attributes:
+        neurons: in the hidden layer.
+        seeds: one network is fitted for each; it sets the weights that the search starts from.
+        iterations: at most, of each search.
+    """
+
+    neurons: int = 12
+    seeds: tuple[int, ...] = (1, 2, 3)
+    iterations: int = 200
+    name: str = "neural"
+
+    def fit(
+        self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
+    ) -> NeuralModel:
+        """The network that predicts the next row best.
+
+        Args:
+            structure: lags and delay; one output.
+            inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
+            outputs: shape (rows,) or (rows, 1), likewise.
+            time: shape (rows,); without it no gap is looked for.
+
+        Raises:
+            InputError: scikit-learn is not installed, several outputs, or a record that `fit_arx` refuses.
+        """
+        try:
+            from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped]
+            from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]
+        except ImportError as missing:
+            raise InputError("the neural model needs scikit-learn: pip install reactorwatch[neural]") from missing
+        if structure.outputs != 1:
+            raise InputError(f"a neural model has one output, got {structure.outputs}: fit one model for each")
+        linear = fit_arx(structure, inputs, outputs, time)
+        scaling = Scaling.of(inputs, outputs, centred=structure.offset)
+        rows = _network_rows(structure, scaling, inputs, outputs, time)
+        enough_rows(rows, len(as_columns(outputs, "outputs")))
+        left = linear.residuals(inputs, outputs, time)[rows.position, 0]
+        spread = float(np.std(left)) or 1.0
+        models = []
+        for seed in self.seeds:
+            network = MLPRegressor(
+                hidden_layer_sizes=(self.neurons,),
+                activation="tanh",
+                solver="lbfgs",
+                alpha=1e-3,
+                max_iter=self.iterations,
+                max_fun=20 * self.iterations,
+                random_state=seed,
+            )
+            with warnings.catch_warnings():
+                # The number of iterations is a choice, not a failure: more of them only follow the noise.
+                warnings.simplefilter("ignore", ConvergenceWarning)
+                network.fit(rows.regressors, left / spread)
+            (hidden, output), (hidden_bias, output_bias) = network.coefs_, network.intercepts_
+            models.append(
+                NeuralModel(linear, scaling, spread, hidden, hidden_bias, output[:, 0], float(output_bias[0]))
+            )
+        measured = as_columns(outputs, "outputs")[:, 0]
+        return max(models, key=lambda model: fit_percent(measured, model.free_run(inputs, outputs, time)[:, 0]))
+
+
+def _network_rows(
+    structure: Structure, scaling: Scaling, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None
+) -> Rows:
+    """The scaled regressors, without the constant: the network has its own."""
+    lags = Structure(
+        structure.output_lags, structure.input_lags, structure.delay, structure.inputs, structure.outputs, offset=False
+    )
+    u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", structure.outputs)
+    return rows_of(lags, scaling.inputs(u), scaling.outputs(y), time)

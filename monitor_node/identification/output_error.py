@@ -1,0 +1,364 @@
+"""Output-error models from a record: the recursion whose free run meets the measurements best.
+
+With measurement noise on the output, an ARX model is biased: it weighs the noise as if the plant had felt it. The
+output-error model minimises the error of its own run,
+
+    yhat[k] = a1 yhat[k-1] + ... + b1 u[k-d] + ... + c,      sum (y[k] - yhat[k])^2 -> min,
+
+which is unbiased for any noise that is independent of the input (Ljung, System Identification, 2nd ed., sections 4.2
+and 8.4). The gradient is exact: differentiating the recursion, g[k] = phi[k] + a1 g[k-1] + ... + an g[k-n], phi
+the regressor made of yhat (Ljung, section 10.3, with the run's start taken into account). Marquardt's method
+(J. SIAM 11 (1963) 431) walks down; a step that would put a pole on or outside the unit circle is shortened.
+
+The sum has local minima (Ljung, section 10.5: none for white inputs, but ours are steps). So there are
+several starts: the ARX model, the instrumental variable estimate, the Steiglitz-McBride iterate (IEEE Trans. AC 10
+(1965) 461), and the best model of one order less with a pole at zero, so that a higher order never fits worse.
+
+A run starts from measured rows; what their noise does dies out as the model's own poles do. The parameters' covariance
+is s2 (G'G)^-1, which supposes white residuals: where the whiteness test fails it is too small.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monitor_node.identification.batch import (
+    LeastSquares,
+    enough_rows,
+    least_squares,
+    linear_model,
+    refuse_constant,
+)
+from monitor_node.identification.instrumental_variable import instrumental_variable, stabilised
+from monitor_node.identification.linear_model import LinearModel, RunPlan, plan_run
+from monitor_node.identification.regressor import rows_of
+from monitor_node.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
+from reactorwatch.compiled import compiled
+from reactorwatch.errors import InputError
+
+_ITERATIONS = 200
+_PRECISION = 1e-12  # a smaller relative gain of a step ends the descent
+_FILTERINGS = 10
+
+
+class _Objective:
+    """The sum of squares of one record, its gradient, and where both are taken."""
+
+    def __init__(
+        self,
+        structure: Structure,
+        inputs: NDArray[np.float64],
+        outputs: NDArray[np.float64],
+        plan: RunPlan,
+        compared: NDArray[np.bool_],
+    ) -> None:
+        self.structure = structure
+        self.inputs = np.ascontiguousarray(inputs)
+        self.outputs = np.ascontiguousarray(outputs[:, 0])
+        self.plan = plan
+        self.compared = compared
+
+    def __call__(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Errors, shape (compared rows,), and the run's gradient, shape (compared rows, parameters)."""
+        s = self.structure
+        run, gradient = run_with_gradient(
+            theta,
+            s.output_lags,
+            s.input_lags,
+            s.delay,
+            s.offset,
+            self.inputs,
+            self.outputs,
+            self.plan.starts,
+            self.plan.running,
+        )
+        return self.outputs[self.compared] - run[self.compared], gradient[self.compared]
+
+
+def fit_oe(
+    structure: Structure,
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    time: ArrayLike | None = None,
+    choice: RowChoice = ALL_ROWS,
+) -> LinearModel:
+    """The output-error model of one output.
+
+    Args:
+        structure: its terms; one output.
+        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
+        outputs: shape (rows,) or (rows, 1), likewise.
+        time: shape (rows,), increasing, in any unit; without it no gap is looked for.
+        choice: which rows the run is compared with.
+
+    Raises:
+        InputError: several outputs, too few rows, an output that is constant, or rows that don't determine the
+            parameters.
+    """
+    if structure.outputs != 1:
+        raise InputError(f"an output-error model has one output, got {structure.outputs}: fit one model for each")
+    u = as_columns(inputs, "inputs", structure.inputs)
+    y = as_columns(outputs, "outputs", 1)
+    refuse_constant(y)
+    scaling = Scaling.of(u, y, centred=structure.offset)
+    scaled_u, scaled_y = scaling.inputs(u), scaling.outputs(y)
+    theta, objective = _fit(structure, scaled_u, scaled_y, time, choice)
+    errors, gradient = objective(theta)
+    # The same algebra as for least squares: at the minimum the gradient stands for the regressors.
+    linear = least_squares(gradient, errors)
+    return linear_model(
+        structure,
+        scaling,
+        LeastSquares(theta[None, :], linear.inverse, _variance(errors, theta.size), linear.condition),
+        errors.size,
+        simulates=True,
+    )
+
+
+def _fit(
+    structure: Structure,
+    u: NDArray[np.float64],
+    y: NDArray[np.float64],
+    time: ArrayLike | None,
+    choice: RowChoice,
+) -> tuple[NDArray[np.float64], _Objective]:
+    enough_rows(rows_of(structure, u, y, time, choice), len(y))
+    plan = plan_run(structure, u, y, time)
+    number = np.arange(len(y))
+    chosen = (number >= choice.skip) & ((number - choice.skip) % choice.every == 0)
+    compared = plan.running & np.isfinite(y[:, 0]) & chosen
+    if compared.sum() < structure.parameters:
+        raise InputError(
+            f"{structure.parameters} parameters need at least {structure.parameters} rows of a free run, "
+            f"got {int(compared.sum())} of {len(y)}"
+        )
+    objective = _Objective(structure, u, y, plan, compared)
+    best = min(
+        (descend(objective, start) for start in _starts(structure, u, y, plan, time, choice)), key=lambda r: r[1]
+    )
+    return best[0], objective
+
+
+def _starts(
+    structure: Structure,
+    u: NDArray[np.float64],
+    y: NDArray[np.float64],
+    plan: RunPlan,
+    time: ArrayLike | None,
+    choice: RowChoice,
+) -> list[NDArray[np.float64]]:
+    rows = rows_of(structure, u, y, time)
+    arx = stabilised(structure, least_squares(rows.regressors, rows.outputs).parameters[0])
+    starts = [
+        arx,
+        instrumental_variable(structure, u, y, plan, time),
+        _steiglitz_mcbride(structure, u, y, time, arx),
+    ]
+    if structure.output_lags > 1 and structure.input_lags > 1:
+        lower = Structure(
+            structure.output_lags - 1,
+            structure.input_lags - 1,
+            structure.delay,
+            structure.inputs,
+            1,
+            structure.offset,
+        )
+        smaller, _ = _fit(lower, u, y, time, choice)
+        lags = lower.output_lags
+        middle = lags + lower.input_lags * lower.inputs
+        starts.append(
+            np.concatenate([smaller[:lags], [0.0], smaller[lags:middle], np.zeros(lower.inputs), smaller[middle:]])
+        )
+    return starts
+
+
+def _steiglitz_mcbride(
+    structure: Structure,
+    u: NDArray[np.float64],
+    y: NDArray[np.float64],
+    time: ArrayLike | None,
+    theta: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """ARX of signals filtered by 1 / (1 - a1 q^-1 - ...) of the model before, again and again."""
+    lags = structure.output_lags
+    for _ in range(_FILTERINGS):
+        signals = np.concatenate([u, y, np.ones_like(y)], axis=1)
+        filtered = _filtered(np.ascontiguousarray(theta[:lags]), signals)
+        rows = rows_of(structure, filtered[:, :-2], filtered[:, -2], time)
+        regressors = rows.regressors.copy()
+        if structure.offset:
+            regressors[:, -1] = filtered[rows.position, -1]
+        try:
+            solution = least_squares(regressors, rows.outputs)
+        except InputError:  # the filter has left too little to go on with: the last iterate is a start as well
+            break
+        theta = stabilised(structure, solution.parameters[0])
+    return theta
+
+
+def descend(objective: _Objective, start: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+    """Marquardt's method from a start whose poles are inside the unit circle.
+
+    Returns:
+        The parameters and their sum of squares.
+    """
+    lags = objective.structure.output_lags
+    size = start.size
+    theta, damping = start, 1e-3
+    errors, gradient = objective(theta)
+    squares = float(errors @ errors)
+    for _ in range(_ITERATIONS):
+        factor = _triangle(np.ascontiguousarray(np.concatenate([gradient, errors[:, None]], axis=1).T))[:size]
+        scales = np.linalg.norm(factor[:, :size], axis=0)
+        scales = np.where(scales > 0.0, scales, 1.0)
+        gained = math.inf
+        while damping < 1e12:
+            stacked = np.concatenate([factor[:, :size] / scales, math.sqrt(damping) * np.eye(size)])
+            step = np.linalg.lstsq(stacked, np.concatenate([factor[:, size], np.zeros(size)]))[0] / scales
+            candidate = theta + step
+            if stable(np.ascontiguousarray(candidate[:lags])):
+                new_errors, new_gradient = objective(candidate)
+                new_squares = float(new_errors @ new_errors)
+                if new_squares <= squares:
+                    gained = squares - new_squares
+                    theta, errors, gradient, squares = candidate, new_errors, new_gradient, new_squares
+                    damping = max(0.1 * damping, 1e-12)
+                    break
+            damping *= 10.0
+        if not _PRECISION * squares < gained < math.inf:
+            break
+    return theta, squares
+
+
+def _variance(errors: NDArray[np.float64], parameters: int) -> NDArray[np.float64]:
+    free = errors.size - parameters
+    return np.array([float(errors @ errors) / free if free > 0 else math.inf])
+
+
+@compiled
+def stable(a: NDArray[np.float64]) -> bool:
+    """Whether all poles of yhat[k] = a1 yhat[k-1] + ... lie inside the unit circle.
+
+    By the step-down recursion to the reflection coefficients, all of which must be below 1 (Schur and Cohn; Astrom and
+    Wittenmark, Computer-Controlled Systems, 3rd ed., chapter 3).
+    """
+    polynomial = -a
+    for order in range(a.size, 0, -1):
+        reflection = polynomial[order - 1]
+        if not abs(reflection) < 1.0:
+            return False
+        scale = 1.0 - reflection * reflection
+        shorter = np.empty(order - 1)
+        for i in range(order - 1):
+            shorter[i] = (polynomial[i] - reflection * polynomial[order - 2 - i]) / scale
+        polynomial = shorter
+    return True
+
+
+@compiled
+def run_with_gradient(
+    theta: NDArray[np.float64],
+    output_lags: int,
+    input_lags: int,
+    delay: int,
+    offset: bool,
+    u: NDArray[np.float64],
+    y: NDArray[np.float64],
+    starts: NDArray[np.bool_],
+    running: NDArray[np.bool_],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The free run of one output and its derivatives.
+
+    Args:
+        theta: shape (parameters,).
+        output_lags: of the structure.
+        input_lags: of the structure.
+        delay: of the structure.
+        offset: of the structure.
+        u: shape (rows, inputs).
+        y: shape (rows,).
+        starts: shape (rows,), of the plan.
+        running: shape (rows,), of the plan.
+
+    Returns:
+        The run, shape (rows,), and its gradient, shape (rows, parameters); NaN and 0 where it does not run.
+    """
+    rows, inputs = u.shape
+    size = theta.size
+    run = np.full(rows, np.nan)
+    own = np.zeros(rows)
+    gradient = np.zeros((rows, size))
+    for k in range(rows):
+        if not running[k]:
+            continue
+        if starts[k]:
+            for back in range(1, output_lags + 1):
+                own[k - back] = y[k - back]
+                gradient[k - back] = 0.0
+        for lag in range(output_lags):
+            gradient[k, lag] = own[k - 1 - lag]
+        for lag in range(input_lags):
+            for i in range(inputs):
+                gradient[k, output_lags + lag * inputs + i] = u[k - delay - lag, i]
+        if offset:
+            gradient[k, size - 1] = 1.0
+        total = 0.0
+        for i in range(size):
+            total += theta[i] * gradient[k, i]
+        own[k] = total
+        run[k] = total
+        for lag in range(output_lags):
+            for i in range(size):
+                gradient[k, i] += theta[lag] * gradient[k - 1 - lag, i]
+    return run, gradient
+
+
+@compiled
+def _triangle(columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """R of a QR factorisation by Householder's reflections (Golub and Van Loan, algorithm 5.2.1), small and often.
+
+    LAPACK's would wait for threads on a machine that is busy, which here takes far longer than the work.
+
+    Args:
+        columns: shape (columns, rows), of the matrix; overwritten. At least as many rows as columns.
+
+    Returns:
+        Shape (columns, columns), upper triangular.
+    """
+    size, rows = columns.shape
+    triangle = np.zeros((size, size))
+    for i in range(size):
+        norm = 0.0
+        for k in range(i, rows):
+            norm += columns[i, k] * columns[i, k]
+        norm = np.sqrt(norm)
+        triangle[i, i] = -norm if columns[i, i] > 0.0 else norm
+        columns[i, i] -= triangle[i, i]
+        # A column of zeros needs no reflection.
+        scale = -1.0 / (triangle[i, i] * columns[i, i]) if norm > 0.0 else 0.0
+        for j in range(i + 1, size):
+            product = 0.0
+            for k in range(i, rows):
+                product += columns[i, k] * columns[j, k]
+            product *= scale
+            for k in range(i, rows):
+                columns[j, k] -= product * columns[i, k]
+            triangle[i, j] = columns[j, i]
+    return triangle
+
+
+@compiled
+def _filtered(a: NDArray[np.float64], signals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Each column filtered by 1 / (1 - a1 q^-1 - ...); it starts from rest again after a missing value."""
+    filtered = np.empty_like(signals)
+    for i in range(signals.shape[1]):
+        for k in range(signals.shape[0]):
+            total = signals[k, i]
+            for lag in range(min(a.size, k)):
+                before = filtered[k - 1 - lag, i]
+                if before != before:
+                    break
+                total += a[lag] * before
+            filtered[k, i] = total
+    return filtered

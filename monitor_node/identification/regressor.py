@@ -1,0 +1,242 @@
+"""Regressors of a linear model: row by row as samples come, and all at once from a record.
+
+Both leave out what cannot be trusted: a row is only predicted from rows that are complete and follow each other
+without a gap. After a gap or a missing value the history starts anew.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import isfinite
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monitor_node.identification.structure import ALL_ROWS, RowChoice, Structure, as_columns
+from monitor_node.stored_state import StoredState
+from reactorwatch.errors import InputError
+
+GAP_TOLERANCE = 0.25
+"""An interval that differs from the period by more than this share of it is a gap."""
+
+
+class BufferState(StoredState, frozen=True):
+    """All that a RegressorBuffer remembers.
+
+    Attributes:
+        structure: of the model.
+        period_ns: between rows; None if gaps are not looked for.
+        choice: which rows are fitted.
+        outputs: the rows that the next regressor needs, newest first; shorter while the history fills.
+        inputs: likewise.
+        last_time_ns: of the newest row; None before the first.
+        row: index of the next row, from 0.
+    """
+
+    structure: Structure
+    period_ns: int | None
+    choice: RowChoice
+    outputs: tuple[tuple[float, ...], ...] = ()
+    inputs: tuple[tuple[float, ...], ...] = ()
+    last_time_ns: int | None = None
+    row: int = 0
+
+
+class RegressorBuffer:
+    """Turns rows as they come into regressors.
+
+    >>> buffer = RegressorBuffer(Structure.of_order(1))
+    >>> buffer.update(0, [10.0], [1.0]) is None  # nothing is known before the first row
+    True
+    >>> buffer.update(1, [20.0], [2.0])  # y[k-1], u[k-1], 1
+    array([ 1., 10.,  1.])
+
+    Args:
+        structure: of the model.
+        period_ns: time between rows; without it no gap is looked for.
+        choice: which rows are fitted; rows are counted from the first that comes.
+
+    Raises:
+        ValueError: a period that is not above 0.
+    """
+
+    def __init__(self, structure: Structure, period_ns: int | None = None, choice: RowChoice = ALL_ROWS) -> None:
+        if period_ns is not None and period_ns <= 0:
+            raise ValueError(f"period_ns must be above 0, got {period_ns}")
+        self._structure = structure
+        self._period_ns = period_ns
+        self._choice = choice
+        # Lists, newest row first, one row after the other: a regressor is a dozen numbers, and a list of a dozen is
+        # cut and joined in a fraction of the time that NumPy needs to begin.
+        self._outputs: list[float] = []
+        self._inputs: list[float] = []
+        self._last_time_ns: int | None = None
+        self._row = 0
+
+    @classmethod
+    def from_state(cls, state: BufferState) -> Self:
+        """The buffer that goes on where `state` was taken.
+
+        Raises:
+            ValueError: the state does not fit its structure.
+        """
+        buffer = cls(state.structure, state.period_ns, state.choice)
+        filled = len(state.outputs)
+        if len(state.inputs) != filled or filled > state.structure.history:
+            raise ValueError(f"state must hold at most {state.structure.history} equal rows, got {filled}")
+        buffer._outputs = [value for row in state.outputs for value in row]
+        buffer._inputs = [value for row in state.inputs for value in row]
+        buffer._last_time_ns = state.last_time_ns
+        buffer._row = state.row
+        return buffer
+
+    @property
+    def state(self) -> BufferState:
+        """A copy of all that is remembered."""
+        return BufferState(
+            self._structure,
+            self._period_ns,
+            self._choice,
+            _rows(self._outputs, self._structure.outputs),
+            _rows(self._inputs, self._structure.inputs),
+            self._last_time_ns,
+            self._row,
+        )
+
+    @property
+    def upcoming(self) -> NDArray[np.float64] | None:
+        """The regressor of the row that will come next, shape (parameters,); None while the history fills."""
+        structure = self._structure
+        if len(self._outputs) < structure.history * structure.outputs:
+            return None
+        first, last = (structure.delay - 1) * structure.inputs, (structure.delay - 1 + structure.input_lags)
+        values = self._outputs[: structure.output_lags * structure.outputs]
+        values += self._inputs[first : last * structure.inputs]
+        if structure.offset:
+            values.append(1.0)
+        return np.array(values)
+
+    def restart(self) -> None:
+        """Forget the rows so far, as after a gap."""
+        self._outputs, self._inputs, self._last_time_ns = [], [], None
+
+    def update(self, time_ns: int, inputs: Iterable[float], outputs: Iterable[float]) -> NDArray[np.float64] | None:
+        """Take a row.
+
+        Args:
+            time_ns: of the row.
+            inputs: shape (inputs,), NaN for what was not measured.
+            outputs: shape (outputs,), likewise.
+
+        Returns:
+            The regressor of this row, made of the rows before it, shape (parameters,). None for a row that cannot be
+            predicted (its history is not complete), has a missing value, or is not chosen.
+
+        Raises:
+            ValueError: a time not after the last one's, or a wrong number of values; nothing is changed then.
+        """
+        structure = self._structure
+        new_inputs, new_outputs = list(map(float, inputs)), list(map(float, outputs))
+        if len(new_inputs) != structure.inputs or len(new_outputs) != structure.outputs:
+            raise ValueError(
+                f"a row must have {structure.inputs} inputs and {structure.outputs} outputs, "
+                f"got {len(new_inputs)} and {len(new_outputs)}"
+            )
+        if self._last_time_ns is not None:
+            interval = time_ns - self._last_time_ns
+            if interval <= 0:
+                raise ValueError(f"time_ns must increase, got {time_ns} after {self._last_time_ns}")
+            if self._period_ns is not None and abs(interval - self._period_ns) > GAP_TOLERANCE * self._period_ns:
+                self.restart()
+        complete = all(map(isfinite, new_inputs)) and all(map(isfinite, new_outputs))
+        regressor = self.upcoming if complete and self._choice.takes(self._row) else None
+        if complete:
+            self._outputs = new_outputs + self._outputs[: (structure.history - 1) * structure.outputs]
+            self._inputs = new_inputs + self._inputs[: (structure.history - 1) * structure.inputs]
+        else:
+            self.restart()
+        self._last_time_ns = time_ns
+        self._row += 1
+        return regressor
+
+
+def _rows(values: list[float], signals: int) -> tuple[tuple[float, ...], ...]:
+    """Values one row after the other, as rows."""
+    return tuple(tuple(values[first : first + signals]) for first in range(0, len(values), signals))
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of a record that a model can be fitted to.
+
+    Attributes:
+        regressors: shape (rows, parameters).
+        outputs: shape (rows, outputs).
+        position: shape (rows,), where in the record they are, from 0.
+    """
+
+    regressors: NDArray[np.float64]
+    outputs: NDArray[np.float64]
+    position: NDArray[np.int64]
+
+
+def rows_of(
+    structure: Structure,
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    time: ArrayLike | None = None,
+    choice: RowChoice = ALL_ROWS,
+) -> Rows:
+    """All rows of a record that can be predicted from complete rows without a gap between them.
+
+    Args:
+        structure: of the model.
+        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
+        outputs: shape (rows,) or (rows, outputs), likewise.
+        time: shape (rows,), increasing, in any unit; without it no gap is looked for.
+        choice: which rows are fitted.
+
+    Raises:
+        InputError: shapes that don't fit, or times that don't increase.
+    """
+    u = as_columns(inputs, "inputs", structure.inputs)
+    y = as_columns(outputs, "outputs", structure.outputs)
+    if len(u) != len(y):
+        raise InputError(f"inputs and outputs must have equally many rows, got {len(u)} and {len(y)}")
+    count, reach = len(y), structure.history
+    run = unbroken(np.concatenate([u, y], axis=1), time)
+    wanted = np.arange(count)
+    position = wanted[(run > reach) & (wanted >= choice.skip) & ((wanted - choice.skip) % choice.every == 0)]
+    columns = [y[position - lag] for lag in range(1, structure.output_lags + 1)]
+    columns += [u[position - structure.delay - lag] for lag in range(structure.input_lags)]
+    if structure.offset:
+        columns.append(np.ones((position.size, 1)))
+    return Rows(np.concatenate(columns, axis=1), y[position], position)
+
+
+def unbroken(signals: NDArray[np.float64], time: ArrayLike | None = None) -> NDArray[np.int64]:
+    """How many complete rows, itself included, lie without a gap up to each row; 0 for an incomplete one.
+
+    Args:
+        signals: shape (rows, signals), NaN where nothing was measured.
+        time: shape (rows,), increasing; the period is the median interval. Without it no gap is looked for.
+
+    Raises:
+        InputError: times that don't fit, or don't increase.
+    """
+    complete = np.asarray(np.isfinite(signals).all(axis=1))
+    count = complete.size
+    position = np.arange(count)
+    starts = np.where(complete, -1, position + 1)
+    if time is not None and count > 1:
+        times = np.asarray(time, dtype=np.float64)
+        if times.shape != (count,):
+            raise InputError(f"time must have the shape ({count},), got {times.shape}")
+        intervals = np.diff(times)
+        if not np.all(intervals > 0.0):
+            row = int(np.argmin(intervals > 0.0)) + 1
+            raise InputError(f"time must increase, got {times[row]} after {times[row - 1]} in row {row + 1}")
+        period = np.median(intervals)
+        gap = np.abs(intervals - period) > GAP_TOLERANCE * period
+        starts[1:] = np.where(gap & complete[1:], position[1:], starts[1:])
+    return np.where(complete, position - np.maximum(np.maximum.accumulate(starts), 0) + 1, 0)

@@ -1,0 +1,231 @@
+"""Recursive least squares that can run for years.
+
+The covariance form of the textbooks fails in service: without excitation its forgetting divides the covariance by
+`forgetting` at every row until it overflows, and rounding makes it indefinite. Here the information matrix A is kept
+as factors R' D R (`information.py`). Three things follow.
+
+*Nothing need be assumed.* D = 0 is a valid start: no prior, no "large P(0)". Without forgetting the result is the QR
+solution of the batch problem, and as accurate. A column that adds nothing to those before it keeps the parameter 0
+and an infinite standard deviation until rows come that tell it apart.
+
+*Forgetting costs n multiplications*, D <- forgetting D, and leaves the parameters exactly as they are.
+
+*Forgetting has a floor.* Salgado, Goodwin and Middleton (Int. J. Control 47 (1988) 477) forget only what exceeds a
+floor: A <- forgetting A + (1 - forgetting) floor I. The floor is information about the parameters as they now are,
+so it pulls them nowhere. It is renewed one coordinate a row, in turn (the idea is Gunnarsson's, Proc. 35th IEEE
+Conference on Decision and Control, 1996), by a row e_i with the output theta_i. With f for forgetting, the weight
+floor (1 - f^n) / f^(n-1), and a start at A = floor / f^(n-1) I, a coordinate holds floor / f^(n-1) just after its
+turn and still the floor when its turn comes again. Hence, with P = A^-1 and `covariance_limit` = 1 / floor, whatever
+the data are and for ever,
+
+    0 < every eigenvalue of P <= covariance_limit,
+    every eigenvalue of A <= (largest phi' phi) / (1 - f) + 1 / (covariance_limit f^(n-1)),
+
+to rounding for regressors scaled to the order of 1. (Sizes that differ by many powers of ten within a row cost digits
+of the bound, as they do of any matrix, but never finiteness.)
+
+Forgetting so acts only along directions that the data excite. Along the others the covariance rises to its limit and
+rests there, the parameters stand still, and the first exciting rows identify them anew.
+
+*Innovation variance and standard deviations* allow for the weights. With W = sum of f^age and W2 = sum of f^(2 age),
+white noise of variance s2 gives cov(theta) = s2 P W2/W, and the weighted sum of squares, which grows by
+residual^2 (1 - leverage) a row, has the expectation s2 (W - n W2/W). Without forgetting these are the familiar
+s2 P and N - n.
+"""
+
+import math
+from typing import Self
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from monitor_node.identification import information
+from monitor_node.identification.recursion import Recursion, RlsState, refusal
+
+
+class Innovation(msgspec.Struct, frozen=True, gc=False):
+    """What one row said.
+
+    Attributes:
+        prediction: of the output, made before the row was used.
+        residual: output - prediction.
+        residual_sd: standard deviation that such a residual has by the rows before: noise and uncertain parameters.
+            inf until there are more rows than parameters.
+        leverage: share of this row in the prediction of its own output after the update, 0 to 1.
+    """
+
+    prediction: float
+    residual: float
+    residual_sd: float
+    leverage: float
+
+
+class RecursiveLeastSquares(Recursion):
+    """y = regressor . parameters + noise, learned row by row.
+
+    Regressors should be of the order of 1 (`regressor.Scaling`): `covariance_limit` counts in their units.
+
+    >>> rls = RecursiveLeastSquares(2)
+    >>> for k in range(5):
+    ...     innovation = rls.update([k, 1.0], 3.0 * k - 1.0)
+    >>> rls.parameters
+    array([ 3., -1.])
+
+    Args:
+        parameters: their number, n.
+        forgetting: weight of a row relative to its successor, in (0, 1]; the memory is 1 / (1 - forgetting) rows.
+        covariance_limit: bound on the eigenvalues of `covariance`, and their value at the start. The default is
+            1e6; without forgetting it is inf: nothing is assumed at the start.
+        start: shape (n,), the parameters at the start; 0 by default.
+
+    Raises:
+        InputError: a setting out of its range.
+    """
+
+    def __init__(
+        self,
+        parameters: int,
+        forgetting: float = 1.0,
+        covariance_limit: float | None = None,
+        start: ArrayLike | None = None,
+    ) -> None:
+        super().__init__(1, parameters, forgetting, covariance_limit, plants_in_tile=1)
+        self._tile: NDArray[np.float64] = self._tiles[0]
+        if start is not None:
+            self.move_to(start)
+
+    @classmethod
+    def from_state(cls, state: RlsState) -> Self:
+        """The estimator that goes on, bit for bit, where `state` was taken.
+
+        Raises:
+            ValueError: the state is of several plants, or damaged.
+        """
+        if state.plants != 1:
+            raise ValueError(f"state must be of one plant, got {state.plants}: use RecursiveLeastSquaresBank")
+        estimator = cls(state.parameters, state.forgetting, state.covariance_limit)
+        estimator._load(state.memory)
+        return estimator
+
+    def update(self, regressor: ArrayLike, output: float) -> Innovation:
+        """Predict the output, then learn from it.
+
+        Args:
+            regressor: shape (n,).
+            output: what was measured.
+
+        Raises:
+            ValueError: a value that is NaN, infinite or beyond 1e30, or a wrong shape; nothing is changed then.
+        """
+        row = np.ascontiguousarray(regressor, dtype=np.float64)
+        if row.ndim != 1 or row.size != self._parameters:
+            raise ValueError(f"regressor must have shape ({self._parameters},), got {row.shape}")
+        said = information.learn_one(self._tile, row, float(output), self._forgetting, self._renewal, self._rank_share)
+        if said[0] != said[0]:
+            raise ValueError(refusal(row, output))
+        return Innovation(*said)
+
+    def predict(self, regressor: ArrayLike) -> float:
+        """The output that the present parameters give; nothing is learned."""
+        return float(np.dot(np.asarray(regressor, dtype=np.float64), self._tile[: self._parameters, 0]))
+
+    def move_to(self, parameters: ArrayLike) -> None:
+        """Set the parameters and keep what is known about their uncertainty.
+
+        Args:
+            parameters: shape (n,).
+
+        Raises:
+            ValueError: a wrong shape, or a value that is not finite.
+        """
+        theta = np.asarray(parameters, dtype=np.float64)
+        if theta.shape != (self._parameters,) or not np.all(np.isfinite(theta)):
+            raise ValueError(f"parameters must be {self._parameters} finite numbers, got {theta}")
+        n = self._parameters
+        self._tile[:n, 0] = theta
+        self._tile[n : 2 * n, 0] = self._factor() @ theta
+        self._tile[4 * n : 5 * n, 0] = 0.0
+
+    def remember_longer(self, forgetting: float) -> None:
+        """Raise the forgetting factor from here on, as a recursion that starts far off does while it settles.
+
+        Raises:
+            ValueError: a value below the present one, for which the covariance's bound would not hold, or above 1.
+        """
+        if forgetting < self._forgetting:
+            raise ValueError(f"forgetting can only rise, from {self._forgetting}, got {forgetting}")
+        self._set_forgetting(forgetting)
+
+    @property
+    def parameters(self) -> NDArray[np.float64]:
+        """Shape (n,); 0 for a parameter that no row has yet told apart."""
+        return self._tile[: self._parameters, 0].copy()
+
+    @property
+    def rows(self) -> int:
+        """How many rows have been learned from."""
+        return int(self._sums()[information.ROWS])
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """P, shape (n, n): the inverse of the information matrix, in units of the noise variance."""
+        inverse = np.linalg.inv(self._factor())
+        with np.errstate(divide="ignore", invalid="ignore"):
+            spread = np.where(inverse != 0.0, inverse / np.sqrt(self._diagonal()), 0.0)
+        if np.all(np.isfinite(spread)):
+            return np.asarray(spread @ spread.T)
+        # Along a direction without information two infinities of unlike sign have no sum: only variances are told.
+        variances = np.sum(spread * spread, axis=1)
+        covariance = np.where(np.isinf(variances)[:, None] | np.isinf(variances)[None, :], np.nan, 0.0)
+        known = np.isfinite(variances)
+        covariance[np.ix_(known, known)] = spread[known] @ spread[known].T
+        np.fill_diagonal(covariance, variances)
+        return covariance
+
+    @property
+    def unit_covariance(self) -> NDArray[np.float64]:
+        """Of the parameters for noise of variance 1, P W2/W, shape (n, n)."""
+        return self.covariance * self._weight_share()
+
+    @property
+    def noise_variance(self) -> float:
+        """Of the residuals that the model leaves at its best; inf until there are more rows than parameters."""
+        sums = self._sums()
+        free = sums[information.WEIGHT] - self._parameters * self._weight_share()
+        return float(sums[information.SQUARES] / free) if free > 0.0 else math.inf
+
+    @property
+    def parameter_covariance(self) -> NDArray[np.float64]:
+        """Of the parameters, shape (n, n); NaN where nothing is known, or no more rows than parameters have come."""
+        variance, covariance = self.noise_variance, self.unit_covariance
+        known = np.isfinite(covariance) & math.isfinite(variance)
+        return np.where(known, covariance, math.nan) * (variance if math.isfinite(variance) else 1.0)
+
+    @property
+    def standard_deviations(self) -> NDArray[np.float64]:
+        """Of the parameters, shape (n,); inf where nothing is known, and until there are more rows than parameters."""
+        variances = np.diag(self.parameter_covariance)
+        return np.sqrt(np.where(np.isnan(variances), math.inf, variances))
+
+    @property
+    def condition(self) -> float:
+        """Condition number of the regressors in memory; inf if they don't determine the parameters."""
+        values = np.linalg.svd(np.sqrt(self._diagonal())[:, None] * self._factor(), compute_uv=False)
+        return float(values[0] / values[-1]) if values[-1] > 0.0 else math.inf
+
+    def _factor(self) -> NDArray[np.float64]:
+        n = self._parameters
+        factor = np.eye(n)
+        factor[np.triu_indices(n, 1)] = self._tile[5 * n + 5 : 5 * n + 5 + n * (n - 1) // 2, 0]
+        return factor
+
+    def _diagonal(self) -> NDArray[np.float64]:
+        return np.asarray(self._tile[2 * self._parameters : 3 * self._parameters, 0])
+
+    def _sums(self) -> NDArray[np.float64]:
+        return np.asarray(self._tile[5 * self._parameters : 5 * self._parameters + 5, 0])
+
+    def _weight_share(self) -> float:
+        sums = self._sums()
+        return float(sums[information.WEIGHT2] / sums[information.WEIGHT]) if sums[information.WEIGHT] > 0.0 else 1.0

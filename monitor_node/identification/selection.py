@@ -1,0 +1,168 @@
+"""Which model? Families and orders in one table, and the reason for the choice in one sentence.
+
+The first half of the rows is fitted, the second held out. A model for watching must run by itself: its free run on the
+held-out half is what it is chosen by. Fits that differ by less than half a percentage point are called equal, and
+of equals the one with the fewest parameters is taken: what a parameter adds less than that, the next record takes away.
+
+BIC = N ln(S/N) + p ln N, with S the sum of squares of the residuals that the model was fitted by (Schwarz, Ann.
+Statist. 6 (1978) 461), compares orders of one family, not families: those of an ARX model are one-step errors, those of
+an output-error model errors of its run. With nearly noise-free data it always asks for more: everything is significant.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from monitor_node.identification.families import LINEAR_FAMILIES, Family, Model
+from monitor_node.identification.linear_model import fit_percent
+from monitor_node.identification.structure import Structure, as_columns
+from reactorwatch.errors import InputError
+
+EQUAL_PERCENT = 0.5
+
+
+class Candidate(msgspec.Struct, frozen=True):
+    """One row of the table.
+
+    Attributes:
+        family: name of the family.
+        order: lags of output and input.
+        parameters: their number.
+        one_step_percent: fit of the one-step prediction on the held-out half.
+        free_run_percent: fit of the free run on the held-out half; -inf if it ran away.
+        bic: on the fitted half; comparable within a family.
+        refusal: why there is no such model; empty if there is one.
+    """
+
+    family: str
+    order: int
+    parameters: int = 0
+    one_step_percent: float = math.nan
+    free_run_percent: float = math.nan
+    bic: float = math.nan
+    refusal: str = ""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The table and the choice.
+
+    Attributes:
+        candidates: in the order of families, then orders.
+        chosen: the candidate that was chosen.
+        model: it, fitted to the first half.
+        reason: one sentence.
+    """
+
+    candidates: tuple[Candidate, ...]
+    chosen: Candidate
+    model: Model
+    reason: str
+
+    def table(self) -> str:
+        """The candidates as text, the chosen one marked."""
+        lines = ["  family   order  parameters  one-step %  free run %         BIC"]
+        for candidate in self.candidates:
+            mark = ">" if candidate is self.chosen else " "
+            head = f"{mark} {candidate.family:<8} {candidate.order:>5}"
+            if candidate.refusal:
+                lines.append(f"{head}  {candidate.refusal}")
+            else:
+                lines.append(
+                    f"{head}  {candidate.parameters:>10}  {candidate.one_step_percent:>10.3f}"
+                    f"  {candidate.free_run_percent:>10.3f}  {candidate.bic:>10.1f}"
+                )
+        return "\n".join(lines)
+
+
+def select(
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    time: ArrayLike | None = None,
+    families: Sequence[Family] = LINEAR_FAMILIES,
+    orders: Sequence[int] = (1, 2, 3),
+    delay: int = 1,
+) -> Selection:
+    """Fit every order of every family to the first half of a record, and choose by the second.
+
+    Args:
+        inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
+        outputs: shape (rows,) or (rows, 1), likewise.
+        time: shape (rows,); without it no gap is looked for.
+        families: what is compared.
+        orders: likewise.
+        delay: of the input, in samples.
+
+    Raises:
+        InputError: no family, an order or delay below 1, or a record that no model can be fitted to.
+    """
+    u, y = as_columns(inputs, "inputs"), as_columns(outputs, "outputs", 1)
+    if len(u) != len(y):
+        raise InputError(f"inputs and outputs must have equally many rows, got {len(u)} and {len(y)}")
+    t = np.arange(len(y), dtype=np.float64) if time is None else np.asarray(time, dtype=np.float64)
+    half = len(y) // 2
+    fitted: list[tuple[Candidate, Model]] = []
+    candidates: list[Candidate] = []
+    for family in families:
+        for order in orders:
+            structure = Structure.of_order(order, delay, u.shape[1])
+            try:
+                model = family.fit(structure, u[:half], y[:half], t[:half])
+            except InputError as refusal:
+                candidates.append(Candidate(family.name, order, refusal=str(refusal)))
+                continue
+            held_out = u[half:], y[half:], t[half:]
+            candidate = Candidate(
+                family.name,
+                order,
+                model.parameter_count,
+                fit_percent(y[half:, 0], model.one_step(*held_out)[:, 0]),
+                fit_percent(y[half:, 0], model.free_run(*held_out)[:, 0]),
+                bic(model.residuals(u[:half], y[:half], t[:half]), model.parameter_count),
+            )
+            candidates.append(candidate)
+            fitted.append((candidate, model))
+    judged = [pair for pair in fitted if math.isfinite(pair[0].free_run_percent)]
+    if not judged:
+        reasons = "; ".join(f"{c.family} {c.order}: {c.refusal or 'its free run leaves for good'}" for c in candidates)
+        raise InputError(f"no model can be chosen: {reasons or 'no family or order was given'}")
+    best = max(judged, key=lambda pair: pair[0].free_run_percent)[0]
+    equal = [pair for pair in judged if pair[0].free_run_percent >= best.free_run_percent - EQUAL_PERCENT]
+    chosen, model = min(equal, key=lambda pair: (pair[0].parameters, -pair[0].free_run_percent))
+    return Selection(tuple(candidates), chosen, model, _reason(chosen, best, candidates))
+
+
+def bic(residuals: ArrayLike, parameters: int) -> float:
+    """Schwarz's criterion; the smaller the better.
+
+    Args:
+        residuals: of the fitted rows, NaN where there is none.
+        parameters: their number.
+    """
+    values = np.asarray(residuals, dtype=np.float64)
+    values = values[np.isfinite(values)]
+    squares = float(values @ values)
+    if values.size == 0 or squares == 0.0:
+        return -math.inf
+    return values.size * math.log(squares / values.size) + parameters * math.log(values.size)
+
+
+def _reason(chosen: Candidate, best: Candidate, candidates: Sequence[Candidate]) -> str:
+    name, percent = f"{chosen.family} of order {chosen.order}", chosen.free_run_percent
+    if chosen is best:
+        text = f"{name} runs best on the held-out half, {percent:.1f} %"
+    else:
+        text = (
+            f"{name} is the smallest model whose free run on the held-out half, {percent:.1f} %, is within "
+            f"{EQUAL_PERCENT} of the best, {best.family} of order {best.order} with {best.free_run_percent:.1f} %"
+        )
+    smallest = min(
+        (c for c in candidates if c.family == chosen.family and not c.refusal), key=lambda candidate: candidate.bic
+    )
+    if smallest is chosen:
+        return f"{text}, and BIC agrees."
+    return f"{text}; BIC alone would take order {smallest.order}."

@@ -1,0 +1,266 @@
+"""What a linear model looks like: its orders, its delay, its scaling, and which rows it is fitted to."""
+
+from typing import Self
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reactorwatch.errors import InputError
+
+
+class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The terms of the model.
+
+    For each output
+
+        y[k] = a1 y[k-1] + ... + a_na y[k-na] + b1 u[k-d] + ... + b_nb u[k-d-nb+1] + c.
+
+    With several outputs y[k-i] stands for all of them, and a_i has one value for each; inputs likewise.
+
+    Attributes:
+        output_lags: na.
+        input_lags: nb.
+        delay: d, samples from a move of the input to its first effect. An input held over [t_k, t_k+1) first shows
+            in row k+1: delay 1.
+        inputs: number of inputs.
+        outputs: number of outputs.
+        offset: whether there is a term c.
+
+    Raises:
+        InputError: an order or the delay below 1, or no input or output.
+    """
+
+    output_lags: int
+    input_lags: int
+    delay: int = 1
+    inputs: int = 1
+    outputs: int = 1
+    offset: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("output_lags", "input_lags", "delay", "inputs", "outputs"):
+            value = getattr(self, name)
+            if value < 1:
+                raise InputError(f"{_TITLES[name]} must be at least 1, got {value}")
+
+    @classmethod
+    def of_order(cls, order: int, delay: int = 1, inputs: int = 1, outputs: int = 1, offset: bool = True) -> Self:
+        """As many lags of the output as of the input.
+
+        Raises:
+            InputError: order or delay below 1.
+        """
+        if order < 1:
+            raise InputError(f"order must be at least 1, got {order}")
+        return cls(order, order, delay, inputs, outputs, offset)
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of one output's equation."""
+        return self.output_lags * self.outputs + self.input_lags * self.inputs + int(self.offset)
+
+    @property
+    def history(self) -> int:
+        """How many rows before row k the equation for row k reaches back."""
+        return max(self.output_lags, self.delay + self.input_lags - 1)
+
+    def parameter_names(self, inputs: tuple[str, ...] = (), outputs: tuple[str, ...] = ()) -> tuple[str, ...]:
+        """Names of one equation's parameters, in order; signals are named only where there are several.
+
+        >>> Structure.of_order(2).parameter_names()
+        ('a1', 'a2', 'b1', 'b2', 'c')
+        >>> Structure.of_order(1, outputs=2).parameter_names(("qc",), ("C", "T"))
+        ('a1_C', 'a1_T', 'b1', 'c')
+        """
+        of_outputs = _suffixes(self.outputs, outputs)
+        of_inputs = _suffixes(self.inputs, inputs)
+        names = [f"a{lag}{suffix}" for lag in range(1, self.output_lags + 1) for suffix in of_outputs]
+        names += [f"b{lag}{suffix}" for lag in range(1, self.input_lags + 1) for suffix in of_inputs]
+        return tuple([*names, "c"] if self.offset else names)
+
+
+_TITLES = {
+    "output_lags": "order (lags of the output)",
+    "input_lags": "order (lags of the input)",
+    "delay": "delay (samples)",
+    "inputs": "number of inputs",
+    "outputs": "number of outputs",
+}
+
+
+class RowChoice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which rows of a record are fitted; lags count in samples of the record's clock whatever is chosen.
+
+    Attributes:
+        skip: rows passed over at the start.
+        every: of the others the first of each so many is taken.
+
+    Raises:
+        InputError: a negative skip, or every below 1.
+    """
+
+    skip: int = 0
+    every: int = 1
+
+    def __post_init__(self) -> None:
+        if self.skip < 0:
+            raise InputError(f"skip must be at least 0, got {self.skip}")
+        if self.every < 1:
+            raise InputError(f"every must be at least 1, got {self.every}")
+
+    def takes(self, row: int) -> bool:
+        """Whether the row of this index, from 0, is fitted."""
+        return row >= self.skip and (row - self.skip) % self.every == 0
+
+
+ALL_ROWS = RowChoice()
+REPORT_ROWS = RowChoice(skip=99, every=6)
+"""The choice of the report this project starts from: from the 100th row on every 6th."""
+
+
+class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Signals as (value - centre) / spread, and what that does to parameters.
+
+    Attributes:
+        input_centres: one for each input, in its unit.
+        input_spreads: likewise, above 0.
+        output_centres: one for each output.
+        output_spreads: likewise, above 0.
+
+    Raises:
+        InputError: a spread that is not above 0, or a number that is not finite.
+    """
+
+    input_centres: tuple[float, ...]
+    input_spreads: tuple[float, ...]
+    output_centres: tuple[float, ...]
+    output_spreads: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        for spread in (*self.input_spreads, *self.output_spreads):
+            if not 0.0 < spread < np.inf:
+                raise InputError(f"spread of a signal must be finite and above 0, got {spread}")
+        for centre in (*self.input_centres, *self.output_centres):
+            if not np.isfinite(centre):
+                raise InputError(f"centre of a signal must be finite, got {centre}")
+
+    @classmethod
+    def none(cls, inputs: int = 1, outputs: int = 1) -> Self:
+        """Signals as they are."""
+        return cls((0.0,) * inputs, (1.0,) * inputs, (0.0,) * outputs, (1.0,) * outputs)
+
+    @classmethod
+    def of(cls, inputs: ArrayLike, outputs: ArrayLike, centred: bool = True) -> Self:
+        """Mean and standard deviation of the measured values; of a constant signal the spread is 1.
+
+        Args:
+            inputs: shape (rows,) or (rows, inputs); NaN where nothing was measured.
+            outputs: likewise.
+            centred: False for a model without offset: all centres are 0 then.
+
+        Raises:
+            InputError: a signal without any measured value.
+        """
+        moments = []
+        for name, signals in (("input", as_columns(inputs, "inputs")), ("output", as_columns(outputs, "outputs"))):
+            for i, column in enumerate(signals.T):
+                values = column[np.isfinite(column)]
+                if values.size == 0:
+                    raise InputError(f"{name} {i + 1} has no measured value")
+                centre, spread = float(np.mean(values)), float(np.std(values))
+                constant = spread <= 1e-12 * abs(centre)
+                moments.append((name, centre if centred else 0.0, 1.0 if constant else spread))
+        return cls(
+            tuple(centre for name, centre, _ in moments if name == "input"),
+            tuple(spread for name, _, spread in moments if name == "input"),
+            tuple(centre for name, centre, _ in moments if name == "output"),
+            tuple(spread for name, _, spread in moments if name == "output"),
+        )
+
+    def inputs(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Inputs scaled; the last axis counts them."""
+        return (np.asarray(values, dtype=np.float64) - self.input_centres) / self.input_spreads
+
+    def outputs(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Outputs scaled; the last axis counts them."""
+        return (np.asarray(values, dtype=np.float64) - self.output_centres) / self.output_spreads
+
+    def undoing(self, structure: Structure, output: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """How parameters for scaled signals turn into those for the signals' own units: M p + m.
+
+        Args:
+            structure: of the model.
+            output: whose equation.
+
+        Returns:
+            M, shape (parameters, parameters), and m, shape (parameters,). A covariance turns into M cov M'.
+
+        Raises:
+            InputError: a model without offset whose signals were centred.
+        """
+        spread, centre = self.output_spreads[output], self.output_centres[output]
+        factors = spread / np.concatenate(
+            [
+                np.tile(self.output_spreads, structure.output_lags),
+                np.tile(self.input_spreads, structure.input_lags),
+            ]
+        )
+        centres = np.concatenate(
+            [
+                np.tile(self.output_centres, structure.output_lags),
+                np.tile(self.input_centres, structure.input_lags),
+            ]
+        )
+        if not structure.offset:
+            if np.any(centres != 0.0) or centre != 0.0:
+                raise InputError("a model without offset needs signals that are not centred: use centred=False")
+            return np.diag(factors), np.zeros(structure.parameters)
+        matrix = np.zeros((structure.parameters, structure.parameters))
+        np.fill_diagonal(matrix, [*factors, spread])
+        matrix[-1, :-1] = -factors * centres
+        shift = np.zeros(structure.parameters)
+        shift[-1] = centre
+        return matrix, shift
+
+    def redoing(self, structure: Structure, parameters: NDArray[np.float64], output: int = 0) -> NDArray[np.float64]:
+        """Parameters for scaled signals from those for the signals' own units; `undoing` backwards.
+
+        Args:
+            structure: of the model.
+            parameters: shape (parameters,).
+            output: whose equation.
+
+        Raises:
+            InputError: a model without offset whose signals were centred.
+        """
+        matrix, shift = self.undoing(structure, output)
+        return np.asarray(np.linalg.solve(matrix, parameters - shift))
+
+
+def as_columns(values: ArrayLike, name: str, count: int | None = None) -> NDArray[np.float64]:
+    """Signals as an array of shape (rows, signals).
+
+    Args:
+        values: shape (rows,) for one signal, or (rows, signals).
+        name: for messages.
+        count: how many signals are expected.
+
+    Raises:
+        InputError: another number of axes or of signals.
+    """
+    columns = np.asarray(values, dtype=np.float64)
+    if columns.ndim == 1:
+        columns = columns[:, None]
+    if columns.ndim != 2 or (count is not None and columns.shape[1] != count):
+        wanted = "signals" if count is None else str(count)
+        raise InputError(f"{name} must have the shape (rows, {wanted}), got {columns.shape}")
+    return columns
+
+
+def _suffixes(count: int, names: tuple[str, ...]) -> tuple[str, ...]:
+    if count == 1:
+        return ("",)
+    if names and len(names) != count:
+        raise InputError(f"{count} signals need {count} names, got {names}")
+    return tuple(f"_{name}" for name in names) or tuple(f"_{i + 1}" for i in range(count))

@@ -1,0 +1,62 @@
+"""`python -m plant_node [settings.toml]`: the plant as a process."""
+
+import sys
+
+import msgspec
+import structlog
+
+from plant_node.config import PlantConfig
+from plant_node.node import COMMANDS, NODE, PlantNode
+from plant_node.record import plant_from
+from reactorwatch.contract import keys
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import Record
+from reactorwatch.runtime.bus import Bus
+from reactorwatch.runtime.bus_zenoh import connect
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.entry import main
+from reactorwatch.runtime.liveliness import wait_alive
+from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+
+log = structlog.get_logger()
+
+
+def run(
+    config: PlantConfig, bus_config: BusConfig, model: ProcessModel | None = None, driver: Record | None = None
+) -> None:
+    """Simulate a plant on the bus until its duration is over, or SIGINT or SIGTERM.
+
+    Args:
+        config: of the plant.
+        bus_config: where the bus is.
+        model: the process; the nominal reactor if not given.
+        driver: a record whose input drives the plant, instead of the scenario of `config`.
+
+    Raises:
+        InputError: settings that cannot be used.
+    """
+    plant = plant_from(config, model, driver)
+    log.info("plant", seed=config.seed, settings=msgspec.to_builtins(config))
+    with stop_on_signals() as stop:
+        bus = connect(bus_config, NODE, stop)
+        if bus is None:
+            return
+        try:
+            serve_plant(PlantNode(plant, config, log.info), config, bus, stop)
+        finally:
+            bus.close()
+
+
+def serve_plant(node: PlantNode, config: PlantConfig, bus: Bus, stop: StopSignal) -> None:
+    """Run the node on an open bus: listen to commands, show that it is alive, wait for the others, run."""
+
+    def on_ready() -> None:
+        bus.announce(keys.key(config.name, keys.ALIVE, NODE))
+        wait_alive(bus, config.name, config.wait_for, stop, NODE)
+
+    commands = tuple(keys.key(config.name, keys.COMMAND, name) for name in COMMANDS)
+    serve(node, bus, stop, commands=commands, on_ready=on_ready)
+
+
+if __name__ == "__main__":
+    sys.exit(main("plant_node", "plant", PlantConfig, run))

@@ -1,0 +1,24 @@
+"""What an actuator makes of its command."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class CoolantValve:
+    """Lets through what it is told, between closed and fully open.
+
+    Attributes:
+        lower_l_min: flow when it is closed.
+        upper_l_min: flow when it is open.
+    """
+
+    lower_l_min: float
+    upper_l_min: float
+
+    def flow(self, command_l_min: float) -> float:
+        """The coolant flow in l/min at a command in l/min."""
+        return min(max(command_l_min, self.lower_l_min), self.upper_l_min)
+
+    def reaches(self, command_l_min: float) -> bool:
+        """Whether a command is within what it can do."""
+        return self.lower_l_min <= command_l_min <= self.upper_l_min

@@ -1,0 +1,305 @@
+"""The simulated plant: row after row from equations, valve, sensors, scenario and faults. No clock, no bus.
+
+Row k is what is measured at t_k = k periods, and its input is held until the row after. What is done to the plant
+between two rows (another input, a fault put in or taken away) acts from the next row on, whose time is `time_min`.
+Under temperature control the input of row k is the controller's answer to what is measured in row k. So the rows are a
+function of the configuration and of which row each command came before, and of nothing else.
+
+The plant may leave its operating branch, go out, ignite again or run away: that is its physics, and it goes on. Should
+the equations fail to be integrable, the state is held and the rows are marked, until they can be again.
+"""
+
+from dataclasses import dataclass
+from math import isfinite
+from typing import Literal
+
+import numpy as np
+from msgspec.structs import asdict
+from msgspec.structs import replace as with_changes
+
+from plant_node.actuators import CoolantValve
+from plant_node.config import PlantConfig
+from plant_node.controllers import CONTROLLED, check_set_point
+from plant_node.disturbances import process_noise
+from plant_node.initial_state import carried_over, start_state
+from plant_node.scenario import SIGNAL, Scenario
+from plant_node.sensors import Sensor
+from reactorwatch.errors import InputError
+from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.process.fault import FaultSpecification
+from reactorwatch.process.integrate import SimulationError, Stepper
+from reactorwatch.process.level_control import with_level_control
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.records.record import to_minutes, to_time_ns
+
+
+@dataclass(frozen=True)
+class FaultChange:
+    """A fault that has set in, or was taken away.
+
+    Attributes:
+        specification: every number of it said.
+        onset_min: when it set in, plant time.
+        active: whether it is there now.
+    """
+
+    specification: FaultSpecification
+    onset_min: float
+    active: bool
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is measured at one time.
+
+    Attributes:
+        number: from 0.
+        time_min: plant time.
+        readings: by signal, in its unit: the inputs as commanded, the outputs as measured.
+        good: false while the state is held because the equations could not be integrated.
+        changes: the faults that set in or were taken away since the row before.
+    """
+
+    number: int
+    time_min: float
+    readings: dict[str, float]
+    good: bool
+    changes: tuple[FaultChange, ...]
+
+
+@dataclass(eq=False)
+class _Installed:
+    """A fault in the plant."""
+
+    specification: FaultSpecification
+    onset_min: float
+    announced: bool = False
+
+
+class Plant:
+    """The simulated plant.
+
+    Args:
+        config: its settings; those about pace and health are not used here.
+        model: the process, without the faults of `config`.
+        scenario: drives it.
+
+    Raises:
+        InputError: settings that do not go with the model.
+    """
+
+    def __init__(self, config: PlantConfig, model: ProcessModel, scenario: Scenario) -> None:
+        if model.input_names != (SIGNAL,):
+            raise InputError(f"{model.name}: a plant must have the one input {SIGNAL!r}, got {model.input_names}")
+        lower, upper = config.valve_limits_l_min
+        coolant = model.inputs[0]
+        if not coolant.lower <= lower < upper <= coolant.upper:
+            raise InputError(
+                f"valve_limits_l_min must be in [{coolant.lower:g}, {coolant.upper:g}] l/min, "
+                f"got {lower:g} and {upper:g}"
+            )
+        if config.level_control is not None:
+            model = _with_level(model, config.level_control.gain_per_min)
+        self.units = {item.name: item.unit for item in model.inputs} | {item.name: item.unit for item in model.outputs}
+        self.trouble: str | None = None
+        self._config = config
+        self._base = model
+        self._scenario = scenario
+        self._valve = CoolantValve(lower, upper)
+        noise_sd, resolution = asdict(config.noise_sd), asdict(config.resolution)
+        self._sensors = [
+            Sensor(signal, noise_sd.get(signal, 0.0), resolution.get(signal, 0.0), config.seed) for signal in self.units
+        ]
+        self._process_noise = process_noise(config.process_noise_sd, model, config.period_min, config.seed)
+        self._number = 0
+        self._control = config.temperature_control
+        if self._control is not None:
+            self._control.check(model, self._valve)
+        self._by_hand_l_min: float | None = None
+        self._cleared: list[FaultChange] = []
+        self._installed = [_Installed(item, item.values.get("onset", 0.0)) for item in config.fault_specifications()]
+        self._use(self._extended(self._installed))
+        self._x = self._start()
+
+    @property
+    def number(self) -> int:
+        """Of the next row."""
+        return self._number
+
+    @property
+    def time_min(self) -> float:
+        """Plant time of the next row, from which on whatever is done to the plant acts."""
+        return self._time_of(self._number)
+
+    @property
+    def mode(self) -> Literal["open loop", "automatic", "manual"]:
+        """Of the coolant flow: by the scenario, by the temperature controller, or as set in place of it."""
+        if self._control is None:
+            return "open loop"
+        return "automatic" if self._by_hand_l_min is None else "manual"
+
+    @property
+    def state(self) -> dict[str, float]:
+        """The true state at `time_min`, by name."""
+        return dict(zip(self._model.state_names, self._x.tolist(), strict=True))
+
+    @property
+    def faults(self) -> tuple[FaultSpecification, ...]:
+        """All faults in the plant, those included that have not set in yet."""
+        return tuple(item.specification for item in self._installed)
+
+    def next_row(self) -> Row:
+        """Measure, and let the plant run on to the row after."""
+        time_min, inputs = self.time_min, self._input()
+        row = Row(
+            number=self._number,
+            time_min=time_min,
+            readings={
+                sensor.signal: sensor.reading(float(value), self._number)
+                for sensor, value in zip(self._sensors, (*inputs, *self._true_outputs(inputs)), strict=True)
+            },
+            good=self.trouble is None,
+            changes=self._changes(time_min),
+        )
+        self._number += 1
+        try:
+            self._x = self._stepper.advance(self._x, inputs, self._p, time_min, self.time_min)
+            for index, noise in self._process_noise:
+                self._x[index] = noise.moved(float(self._x[index]), self._number)
+            self.trouble = None
+        except SimulationError as error:
+            self.trouble = str(error)
+        return row
+
+    def set_input(self, signal: str, value: float) -> None:
+        """Hold an input at a value from the next row on, whatever the scenario or the controller says.
+
+        Under temperature control, `qc` puts the coolant flow on manual, as an operator would; and `T` is an input too:
+        the set point, constant from then on, and back on automatic.
+
+        Raises:
+            InputError: a signal that is not an input, or a value that the valve does not reach or the process cannot
+                have.
+        """
+        if self._control is not None and signal == CONTROLLED:
+            check_set_point(self._base, value)
+            self._control = with_changes(self._control, set_point_K=value)
+            self._by_hand_l_min = None
+            return
+        if signal != SIGNAL:
+            valid = SIGNAL if self._control is None else f"{SIGNAL}, {CONTROLLED}"
+            raise InputError(f"unknown input {signal!r} (valid: {valid})")
+        if not (isfinite(value) and self._valve.reaches(value)):
+            lower, upper = self._valve.lower_l_min, self._valve.upper_l_min
+            raise InputError(f"{signal} must be in [{lower:g}, {upper:g}] l/min, got {value:g}")
+        self._by_hand_l_min = value
+
+    def inject(self, specification: FaultSpecification) -> FaultSpecification:
+        """Put a fault into the plant.
+
+        Args:
+            specification: without an onset it sets in with the next row; a ramp without end reaches its size
+                at the end of the run.
+
+        Returns:
+            The same with every number said.
+
+        Raises:
+            InputError: an onset that is past, a ramp that never ends, or a fault that the model cannot have.
+        """
+        settled = specification.settled(self.time_min, self._config.duration_min)
+        onset_min = settled.values.get("onset", self.time_min)
+        if onset_min < self.time_min:
+            raise InputError(
+                f"fault {str(settled)!r}: onset must not lie before the plant's time, {self.time_min:g} min, "
+                f"got {onset_min:g} min; leave it out for now"
+            )
+        self._install([*self._installed, _Installed(settled, onset_min)])
+        return settled
+
+    def clear(self, cause: str) -> tuple[FaultSpecification, ...]:
+        """Take all faults of a cause away, from the next row on.
+
+        Returns:
+            What was taken away.
+
+        Raises:
+            InputError: there is none of that cause.
+        """
+        gone = [item for item in self._installed if item.specification.effect.name == cause]
+        if not gone:
+            there = sorted({item.specification.effect.name for item in self._installed})
+            raise InputError(f"no fault {cause!r} is in the plant (there is: {', '.join(there) or 'none'})")
+        self._install([item for item in self._installed if item not in gone])
+        self._cleared += [FaultChange(item.specification, item.onset_min, False) for item in gone if item.announced]
+        return tuple(item.specification for item in gone)
+
+    def _time_of(self, number: int) -> float:
+        return to_minutes(to_time_ns(number * self._config.period_min))
+
+    def _input(self) -> Array:
+        command = self._by_hand_l_min
+        if command is None and self._control is not None:
+            # A sensor sees the state, which no input moves at once: that of this row is not needed to read it.
+            there = self._true_outputs(np.array([self._control.base_flow_l_min]))
+            index = self._model.output_names.index(CONTROLLED)
+            sensor = self._sensors[len(self._model.inputs) + index]
+            temperature_K = sensor.reading(float(there[index]), self._number)
+            command = self._control.command(temperature_K, self.time_min, self._dither())
+        elif command is None:
+            command = self._scenario.level(self.time_min, self._config.seed)
+        return np.array([self._valve.flow(command)])
+
+    def _dither(self) -> float:
+        if self._control is None or not self._control.dither:
+            return 0.0
+        return self._scenario.level(self.time_min, self._config.seed) - self._scenario.mean
+
+    def _start(self) -> Array:
+        if self._control is None:
+            return start_state(self._model, self._input(), self._config.start)
+        base = np.array([self._control.base_flow_l_min + self._dither()])
+        return start_state(self._control.closed(self._model, self._valve), base, self._config.start)
+
+    def _true_outputs(self, inputs: Array) -> Array:
+        x, u, p, now, middle = self._outputs.arguments
+        x[0], u[0], p[0], now[0], middle[0] = self._x, inputs, self._p, self.time_min, self.time_min
+        self._outputs()
+        outputs: Array = self._outputs.results[1][0]
+        return outputs
+
+    def _changes(self, time_min: float) -> tuple[FaultChange, ...]:
+        """What has changed up to now and was not told yet."""
+        changes, self._cleared = self._cleared, []
+        for item in self._installed:
+            if not item.announced and item.onset_min <= time_min:
+                item.announced = True
+                changes.append(FaultChange(item.specification, item.onset_min, True))
+        return tuple(changes)
+
+    def _install(self, faults: list[_Installed]) -> None:
+        """Go on from where the plant is, with these faults in it; nothing has changed if they cannot be."""
+        model = self._extended(faults)
+        self._x = carried_over(model, self.state, self._input(), self.time_min)
+        self._installed = faults
+        self._use(model)
+
+    def _extended(self, faults: list[_Installed]) -> ProcessModel:
+        model = self._base
+        for fault in faults:
+            try:
+                model = fault.specification.extend(model)
+            except ValueError as error:
+                raise InputError(f"fault {str(fault.specification)!r}: {error}") from error
+        return model
+
+    def _use(self, model: ProcessModel) -> None:
+        self._model, self._p = model, model.values()
+        self._stepper, self._outputs = Stepper(model), ArrayFunction(model.function("outputs"))
+
+
+def _with_level(model: ProcessModel, gain_per_min: float) -> ProcessModel:
+    try:
+        return with_level_control(model, gain_per_min)
+    except ValueError as error:
+        raise InputError(f"level_control: {error}") from error

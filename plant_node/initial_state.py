@@ -1,0 +1,95 @@
+"""Where the plant's state begins: at the start of a run, and when its equations change under way."""
+
+from collections.abc import Mapping
+from math import nextafter
+from typing import Literal
+
+import casadi as ca
+import numpy as np
+
+from reactorwatch.errors import InputError
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.steady_state import steady_states
+
+BEFORE_MIN = nextafter(0.0, -1.0)
+"""The last moment before plant time 0: what sets in at 0 has not yet moved a plant that starts at rest."""
+
+ITERATIONS = 50
+SETTLED = 1e-9  # scales
+
+
+def start_state(
+    model: ProcessModel, inputs: Array, start: Literal["operating", "extinguished"] | Mapping[str, float]
+) -> Array:
+    """The state at the beginning of a run.
+
+    Args:
+        model: the process, with the faults that are in it from the start.
+        inputs: shape (n_u,), of the first row.
+        start: `operating` or `extinguished` for the hottest or coldest steady state at these inputs, or values of
+            the states by name.
+
+    Returns:
+        Shape (n_x,).
+
+    Raises:
+        InputError: a state that is not there or out of its bounds, or no steady state at these inputs.
+    """
+    if isinstance(start, Mapping):
+        for name, value in start.items():
+            if name not in model.state_names:
+                raise InputError(f"start: {model.name} has no state {name!r} (valid: {', '.join(model.state_names)})")
+            state = model.states[model.state_names.index(name)]
+            if not state.lower <= value <= state.upper:
+                raise InputError(
+                    f"start: {name} must be in [{state.lower:g}, {state.upper:g}] {state.unit}, got {value:g}"
+                )
+        return carried_over(model, start, inputs, BEFORE_MIN)
+    found = steady_states(model, inputs, BEFORE_MIN)
+    if not found:
+        said = ", ".join(f"{item.name} = {value:g}" for item, value in zip(model.inputs, inputs, strict=True))
+        raise InputError(
+            f"start: {model.name} has no steady state at {said}; give the states, like {{C = 0.1, T = 438.54}}"
+        )
+    temperature = model.state_names.index("T")
+    by_temperature = sorted((item.state for item in found), key=lambda state: float(state[temperature]))
+    return by_temperature[-1 if start == "operating" else 0]
+
+
+def carried_over(model: ProcessModel, known: Mapping[str, float], inputs: Array, time_min: float) -> Array:
+    """The state of a model of which some states are known.
+
+    The others, such as the position of a valve that was without inertia before, are where they do not change while the
+    known ones are as they are: Newton's method on their balances.
+
+    Args:
+        model: the process.
+        known: values by name; names that the model lacks are left out.
+        inputs: shape (n_u,).
+        time_min: when.
+
+    Returns:
+        Shape (n_x,).
+
+    Raises:
+        InputError: the others have no such point.
+    """
+    state = np.array([known.get(item.name, 0.5 * (item.lower + item.upper)) for item in model.states])
+    missing = [index for index, item in enumerate(model.states) if item.name not in known]
+    if not missing:
+        return state
+    free = ca.vertcat(*(model.states[index].symbol for index in missing))
+    balance = ca.vertcat(*(model.rhs[index] for index in missing))
+    step = ca.Function(
+        "step",
+        [*model.arguments(), model.clock.now, model.clock.middle],
+        [ca.solve(ca.jacobian(balance, free), balance)],
+    )
+    scales = np.array([model.states[index].scale for index in missing])
+    for _ in range(ITERATIONS):
+        change = np.array(step(state, inputs, model.values(), time_min, time_min)).ravel()
+        state[missing] -= change
+        if np.all(np.abs(change) <= SETTLED * scales):
+            return state
+    names = ", ".join(model.states[index].name for index in missing)
+    raise InputError(f"{model.name}: {names} cannot be at rest while {dict(known)}; give a start for them")

@@ -1,0 +1,196 @@
+"""The plant as a node: rows at their pace, commands, health. Pure: it is told what time it is.
+
+Plant time runs `speed` times as fast as the wall clock, from the first tick on. A row is due when its plant time has
+come; if the machine cannot keep up, rows come late, but all of them, and the lag is reported.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from math import isinf
+
+from plant_node.config import PlantConfig
+from plant_node.core import FaultChange, Plant, Row
+from reactorwatch import __version__
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encoding_of
+from reactorwatch.contract.messages_pb2 import (
+    ClearFault,
+    CommandReply,
+    Fault,
+    Health,
+    InjectFault,
+    Quality,
+    Sample,
+    SetInput,
+)
+from reactorwatch.errors import InputError
+from reactorwatch.process.fault import parse_fault
+from reactorwatch.records.record import to_time_ns
+
+NODE = "plant"
+COMMANDS: dict[str, type[SetInput | InjectFault | ClearFault]] = {
+    "set_input": SetInput,
+    "inject_fault": InjectFault,
+    "clear_fault": ClearFault,
+}
+"""The commands and what they carry."""
+
+BATCH = 200  # rows published before the loop may serve a command again
+BEHIND_S = 1.0  # a lag worth a line in the log
+SAY_AGAIN_NS = 60_000_000_000
+
+
+class PlantNode:
+    """See `reactorwatch.runtime.serve.Node`.
+
+    Args:
+        plant: the simulated plant, at its first row.
+        config: its settings.
+        tell: called with a line for people when something happens.
+    """
+
+    def __init__(self, plant: Plant, config: PlantConfig, tell: Callable[[str], None]) -> None:
+        self._plant = plant
+        self._config = config
+        self._tell = tell
+        self._started_ns: int | None = None
+        self._zero_ns = config.zero_ns
+        self._health_due_ns = 0
+        self._said_behind_ns = -SAY_AGAIN_NS
+        self._was_in_trouble = False
+        self._lag_ns = 0
+        self._published = 0
+        self._received = 0
+        self._refused: Counter[str] = Counter()
+
+    @property
+    def finished(self) -> bool:
+        """Whether all rows of the run are out."""
+        return self._config.rows is not None and self._plant.number >= self._config.rows
+
+    def next_tick_ns(self) -> int:
+        """When the next row, or the next word on health, is due."""
+        if self._started_ns is None:
+            return 0
+        return min(self._row_due_ns(self._started_ns), self._health_due_ns)
+
+    def on_tick(self, now_ns: int) -> list[Publication]:
+        """The rows that are due, a batch at most, and health if it is due."""
+        if self._started_ns is None:
+            self._started_ns = self._health_due_ns = now_ns
+            self._zero_ns = now_ns if self._zero_ns is None else self._zero_ns
+        publications: list[Publication] = []
+        for _ in range(BATCH):
+            due_ns = self._row_due_ns(self._started_ns)
+            if self.finished or due_ns > now_ns:
+                break
+            self._lag_ns = 0 if isinf(self._config.speed) else now_ns - due_ns
+            publications += self._publications(self._plant.next_row())
+        self._say_what_is_wrong(now_ns)
+        if now_ns >= self._health_due_ns:
+            self._health_due_ns = now_ns + round(self._config.health_period_s * 1e9)
+            self._published += len(publications) + 1
+            return [*publications, self._health(now_ns, "holding" if self._plant.trouble else "running")]
+        self._published += len(publications)
+        return publications
+
+    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
+        """Nothing that is published concerns a plant."""
+        return []
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
+        """Do what is asked, from the next row on; or say why not."""
+        self._received += 1
+        try:
+            text = self._obey(question)
+        except InputError as error:
+            self._refused["command"] += 1
+            return CommandReply(accepted=False, text=str(error)), []
+        except DecodeError as error:
+            self._refused[error.reason] += 1
+            return CommandReply(accepted=False, text=str(error)), []
+        self._tell(text)
+        return CommandReply(accepted=True, text=text), []
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        """Last words."""
+        self._published += 1
+        return [self._health(now_ns, "stopped")]
+
+    def _row_due_ns(self, started_ns: int) -> int:
+        return started_ns + round(self._plant.time_min * 60e9 / self._config.speed)
+
+    def _obey(self, question: Encoded) -> str:
+        topic = keys.parse(question.key)
+        name = topic.name if topic is not None and topic.kind == keys.COMMAND else question.key
+        if name not in COMMANDS:
+            raise InputError(f"unknown command {name!r} (valid: {', '.join(COMMANDS)})")
+        command = decode(question.payload, question.encoding)
+        when = f"from {self._plant.time_min:g} min on"
+        match command:
+            case SetInput() if name == "set_input":
+                self._plant.set_input(command.signal, command.value)
+                text = f"{command.signal} = {command.value:g} {self._plant.units[command.signal]} {when}"
+                return text if self._plant.mode == "open loop" else f"{text}, on {self._plant.mode}"
+            case InjectFault() if name == "inject_fault":
+                return f"fault {self._plant.inject(parse_fault(command.specification))} is in the plant"
+            case ClearFault() if name == "clear_fault":
+                gone = ", ".join(str(item) for item in self._plant.clear(command.cause))
+                return f"fault {gone} is taken away {when}"
+        wanted, got = encoding_of(COMMANDS[name]), question.encoding
+        raise DecodeError("encoding", f"command {name} must carry {wanted!r}, got {got!r}")
+
+    def _publications(self, row: Row) -> list[Publication]:
+        time_ns = self._time_ns(row.time_min)
+        quality = Quality.QUALITY_GOOD if row.good else Quality.QUALITY_BAD
+        publications = [self._fault(change, time_ns) for change in row.changes]
+        for signal, value in row.readings.items():
+            sample = Sample(
+                time_ns=time_ns, sequence=row.number, value=value, unit=self._plant.units[signal], quality=quality
+            )
+            publications.append(Publication(keys.key(self._config.name, keys.SAMPLE, signal), sample))
+        return publications
+
+    def _fault(self, change: FaultChange, time_ns: int) -> Publication:
+        cause = change.specification.effect.name
+        self._tell(f"fault {change.specification} {'sets in' if change.active else 'is gone'}")
+        return Publication(
+            keys.key(self._config.name, keys.FAULT, cause),
+            Fault(
+                time_ns=time_ns,
+                cause=cause,
+                specification=str(change.specification),
+                active=change.active,
+                onset_ns=self._time_ns(change.onset_min),
+            ),
+        )
+
+    def _health(self, now_ns: int, phase: str) -> Publication:
+        started_ns = now_ns if self._started_ns is None else self._started_ns
+        health = Health(
+            time_ns=now_ns,
+            node=NODE,
+            version=__version__,
+            phase=phase,
+            uptime_s=(now_ns - started_ns) / 1e9,
+            received=self._received,
+            refused=self._refused.total(),
+            refused_by_reason=self._refused,
+            lag_ms=self._lag_ns / 1e6,
+            published=self._published,
+            rows=self._plant.number,
+        )
+        return Publication(keys.key(self._config.name, keys.HEALTH, NODE), health)
+
+    def _say_what_is_wrong(self, now_ns: int) -> None:
+        trouble = self._plant.trouble
+        if trouble is not None and not self._was_in_trouble:
+            self._tell(f"{trouble}: the state is held, samples are marked bad")
+        self._was_in_trouble = trouble is not None
+        if self._lag_ns > BEHIND_S * 1e9 and now_ns - self._said_behind_ns >= SAY_AGAIN_NS:
+            self._said_behind_ns = now_ns
+            self._tell(f"behind its pace by {self._lag_ns / 1e9:.1f} s; no row is left out")
+
+    def _time_ns(self, time_min: float) -> int:
+        assert self._zero_ns is not None, "set at the first tick"
+        return to_time_ns(time_min, self._zero_ns)

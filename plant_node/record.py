@@ -1,0 +1,56 @@
+"""A plant from its settings, and its record without a bus: what tests and studies are made of."""
+
+from pathlib import Path
+
+import numpy as np
+
+from plant_node.config import PlantConfig
+from plant_node.core import Plant
+from plant_node.scenario import FromFile, HeldRecord
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.csv_file import read_csv
+from reactorwatch.records.record import Record
+
+
+def plant_from(config: PlantConfig, model: ProcessModel | None = None, driver: Record | None = None) -> Plant:
+    """The simulated plant at its first row; reads the record that drives it, if there is one.
+
+    Args:
+        config: settings.
+        model: the process; the nominal reactor if not given.
+        driver: a record whose input drives the plant, instead of the scenario of `config`.
+
+    Raises:
+        InputError: settings that do not go with the model, or a file that cannot be used.
+    """
+    scenario = config.scenario_settings()
+    if driver is not None:
+        return Plant(config, model or cstr(), HeldRecord.of(driver))
+    if isinstance(scenario, FromFile):
+        return Plant(config, model or cstr(), HeldRecord.of(read_csv(Path(scenario.path), required=("qc",))))
+    return Plant(config, model or cstr(), scenario)
+
+
+def simulate_record(
+    config: PlantConfig, rows: int | None = None, model: ProcessModel | None = None, driver: Record | None = None
+) -> Record:
+    """What a plant of these settings publishes, as a record.
+
+    Args:
+        config: settings; those about pace are not used.
+        rows: how many; those of the configured duration if not given.
+        model: as for `plant_from`.
+        driver: as for `plant_from`.
+
+    Raises:
+        ValueError: neither rows nor a duration is given, or fewer than one row.
+        InputError: as `plant_from`.
+    """
+    rows = config.rows if rows is None else rows
+    if rows is None or rows < 1:
+        raise ValueError(f"rows must be at least 1, or the configuration must have a duration, got {rows}")
+    plant = plant_from(config, model, driver)
+    measured = [plant.next_row() for _ in range(rows)]
+    columns = {signal: np.array([row.readings[signal] for row in measured]) for signal in plant.units}
+    return Record(np.array([row.time_min for row in measured]), columns, f"simulated {config.name}")

@@ -1,0 +1,272 @@
+"""What the plant is driven with: the coolant flow that is asked for, as a function of time.
+
+A scenario is a frozen structure that settings fill, and its level at a time depends on nothing but that time and
+the seed. So a run can be cut anywhere, sped up or begun in the middle, and its input is the same. Randomness gets this
+by numbering: every hold of `RandomSteps` has a generator of its own, seeded with (seed, stream, number of the hold).
+
+The default levels keep the nominal plant on its operating branch, which a large or quick enough change of the coolant
+flow leaves for the extinguished state.
+"""
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from math import isfinite, pi, sin
+from typing import Any, ClassVar, Protocol, TypeAlias
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.record import Record
+
+SIGNAL = "qc"
+
+_STREAM = int.from_bytes(b"scenario")
+_EDGE = 1e-6  # holds: a sample that should lie on an edge may lie this much before it, by rounding
+
+
+class Scenario(Protocol):
+    """A coolant flow over time."""
+
+    @property
+    def mean(self) -> float:
+        """About which it goes up and down, in l/min."""
+
+    def level(self, time_min: float, seed: int) -> float:
+        """The coolant flow in l/min that is asked for at a plant time; the same for the same arguments, always."""
+
+
+class RandomSteps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A new level, uniform between two, at regular times.
+
+    Attributes:
+        low: l/min.
+        high: l/min.
+        hold_min: how long each level is held.
+    """
+
+    kind: ClassVar[str] = "random-steps"
+    low: float = 90.0
+    high: float = 111.0
+    hold_min: float = 1.0
+
+    def __post_init__(self) -> None:
+        _check_levels(low=self.low, high=self.high)
+        _check_order(self.low, self.high)
+        _check_positive("hold_min", self.hold_min)
+
+    @property
+    def mean(self) -> float:
+        """See `Scenario`."""
+        return 0.5 * (self.low + self.high)
+
+    def level(self, time_min: float, seed: int) -> float:
+        """See `Scenario`."""
+        return self.low + (self.high - self.low) * _uniform(seed, int(time_min / self.hold_min + _EDGE))
+
+
+class Sines(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A sum of sinusoids about a mean.
+
+    Attributes:
+        mean: l/min.
+        amplitudes: l/min, one a sinusoid.
+        periods_min: one a sinusoid. The defaults have no common multiple within hours.
+        phases: at plant time 0, in rad, one a sinusoid; not said: all zero.
+    """
+
+    kind: ClassVar[str] = "sines"
+    mean: float = 100.0
+    amplitudes: tuple[float, ...] = (4.0, 3.0, 2.0)
+    periods_min: tuple[float, ...] = (3.1, 7.3, 19.7)
+    phases: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.amplitudes:
+            raise ValueError("amplitudes must hold at least one number; for none there is 'constant'")
+        for name, values in (("periods_min", self.periods_min), ("phases", self.phases or self.amplitudes)):
+            if len(values) != len(self.amplitudes):
+                raise ValueError(f"{name} must be as many as amplitudes, {len(self.amplitudes)}, got {len(values)}")
+        swing = sum(abs(amplitude) for amplitude in self.amplitudes)
+        _check_levels(**{"mean - amplitudes": self.mean - swing, "mean + amplitudes": self.mean + swing})
+        for period in self.periods_min:
+            _check_positive("periods_min", period)
+
+    def level(self, time_min: float, seed: int) -> float:
+        """See `Scenario`."""
+        phases = self.phases or (0.0,) * len(self.amplitudes)
+        return self.mean + sum(
+            amplitude * sin(2 * pi * time_min / period + phase)
+            for amplitude, period, phase in zip(self.amplitudes, self.periods_min, phases, strict=True)
+        )
+
+
+class Square(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Half a period low, half a period high.
+
+    Attributes:
+        low: l/min.
+        high: l/min.
+        period_min: from rise to rise.
+    """
+
+    kind: ClassVar[str] = "square"
+    low: float = 95.0
+    high: float = 105.0
+    period_min: float = 20.0
+
+    def __post_init__(self) -> None:
+        _check_levels(low=self.low, high=self.high)
+        _check_order(self.low, self.high)
+        _check_positive("period_min", self.period_min)
+
+    @property
+    def mean(self) -> float:
+        """See `Scenario`."""
+        return 0.5 * (self.low + self.high)
+
+    def level(self, time_min: float, seed: int) -> float:
+        """See `Scenario`."""
+        return self.high if int(2 * time_min / self.period_min + _EDGE) % 2 else self.low
+
+
+class Constant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One level.
+
+    Attributes:
+        level_l_min: l/min.
+    """
+
+    kind: ClassVar[str] = "constant"
+    level_l_min: float = 100.0
+
+    def __post_init__(self) -> None:
+        _check_levels(level_l_min=self.level_l_min)
+
+    @property
+    def mean(self) -> float:
+        """See `Scenario`."""
+        return self.level_l_min
+
+    def level(self, time_min: float, seed: int) -> float:
+        """See `Scenario`."""
+        return self.level_l_min
+
+
+class FromFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The coolant flow of a measured record; `HeldRecord` once it is read.
+
+    Attributes:
+        path: of the record, a .csv file.
+    """
+
+    kind: ClassVar[str] = "file"
+    path: str
+
+
+@dataclass(frozen=True, eq=False)
+class HeldRecord:
+    """The coolant flow of a record, each row's until the next; the first row is plant time 0, the last goes on.
+
+    Attributes:
+        time_min: shape (rows,), from 0.
+        levels: l/min, shape (rows,).
+    """
+
+    time_min: NDArray[np.float64]
+    levels: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, record: Record) -> "HeldRecord":
+        """The coolant flow of a record.
+
+        Raises:
+            InputError: it has no coolant flow, or one with gaps.
+        """
+        if SIGNAL not in record.columns or not record.rows:
+            raise InputError(f"{record.name}: must have a column {SIGNAL!r} with at least one row to drive the plant")
+        levels = record.columns[SIGNAL]
+        bad = ~(np.isfinite(levels) & (levels >= 0))
+        if bad.any():
+            row = int(np.argmax(bad))
+            raise InputError(
+                f"{record.name}: {SIGNAL} must be a number of at least 0 l/min in every row to drive the plant, "
+                f"got {levels[row]:g} at {record.time_min[row]:g} min"
+            )
+        return cls(record.time_min - record.time_min[0], levels)
+
+    @property
+    def mean(self) -> float:
+        """See `Scenario`; every row counts alike."""
+        return float(np.mean(self.levels))
+
+    def level(self, time_min: float, seed: int) -> float:
+        """See `Scenario`."""
+        row = int(np.searchsorted(self.time_min, time_min + _EDGE * 1e-3, side="right")) - 1
+        return float(self.levels[max(row, 0)])
+
+
+Settings: TypeAlias = RandomSteps | Sines | Square | Constant | FromFile
+
+SCENARIOS: tuple[type[Settings], ...] = (RandomSteps, Sines, Square, Constant, FromFile)
+
+
+def scenario_settings(said: str | Mapping[str, Any]) -> Settings:
+    """The scenario that a setting names.
+
+    Args:
+        said: the kind alone, for its defaults; the path of a .csv record; or a table with `kind` and its numbers.
+
+    Raises:
+        InputError: a kind or key that there is not, or a value that breaks a rule.
+    """
+    if isinstance(said, str):
+        said = {"kind": FromFile.kind, "path": said} if said.lower().endswith(".csv") else {"kind": said}
+    kinds = {item.kind: item for item in SCENARIOS}
+    if "kind" not in said:
+        raise InputError(f"scenario must have a 'kind' (valid: {', '.join(kinds)}), got {dict(said)}")
+    kind, numbers = said["kind"], {key: value for key, value in said.items() if key != "kind"}
+    if kind not in kinds:
+        raise InputError(f"scenario: {_unknown('kind', str(kind), tuple(kinds))}")
+    fields = tuple(field.name for field in msgspec.structs.fields(kinds[kind]))
+    for key in numbers:
+        if key not in fields:
+            raise InputError(f"scenario {kind}: {_unknown('key', key, fields)}")
+    if kind == FromFile.kind and "path" not in numbers:
+        raise InputError("scenario file: 'path' must say which .csv record drives the plant")
+    try:
+        settings: Settings = msgspec.convert(numbers, kinds[kind])
+    except msgspec.ValidationError as error:
+        raise InputError(f"scenario {kind}: {error}") from error
+    return settings
+
+
+@lru_cache(maxsize=1024)
+def _uniform(seed: int, number: int) -> float:
+    """A number in [0, 1) that belongs to (seed, number)."""
+    return float(np.random.default_rng(np.random.SeedSequence([seed, _STREAM, number])).random())
+
+
+def _unknown(what: str, name: str, valid: tuple[str, ...]) -> str:
+    close = difflib.get_close_matches(name, valid, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"unknown {what} {name!r}{hint} (valid: {', '.join(valid)})"
+
+
+def _check_levels(**levels: float) -> None:
+    for name, level in levels.items():
+        if not (isfinite(level) and level >= 0):
+            raise ValueError(f"{name} must be at least 0 l/min, got {level:g}")
+
+
+def _check_order(low: float, high: float) -> None:
+    if not low <= high:
+        raise ValueError(f"low must not exceed high, got {low:g} and {high:g} l/min")
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not (isfinite(value) and value > 0):
+        raise ValueError(f"{name} must be above 0 min, got {value:g}")

@@ -1,0 +1,197 @@
+"""`alarm`: what the operator does with alarms, asked of the running monitor."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from reactorwatch.cli.options import Endpoint, Json, Plant, Settings
+from reactorwatch.errors import InputError
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
+
+    from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+
+Name = Annotated[str, typer.Argument(help="As `alarm list` names it: shewhart/T.", show_default=False)]
+By = Annotated[str, typer.Option("--by", help="Who you are.", show_default=False)]
+Comment = Annotated[str, typer.Option("--comment", help="Why.", show_default=False)]
+Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the monitor.", min=0.1)]
+
+PATIENCE_S = 5.0
+
+alarms = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.add_typer(alarms, name="alarm", help="List, acknowledge, shelve, suppress or comment the alarms of a plant.")
+
+
+@alarms.command("list")
+def list_alarms(
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Plant = None,
+    timeout: Timeout = PATIENCE_S,
+    json: Json = False,
+) -> None:
+    """Show all alarms as they are now."""
+    from reactorwatch.contract.messages_pb2 import ListAlarms
+
+    reply = _ask(config, endpoint, name, timeout, "list_alarms", ListAlarms())
+    _show(reply, json=json)
+
+
+@alarms.command("shelve")
+def shelve(
+    alarm: Name,
+    by: By,
+    minutes: Annotated[float, typer.Option("--minutes", help="How long, in minutes of plant time.")],
+    comment: Comment = "",
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Plant = None,
+    timeout: Timeout = PATIENCE_S,
+    json: Json = False,
+) -> None:
+    """Put an alarm out of sight for a time."""
+    from reactorwatch.contract.messages_pb2 import ShelveAlarm
+
+    command = ShelveAlarm(alarm=alarm, by=by, comment=comment, minutes=minutes)
+    _show(_ask(config, endpoint, name, timeout, "shelve", command), json=json)
+
+
+def _register(word: str, command: str, description: str) -> None:
+    """A subcommand that names an alarm and a person, and no more."""
+
+    def act(
+        alarm: Name,
+        by: By,
+        comment: Comment = "",
+        config: Settings = None,
+        endpoint: Endpoint = None,
+        name: Plant = None,
+        timeout: Timeout = PATIENCE_S,
+        json: Json = False,
+    ) -> None:
+        from reactorwatch.contract.messages_pb2 import AlarmCommand
+
+        asked = AlarmCommand(alarm=alarm, by=by, comment=comment)
+        _show(_ask(config, endpoint, name, timeout, command, asked), json=json)
+
+    alarms.command(word, help=description)(act)
+
+
+for _word, _command, _description in (
+    ("acknowledge", "acknowledge", "Say that you have seen an alarm."),
+    ("unshelve", "unshelve", "Bring a shelved alarm back before its time is over."),
+    ("suppress", "suppress", "Put an alarm out of sight while it means nothing, as in a start-up."),
+    ("unsuppress", "unsuppress", "Bring a suppressed alarm back."),
+    ("out-of-service", "take_out_of_service", "Take an alarm out of service, for maintenance."),
+    ("in-service", "return_to_service", "Return an alarm to service."),
+    ("comment", "comment", "Say something about an alarm, with --comment."),
+):
+    _register(_word, _command, _description)
+
+
+def _ask(
+    config: Path | None, endpoint: str | None, plant: str | None, timeout_s: float, name: str, message: "Message"
+) -> "CommandReply":
+    """The monitor's answer to a command.
+
+    Raises:
+        InputError: no router or no monitor within the time, or the monitor refuses.
+    """
+    import logging
+    import threading
+
+    from reactorwatch.contract import keys
+    from reactorwatch.contract.codec import Encoded, decode, encode_message
+    from reactorwatch.contract.messages_pb2 import CommandReply
+    from reactorwatch.runtime.bus_zenoh import connect
+    from reactorwatch.runtime.config import BusConfig, read_settings, section
+    from reactorwatch.runtime.logs import configure
+    from reactorwatch.runtime.serve import StopSignal
+
+    configure(logging.WARNING)
+    tables = read_settings(config)
+    bus_config = section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    try:
+        plant = keys.checked_plant(plant or str(tables.get("monitor", {}).get("plant", "cstr")))
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    stop = StopSignal()
+    timer = threading.Timer(timeout_s, stop.set)
+    timer.start()
+    try:
+        bus = connect(bus_config, "alarm", stop)
+    finally:
+        timer.cancel()
+    if bus is None:
+        raise InputError(f"no router at {bus_config.endpoint} within {timeout_s:g} s; is it running?")
+    try:
+        answers = bus.ask(Encoded(keys.key(plant, keys.COMMAND, name), *encode_message(message)), timeout_s)
+    finally:
+        bus.close()
+    replies = [decode(answer.payload, answer.encoding) for answer in answers]
+    reply = next((item for item in replies if isinstance(item, CommandReply)), None)
+    if reply is None:
+        raise InputError(f"no monitor of plant {plant!r} answered within {timeout_s:g} s; is it running?")
+    if not reply.accepted:
+        raise InputError(reply.text)
+    return reply
+
+
+def _show(reply: "CommandReply", *, json: bool) -> None:
+    """Print the alarms of an answer: one JSON object a line, or a line each for people."""
+    import msgspec
+
+    for alarm in reply.alarms:
+        typer.echo(msgspec.json.encode(_object(alarm)).decode() if json else _line(alarm))
+
+
+def _object(alarm: "Alarm") -> dict[str, object]:
+    from reactorwatch.cli.reports import priority_word
+
+    return {
+        "alarm": alarm.alarm,
+        "state": _state(alarm),
+        "priority": priority_word(alarm),
+        "raised_ns": alarm.raised_ns or None,
+        "cleared_ns": alarm.cleared_ns or None,
+        "shelved_until_ns": alarm.shelved_until_ns or None,
+        "incident": alarm.incident or None,
+        "first_in": alarm.first_in,
+        "text": alarm.text,
+        "by": alarm.by,
+        "comment": alarm.comment,
+    }
+
+
+def _line(alarm: "Alarm") -> str:
+    from reactorwatch.cli.reports import priority_word
+
+    parts = [f"{alarm.alarm} ({priority_word(alarm)}): {_state(alarm)}"]
+    if alarm.shelved_until_ns:
+        parts.append(f"until {_moment(alarm.shelved_until_ns)}")
+    if alarm.incident:
+        first = ", first in" if alarm.first_in else ""
+        parts.append(f"raised {_moment(alarm.raised_ns)} (incident {alarm.incident}{first})")
+    if alarm.text:
+        parts.append(alarm.text)
+    if alarm.by:
+        parts.append(f"{alarm.by}: {alarm.comment}" if alarm.comment else alarm.by)
+    return "; ".join(parts)
+
+
+def _state(alarm: "Alarm") -> str:
+    from reactorwatch.contract.messages_pb2 import AlarmState
+
+    return AlarmState.Name(alarm.state).removeprefix("ALARM_STATE_").lower().replace("_", " ")
+
+
+def _moment(time_ns: int) -> str:
+    from datetime import UTC, datetime
+
+    return datetime.fromtimestamp(time_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

@@ -1,0 +1,139 @@
+"""Control charts: how long they run, and which is fastest."""
+
+from typing import Annotated
+
+import typer
+
+from reactorwatch.cli.options import Json
+from reactorwatch.errors import InputError
+
+Shift = Annotated[float, typer.Option(help="Of the mean, in standard deviations; 0: the false alarms.")]
+SteadyState = Annotated[bool, typer.Option("--steady-state", help="The chart has long run when the shift comes.")]
+Rules = Annotated[str, typer.Option(help="Run rules, some of 1,2,3,4.")]
+Dimension = Annotated[int, typer.Option(help="Number of signals.")]
+Weight = Annotated[float, typer.Option("--lambda", help="Weight of the newest sample.", show_default=False)]
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    charts = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+    arl = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+    for command in (shewhart, cusum, ewma, mewma, t2):
+        arl.command(command.__name__)(command)
+    charts.add_typer(arl, name="arl", help="The average run length of a chart, in samples.")
+    charts.command("design")(design)
+    app.add_typer(charts, name="charts", help="Control charts: how long they run, and which is fastest.")
+
+
+def shewhart(
+    shift: Shift = 0.0,
+    rules: Rules = "1",
+    limit: Annotated[float, typer.Option(help="Width L of the outer lines, in standard deviations.")] = 3.0,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Individual values, with run rules."""
+    from monitor_node.charts import run_length
+
+    length = run_length.shewhart(shift, limit, _rules(rules), steady_state=steady_state)
+    _tell(length, as_json, chart="shewhart", rules=list(_rules(rules)), limit=limit, shift=shift)
+
+
+def cusum(
+    k: Annotated[float, typer.Option(help="Allowance, in standard deviations.", show_default=False)],
+    h: Annotated[float, typer.Option(help="Limit, in standard deviations.", show_default=False)],
+    shift: Shift = 0.0,
+    headstart: Annotated[float, typer.Option(help="Where the sums start, in standard deviations.")] = 0.0,
+    one_sided: Annotated[bool, typer.Option("--one-sided", help="The high sum only.")] = False,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Two-sided cumulative sums."""
+    from monitor_node.charts import run_length
+
+    length = run_length.cusum(shift, k, h, headstart, one_sided=one_sided, steady_state=steady_state)
+    _tell(length, as_json, chart="cusum", k=k, h=h, headstart=headstart, shift=shift)
+
+
+def ewma(
+    weight: Weight,
+    limit: Annotated[float, typer.Option(help="L, in standard deviations of the average.", show_default=False)],
+    shift: Shift = 0.0,
+    exact_limits: Annotated[bool, typer.Option("--exact-limits", help="Limits that widen from the start.")] = False,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Exponentially weighted moving average."""
+    from monitor_node.charts import run_length
+
+    length = run_length.ewma(shift, weight, limit, exact_limits=exact_limits, steady_state=steady_state)
+    _tell(length, as_json, chart="ewma", **{"lambda": weight}, limit=limit, shift=shift)
+
+
+def mewma(
+    dimension: Annotated[int, typer.Option(help="Number of signals.", show_default=False)],
+    weight: Weight,
+    limit: Annotated[float, typer.Option(help="H, of the statistic.", show_default=False)],
+    shift: Shift = 0.0,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Moving average of several signals."""
+    from monitor_node.charts import run_length
+
+    length = run_length.mewma(shift, dimension, weight, limit, steady_state=steady_state)
+    _tell(length, as_json, chart="mewma", dimension=dimension, **{"lambda": weight}, limit=limit, shift=shift)
+
+
+def t2(
+    dimension: Annotated[int, typer.Option(help="Number of signals.", show_default=False)],
+    limit: Annotated[float, typer.Option(help="Of T2.", show_default=False)],
+    shift: Shift = 0.0,
+    steady_state: SteadyState = False,
+    as_json: Json = False,
+) -> None:
+    """Hotelling's T2, known covariance; it has no memory, so its steady state is as any other."""
+    from monitor_node.charts import run_length
+
+    _tell(run_length.t2(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift)
+
+
+def design(
+    chart: Annotated[str, typer.Argument(help="shewhart, cusum, ewma, mewma or t2.", show_default=False)],
+    arl0: Annotated[float, typer.Option(help="Samples to a false alarm, on average.", show_default=False)],
+    shift: Annotated[float, typer.Option(help="To be detected, in standard deviations.", show_default=False)],
+    dimension: Dimension = 2,
+    rules: Rules = "1",
+    as_json: Json = False,
+) -> None:
+    """The chart that detects a shift fastest at a rate of false alarms."""
+    from monitor_node.charts.run_length.design import design as fastest
+
+    found = fastest(chart, arl0, shift, dimension=dimension, rules=_rules(rules))
+    if as_json:
+        import msgspec
+
+        typer.echo(msgspec.json.encode(found).decode())
+        return
+    typer.echo(chart)
+    for name, value in found.parameters.items():
+        text = ",".join(map(str, value)) if isinstance(value, list) else f"{value:.6g}"
+        typer.echo(f"  {name:<10} {text}")
+    typer.echo(f"false alarm every {found.arl0:g} samples; a shift of {found.shift:g} is seen after {found.arl:.4g}")
+
+
+def _rules(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(rule) for rule in text.split(","))
+    except ValueError:
+        raise InputError(f"--rules must be some of 1,2,3,4 with commas between, got {text!r}") from None
+
+
+def _tell(length: float, as_json: bool, **chart: object) -> None:
+    """The run length: one number, or one object with the chart's parameters."""
+    if not as_json:
+        typer.echo(f"{length:.8g}")
+        return
+    import msgspec
+
+    typer.echo(msgspec.json.encode({**chart, "arl": length}).decode())

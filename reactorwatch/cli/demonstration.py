@@ -1,0 +1,258 @@
+"""`demo`: the whole chain once, at accelerated plant time with a fault in it, and what came of it in plain words.
+
+Real processes on a real router on loopback. Afterwards everything that is claimed is read from the recording: when the
+fault set in, which alarms came, and that a back-test over the recording gives the same alarms, value for value.
+"""
+
+import sys
+import threading
+import time
+from pathlib import Path
+
+import typer
+
+from monitor_node import backtest
+from monitor_node.config import MonitorConfig
+from plant_node.config import PlantConfig
+from reactorwatch.cli.processes import Processes, write_settings
+from reactorwatch.cli.progress import bar, task
+from reactorwatch.cli.sources import messages
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, decode
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Estimate, Fault, Sample
+from reactorwatch.errors import InputError
+from reactorwatch.process.fault import parse_fault
+from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
+from reactorwatch.runtime.bus_zenoh import ZenohBus, router
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.logs import configure
+from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.serve import StopSignal, stop_on_signals
+from recorder.config import RecorderConfig
+
+PLANT = "demo"
+START_WITHIN_S = 60.0
+DRAIN_WITHIN_S = 20.0
+LOOK_EVERY_S = 0.1
+SETTINGS_FILE = "settings.toml"
+LINGER_S = 1.0  # silence after which the recorder, asked to stop last, takes everything as heard
+
+
+class Watch:
+    """Follows on the bus how far the plant has come, and how far the monitor has.
+
+    Args:
+        bus: of the run.
+        span_ns: from the first row of the run to its last.
+    """
+
+    def __init__(self, bus: ZenohBus, span_ns: int) -> None:
+        self._span_ns = span_ns
+        self._lock = threading.Lock()
+        self._first_ns: int | None = None
+        self._plant_ns = 0
+        self._judged_ns = 0
+        bus.subscribe(keys.key(PLANT, keys.SAMPLE, "T"), self._on_sample)
+        bus.subscribe(keys.key(PLANT, keys.ESTIMATE, "T"), self._on_estimate)
+
+    @property
+    def started(self) -> bool:
+        """Whether a sample has come."""
+        return self._first_ns is not None
+
+    @property
+    def plant_min(self) -> float:
+        """How far the plant has come."""
+        with self._lock:
+            return 0.0 if self._first_ns is None else (self._plant_ns - self._first_ns) / MINUTE_NS
+
+    @property
+    def all_judged(self) -> bool:
+        """Whether the monitor has judged the last row of the run."""
+        with self._lock:
+            return self._first_ns is not None and self._judged_ns >= self._first_ns + self._span_ns
+
+    def _on_sample(self, message: Encoded) -> None:
+        sample = decode(message.payload, message.encoding)
+        assert isinstance(sample, Sample)
+        with self._lock:
+            self._first_ns = sample.time_ns if self._first_ns is None else self._first_ns
+            self._plant_ns = max(self._plant_ns, sample.time_ns)
+
+    def _on_estimate(self, message: Encoded) -> None:
+        estimate = decode(message.payload, message.encoding)
+        assert isinstance(estimate, Estimate)
+        with self._lock:
+            self._judged_ns = max(self._judged_ns, estimate.time_ns)
+
+
+def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: int) -> int:
+    """Run the demonstration.
+
+    Args:
+        out: folder to make; None: one named after the time.
+        duration_min: of plant time.
+        speed: plant time over wall time.
+        fault: specification.
+        seed: of input and noise.
+
+    Returns:
+        0 if the alarm came after the fault and not before, and the back-test agreed; 1 if not; 130 if it was stopped.
+
+    Raises:
+        InputError: arguments that cannot be used, or a node that failed.
+    """
+    configure()
+    specification = parse_fault(fault)
+    folder = _new_folder(out)
+    bus_config = BusConfig(endpoint=free_endpoint())
+    recording = folder / f"{PLANT}.mcap"
+    plant = PlantConfig(
+        name=PLANT,
+        speed=speed,
+        duration_min=duration_min,
+        seed=seed,
+        faults=(str(specification),),
+        wait_for=("monitor", "recorder"),
+    )
+    monitor = MonitorConfig(plant=PLANT)
+    settings = folder / SETTINGS_FILE
+    write_settings(
+        settings,
+        {
+            "bus": bus_config,
+            "plant": plant,
+            "monitor": monitor,
+            "recorder": RecorderConfig(plant=PLANT, out=str(recording), linger_s=LINGER_S),
+        },
+    )
+    bus = router(bus_config)
+    try:
+        with stop_on_signals() as stop:
+            if not _run_nodes(bus, stop, settings, folder, plant):
+                typer.echo(f"stopped; what was recorded until then is in {folder}", err=True)
+                return 130
+    finally:
+        bus.close()
+    return _conclude(folder, recording, monitor, str(specification))
+
+
+def _new_folder(out: Path | None) -> Path:
+    folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"--out {folder}: is there already and not empty; choose another, or remove it")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {folder}: the folder cannot be made: {error.strerror}") from error
+    return folder
+
+
+def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: Path, folder: Path, plant: PlantConfig) -> bool:
+    """Run the nodes until the plant has come to its end; False if that was cut short by a signal."""
+    woken = threading.Event()
+    stop.wakes(woken.set)
+    assert plant.rows is not None, "a demonstration has an end"
+    duration_min = plant.rows * plant.period_min
+    watch = Watch(bus, to_time_ns((plant.rows - 1) * plant.period_min))
+    with Processes(settings, logs=folder) as processes, bar("starting the nodes", duration_min) as advance:
+        for node in ("recorder", "monitor", "plant"):
+            processes.start(node)
+        started = time.monotonic()
+        while not woken.wait(LOOK_EVERY_S):
+            ended = processes.ended()
+            failed = {node: code for node, code in ended.items() if code or node != "plant"}
+            if failed:
+                node, code = next(iter(failed.items()))
+                raise InputError(f"the {node} ended with code {code}; it says why in {folder / (node + '.log')}")
+            if "plant" in ended:
+                break
+            if not watch.started and time.monotonic() - started > START_WITHIN_S:
+                raise InputError(f"no sample within {START_WITHIN_S:g} s of the start; see the .log files in {folder}")
+            advance(watch.plant_min, "starting the nodes" if not watch.started else "running the reactor")
+        deadline = time.monotonic() + DRAIN_WITHIN_S
+        while not stop.is_set and not watch.all_judged and time.monotonic() < deadline:
+            woken.wait(LOOK_EVERY_S)
+        processes.stop(("plant", "monitor", "recorder"))
+    return not stop.is_set
+
+
+def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
+    """Draw the recording, read from it what happened, and write that down."""
+    from recorder.rerun_file import write_rrd
+    from recorder.run import read_run
+
+    drawing = recording.with_suffix(".rrd")
+    with task("drawing and checking"):
+        write_rrd(read_run(messages(recording, PLANT)), drawing)
+        first_ns, faults, alarms = _events(recording)
+        again = backtest.run(messages(recording, PLANT), monitor)
+    same = [alarm.SerializeToString() for alarm in alarms] == [
+        alarm.SerializeToString() for alarm in again.alarm_messages
+    ]
+    raised = [alarm for alarm in alarms if alarm.state == AlarmState.ALARM_STATE_UNACKNOWLEDGED]
+    onset_ns = min((item.onset_ns for item in faults if item.active), default=None)
+    before = [alarm for alarm in raised if onset_ns is None or alarm.time_ns < onset_ns]
+    after = [alarm for alarm in raised if onset_ns is not None and alarm.time_ns >= onset_ns]
+
+    def at(time_ns: int) -> str:
+        return f"{to_minutes(time_ns, first_ns):.1f} min"
+
+    lines = [
+        "# What happened",
+        "",
+        f"- Fault injected: `{fault}`, set in at {at(onset_ns)}."
+        if onset_ns is not None
+        else f"- Fault `{fault}` never set in: the run was too short.",
+    ]
+    for alarm in after:
+        late = (alarm.time_ns - (onset_ns or 0)) / MINUTE_NS
+        lines.append(
+            f"- Alarm raised: `{alarm.alarm}` at {at(alarm.time_ns)}, {late:.1f} min after the fault: {alarm.text}."
+        )
+    if not after:
+        lines.append("- No alarm was raised after the fault.")
+    lines.append(
+        "- False alarms before the fault: "
+        + (", ".join(f"`{alarm.alarm}` at {at(alarm.time_ns)}" for alarm in before) or "none")
+        + f" ({again.expected_false_alarms:.2g} to be expected in the whole run)."
+    )
+    lines.append(f"- Back-test over the recording: {'the same alarms, value for value' if same else 'OTHER ALARMS'}.")
+    lines += [
+        "",
+        "# Which file to open",
+        "",
+        f"- `{drawing.name}`: the run as a dashboard. `{_program('rerun')} {drawing}`",
+        f"- `{recording.name}`: everything that went over the bus; opens in Foxglove and PlotJuggler, too.",
+        f"- `{SETTINGS_FILE}`: all settings, seeds included; the `.log` files: what the nodes said.",
+        "",
+    ]
+    text = "\n".join(lines)
+    (folder / "summary.md").write_text(text, encoding="utf-8")
+    typer.echo(text)
+    typer.echo(f"All of it is in {folder}")
+    return 0 if after and not before and same else 1
+
+
+def _program(name: str) -> str:
+    """How a program that came with this installation is called from here."""
+    path = Path(sys.executable).with_name(name)
+    folder = Path.cwd()
+    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
+
+
+def _events(recording: Path) -> tuple[int, list[Fault], list[Alarm]]:
+    first_ns: int | None = None
+    faults: list[Fault] = []
+    alarms: list[Alarm] = []
+    for message in messages(recording, PLANT):
+        body = decode(message.payload, message.encoding)
+        if isinstance(body, Sample):
+            first_ns = body.time_ns if first_ns is None else min(first_ns, body.time_ns)
+        elif isinstance(body, Fault):
+            faults.append(body)
+        elif isinstance(body, Alarm):
+            alarms.append(body)
+    if first_ns is None:
+        raise InputError(f"{recording}: holds no sample")
+    return first_ns, faults, alarms

@@ -1,0 +1,107 @@
+"""`identify`: what a record says of a linear model, for machines and for people."""
+
+import msgspec
+
+from monitor_node.identification.families import Arx, Family, OutputError
+from monitor_node.identification.identify import Identification
+from monitor_node.identification.identify import identify as identify_model
+from monitor_node.identification.selection import Selection, select
+from monitor_node.identification.structure import ALL_ROWS, REPORT_ROWS
+from reactorwatch.errors import InputError
+from reactorwatch.process.model import Array
+from reactorwatch.records.record import UNITS, Record
+
+INPUT = "qc"
+
+
+def one(
+    measured: Record,
+    output: str,
+    model: str,
+    order: int,
+    delay: int,
+    *,
+    recursive: bool,
+    report_rows: bool,
+    as_json: bool,
+) -> str:
+    """One model of one output.
+
+    Raises:
+        InputError: the record or the options cannot give one.
+    """
+    found = identify_model(
+        measured.time_min,
+        measured.columns[INPUT],
+        _column(measured, output),
+        model=model,
+        order=order,
+        delay=delay,
+        output=output,
+        recursive=recursive,
+        choice=REPORT_ROWS if report_rows else ALL_ROWS,
+        missing="leave out",
+    )
+    return msgspec.json.encode(found).decode() if as_json else _text(found)
+
+
+def compare(measured: Record, output: str, order: int, delay: int, *, neural: bool, as_json: bool) -> str:
+    """Every family at every order up to one, and which is chosen and why.
+
+    Raises:
+        InputError: as `one`, or the extra for neural networks is not installed.
+    """
+    families: list[Family] = [Arx(), OutputError()]
+    if neural:
+        from monitor_node.identification.neural import Neural
+
+        families.append(Neural())
+    if order < 1:
+        raise InputError(f"order must be at least 1, got {order}")
+    selection = select(
+        measured.columns[INPUT],
+        _column(measured, output),
+        measured.time_min,
+        families=families,
+        orders=range(1, order + 1),
+        delay=delay,
+    )
+    return _selection_json(selection, output) if as_json else f"{selection.table()}\n\n{selection.reason}"
+
+
+def _column(measured: Record, output: str) -> Array:
+    if output not in ("C", "T"):
+        raise InputError(f"--output must be C or T, got {output!r}")
+    return measured.columns[output]
+
+
+def _selection_json(selection: Selection, output: str) -> str:
+    said = {
+        "output": output,
+        "candidates": selection.candidates,
+        "chosen": {"family": selection.chosen.family, "order": selection.chosen.order},
+        "reason": selection.reason,
+    }
+    return msgspec.json.encode(said).decode()
+
+
+def _text(found: Identification) -> str:
+    unit = UNITS[found.output]
+    names = [f"a{lag}" for lag in range(1, found.order + 1)] + [f"b{lag}" for lag in range(1, found.order + 1)]
+    values = [*found.a, *found.b, found.offset]
+    deviations = [*found.sd.a, *found.sd.b, found.sd.offset]
+    past = "measured past" if found.model == "arx" else "model's own past"
+    lines = [
+        f"{found.model.upper()} of order {found.order}, delay {found.delay}: {found.output} ({unit}) from the {past} "
+        f"and {INPUT}; {found.rows} rows fitted{', row by row' if found.recursive else ''}",
+        "",
+        *(
+            f"  {name:<4}{value: .6g}  +- {deviation:.2g}"
+            for name, value, deviation in zip([*names, "c"], values, deviations, strict=True)
+        ),
+        "",
+        f"fit on the other half: one step {found.fit_percent.one_step:.2f} %, "
+        f"free run {found.fit_percent.free_run:.2f} %",
+        *(f"{name}: {result}" for name, result in found.checks.items()),
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,62 @@
+"""The command's entry: gathers the subcommands, and turns a person's mistakes into one line and exit code 2.
+
+Only what `--help` needs is imported here; each command imports its own when it is called.
+"""
+
+import sys
+from typing import cast
+
+import typer
+
+from reactorwatch import __version__
+from reactorwatch.cli import alarm, charts, files, models, nodes, runs, studies
+from reactorwatch.errors import InputError
+
+# Typer brings a copy of click, or uses the one installed, depending on its version; its errors are one family in both.
+UsageProblem: type[typer.BadParameter] = next(
+    cast(type[typer.BadParameter], kind) for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"
+)
+
+app = typer.Typer(
+    name="reactorwatch",
+    help="Watches a chemical reactor as it runs, and explains it when it misbehaves.",
+    no_args_is_help=True,
+    rich_markup_mode=None,  # importing rich for the help alone takes longer than all the rest
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for group in (runs, nodes, alarm, files, studies, models, charts):
+    group.add_to(app)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"reactorwatch {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    _version: bool = typer.Option(False, "--version", callback=_print_version, is_eager=True, help="Show the version."),
+) -> None:
+    """Watches a chemical reactor as it runs, and explains it when it misbehaves."""
+
+
+def main() -> None:
+    """Run the command and end the process with its exit code."""
+    try:
+        code = app(standalone_mode=False)
+    except UsageProblem as error:
+        _complain(error.format_message())
+        code = 2
+    except InputError as error:
+        _complain(str(error))
+        code = 2
+    except (typer.Abort, KeyboardInterrupt):
+        code = 130
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _complain(text: str) -> None:
+    line = " ".join(text.split())
+    sys.stderr.write(f"reactorwatch: {line}\n")

@@ -1,0 +1,83 @@
+"""Linear models: from a record, `identify`; from the equations, `linearise`; and the study of both, `reproduce`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from reactorwatch.cli.options import Columns, Json, Plant, columns, existing
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command("identify")(identify)
+    app.command("linearise")(linearise)
+    app.command("reproduce")(reproduce)
+
+
+def identify(
+    file: Annotated[Path, typer.Argument(help="A record (.csv) or recording (.mcap).", show_default=False)],
+    model: Annotated[str, typer.Option(help="arx or oe.")] = "arx",
+    order: Annotated[int, typer.Option(help="Lags of output and input.")] = 3,
+    delay: Annotated[int, typer.Option(help="Samples from a move of qc to its first effect.")] = 1,
+    output: Annotated[str, typer.Option(help="C or T.")] = "T",
+    recursive: Annotated[bool, typer.Option("--recursive", help="Learn row by row, as the monitor does.")] = False,
+    report_rows: Annotated[
+        bool, typer.Option("--report-rows", help="Fit every 6th row from the 100th on, as the original report did.")
+    ] = False,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Compare ARX and OE of orders 1 to --order, and choose.")
+    ] = False,
+    neural: Annotated[
+        bool, typer.Option("--neural", help="With --compare: a neural network too (reactorwatch[neural]).")
+    ] = False,
+    plant: Plant = None,
+    column: Columns = None,
+    as_json: Json = False,
+) -> None:
+    """Fit a linear model to one half, judge it by the other."""
+    from reactorwatch.cli import identification
+    from reactorwatch.cli.progress import task
+    from reactorwatch.cli.sources import record
+
+    measured = record(existing(file), plant, columns(column))
+    with task(f"identifying {file.name}"):
+        if compare:
+            said = identification.compare(measured, output, order, delay, neural=neural, as_json=as_json)
+        else:
+            said = identification.one(
+                measured, output, model, order, delay, recursive=recursive, report_rows=report_rows, as_json=as_json
+            )
+    typer.echo(said)
+
+
+def linearise(
+    qc: Annotated[float, typer.Argument(help="The coolant flow, l/min.", show_default=False)],
+    step: Annotated[float, typer.Option(help="Of qc, by which linear model and plant are compared, l/min.")] = 1.0,
+    as_json: Json = False,
+) -> None:
+    """The linear models at all steady states of a coolant flow."""
+    from reactorwatch.cli.linear_models import describe
+
+    typer.echo(describe(qc, step, as_json=as_json))
+
+
+def reproduce(
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for study.md and its pictures.", show_default=False)],
+    seed: Annotated[int, typer.Option(help="Of every simulated record.", min=0)] = 1,
+    only: Annotated[str | None, typer.Option(help="Figures, such as 7,12 [4 to 20].", show_default=False)] = None,
+    file: Annotated[
+        Path | None,
+        typer.Option(
+            "--record", help="A record that figures 14 to 17 learn from, not a simulated one.", show_default=False
+        ),
+    ] = None,
+    plant: Plant = None,
+    column: Columns = None,
+) -> None:
+    """Make every figure of the original report anew (reactorwatch[pictures])."""
+    from reactorwatch.cli.sources import record
+    from reactorwatch.cli.study.reproduce import reproduce as reproduce_figures
+
+    measured = record(existing(file), plant, columns(column)) if file else None
+    typer.echo(reproduce_figures(out, seed, only, measured))

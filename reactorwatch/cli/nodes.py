@@ -1,0 +1,148 @@
+"""One node each: `plant`, `monitor`, `record`, `replay`. Every one runs until it is finished or stopped."""
+
+import logging
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from reactorwatch.cli.options import Columns, Endpoint, Plant, Settings, columns, existing, pace
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command("plant")(plant)
+    app.command("monitor")(monitor)
+    app.command("record")(record)
+    app.command("replay")(replay)
+    app.command("alive")(alive)
+
+
+def _settings(path: Path | None, endpoint: str | None, *, quiet: bool = False) -> tuple[dict[str, dict[str, Any]], Any]:
+    from reactorwatch.runtime.config import BusConfig, read_settings, section
+    from reactorwatch.runtime.logs import configure
+
+    configure(logging.WARNING if quiet else logging.INFO)
+    tables = read_settings(path)
+    return tables, section(BusConfig, "bus", tables, {"endpoint": endpoint})
+
+
+def plant(
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Plant = None,
+    preset: Annotated[
+        str | None,
+        typer.Option(help="Settings of a named run: fault-free, input-leakage, heat-transfer or reaction-rate."),
+    ] = None,
+    speed: Annotated[
+        str | None, typer.Option(help="Plant time over wall time: a number, or 'max' [1].", show_default=False)
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option("--duration", help="Minutes of plant time, then it ends [endless].", min=0)
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the input and the noise.", show_default=False)] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            help="The input: random-steps, sines, square, constant or file [random-steps].", show_default=False
+        ),
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="A fault, as cause:profile:size@onset: coolant_flow:step:-0.05@30min. Repeatable."),
+    ] = None,
+) -> None:
+    """Simulate the reactor and publish what its sensors see."""
+    from plant_node.__main__ import run
+    from plant_node.config import PlantConfig
+    from reactorwatch.runtime.config import section
+
+    tables, bus = _settings(config, endpoint)
+    flags = {
+        "name": name,
+        "preset": preset,
+        "speed": pace(speed, "--speed"),
+        "duration_min": duration,
+        "seed": seed,
+        "scenario": scenario,
+        "faults": fault or None,
+    }
+    run(section(PlantConfig, "plant", tables, flags), bus)
+
+
+def monitor(
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Plant = None,
+    training: Annotated[
+        float | None, typer.Option("--training", help="Minutes of plant time to learn from [100].", show_default=False)
+    ] = None,
+) -> None:
+    """Watch a plant: predict its signals, raise alarms."""
+    from monitor_node.__main__ import run
+    from monitor_node.config import MonitorConfig
+    from reactorwatch.runtime.config import section
+
+    tables, bus = _settings(config, endpoint)
+    run(section(MonitorConfig, "monitor", tables, {"plant": name, "training_min": training}), bus)
+
+
+def record(
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Plant = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="File or folder to write to [.].", show_default=False)
+    ] = None,
+) -> None:
+    """Record everything on the bus into an MCAP file."""
+    from reactorwatch.runtime.config import section
+    from recorder.__main__ import run
+    from recorder.config import RecorderConfig
+
+    tables, bus = _settings(config, endpoint)
+    flags = {"plant": name, "out": str(out) if out is not None else None}
+    run(section(RecorderConfig, "recorder", tables, flags), bus)
+
+
+def replay(
+    file: Annotated[Path, typer.Argument(help="A recording (.mcap) or a record (.csv).", show_default=False)],
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Annotated[
+        str | None, typer.Option("--plant", help="Publish it as this plant [as recorded].", show_default=False)
+    ] = None,
+    rate: Annotated[
+        str | None, typer.Option(help="Times real time: a number, or 'max' [1].", show_default=False)
+    ] = None,
+    column: Columns = None,
+) -> None:
+    """Publish a recording or a record as the plant did."""
+    from reactorwatch.runtime.config import section
+    from recorder.replay import ReplayConfig, run_replay
+
+    tables, bus = _settings(config, endpoint)
+    flags = {
+        "file": str(existing(file)),
+        "plant": name,
+        "rate": pace(rate, "--rate"),
+        "columns": columns(column) or None,
+    }
+    run_replay(section(ReplayConfig, "replay", tables, flags), bus)
+
+
+def alive(
+    node: Annotated[str, typer.Argument(help="plant, monitor or recorder.", show_default=False)],
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Plant = None,
+    timeout: Annotated[float, typer.Option(help="Seconds to wait for it.", min=0.1)] = 5.0,
+) -> None:
+    """Is a node there? A health check: ends with 0 or 1."""
+    from reactorwatch.cli.liveliness import comes_alive
+
+    _, bus = _settings(config, endpoint, quiet=True)
+    there = comes_alive(bus, name or "cstr", node, timeout)
+    typer.echo(f"{node} is {'alive' if there else f'not there within {timeout:g} s'}")
+    raise typer.Exit(0 if there else 1)

@@ -1,0 +1,80 @@
+"""Options that several commands share, and how their values are read."""
+
+from math import inf
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from reactorwatch.errors import InputError
+
+Settings = Annotated[
+    Path | None, typer.Option("--config", help="Settings file (TOML), a table for each node.", show_default=False)
+]
+Endpoint = Annotated[str | None, typer.Option(help="Address of the router [tcp/127.0.0.1:7447].", show_default=False)]
+Plant = Annotated[str | None, typer.Option("--plant", help="Name of the plant [cstr].", show_default=False)]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object, for machines.")]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", help="A column of another name, as signal=column: --column T=reactor_temp."),
+]
+
+
+def columns(pairs: list[str] | None) -> dict[str, str]:
+    """The columns' names by signal, from `signal=column` pairs.
+
+    Raises:
+        InputError: not such a pair.
+    """
+    named = {}
+    for pair in pairs or []:
+        signal, equals, column = pair.partition("=")
+        if not (signal and equals and column):
+            raise InputError(f"--column must be signal=column, such as T=reactor_temp, got {pair!r}")
+        named[signal] = column
+    return named
+
+
+def pace(text: str | None, option: str) -> float | None:
+    """A speed or a rate: a positive number, or `max` for as fast as it goes.
+
+    Raises:
+        InputError: neither.
+    """
+    if text is None:
+        return None
+    if text == "max":
+        return inf
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < inf:
+        raise InputError(f"{option} must be a positive number or 'max', got {text!r}")
+    return value
+
+
+def existing(path: Path) -> Path:
+    """The path of a file that is to be read.
+
+    Raises:
+        InputError: there is none, or it is a folder.
+    """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, a file was expected")
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file")
+    return path
+
+
+def new_file(path: Path) -> Path:
+    """The path of a file that is to be written; one that is there is replaced.
+
+    Raises:
+        InputError: its folder does not exist, or it is a folder itself.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder, a file name was expected")
+    return path

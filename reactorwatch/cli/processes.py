@@ -1,0 +1,98 @@
+"""The nodes as processes of their own, under one supervisor that also is their router.
+
+A node is started as `python -m plant_node SETTINGS`, in a session of its own, so that Ctrl-C on the terminal reaches
+the supervisor alone. It then stops them in order: the plant first, the recorder last, each after the one
+before has said its last words.
+"""
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+import structlog
+
+log = structlog.get_logger()
+
+MODULES = {"plant": "plant_node", "monitor": "monitor_node", "recorder": "recorder"}
+STOP_WITHIN_S = 15.0
+
+
+class Processes:
+    """The running nodes, as a context that ends them.
+
+    Args:
+        settings: file that all of them read.
+        logs: folder for what they say; None: to our own standard error.
+    """
+
+    def __init__(self, settings: Path, logs: Path | None = None) -> None:
+        self._settings = settings
+        self._logs = logs
+        self._running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(self, node: str) -> subprocess.Popen[bytes]:
+        """Start a node."""
+        command = [sys.executable, "-m", MODULES[node], str(self._settings)]
+        if self._logs is None:
+            process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)  # noqa: S603 (our own modules)
+        else:
+            with (self._logs / f"{node}.log").open("wb") as output:
+                process = subprocess.Popen(  # noqa: S603 (our own modules)
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,
+                )
+        self._running[node] = process
+        return process
+
+    def ended(self) -> dict[str, int]:
+        """Exit codes of the nodes that have ended by themselves."""
+        codes = {node: process.poll() for node, process in self._running.items()}
+        return {node: code for node, code in codes.items() if code is not None}
+
+    def stop(self, nodes: Sequence[str]) -> dict[str, int]:
+        """Ask nodes to end, one after the other, and wait for each; returns their exit codes."""
+        codes = {}
+        for node in nodes:
+            process = self._running.pop(node, None)
+            if process is None:
+                continue
+            if process.poll() is None:
+                process.terminate()
+            try:
+                codes[node] = process.wait(STOP_WITHIN_S)
+            except subprocess.TimeoutExpired:
+                log.warning("did not stop when asked, killed", node=node, after_s=STOP_WITHIN_S)
+                process.kill()
+                codes[node] = process.wait()
+        return codes
+
+    def __enter__(self) -> Self:
+        """The processes themselves."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End what still runs, the recorder last."""
+        self.stop([*(node for node in MODULES if node != "recorder"), "recorder"])
+
+
+def write_settings(path: Path, tables: dict[str, msgspec.Struct]) -> None:
+    """Write whole settings as TOML, every value spelled out, so that the file says what ran."""
+    import tomli_w
+
+    plain = {name: _without_none(msgspec.to_builtins(table)) for name, table in tables.items()}
+    path.write_text(tomli_w.dumps(plain), encoding="utf-8")
+
+
+def _without_none(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_none(item) for key, item in value.items() if item is not None}
+    return value

@@ -1,0 +1,41 @@
+"""Progress for people: only on a terminal, and on standard error, so that what a command prints stays clean."""
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+
+Advance = Callable[[float, str], None]
+
+
+@contextlib.contextmanager
+def task(text: str) -> Iterator[None]:
+    """A spinner while something of unknown length runs."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        progress.add_task(text, total=None)
+        yield
+
+
+@contextlib.contextmanager
+def bar(text: str, total: float) -> Iterator[Advance]:
+    """A bar while something of known length runs; call what it gives with (how far, what is going on)."""
+    if not sys.stderr.isatty():
+        yield lambda _completed, _now: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        number = progress.add_task(text, total=total)
+
+        def advance(completed: float, now: str) -> None:
+            progress.update(number, completed=completed, description=now)
+
+        yield advance

@@ -1,0 +1,72 @@
+"""What commands print: a JSON object for machines, a few lines for people."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from monitor_node.backtest import Backtest
+from reactorwatch.contract.messages_pb2 import Alarm, Priority
+from reactorwatch.records.record import to_minutes
+
+
+def backtest_object(result: Backtest, zero_ns: int) -> dict[str, Any]:
+    """The object that `backtest --json` prints.
+
+    Args:
+        result: of the back-test.
+        zero_ns: where the file's minutes start.
+    """
+
+    def minutes(time_ns: int | None) -> float | None:
+        return None if time_ns is None else to_minutes(time_ns, zero_ns)
+
+    return {
+        "samples": result.rows,
+        "span_min": to_minutes(result.last_ns, result.first_ns),
+        "trained_until_min": minutes(result.watching_since_ns),
+        "expected_false_alarms": float(f"{result.expected_false_alarms:.3g}"),
+        "alarms": [
+            {
+                "alarm": alarm.alarm,
+                "priority": priority_word(alarm),
+                "raised_min": minutes(alarm.raised_ns),
+                "cleared_min": minutes(cleared_ns),
+                "signals": [item.signal for item in alarm.contributions],
+                "suspect": [{"cause": item.cause, "probability": item.probability} for item in alarm.suspects],
+            }
+            for alarm, cleared_ns in result.raised
+        ],
+    }
+
+
+def backtest_json(result: Backtest, zero_ns: int) -> str:
+    """The JSON object of the contract, on one line."""
+    return msgspec.json.encode(backtest_object(result, zero_ns)).decode()
+
+
+def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
+    """The same for people."""
+    said = backtest_object(result, zero_ns)
+    lines = [f"{file}: {said['samples']} rows over {said['span_min']:g} min"]
+    if said["trained_until_min"] is None:
+        lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
+    else:
+        lines.append(
+            f"trained until {said['trained_until_min']:g} min; "
+            f"{said['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
+        )
+    for alarm, cleared_ns in result.raised:
+        end = f"cleared at {to_minutes(cleared_ns, zero_ns):g} min" if cleared_ns else "still standing at the end"
+        raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
+        lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}")
+    if not result.raised and said["trained_until_min"] is not None:
+        lines.append("no alarms")
+    if result.refused:
+        lines.append("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items())))
+    return "\n".join(lines)
+
+
+def priority_word(alarm: Alarm) -> str:
+    """`high` for PRIORITY_HIGH."""
+    return Priority.Name(alarm.priority).removeprefix("PRIORITY_").lower()

@@ -1,0 +1,61 @@
+"""`simulate`: the plant's equations against a record."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from reactorwatch.errors import InputError
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.simulate import Simulator
+from reactorwatch.records.record import UNITS, Record
+
+
+def free_run(measured: Record, faults: list[str]) -> Record:
+    """Run the equations from the record's first row, driven by its input.
+
+    Args:
+        measured: with the model's inputs and states as columns.
+        faults: specifications; their onsets are in the record's time.
+
+    Raises:
+        InputError: the record cannot drive the model.
+    """
+    model: ProcessModel = cstr()
+    for text in faults:
+        model = parse_fault(text).extend(model, end_min=float(measured.time_min[-1]))
+    inputs = np.column_stack([measured.columns[name] for name in model.input_names])
+    start = np.array([measured.columns[name][0] for name in ("C", "T")])
+    if not np.all(np.isfinite(start)):
+        raise InputError(f"{measured.name}: the first row must have C and T, the run starts from them; got {start}")
+    if not np.all(np.isfinite(inputs)):
+        row = int(np.argmax(~np.all(np.isfinite(inputs), axis=1)))
+        raise InputError(
+            f"{measured.name}: qc must be there in every row, it is missing at {measured.time_min[row]:g} min"
+        )
+    try:
+        trajectory = Simulator(model).run(measured.time_min, inputs, start)
+    except ValueError as error:
+        raise InputError(f"{measured.name}: {error}") from error
+    columns = {name: inputs[:, index] for index, name in enumerate(model.input_names)}
+    columns |= {name: trajectory.outputs[:, index] for index, name in enumerate(model.output_names)}
+    return Record(measured.time_min, columns, f"simulation of {measured.name}")
+
+
+def report(measured: Record, simulated: Record, out: Path, *, as_json: bool) -> str:
+    """How far the simulation is from the record, by signal."""
+    rmse = {}
+    for name in ("C", "T"):
+        difference = simulated.columns[name] - measured.columns[name]
+        rmse[name] = float(np.sqrt(np.nanmean(difference**2)))
+    if as_json:
+        said = {
+            "file": str(out),
+            "rows": measured.rows,
+            "rmse": {name: {"value": value, "unit": UNITS[name]} for name, value in rmse.items()},
+        }
+        return msgspec.json.encode(said).decode()
+    parts = ", ".join(f"{name} {value:.3g} {UNITS[name]}" for name, value in rmse.items())
+    return f"wrote {out}: {measured.rows} rows; root mean square difference from the record: {parts}"

@@ -1,0 +1,71 @@
+"""Wherever a file is asked for, `.csv` and `.mcap` both serve: this turns either into a record or into messages."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from reactorwatch.contract.codec import Encoded, encode
+from reactorwatch.errors import InputError
+from reactorwatch.records.record import Record
+
+DEFAULT_PLANT = "cstr"
+
+
+def record(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Record:
+    """The columns of a file.
+
+    Raises:
+        InputError: the file is not one of the two kinds, or is malformed.
+    """
+    if kind(path) == "csv":
+        from reactorwatch.records.csv_file import read_csv
+
+        return read_csv(path, columns)
+    from recorder.mcap_file import read_record
+
+    return read_record(path, plant)
+
+
+def messages(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Iterator[Encoded]:
+    """The messages of a file, in the order they were received; those of a .csv are its samples.
+
+    Raises:
+        InputError: as `record`.
+    """
+    if kind(path) == "csv":
+        from recorder.replay import samples_of
+
+        publications = samples_of(record(path, plant, columns), plant or DEFAULT_PLANT)
+        return (encode(publication) for publication in publications)
+    from recorder.mcap_file import read_messages
+
+    return (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
+
+
+def plant_of(path: Path, plant: str | None) -> str:
+    """The plant in a file: the one named, or the only one there.
+
+    Raises:
+        InputError: as `one_plant_in`.
+    """
+    if kind(path) == "csv":
+        return plant or DEFAULT_PLANT
+    from recorder.mcap_file import one_plant_in
+
+    return one_plant_in(path, plant)
+
+
+def zero_of(path: Path, first_ns: int) -> int:
+    """Where the minutes of a file start: a .csv has times of its own, a recording counts from its first sample."""
+    return 0 if kind(path) == "csv" else first_ns
+
+
+def kind(path: Path) -> str:
+    """`csv` or `mcap`, by the file's ending.
+
+    Raises:
+        InputError: neither.
+    """
+    ending = path.suffix.lower().removeprefix(".")
+    if ending not in ("csv", "mcap"):
+        raise InputError(f"{path}: must be a .csv or .mcap file, got {path.suffix or 'no ending'}")
+    return ending

@@ -1,0 +1,69 @@
+"""What a record says: `simulate` and `backtest`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from reactorwatch.cli.options import Columns, Json, Plant, Settings, columns, existing, new_file
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command("simulate")(simulate)
+    app.command("backtest")(backtest)
+
+
+def simulate(
+    file: Annotated[Path, typer.Argument(help="A record (.csv) or recording (.mcap).", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.csv).", show_default=False)],
+    plant: Plant = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset, onset in the file's time.")
+    ] = None,
+    column: Columns = None,
+    as_json: Json = False,
+) -> None:
+    """Run the plant's equations along a record.
+
+    They start from its first row and run freely, driven by its qc.
+    """
+    from reactorwatch.cli.progress import task
+    from reactorwatch.cli.simulation import free_run, report
+    from reactorwatch.cli.sources import record
+    from reactorwatch.records.csv_file import write_csv
+
+    measured = record(existing(file), plant, columns(column))
+    out = new_file(out)
+    with task(f"simulating {file.name}"):
+        simulated = free_run(measured, fault or [])
+        write_csv(out, simulated)
+    typer.echo(report(measured, simulated, out, as_json=as_json))
+
+
+def backtest(
+    file: Annotated[Path, typer.Argument(help="A recording (.mcap) or record (.csv).", show_default=False)],
+    config: Settings = None,
+    plant: Plant = None,
+    training: Annotated[
+        float | None, typer.Option("--training", help="Minutes to learn from [100].", show_default=False)
+    ] = None,
+    column: Columns = None,
+    as_json: Json = False,
+) -> None:
+    """Run the monitor over a recording at full speed."""
+    from monitor_node.backtest import run
+    from monitor_node.config import MonitorConfig
+    from reactorwatch.cli.progress import task
+    from reactorwatch.cli.reports import backtest_json, backtest_text
+    from reactorwatch.cli.sources import messages, plant_of, zero_of
+    from reactorwatch.runtime.config import read_settings, section
+
+    existing(file)
+    name = plant_of(file, plant)
+    flags = {"plant": name, "training_min": training}
+    settings = section(MonitorConfig, "monitor", read_settings(config), flags)
+    with task(f"watching {file.name}"):
+        result = run(messages(file, name, columns(column)), settings)
+    zero_ns = zero_of(file, result.first_ns)
+    typer.echo(backtest_json(result, zero_ns) if as_json else backtest_text(result, zero_ns, file))

@@ -1,0 +1,64 @@
+"""What a figure of the study is, and what comes out of drawing it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
+    from reactorwatch.cli.study.study import Study
+
+
+class Verdict(Enum):
+    """How what was found stands to what the report says."""
+
+    AGREES = "agrees"
+    IN_PART = "agrees in part"
+    DISAGREES = "disagrees"
+    NO_CLAIM = "no result of the report is known"
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a figure shows.
+
+    Attributes:
+        text: Markdown, with the numbers of this run.
+        verdict: against the report.
+    """
+
+    text: str
+    verdict: Verdict = Verdict.NO_CLAIM
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One figure of the report.
+
+    Attributes:
+        number: as the study counts, in the report's order.
+        title: its subject.
+        claim: what the report says or does there, as far as it is known.
+        draw: puts it on an empty drawing and says what was found.
+        height_px: of the picture, which is 900 px wide.
+    """
+
+    number: int
+    title: str
+    claim: str
+    draw: Callable[[Study, Drawing], Finding]
+    height_px: int = 500
+
+    @property
+    def file_name(self) -> str:
+        """Of the picture."""
+        return f"figure-{self.number:02d}.png"
+
+
+def verdict(agrees: bool) -> Verdict:
+    """For a claim that is right or wrong as a whole."""
+    return Verdict.AGREES if agrees else Verdict.DISAGREES

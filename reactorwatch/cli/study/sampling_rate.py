@@ -1,0 +1,156 @@
+"""Figure 13: how the regressors and the response look at different sampling periods."""
+
+from __future__ import annotations
+
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from monitor_node.identification.batch import SINGULAR_CONDITION, fit_arx
+from monitor_node.identification.excitation import (
+    FASTEST_SAMPLES,
+    LARGEST_CONDITION,
+    SLOWEST_SAMPLES,
+    conditioning,
+    sampling,
+)
+from monitor_node.identification.regressor import rows_of
+from monitor_node.identification.structure import ALL_ROWS, REPORT_ROWS, RowChoice, Scaling, Structure
+from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION, label, panels
+from reactorwatch.cli.study.figure import Finding, Verdict
+from reactorwatch.cli.study.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, Study
+from reactorwatch.errors import InputError
+from reactorwatch.process.model import Array
+from reactorwatch.records.record import Record
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure as Drawing
+
+_DECIMATIONS = (1, 2, 4, 5, 10, 20, 30, 40, 60, 80, 120, 240)
+"""Every level of the fast records is held for a whole number of such periods."""
+_CLOCK = 10
+"""The decimation that gives the clock of 0.1 min, which is that of the DaISy record."""
+_OUTPUT = "T"
+_STEPS = f"steps every {IDENTIFICATION_HOLD_MIN:g} min"
+_DRIVEN_BY: dict[str, dict[str, Any]] = {
+    "sum of three sinusoids": {"kind": "sines"},
+    "square wave": {"kind": "square"},
+    _STEPS: {"kind": "random-steps", "hold_min": IDENTIFICATION_HOLD_MIN},
+}
+_TOP = 1e7  # of the picture; what is above is drawn at its edge
+_STRUCTURE = Structure.of_order(3)
+
+
+def draw(study: Study, drawing: Drawing) -> Finding:
+    """Condition number and length of the step response over the sampling period."""
+    for_condition, for_response = panels(drawing, 1, 2)
+    periods = np.array(_DECIMATIONS) * FAST_PERIOD_MIN
+    conditions: dict[bool, Array] = {}
+    judged = []
+    for noise, colour, name in ((False, BLUE, "no noise"), (True, ORANGE, "with the sensors' noise")):
+        record = study.fast(noise)
+        u, y = record.columns["qc"], record.columns[_OUTPUT]
+        conditions[noise] = np.array([conditioning(_STRUCTURE, u[::d], y[::d]).value for d in _DECIMATIONS])
+        for_condition.loglog(periods, conditions[noise], "o-", color=colour, markersize=4, label=name)
+        if not noise:
+            judged = [sampling(_STRUCTURE, u[::d], y[::d]) for d in _DECIMATIONS]
+            really = u[:: _CLOCK * REPORT_ROWS.every], y[:: _CLOCK * REPORT_ROWS.every]
+    samples = np.array([check.value for check in judged])
+    chosen = {name: report_choice(study.quiet(scenario)) for name, scenario in _DRIVEN_BY.items()}
+    slowed = _condition(*really, ALL_ROWS)
+    clock_min = _CLOCK * FAST_PERIOD_MIN
+    for_condition.axhline(LARGEST_CONDITION, color=BLACK, linewidth=1, linestyle=":", label="largest that is accepted")
+    for (name, (_, condition, *_)), colour in zip(chosen.items(), (GREEN, VERMILION, PURPLE), strict=True):
+        beyond = condition > _TOP
+        for_condition.plot(
+            clock_min * (1.25 if name == _STEPS else 1.0),
+            _TOP if beyond else condition,
+            "^" if beyond else "X",
+            color=colour,
+            markersize=9,
+            clip_on=False,
+            label=f"every 6th row, {name}" + (": singular" if condition > SINGULAR_CONDITION else ""),
+        )
+    for_condition.set_ylim(10, _TOP)
+    for_condition.plot(
+        clock_min * REPORT_ROWS.every,
+        slowed,
+        "D",
+        color=BLACK,
+        markersize=6,
+        label="really sampled 6 times more slowly",
+    )
+    label(for_condition, "sampling period, min", "condition number of the regressors", "third-order ARX of T")
+    for_condition.legend(loc="upper right", bbox_to_anchor=(1.0, 0.95))
+    for_response.axhspan(SLOWEST_SAMPLES, FASTEST_SAMPLES, color=GREEN, alpha=0.12, label="accepted")
+    for_response.loglog(periods, samples, "-", color=GREY, linewidth=1)
+    for name, colour, mark in (("ok", GREEN, "o"), ("too fast", VERMILION, "^"), ("too slow", ORANGE, "v")):
+        of_kind = [check.result.startswith(name) for check in judged]
+        for_response.plot(
+            periods[of_kind], samples[of_kind], mark, color=colour, label=name if name != "ok" else "good"
+        )
+    label(for_response, "sampling period, min", "samples to 95 % of a step response", "the check of the sampling rate")
+    for_response.legend(loc="upper right")
+    good = periods[[check.passed for check in judged]]
+    too_fast = conditions[False][0] > LARGEST_CONDITION
+    worse = [name for name, (_, condition, _, blind) in chosen.items() if condition > SINGULAR_CONDITION and blind]
+    cured = [name for name, (every, condition, *_) in chosen.items() if condition < 0.5 * every]
+    (_, pole) = study.operating().eigenvalues
+    rows = "\n".join(
+        f"| {name} | {_condition_said(every)} | {_condition_said(condition)} | {said} |"
+        for name, (every, condition, said, _) in chosen.items()
+    )
+    text = (
+        f"Every {periods[0]:g} min the condition number is {conditions[False][0]:.3g} without noise, at most "
+        f"{LARGEST_CONDITION:.0g} is accepted: {'' if too_fast else 'not '}too close to singular. With noise it is "
+        f"only {conditions[True][0]:.3g}: noise hides the near dependence, it does not cure it. The check, which "
+        f"looks at the response instead, accepts periods of {good.min():g} to {good.max():g} min; slower, the "
+        f"response is over between two samples (one swing takes {2 * np.pi / abs(pole.imag):.2f} min). Sampled every "
+        f"{clock_min * REPORT_ROWS.every:g} min the condition number is {slowed:.3g}.\n\n"
+        f"The report's choice, every {REPORT_ROWS.every}th row from the {REPORT_ROWS.skip + 1}th on with lags of the "
+        f"fast clock, on runs without noise with {clock_min:g} min between rows (the clock of the DaISy record; the "
+        "report's own is not known):\n\n"
+        "| input | condition number, all rows | the report's rows | what the software says of the report's rows |\n"
+        f"|---|---|---|---|\n{rows}\n\n"
+        f"It makes the regressors better conditioned for {' and '.join(cured) or 'none of these inputs'}: the lags "
+        "stay as close as they were, rows are thrown away, the sampling is not slowed."
+    )
+    if worse:
+        text += (
+            f" For {' and '.join(worse)} it makes them singular: in every row that is chosen, two of the input's lags "
+            "are equal, because the input moves in step with the choice."
+        )
+    if not too_fast:
+        return Finding(text, Verdict.DISAGREES)
+    return Finding(text, Verdict.AGREES if cured and not worse else Verdict.IN_PART)
+
+
+def report_choice(record: Record) -> tuple[float, float, str, bool]:
+    """The report's rows of a record.
+
+    Returns:
+        Condition numbers with all rows and with the report's, what fitting the latter comes to, and whether two lags of
+        the input are equal in all of them.
+    """
+    u, y = record.columns["qc"], record.columns[_OUTPUT]
+    try:
+        fit_arx(_STRUCTURE, u, y, choice=REPORT_ROWS)
+        said = "fits"
+    except InputError as refusal:
+        said = f"refused: {str(refusal).partition(':')[0]}"
+    rows = np.arange(REPORT_ROWS.skip, u.size, REPORT_ROWS.every)
+    lags = [u[rows - lag] for lag in range(_STRUCTURE.delay, _STRUCTURE.delay + _STRUCTURE.input_lags)]
+    blind = any(np.array_equal(one, other) for one, other in combinations(lags, 2))
+    return _condition(u, y, ALL_ROWS), _condition(u, y, REPORT_ROWS), said, blind
+
+
+def _condition_said(value: float) -> str:
+    """A condition number; beyond what can be solved its digits are rounding."""
+    return f"{value:.3g}" if value <= SINGULAR_CONDITION else f"above {SINGULAR_CONDITION:.0e}: singular"
+
+
+def _condition(inputs: Array, outputs: Array, choice: RowChoice) -> float:
+    scaling = Scaling.of(inputs, outputs)
+    u, y = scaling.inputs(inputs[:, None]), scaling.outputs(outputs[:, None])
+    return float(np.linalg.cond(rows_of(_STRUCTURE, u, y, choice=choice).regressors))

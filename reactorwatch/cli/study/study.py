@@ -1,0 +1,156 @@
+"""What the figures have in common: the model, its steady states, the records, and the models fitted to them.
+
+All records are simulated by this software, each with the seed of the study; what is asked for twice is made once.
+"""
+
+from collections.abc import Callable
+from functools import cached_property
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from monitor_node.identification.families import LINEAR_FAMILIES, Model
+from monitor_node.identification.structure import Structure
+from plant_node.config import NoiseSd, PlantConfig
+from plant_node.presets import PRESETS
+from plant_node.record import simulate_record
+from plant_node.scenario import Scenario
+from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, cstr
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.steady_state import SteadyState, steady_states
+from reactorwatch.records.record import Record
+
+ORDERS = (1, 2, 3)
+OUTPUTS = ("C", "T")
+NAMES = {"C": "C, mol/l", "T": "T, K", "qc": "qc, l/min"}
+TRAINING_ROWS = 1000
+"""Of the fault records, known to be fault free: 100 minutes."""
+
+_NO_NOISE = NoiseSd(C=0.0, T=0.0)
+IDENTIFICATION_HOLD_MIN, FAST_HOLD_MIN = 1.0, 2.4
+_IDENTIFICATION = {"kind": "random-steps", "low": 85.0, "high": 111.0, "hold_min": IDENTIFICATION_HOLD_MIN}
+_FAST = {"kind": "random-steps", "low": 90.0, "high": 108.0, "hold_min": FAST_HOLD_MIN}
+_ROWS = 4000
+_FAST_ROWS = 48_000
+FAST_PERIOD_MIN = 0.01
+
+
+class Study:
+    """What one run of `reproduce` works with.
+
+    Args:
+        seed: of every record.
+        measured: a record that the models are identified from, in place of a simulated one.
+    """
+
+    def __init__(self, seed: int, measured: Record | None = None) -> None:
+        self.seed = seed
+        self.measured = measured
+        self._points: dict[float, list[SteadyState]] = {}
+        self._fits: dict[tuple[str, int, str], Model] = {}
+        self._fault_records: dict[str, Record] = {}
+
+    @cached_property
+    def model(self) -> ProcessModel:
+        """The reactor."""
+        return cstr()
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """Its free runs."""
+        return Simulator(self.model)
+
+    def points(self, qc: float) -> list[SteadyState]:
+        """The steady states at a coolant flow in l/min, from the coldest to the hottest."""
+        if qc not in self._points:
+            self._points[qc] = steady_states(self.model, np.array([qc]))
+        return self._points[qc]
+
+    def operating(self, qc: float = OPERATING_COOLANT_FLOW) -> SteadyState:
+        """The steady state on the operating branch."""
+        return self.points(qc)[-1]
+
+    @cached_property
+    def identification(self) -> Record:
+        """What the models are identified from: with the sensors' noise, 0.1 min between rows."""
+        return self.measured or simulate_record(PlantConfig(seed=self.seed, scenario=_IDENTIFICATION), _ROWS)
+
+    @cached_property
+    def noise_free(self) -> Record:
+        """The simulated record of `identification` without noise."""
+        return self.quiet(_IDENTIFICATION)
+
+    @cached_property
+    def small_steps(self) -> Record:
+        """Without noise, and so close to 100 l/min that the plant is nearly linear."""
+        return self.quiet({"kind": "random-steps", "low": 99.9, "high": 100.1, "hold_min": 1.0})
+
+    def quiet(self, scenario: dict[str, Any]) -> Record:
+        """A record without noise, 0.1 min between rows, of a scenario as settings have it."""
+        return simulate_record(PlantConfig(seed=self.seed, scenario=scenario, noise_sd=_NO_NOISE), _ROWS)
+
+    def fast(self, noise: bool) -> Record:
+        """A record of 0.01 min between rows, in which every level is held for `FAST_HOLD_MIN`."""
+        config = PlantConfig(seed=self.seed, period_min=FAST_PERIOD_MIN, scenario=_FAST)
+        return simulate_record(config if noise else msgspec.structs.replace(config, noise_sd=_NO_NOISE), _FAST_ROWS)
+
+    @property
+    def source(self) -> str:
+        """What the models of figures 14 to 17 are identified from, in words."""
+        record = self.identification
+        period = float(np.median(np.diff(record.time_min)))
+        if self.measured is not None:
+            return f"the record {record.name}, {record.rows} rows {period:g} min apart"
+        low, high, noise = _IDENTIFICATION["low"], _IDENTIFICATION["high"], NoiseSd()
+        return (
+            f"{record.rows} simulated rows {period:g} min apart, a new coolant flow between {low:g} and {high:g} "
+            f"l/min every {IDENTIFICATION_HOLD_MIN:g} min, noise of {noise.C:g} mol/l and {noise.T:g} K (standard "
+            "deviations)"
+        )
+
+    def signals(self, output: str) -> tuple[Array, Array, Array]:
+        """Of the identification record: input, output and time."""
+        record = self.identification
+        return record.columns["qc"], record.columns[output], record.time_min
+
+    def fitted(self, family: str, order: int, output: str) -> Model:
+        """A model of the first half of the identification record."""
+        key = (family, order, output)
+        if key not in self._fits:
+            u, y, t = self.signals(output)
+            half = y.size // 2
+            (kind,) = (item for item in LINEAR_FAMILIES if item.name == family)
+            self._fits[key] = kind.fit(Structure.of_order(order), u[:half], y[:half], t[:half])
+        return self._fits[key]
+
+    def fault_record(self, preset: str) -> Record:
+        """One of the four named records."""
+        if preset not in self._fault_records:
+            (settings,) = (item.settings for item in PRESETS if item.name == preset)
+            self._fault_records[preset] = simulate_record(msgspec.convert({"seed": self.seed, **settings}, PlantConfig))
+        return self._fault_records[preset]
+
+
+def row_times(rows: int, period_min: float) -> Array:
+    """Minutes from 0, shape (rows,)."""
+    return np.arange(rows, dtype=np.float64) * period_min
+
+
+def levels(scenario: Scenario, time_min: Array, seed: int) -> Array:
+    """The coolant flow of a scenario at some times, shape (rows,)."""
+    return np.array([scenario.level(float(t), seed) for t in time_min])
+
+
+def edge(holds: Callable[[float], bool], low: float, high: float, precision: float = 1e-3) -> float:
+    """Where something that holds at `low` and not at `high` ceases to hold, by halving."""
+    while high - low > precision:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return 0.5 * (low + high)
+
+
+def held_out(values: Array) -> Array:
+    """The half of a record that no model is fitted to."""
+    return values[values.size // 2 :]

@@ -1,0 +1,15 @@
+"""The reaction depends on temperature more strongly, or less."""
+
+from reactorwatch.process.effects.base import ParameterEffect
+
+
+class ActivationEnergy(ParameterEffect):
+    """E/R (1 + m)."""
+
+    name = "activation_energy"
+    label = "wrong activation energy"
+    location = "reaction"
+    unit = "1"
+    lower = -0.5
+    upper = 0.5
+    parameter = "E_R"

@@ -1,0 +1,147 @@
+"""What an effect is: a physical deviation that maps a model to a model.
+
+An effect has a size m, whose neutral value leaves the model as it was; a profile says how m goes in time. The
+extended model has the profile's numbers as further parameters, named `<effect>.size`, `<effect>.onset` and so on,
+and is a `ProcessModel` like any other: what can be injected into the plant and what can be found in data are one.
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from typing import ClassVar
+
+import casadi as ca
+
+from reactorwatch.process.model import Parameter, ProcessModel
+from reactorwatch.process.profiles import CONSTANT, Profile
+
+
+class Effect(ABC):
+    """A physical deviation.
+
+    Attributes:
+        name: as in the catalogue of causes.
+        label: what a person calls it.
+        location: where in the plant it acts.
+        unit: of its size.
+        lower: smallest size that makes physical sense.
+        upper: largest size that makes physical sense.
+        neutral: the size at which it does nothing.
+        labels: what a person calls it with a given profile, where that has a name of its own.
+    """
+
+    name: ClassVar[str]
+    label: ClassVar[str]
+    location: ClassVar[str]
+    unit: ClassVar[str]
+    lower: ClassVar[float]
+    upper: ClassVar[float]
+    neutral: ClassVar[float] = 0.0
+    labels: ClassVar[dict[str, str]] = {}
+
+    @abstractmethod
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """The model with the deviation in it; `size` is m(t) as an expression."""
+
+    def extend(self, model: ProcessModel, profile: Profile = CONSTANT) -> ProcessModel:
+        """The model with this effect in it.
+
+        Args:
+            model: any model that has what the effect acts on; it may hold effects already.
+            profile: how the size goes in time.
+
+        Returns:
+            A model with the parameters `<name>.size` (neutral) and those of the profile; when the model holds this
+            effect already, `<name>_2.size` and so on.
+
+        Raises:
+            ValueError: the model lacks what the effect acts on.
+        """
+        prefix = self._free_prefix(model)
+        size = Parameter(
+            f"{prefix}.size", self.neutral, self.unit, self.lower, self.upper, f"size of: {self.label}", ca.SX.sym("m")
+        )
+        shape = tuple(
+            Parameter(
+                f"{prefix}.{item.name}",
+                item.default if item.default is not None else 0.0,
+                item.unit,
+                item.lower,
+                item.upper,
+                item.meaning,
+                ca.SX.sym(item.name),
+            )
+            for item in profile.parameters
+        )
+        symbols = {"size": size.symbol}
+        symbols |= {item.name: new.symbol for item, new in zip(profile.parameters, shape, strict=True)}
+        extended = self.apply(model, profile.expression(model.clock, symbols))
+        return replace(
+            extended,
+            parameters=(*extended.parameters, size, *shape),
+            breakpoints=(
+                *extended.breakpoints,
+                *(f"{prefix}.{item.name}" for item in profile.parameters if item.breakpoint),
+            ),
+        )
+
+    def label_with(self, profile: Profile) -> str:
+        """What a person calls this effect with that profile."""
+        return self.labels.get(profile.name, self.label)
+
+    def _free_prefix(self, model: ProcessModel) -> str:
+        taken = set(model.parameter_names)
+        prefix, number = self.name, 1
+        while f"{prefix}.size" in taken:
+            number += 1
+            prefix = f"{self.name}_{number}"
+        return prefix
+
+
+class ParameterEffect(Effect):
+    """An effect that multiplies one parameter of the balances by (1 + m)."""
+
+    parameter: ClassVar[str]
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`."""
+        symbol = model.parameter(self.parameter).symbol
+        return model.substitute(symbol, symbol * (1 + size))
+
+
+class ParameterShift(Effect):
+    """An effect that adds m to one parameter of the balances."""
+
+    parameter: ClassVar[str]
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`."""
+        symbol = model.parameter(self.parameter).symbol
+        return model.substitute(symbol, symbol + size)
+
+
+class SensorEffect(Effect):
+    """An effect on how one output is measured; the balances stay as they are."""
+
+    output: ClassVar[str]
+
+    @abstractmethod
+    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """What the sensor makes of the value that is there."""
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`.
+
+        Raises:
+            ValueError: the model has no such output.
+        """
+        if self.output not in model.output_names:
+            raise ValueError(
+                f"{self.name} needs a model with the output {self.output!r}, {model.name} has {model.output_names}"
+            )
+        return replace(
+            model,
+            outputs=tuple(
+                replace(item, expression=self.measured(item.expression, size)) if item.name == self.output else item
+                for item in model.outputs
+            ),
+        )

@@ -1,0 +1,24 @@
+"""The analyser is off by the same everywhere."""
+
+from typing import ClassVar
+
+import casadi as ca
+
+from reactorwatch.process.effects.base import SensorEffect
+
+
+class ConcentrationBias(SensorEffect):
+    """The measured concentration is C + m."""
+
+    name = "concentration_bias"
+    label = "bias of the analyser"
+    location = "concentration_sensor"
+    unit = "mol/l"
+    lower = -1.0
+    upper = 1.0
+    output = "C"
+    labels: ClassVar[dict[str, str]] = {"ramp": "drift of the analyser"}
+
+    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """See `SensorEffect`."""
+        return value + size

@@ -1,0 +1,24 @@
+"""The analyser is off by a share of what it measures."""
+
+from typing import ClassVar
+
+import casadi as ca
+
+from reactorwatch.process.effects.base import SensorEffect
+
+
+class ConcentrationGain(SensorEffect):
+    """The measured concentration is C (1 + m)."""
+
+    name = "concentration_gain"
+    label = "wrong gain of the analyser"
+    location = "concentration_sensor"
+    unit = "1"
+    lower = -0.99
+    upper = 4.0
+    output = "C"
+    labels: ClassVar[dict[str, str]] = {"ramp": "drift of the gain of the analyser"}
+
+    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """See `SensorEffect`."""
+        return value * (1 + size)

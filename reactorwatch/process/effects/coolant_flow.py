@@ -1,0 +1,31 @@
+"""The coolant that flows is not the coolant that the valve was told."""
+
+from typing import ClassVar
+
+import casadi as ca
+
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.model import ProcessModel
+
+
+class CoolantFlow(Effect):
+    """The real coolant flow is qc (1 + m)."""
+
+    name = "coolant_flow"
+    label = "wrong coolant flow"
+    location = "coolant"
+    unit = "1"
+    lower = -0.99
+    upper = 4.0
+    labels: ClassVar[dict[str, str]] = {"step": "coolant leak", "constant": "wrong gain of the coolant valve"}
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`.
+
+        Raises:
+            ValueError: the model has no input qc.
+        """
+        for item in model.inputs:
+            if item.name == "qc":
+                return model.substitute(item.symbol, item.symbol * (1 + size))
+        raise ValueError(f"coolant_flow needs a model with the input 'qc', {model.name} has {model.input_names}")

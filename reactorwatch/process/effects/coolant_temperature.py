@@ -1,0 +1,15 @@
+"""The coolant comes in warmer or colder than it should."""
+
+from reactorwatch.process.effects.base import ParameterShift
+
+
+class CoolantTemperature(ParameterShift):
+    """Tcf + m."""
+
+    name = "coolant_temperature"
+    label = "wrong coolant temperature"
+    location = "coolant"
+    unit = "K"
+    lower = -50.0
+    upper = 50.0
+    parameter = "Tcf"

@@ -1,0 +1,15 @@
+"""The feed holds more of A, or less."""
+
+from reactorwatch.process.effects.base import ParameterShift
+
+
+class FeedConcentration(ParameterShift):
+    """Cf + m."""
+
+    name = "feed_concentration"
+    label = "wrong feed concentration"
+    location = "feed"
+    unit = "mol/l"
+    lower = -1.0
+    upper = 1.0
+    parameter = "Cf"

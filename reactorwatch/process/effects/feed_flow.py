@@ -1,0 +1,15 @@
+"""More is fed, or less."""
+
+from reactorwatch.process.effects.base import ParameterEffect
+
+
+class FeedFlow(ParameterEffect):
+    """q (1 + m). At constant volume as much flows out; with a level of its own the level follows."""
+
+    name = "feed_flow"
+    label = "wrong feed flow"
+    location = "feed"
+    unit = "1"
+    lower = -0.99
+    upper = 4.0
+    parameter = "q"

@@ -1,0 +1,15 @@
+"""The feed is warmer or colder than it should be."""
+
+from reactorwatch.process.effects.base import ParameterShift
+
+
+class FeedTemperature(ParameterShift):
+    """Tf + m."""
+
+    name = "feed_temperature"
+    label = "wrong feed temperature"
+    location = "feed"
+    unit = "K"
+    lower = -50.0
+    upper = 50.0
+    parameter = "Tf"

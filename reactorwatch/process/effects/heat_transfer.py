@@ -1,0 +1,18 @@
+"""Heat passes to the coolant less easily, or more."""
+
+from typing import ClassVar
+
+from reactorwatch.process.effects.base import ParameterEffect
+
+
+class HeatTransfer(ParameterEffect):
+    """K3 (1 + m): the heat transfer coefficient times the area."""
+
+    name = "heat_transfer"
+    label = "changed heat transfer"
+    location = "coolant"
+    unit = "1"
+    lower = -0.99
+    upper = 4.0
+    parameter = "K3"
+    labels: ClassVar[dict[str, str]] = {"ramp": "fouling of the jacket", "decay": "fouling of the jacket"}

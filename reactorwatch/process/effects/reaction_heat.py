@@ -1,0 +1,15 @@
+"""The reaction gives more or less heat, at the same rate."""
+
+from reactorwatch.process.effects.base import ParameterEffect
+
+
+class ReactionHeat(ParameterEffect):
+    """K1 (1 + m), k0 unchanged."""
+
+    name = "reaction_heat"
+    label = "wrong heat of reaction"
+    location = "reaction"
+    unit = "1"
+    lower = -0.99
+    upper = 4.0
+    parameter = "K1"

@@ -1,0 +1,24 @@
+"""The thermometer is off."""
+
+from typing import ClassVar
+
+import casadi as ca
+
+from reactorwatch.process.effects.base import SensorEffect
+
+
+class TemperatureBias(SensorEffect):
+    """The measured temperature is T + m."""
+
+    name = "temperature_bias"
+    label = "bias of the temperature sensor"
+    location = "temperature_sensor"
+    unit = "K"
+    lower = -100.0
+    upper = 100.0
+    output = "T"
+    labels: ClassVar[dict[str, str]] = {"ramp": "drift of the temperature sensor"}
+
+    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """See `SensorEffect`."""
+        return value + size

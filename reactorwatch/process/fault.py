@@ -1,0 +1,169 @@
+"""What a person says to have a fault put into the plant: an effect of the catalogue, a profile, and numbers.
+
+    coolant_flow:step:-0.05@30min
+    heat_transfer:ramp:-0.3@30min,end=90min
+    reaction_rate:decay:-0.2@30min,time_constant=1h
+    activation_energy:constant:0.002
+
+So: cause, profile and size with colons between; where the profile has an onset, `@` and that; then `name=value` for
+whatever else the profile knows, each after a comma. The size is in the effect's unit. A time carries its unit: s,
+min or h.
+"""
+
+import difflib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import isfinite
+from typing import TypeVar
+
+from reactorwatch.errors import InputError
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import PROFILES, Profile
+
+EXAMPLE = "coolant_flow:step:-0.05@30min"
+
+_MINUTES = {"s": 1 / 60, "min": 1.0, "h": 60.0}
+_NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)")
+
+_Item = TypeVar("_Item")
+
+
+@dataclass(frozen=True)
+class FaultSpecification:
+    """A fault as it was said: which effect, how it goes in time, how large.
+
+    Attributes:
+        effect: from the catalogue.
+        profile: from the catalogue.
+        values: `size`, and those parameters of the profile that were said; times in minutes of the plant.
+    """
+
+    effect: Effect
+    profile: Profile
+    values: Mapping[str, float]
+
+    def settled(self, onset_min: float = 0.0, end_min: float | None = None) -> "FaultSpecification":
+        """The same fault with every number of its profile said.
+
+        Args:
+            onset_min: when it sets in, if it does not say so itself.
+            end_min: the end of the run, where a ramp reaches its size if it does not say so itself; None: not known.
+
+        Raises:
+            InputError: a ramp that has no end in a run that has none, or that ends before it begins.
+        """
+        values = {"size": self.values["size"]}
+        for item in self.profile.parameters:
+            of_the_run = {"onset": onset_min, "end": end_min}.get(item.name, item.default)
+            value = self.values.get(item.name, of_the_run)
+            if value is None:
+                raise InputError(
+                    f"fault {str(self)!r}: {item.name} ({item.meaning}) must be said where the run has no end, "
+                    f"like ,{item.name}=90min; or give the run a duration"
+                )
+            values[item.name] = value
+        _check_order(str(self), values)
+        return FaultSpecification(self.effect, self.profile, values)
+
+    def extend(self, model: ProcessModel, end_min: float | None = None) -> ProcessModel:
+        """The model with this fault in it; an onset that was not said is 0, the start.
+
+        Args:
+            model: any that has what the effect acts on.
+            end_min: as for `settled`.
+
+        Raises:
+            InputError: as `settled`.
+            ValueError: the model lacks what the effect acts on.
+        """
+        values = self.settled(end_min=end_min).values
+        extended = self.effect.extend(model, self.profile)
+        new = [name for name in extended.parameter_names if name not in model.parameter_names]
+        prefix = next(name for name in new if name.endswith(".size")).removesuffix("size")
+        return extended.with_values({f"{prefix}{name}": value for name, value in values.items()})
+
+    def __str__(self) -> str:
+        """The canonical text; `parse_fault` makes the same specification of it."""
+        text = f"{self.effect.name}:{self.profile.name}:{_written(self.values['size'])}"
+        if "onset" in self.values:
+            text += f"@{_written(self.values['onset'])}min"
+        for item in self.profile.parameters:
+            if item.name in self.values and item.name != "onset":
+                text += f",{item.name}={_written(self.values[item.name])}{'min' if item.unit == 'min' else ''}"
+        return text
+
+
+def parse_fault(text: str) -> FaultSpecification:
+    """Read a fault specification.
+
+    >>> str(parse_fault("coolant_flow:step:-0.05@1800s"))
+    'coolant_flow:step:-0.05@30min'
+
+    Raises:
+        InputError: a part of it is wrong; the text names the part, what would be right, and what is there.
+    """
+    parts = [part.strip() for part in text.split(":")]
+    if len(parts) != 3:
+        raise InputError(f"fault {text!r}: must be cause:profile:size[@onset][,name=value]..., like {EXAMPLE}")
+    effect = _chosen(text, "cause", parts[0], {item.name: item for item in EFFECTS})
+    profile = _chosen(text, "profile", parts[1], {item.name: item for item in PROFILES})
+    first, *assignments = (part.strip() for part in parts[2].split(","))
+    size, at, onset = (part.strip() for part in first.partition("@"))
+    known = {item.name: item for item in profile.parameters}
+    if at and "onset" not in known:
+        raise InputError(f"fault {text!r}: the profile {profile.name} has no onset, got '@{onset}'; leave it out")
+    values = {"size": _number(text, "size", size, effect.unit, (effect.lower, effect.upper))}
+    said = [("onset", onset)] if at else []
+    for assignment in assignments:
+        name, equals, value = (part.strip() for part in assignment.partition("="))
+        if not equals:
+            raise InputError(f"fault {text!r}: after the size must come name=value, got {assignment!r}")
+        said.append((name, value))
+    for name, value in said:
+        item = _chosen(text, f"parameter of the profile {profile.name}", name, known)
+        if name in values:
+            raise InputError(f"fault {text!r}: {name} must be said once, got it again as {value!r}")
+        values[name] = _number(text, name, value, item.unit, (item.lower, item.upper))
+    _check_order(text, values)
+    return FaultSpecification(effect, profile, values)
+
+
+def _chosen(text: str, what: str, name: str, valid: Mapping[str, _Item]) -> _Item:
+    if name in valid:
+        return valid[name]
+    close = difflib.get_close_matches(name, valid, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    raise InputError(f"fault {text!r}: unknown {what} {name!r}{hint} (valid: {', '.join(valid) or 'none'})")
+
+
+def _number(text: str, name: str, written: str, unit: str, bounds: tuple[float, float]) -> float:
+    """The value of a number with its unit, in the unit that it is kept in."""
+    in_unit = "" if unit == "1" else f" {unit}"
+    if unit == "min":
+        factors, rule = dict(_MINUTES), f"a time with its unit ({', '.join(_MINUTES)}), like 30min"
+    else:
+        factors, rule = {unit: 1.0, "": 1.0}, f"a number{in_unit and ' in' + in_unit}"
+    if name == "size":
+        factors[""] = 1.0
+    match = _NUMBER.fullmatch(written)
+    if match is None or match[2] not in factors:
+        raise InputError(f"fault {text!r}: {name} must be {rule}, got {written!r}")
+    value = float(match[1]) * factors[match[2]]
+    if not (bounds[0] <= value <= bounds[1] and isfinite(value)):
+        raise InputError(f"fault {text!r}: {name} must be in [{bounds[0]:g}, {bounds[1]:g}]{in_unit}, got {value:g}")
+    return value
+
+
+def _check_order(text: str, values: Mapping[str, float]) -> None:
+    if "onset" in values and "end" in values and not values["onset"] < values["end"]:
+        raise InputError(
+            f"fault {text!r}: end must come after the onset, got end {values['end']:g} min "
+            f"and onset {values['onset']:g} min"
+        )
+
+
+def _written(value: float) -> str:
+    return repr(value).removesuffix(".0")

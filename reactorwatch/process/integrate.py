@@ -1,0 +1,241 @@
+"""One step of integration, and the grid of steps on which its error stays small.
+
+The method is the pair of Cash & Karp (1990), A variable order Runge-Kutta method for initial value problems with
+rapidly varying right-hand sides, ACM Trans. Math. Softw. 16(3), orders 5 and 4: six evaluations a step, the error
+estimate included. On the operating branch a fixed step of 0.05 min is inside the tolerance, and a record of
+thousands of rows runs as one compiled chain of steps. (The pair of Dormand & Prince takes seven evaluations, the
+last of which would only save one if the input did not jump, and at this step has twice the error.)
+Where the estimate breaks the tolerance (an upset, an ignition: the reaction then has time constants below a
+second) that stretch is walked with steps of its own size, as many as it takes.
+
+A step never crosses a sample, where the input jumps, nor a breakpoint of the model.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from math import isfinite
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.process.model import Array, ProcessModel
+
+LONGEST_STEP_MIN = 0.05
+SHORTEST_STEP_MIN = 1e-9
+MOST_STEPS = 100_000
+"""In one walk between two samples: some half a second. Where more are needed the equations are too stiff for us."""
+
+TOLERANCE = 1e-6
+"""Allowed local error of a step, relative to `Variable.scale` of each state."""
+
+_TIMES = (0.0, 1 / 5, 3 / 10, 3 / 5, 1.0, 7 / 8)
+_STAGES: tuple[tuple[float, ...], ...] = (
+    (),
+    (1 / 5,),
+    (3 / 40, 9 / 40),
+    (3 / 10, -9 / 10, 6 / 5),
+    (-11 / 54, 5 / 2, -70 / 27, 35 / 27),
+    (1631 / 55296, 175 / 512, 575 / 13824, 44275 / 110592, 253 / 4096),
+)
+_FIFTH_ORDER = (37 / 378, 0.0, 250 / 621, 125 / 594, 0.0, 512 / 1771)
+_FOURTH_ORDER = (2825 / 27648, 0.0, 18575 / 48384, 13525 / 55296, 277 / 14336, 1 / 4)
+_ERROR = tuple(fifth - fourth for fifth, fourth in zip(_FIFTH_ORDER, _FOURTH_ORDER, strict=True))
+
+
+class SimulationError(ValueError):
+    """The equations cannot be integrated further; the text says where."""
+
+
+def symbolic_step(model: ProcessModel) -> ca.Function:
+    """One step as a CasADi function (x, u, p, t, t_middle, h) -> (x at t + h, error estimate over scale).
+
+    The error estimate is the largest over the states, a scalar.
+    """
+    rhs = model.function("rhs")
+    x, u, p = model.arguments()
+    t, middle, h = ca.SX.sym("t"), ca.SX.sym("t_middle"), ca.SX.sym("h")
+    slopes: list[ca.SX] = []
+    for time, weights in zip(_TIMES, _STAGES, strict=True):
+        slopes.append(rhs(x + h * _weighted(weights, slopes), u, p, t + time * h, middle)[0])
+    after = x + h * _weighted(_FIFTH_ORDER, slopes)
+    error = h * _weighted(_ERROR, slopes)
+    scales = ca.DM([state.scale for state in model.states])
+    return ca.Function(
+        "step",
+        [x, u, p, t, middle, h],
+        [after, ca.mmax(ca.fabs(error / scales))],
+        ["x", "u", "p", "t", "t_middle", "h"],
+        ["x_next", "error"],
+    )
+
+
+def _weighted(weights: tuple[float, ...], slopes: list[ca.SX]) -> ca.SX:
+    terms = (weight * slope for weight, slope in zip(weights, slopes, strict=True) if weight)
+    return sum(terms, ca.SX(0))
+
+
+@dataclass(frozen=True, eq=False)
+class StepGrid:
+    """The steps of a run, one after the other.
+
+    Attributes:
+        start_min: shape (steps,), when each begins.
+        length_min: shape (steps,).
+        middle_min: shape (steps,), the middle of the stretch without a jump that each lies in.
+        row: shape (steps,), the row of the record whose input holds.
+        origin: shape (steps,), which breakpoint starts the stretch that the step lies in; -1: none.
+        target: shape (steps,), which breakpoint ends it; -1: none.
+        share_before: shape (steps,), the part of the stretch that lies before the step, in [0, 1).
+        share: shape (steps,), the part of the stretch that the step covers, in (0, 1].
+        end_of_row: shape (rows - 1,), index of the step that ends at the following row.
+    """
+
+    start_min: Array
+    length_min: Array
+    middle_min: Array
+    row: NDArray[np.int64]
+    origin: NDArray[np.int64]
+    target: NDArray[np.int64]
+    share_before: Array
+    share: Array
+    end_of_row: NDArray[np.int64]
+
+    def refined(self, cuts: Mapping[int, Array]) -> "StepGrid":
+        """The grid with some steps cut.
+
+        Args:
+            cuts: by the step's number, the lengths that it is cut into.
+        """
+        counts = np.ones(self.length_min.size, dtype=np.int64)
+        counts[list(cuts)] = [lengths.size for lengths in cuts.values()]
+        parts = np.repeat(np.arange(counts.size), counts)
+        length = self.length_min[parts]
+        ends = np.cumsum(counts)
+        for step, lengths in cuts.items():
+            length[ends[step] - lengths.size : ends[step]] = lengths
+        total = np.cumsum(length)
+        before = total - length - np.concatenate(([0.0], total[ends[:-1] - 1]))[parts]
+        whole = np.where(self.length_min > 0, self.length_min, 1.0)[parts]  # a step of no length is not cut
+        fraction = np.where(counts[parts] > 1, length / whole, 1.0)
+        fraction_before = before / whole
+        return StepGrid(
+            start_min=self.start_min[parts] + before,
+            length_min=length,
+            middle_min=self.middle_min[parts],
+            row=self.row[parts],
+            origin=self.origin[parts],
+            target=self.target[parts],
+            share_before=self.share_before[parts] + fraction_before * self.share[parts],
+            share=fraction * self.share[parts],
+            end_of_row=ends[self.end_of_row] - 1,
+        )
+
+
+def step_grid(time_min: Array, breakpoints: Array, longest_min: float = LONGEST_STEP_MIN) -> StepGrid:
+    """Steps that end at every sample and every breakpoint.
+
+    A breakpoint on a sample opens a stretch of no length there, which lies before it: derivatives with respect to
+    it are those towards later times. Of breakpoints that coincide, the last is given the derivative of all.
+
+    Args:
+        time_min: shape (rows,), increasing.
+        breakpoints: shape (n,), times in minutes; those outside the record have no effect.
+        longest_min: the longest step.
+    """
+    inside = np.flatnonzero((breakpoints >= time_min[0]) & (breakpoints < time_min[-1]))
+    edges = np.concatenate([time_min, breakpoints[inside]])
+    marks = np.concatenate([np.full(time_min.size, -1), inside])
+    order = np.argsort(edges, kind="stable")
+    edges, marks = edges[order], marks[order]
+    stretch = np.diff(edges)
+    middle = np.minimum(0.5 * (edges[:-1] + edges[1:]), np.nextafter(edges[1:], -np.inf))  # before what ends it
+    counts = np.maximum(np.ceil(stretch / longest_min - 1e-9).astype(np.int64), 1)
+    part = np.repeat(np.arange(stretch.size), counts)
+    position = np.arange(part.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = 1.0 / counts[part]
+    row = np.searchsorted(time_min, edges[:-1], side="right") - 1
+    ends = np.cumsum(counts) - 1
+    return StepGrid(
+        start_min=edges[part] + position * share * stretch[part],
+        length_min=share * stretch[part],
+        middle_min=middle[part],
+        row=row[part],
+        origin=marks[part],
+        target=marks[part + 1],
+        share_before=position * share,
+        share=share,
+        end_of_row=ends[np.searchsorted(edges[1:], time_min[1:], side="left")],
+    )
+
+
+class Stepper:
+    """Walks a model step by step, each as long as the tolerance allows.
+
+    Args:
+        model: the process.
+    """
+
+    def __init__(self, model: ProcessModel) -> None:
+        self._model = model
+        self._step = ArrayFunction(symbolic_step(model))
+        self._breakpoints = [model.parameter_names.index(name) for name in model.breakpoints]
+
+    def advance(self, x: Array, u: Array, p: Array, start_min: float, end_min: float) -> Array:
+        """The state at the end of a stretch over which the input is constant.
+
+        Args:
+            x: state at its start, shape (n_x,).
+            u: input, shape (n_u,).
+            p: parameters, shape (n_p,).
+            start_min: where it starts, plant time.
+            end_min: where it ends.
+
+        Raises:
+            SimulationError: the equations cannot be integrated further.
+        """
+        jumps = sorted({float(p[i]) for i in self._breakpoints if start_min < p[i] < end_min})
+        edges = [start_min, *jumps, end_min]
+        for left, right in pairwise(edges):
+            x, _ = self.walk(x, u, p, left, right - left, 0.5 * (left + right))
+        return x
+
+    def walk(
+        self, x: Array, u: Array, p: Array, start_min: float, length_min: float, middle_min: float
+    ) -> tuple[Array, Array]:
+        """Walk a stretch without a jump; returns the state at its end and the lengths of the steps taken.
+
+        Raises:
+            SimulationError: no step, however short, keeps the tolerance, or too many are needed.
+        """
+        state, inputs, parameters, time, middle, length = (argument[0] for argument in self._step.arguments)
+        after, estimate = (result[0] for result in self._step.results)
+        state[:], inputs[:], parameters[:], middle[0] = x, u, p, middle_min
+        done, step = 0.0, min(length_min, LONGEST_STEP_MIN)
+        lengths: list[float] = []
+        while done < length_min:
+            step = min(step, length_min - done)
+            if length_min - done - step < 1e-12 * length_min:
+                step = length_min - done
+            time[0], length[0] = start_min + done, step
+            self._step()
+            error = estimate.item() / TOLERANCE
+            good = isfinite(error) and bool(np.isfinite(after).all())
+            if good and error <= 1.0:
+                done += step
+                lengths.append(step)
+                state[:] = after
+                step = min(LONGEST_STEP_MIN, step * min(5.0, 0.9 * max(error, 1e-10) ** -0.2))
+                stuck = len(lengths) > MOST_STEPS
+            else:
+                step *= max(0.1, 0.9 * error**-0.2) if good else 0.1
+                stuck = step < SHORTEST_STEP_MIN
+            if stuck:
+                where = zip(self._model.states, state.tolist(), strict=True)
+                values = ", ".join(f"{item.name} = {value:g} {item.unit}" for item, value in where)
+                raise SimulationError(
+                    f"{self._model.name} cannot be integrated beyond {start_min + done:g} min, where {values}"
+                )
+        return state.copy(), np.array(lengths)

@@ -1,0 +1,78 @@
+"""How far the linear model of a point follows the plant away from it.
+
+The error of a first-order Taylor expansion falls with the square of the step, so halving the step halves the error
+relative to the response; how large it is at a given step is what tells whether the linear model is of use there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import expm
+
+from reactorwatch.process.linearise import LinearModel, linearise
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.steady_state import SteadyState
+
+
+@dataclass(frozen=True, eq=False)
+class StepComparison:
+    """The plant's and the linear model's answers to a step of the input, from a steady state.
+
+    Attributes:
+        time_min: shape (rows,), since the step.
+        plant: deviations of the outputs from the steady state, shape (rows, n_y).
+        linear: likewise.
+    """
+
+    time_min: Array
+    plant: Array
+    linear: Array
+
+    @property
+    def error(self) -> Array:
+        """Root mean square of the difference over that of the plant's deviation, shape (n_y,)."""
+        difference = np.sqrt(np.mean((self.linear - self.plant) ** 2, axis=0))
+        size: Array = difference / np.sqrt(np.mean(self.plant**2, axis=0))
+        return size
+
+
+def step_response(linear: LinearModel, step: Array, time_min: Array) -> Array:
+    """What the linear model's outputs deviate by after a step of the inputs, exactly, shape (rows, n_y).
+
+    The exponential of the matrix [[A, B u], [0, 0]] steps the state over an interval with u constant: Van Loan (1978),
+    Computing integrals involving the matrix exponential, IEEE Trans. Automatic Control 23(3).
+
+    Args:
+        linear: the model.
+        step: shape (n_u,).
+        time_min: shape (rows,), from 0 on.
+    """
+    n_x = linear.A.shape[0]
+    block = np.zeros((n_x + 1, n_x + 1))
+    block[:n_x, :n_x], block[:n_x, n_x] = linear.A, linear.B @ step
+    states = np.array([expm(block * t)[:n_x, n_x] for t in time_min])
+    response: Array = states @ linear.C.T + linear.D @ step
+    return response
+
+
+def compare_step(
+    model: ProcessModel, point: SteadyState, inputs: Array, step: Array, span_min: float = 10.0, period_min: float = 0.1
+) -> StepComparison:
+    """Step the inputs at a steady state and compare plant and linear model.
+
+    Args:
+        model: the process.
+        point: a steady state at `inputs`.
+        inputs: before the step, shape (n_u,).
+        step: their change, shape (n_u,).
+        span_min: how long the answer is followed.
+        period_min: between rows.
+
+    Raises:
+        ValueError: the stepped input is outside its bounds.
+    """
+    time_min: Array = np.arange(round(span_min / period_min) + 1, dtype=np.float64) * period_min
+    stepped = np.tile(inputs + step, (time_min.size, 1))
+    plant = Simulator(model).run(time_min, stepped, point.state).outputs - point.outputs
+    return StepComparison(time_min, plant, step_response(linearise(model, point.state, inputs), step, time_min))

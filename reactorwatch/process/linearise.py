@@ -1,0 +1,59 @@
+"""The linear model at a point: first-order Taylor expansion, with derivatives taken symbolically."""
+
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.process.model import Array, ProcessModel
+
+
+@dataclass(frozen=True, eq=False)
+class LinearModel:
+    """d(dx)/dt = A dx + B du, dy = C dx + D du, for deviations from the point.
+
+    Attributes:
+        A: shape (n_x, n_x), 1/min where the states share a unit.
+        B: shape (n_x, n_u).
+        C: shape (n_y, n_x).
+        D: shape (n_y, n_u).
+        state: the point, shape (n_x,).
+        input: the point, shape (n_u,).
+    """
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    state: Array
+    input: Array
+
+    @property
+    def eigenvalues(self) -> NDArray[np.complex128]:
+        """Of A, in 1/min, shape (n_x,), by rising real part."""
+        values = np.linalg.eigvals(self.A).astype(np.complex128)
+        return values[np.lexsort((values.imag, values.real))]
+
+
+def linearise(model: ProcessModel, state: Array, inputs: Array, time_min: float = 0.0) -> LinearModel:
+    """The linear model at a point, which need not be a steady state.
+
+    Args:
+        model: the process.
+        state: shape (n_x,).
+        inputs: shape (n_u,).
+        time_min: when, for models with an effect that depends on time.
+    """
+    x, u, p = model.arguments()
+    clock = model.clock
+    rhs = ca.vertcat(*model.rhs)
+    y = ca.vertcat(*(output.expression for output in model.outputs))
+    function = ca.Function(
+        "linear",
+        [x, u, p, clock.now, clock.middle],
+        [ca.jacobian(rhs, x), ca.jacobian(rhs, u), ca.jacobian(y, x), ca.jacobian(y, u)],
+    )
+    matrices = function(state, inputs, model.values(), time_min, time_min)
+    A, B, C, D = (np.array(matrix) for matrix in matrices)
+    return LinearModel(A, B, C, D, np.array(state, dtype=float), np.array(inputs, dtype=float))

@@ -1,0 +1,213 @@
+"""A process, said once: its balances as symbolic expressions, its parameters with units and bounds.
+
+Everything else is derived from this: trajectories and their exact sensitivities, steady states, linear models, and
+the model with an effect in it, which is again a `ProcessModel`.
+
+Time is in minutes. The right-hand side may depend on it through effects that come and go. Where an effect sets in
+at once, the right-hand side jumps, and an integrator that steps across the jump loses its order. So such an
+expression compares its onset with `Clock.middle`, the middle of the integration step, and never with `Clock.now`,
+which within one step takes both sides; and the onset is listed in `breakpoints`, where the integrator ends its step.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Variable:
+    """A state or an input.
+
+    Attributes:
+        name: as the field writes it.
+        unit: of its values.
+        lower: smallest value that makes physical sense.
+        upper: largest value that makes physical sense.
+        scale: a typical magnitude of its changes; tolerances are relative to it.
+        meaning: a few words for people.
+        symbol: stands for it in the expressions.
+    """
+
+    name: str
+    unit: str
+    lower: float
+    upper: float
+    scale: float
+    meaning: str
+    symbol: ca.SX
+
+
+@dataclass(frozen=True, eq=False)
+class Parameter:
+    """A number in the equations. Attributes as for `Variable`; `value` is its nominal value."""
+
+    name: str
+    value: float
+    unit: str
+    lower: float
+    upper: float
+    meaning: str
+    symbol: ca.SX
+
+
+@dataclass(frozen=True, eq=False)
+class Output:
+    """What is measured, as an expression of states, inputs and parameters."""
+
+    name: str
+    unit: str
+    expression: ca.SX
+
+
+@dataclass(frozen=True, eq=False)
+class Clock:
+    """Time in the expressions, in minutes: now, and the middle of the integration step that now lies in."""
+
+    now: ca.SX
+    middle: ca.SX
+
+
+def variable(name: str, unit: str, bounds: tuple[float, float], scale: float, meaning: str) -> Variable:
+    """A variable with a symbol of its own."""
+    return Variable(name, unit, *bounds, scale, meaning, ca.SX.sym(name))
+
+
+def parameter(name: str, value: float, unit: str, bounds: tuple[float, float], meaning: str) -> Parameter:
+    """A parameter with a symbol of its own.
+
+    Raises:
+        ValueError: its value is outside its bounds.
+    """
+    _check_bounds(name, value, *bounds)
+    return Parameter(name, value, unit, *bounds, meaning, ca.SX.sym(name))
+
+
+def new_clock() -> Clock:
+    """A clock for a new model."""
+    return Clock(ca.SX.sym("t"), ca.SX.sym("t_middle"))
+
+
+@dataclass(frozen=True, eq=False)
+class ProcessModel:
+    """A process: dx/dt = rhs(x, u, p, t), y = outputs(x, u, p, t); t in minutes.
+
+    Attributes:
+        name: of the process.
+        states: x.
+        inputs: u; held constant between samples.
+        parameters: p.
+        rhs: dx/dt, one expression a state, in the state's unit per minute.
+        outputs: y.
+        clock: the symbols that stand for time.
+        breakpoints: names of the parameters, in minutes, that are times at which `rhs` jumps or has a kink.
+    """
+
+    name: str
+    states: tuple[Variable, ...]
+    inputs: tuple[Variable, ...]
+    parameters: tuple[Parameter, ...]
+    rhs: tuple[ca.SX, ...]
+    outputs: tuple[Output, ...]
+    clock: Clock
+    breakpoints: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.rhs) != len(self.states):
+            raise ValueError(f"rhs must have one expression a state, {len(self.states)}, got {len(self.rhs)}")
+        names = [*self.state_names, *self.input_names, *self.parameter_names]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"names in a model must differ, got {', '.join(twice)} more than once")
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, in order."""
+        return tuple(state.name for state in self.states)
+
+    @property
+    def input_names(self) -> tuple[str, ...]:
+        """Names of the inputs, in order."""
+        return tuple(item.name for item in self.inputs)
+
+    @property
+    def output_names(self) -> tuple[str, ...]:
+        """Names of the outputs, in order."""
+        return tuple(output.name for output in self.outputs)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        return tuple(item.name for item in self.parameters)
+
+    def parameter(self, name: str) -> Parameter:
+        """The parameter of that name.
+
+        Raises:
+            ValueError: there is none.
+        """
+        for item in self.parameters:
+            if item.name == name:
+                return item
+        raise ValueError(f"{self.name} has no parameter {name!r} (it has {', '.join(self.parameter_names)})")
+
+    def values(self, changes: Mapping[str, float] | None = None) -> Array:
+        """The parameters' values, shape (n_p,): nominal, but for the changes.
+
+        Raises:
+            ValueError: a change names no parameter, or lies outside its bounds.
+        """
+        changes = changes or {}
+        for name, value in changes.items():
+            item = self.parameter(name)
+            _check_bounds(name, value, item.lower, item.upper)
+        return np.array([changes.get(item.name, item.value) for item in self.parameters], dtype=float)
+
+    def with_values(self, changes: Mapping[str, float]) -> "ProcessModel":
+        """The same model with other nominal values.
+
+        Raises:
+            ValueError: as `values`.
+        """
+        values = self.values(changes)
+        return replace(
+            self,
+            parameters=tuple(
+                replace(item, value=float(value)) for item, value in zip(self.parameters, values, strict=True)
+            ),
+        )
+
+    def substitute(self, symbol: ca.SX, expression: ca.SX) -> "ProcessModel":
+        """The same model with the symbol of a parameter or input replaced in every balance by an expression.
+
+        Outputs stay as they are: a sensor sees what is, not what the balances are told.
+        """
+        new = ca.substitute(list(self.rhs), [symbol], [expression])
+        return replace(self, rhs=tuple(new))
+
+    def function(self, name: str = "model") -> ca.Function:
+        """The model as a CasADi function (x, u, p, t, t_middle) -> (dx/dt, y)."""
+        return ca.Function(
+            name,
+            [*self.arguments(), self.clock.now, self.clock.middle],
+            [ca.vertcat(*self.rhs), ca.vertcat(*(output.expression for output in self.outputs))],
+            ["x", "u", "p", "t", "t_middle"],
+            ["rhs", "y"],
+        )
+
+    def arguments(self) -> tuple[ca.SX, ca.SX, ca.SX]:
+        """The symbols of states, inputs and parameters as three column vectors."""
+        return (
+            ca.vertcat(*(state.symbol for state in self.states)),
+            ca.vertcat(*(item.symbol for item in self.inputs)),
+            ca.vertcat(*(item.symbol for item in self.parameters)),
+        )
+
+
+def _check_bounds(name: str, value: float, lower: float, upper: float) -> None:
+    if not lower <= value <= upper:
+        raise ValueError(f"{name} must be in [{lower:g}, {upper:g}], got {value:g}")

@@ -1,0 +1,117 @@
+"""How a deviation goes in time: the size m(t) of an effect, as an expression of the clock.
+
+All times are minutes of the plant. Before its onset a profile is zero.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import inf, pi
+
+import casadi as ca
+
+from reactorwatch.process.model import Clock
+
+Expression = Callable[[Clock, dict[str, ca.SX]], ca.SX]
+
+
+@dataclass(frozen=True)
+class ProfileParameter:
+    """A number that shapes a profile.
+
+    Attributes:
+        name: such as `onset`.
+        unit: of its value.
+        default: where nothing is said; None if it has to be said.
+        lower: smallest allowed value.
+        upper: largest allowed value.
+        meaning: a few words for people.
+        breakpoint: whether it is a time at which the profile jumps or has a kink.
+    """
+
+    name: str
+    unit: str
+    default: float | None
+    lower: float
+    upper: float
+    meaning: str
+    breakpoint: bool = False
+
+
+@dataclass(frozen=True)
+class Profile:
+    """A shape in time.
+
+    Attributes:
+        name: as in `--fault coolant_flow:step:-0.05@30min`.
+        parameters: beside the size.
+        expression: from the clock and the symbols of `size` and the parameters to m(t).
+        meaning: one line for people.
+    """
+
+    name: str
+    parameters: tuple[ProfileParameter, ...]
+    expression: Expression
+    meaning: str
+
+
+def _since(clock: Clock, onset: ca.SX, value: ca.SX) -> ca.SX:
+    return ca.if_else(clock.middle >= onset, value, 0)
+
+
+def _constant(clock: Clock, p: dict[str, ca.SX]) -> ca.SX:
+    return p["size"]
+
+
+def _step(clock: Clock, p: dict[str, ca.SX]) -> ca.SX:
+    return _since(clock, p["onset"], p["size"])
+
+
+def _ramp(clock: Clock, p: dict[str, ca.SX]) -> ca.SX:
+    span = ca.fmax(p["end"] - p["onset"], 1e-9)
+    rising = _since(clock, p["onset"], p["size"] * (clock.now - p["onset"]) / span)
+    return ca.if_else(clock.middle >= p["end"], p["size"], rising)
+
+
+def _decay(clock: Clock, p: dict[str, ca.SX]) -> ca.SX:
+    age = clock.now - p["onset"]
+    return _since(clock, p["onset"], p["size"] * (1 - ca.exp(-age / p["time_constant"])))
+
+
+def _sine(clock: Clock, p: dict[str, ca.SX]) -> ca.SX:
+    angle = 2 * pi * (clock.now - p["onset"]) / p["period"] + p["phase"]
+    return _since(clock, p["onset"], p["size"] * ca.sin(angle))
+
+
+_ONSET = ProfileParameter("onset", "min", 0.0, -inf, inf, "when it sets in", breakpoint=True)
+
+CONSTANT = Profile("constant", (), _constant, "there all the time")
+STEP = Profile(
+    "step",
+    (ProfileParameter("onset", "min", None, -inf, inf, "when it sets in", breakpoint=True),),
+    _step,
+    "sets in at once and stays",
+)
+RAMP = Profile(
+    "ramp",
+    (_ONSET, ProfileParameter("end", "min", None, -inf, inf, "when it reaches its size", breakpoint=True)),
+    _ramp,
+    "grows evenly from its onset until it reaches its size, and stays",
+)
+DECAY = Profile(
+    "decay",
+    (_ONSET, ProfileParameter("time_constant", "min", 60.0, 1e-3, inf, "how fast it approaches its size")),
+    _decay,
+    "approaches its size exponentially",
+)
+SINE = Profile(
+    "sine",
+    (
+        _ONSET,
+        ProfileParameter("period", "min", 20.0, 1e-3, inf, "from crest to crest"),
+        ProfileParameter("phase", "rad", 0.0, -2 * pi, 2 * pi, "angle at the onset"),
+    ),
+    _sine,
+    "swings about zero",
+)
+
+PROFILES: tuple[Profile, ...] = (CONSTANT, STEP, RAMP, DECAY, SINE)

@@ -1,0 +1,222 @@
+"""Records as CSV: from a plant's historian, a spreadsheet, another program, or `export`.
+
+The header names the columns: `time_min` or `time_s`, then `qc`, `C`, `T` in any order among others, which are
+ignored. Rows are in time order; gaps and irregular times are allowed; an empty cell was not measured.
+
+A well-formed file is parsed by NumPy in one go. Whatever that cannot take is read again row by row, which is slow,
+knows the few things more that are fine (quoted numbers, say), and otherwise finds the row and the column to blame.
+"""
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.atomic import replacing
+from reactorwatch.records.record import UNITS, Record
+
+_MINUTES_PER_UNIT = {"time_min": 1.0, "time_s": 60.0}  # divided by, so that 7 s is the same 7/60 min everywhere
+_MCAP_MAGIC = b"\x89MCAP"
+
+
+class _Column(NamedTuple):
+    name: str  # as in the file
+    position: int
+
+
+class _Layout(NamedTuple):
+    """Where in the file what is."""
+
+    width: int
+    header_lines: int
+    time: _Column
+    units_per_minute: float
+    signals: dict[str, _Column]
+
+
+def read_csv(path: Path, columns: Mapping[str, str] | None = None, required: tuple[str, ...] = tuple(UNITS)) -> Record:
+    """Read a record.
+
+    Args:
+        path: the file: UTF-8, comma separated.
+        columns: the file's own name for a column, where it has another: `{"T": "reactor_temp", "time_s": "t"}`.
+        required: the signals that must be there; the others are read if they are.
+
+    Returns:
+        The record; an empty cell is NaN.
+
+    Raises:
+        InputError: the file cannot be read or is malformed: one line that names file, row (as a text editor counts
+            it), column, what was expected and what was found.
+    """
+    text = _text(path)
+    layout = _layout(path, text, columns or {}, required)
+    values = _parsed_at_once(text, layout)
+    if values is None:
+        values = _parsed_by_row(path, text, layout)
+    time_min = values[:, 0] / layout.units_per_minute
+    signals = {signal: values[:, number].copy() for number, signal in enumerate(layout.signals, start=1)}
+    return Record(time_min=time_min, columns=signals, name=path.name)
+
+
+def write_csv(path: Path, record: Record) -> None:
+    """Write a record so that `read_csv` gives exactly the same numbers.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written to.
+        ValueError: a value is infinite, which the format has no way to say.
+    """
+    cells = [record.time_min.tolist()]
+    for signal, values in record.columns.items():
+        if np.isinf(values).any():
+            raise ValueError(f"column {signal!r} must be finite or NaN to be written as CSV, got an infinite value")
+        cells.append(["" if math.isnan(value) else value for value in values.tolist()])
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")  # writes a float as its repr, which reads back exactly
+        writer.writerow(["time_min", *record.columns])
+        writer.writerows(zip(*cells, strict=True))
+
+
+def _text(path: Path) -> str:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file") from error
+    except IsADirectoryError as error:
+        raise InputError(f"{path}: expected a CSV file, got a folder") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if data.startswith(_MCAP_MAGIC):
+        raise InputError(f"{path}: expected a CSV file, got an MCAP recording; give it the ending .mcap")
+    if b"\0" in data:
+        raise InputError(f"{path}: expected a CSV file, got binary data")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        row = data.count(b"\n", 0, error.start) + 1
+        found = f"byte 0x{data[error.start]:02x}"
+        raise InputError(f"{path}, row {row}: expected UTF-8 text, got {found}; save it as 'CSV UTF-8'") from error
+    if not text or text.isspace():
+        raise InputError(f"{path}: expected a header and rows, got an empty file")
+    if "\r" in text:
+        text = text.replace("\r\n", "\n").replace("\r", "\n")
+    return text
+
+
+def _layout(path: Path, text: str, columns: Mapping[str, str], required: tuple[str, ...]) -> _Layout:
+    known = (*_MINUTES_PER_UNIT, *UNITS)
+    for name in (*columns, *required):
+        if name not in known:
+            raise InputError(f"{path}: unknown column {name!r} asked for (valid: {', '.join(known)})")
+    row, cells = next(_rows(path, text), (1, []))
+    header = [cell.strip() for cell in cells]
+    for name in header:
+        if name and header.count(name) > 1:
+            raise InputError(f"{path}, row {row}: expected each column name once, got {name!r} more than once")
+    found = f"got {', '.join(map(repr, header))}"
+    if len(header) == 1:
+        found += "; the cells must be separated by commas"
+
+    def column(name: str) -> _Column | None:
+        in_file = columns.get(name, name)
+        return _Column(in_file, header.index(in_file)) if in_file in header else None
+
+    times = [(at, per_minute) for name, per_minute in _MINUTES_PER_UNIT.items() if (at := column(name))]
+    if not times:
+        asked = " or ".join(repr(columns.get(name, name)) for name in _MINUTES_PER_UNIT)
+        raise InputError(f"{path}, row {row}: expected a column {asked} in the header, {found}")
+    signals = {signal: at for signal in UNITS if (at := column(signal))}
+    for signal in required:
+        if signal not in signals:
+            asked = repr(columns.get(signal, signal))
+            raise InputError(f"{path}, row {row}: expected a column {asked} in the header, {found}")
+    for signal, in_file in columns.items():
+        if in_file not in header:
+            raise InputError(f"{path}, row {row}: expected a column {in_file!r} (for {signal}) in the header, {found}")
+    time, units_per_minute = times[0]
+    return _Layout(len(header), row, time, units_per_minute, signals)
+
+
+def _parsed_at_once(text: str, layout: _Layout) -> NDArray[np.float64] | None:
+    """Shape (rows, 1 + signals); None if anything at all is unusual."""
+    body = "".join(text.split("\n", layout.header_lines)[layout.header_lines :])
+    if not body or body.isspace():
+        return None
+    commas = body.count(",")
+    for hole, filled in ((",,", ",nan,"), (",,", ",nan,"), (",\n", ",nan\n")):
+        body = body.replace(hole, filled)
+    if body.endswith(","):
+        body += "nan"
+    used = (layout.time.position, *(column.position for column in layout.signals.values()))
+    try:
+        values = np.loadtxt(body.split("\n"), delimiter=",", comments=None, usecols=used, ndmin=2)
+    except ValueError:
+        return None
+    regular = commas == len(values) * (layout.width - 1)
+    times = values[:, 0]
+    if not (regular and np.isfinite(times).all() and (np.diff(times) > 0).all() and not np.isinf(values).any()):
+        return None
+    return values
+
+
+def _parsed_by_row(path: Path, text: str, layout: _Layout) -> NDArray[np.float64]:
+    """As `_parsed_at_once`, a row at a time."""
+    rows = _rows(path, text)
+    next(rows)  # the header
+    parsed: list[list[float]] = []
+    columns = (layout.time, *layout.signals.values())
+    previous = -math.inf
+    for row, cells in rows:
+        if len(cells) != layout.width:
+            raise InputError(f"{path}, row {row}: expected {layout.width} cells as in the header, got {len(cells)}")
+        values = [_number(cells[column.position]) for column in columns]
+        for column, value in zip(columns, values, strict=True):
+            if value is None:
+                raise InputError(
+                    f"{path}, row {row}, column {column.name!r}: expected a finite number"
+                    f"{'' if column is layout.time else ' or nothing'}, got {cells[column.position]!r}"
+                )
+        time = cast(float, values[0])
+        if not time > previous:  # which an empty cell is not either
+            after = "" if not parsed else f" after {previous!r}, that of the row before"
+            found = cells[layout.time.position]
+            raise InputError(f"{path}, row {row}, column {layout.time.name!r}: expected a time{after}, got {found!r}")
+        previous = time
+        parsed.append(cast(list[float], values))
+    if not parsed:
+        raise InputError(f"{path}: expected rows below the header, got none")
+    return np.array(parsed)
+
+
+def _number(cell: str) -> float | None:
+    """The finite number in a cell; NaN if it is empty, None if it holds anything else."""
+    text = cell.strip()
+    if not text:
+        return math.nan
+    if "_" in text:  # Python's own 1_000
+        return None
+    try:
+        number = float(text)
+    except ValueError:
+        return None
+    return None if math.isinf(number) else number
+
+
+def _rows(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
+    """The rows that hold anything, each with the number of its last line."""
+    reader = csv.reader(io.StringIO(text), strict=True)
+    while True:
+        try:
+            cells = next(reader, None)
+        except csv.Error as error:
+            raise InputError(f"{path}, row {reader.line_num}: expected comma separated cells: {error}") from error
+        if cells is None:
+            return
+        if cells and (len(cells) > 1 or cells[0].strip()):
+            yield reader.line_num, cells

@@ -1,0 +1,154 @@
+"""What a node asks of a bus, and a bus within one process that gives it.
+
+The nodes know only the protocol. The real bus is `bus_zenoh`; the one here delivers within the process, in the
+order of publication, so that a whole chain of nodes can be tested without a network.
+"""
+
+import re
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from google.protobuf.message import Message
+
+from reactorwatch.contract.codec import Encoded, encode_message
+
+
+class Request(Protocol):
+    """A question that arrived at a queryable."""
+
+    @property
+    def question(self) -> Encoded:
+        """The key asked at, and the payload."""
+
+    def reply(self, message: Message) -> None:
+        """Answer it; once."""
+
+
+class Bus(Protocol):
+    """Publish and subscribe, ask and answer, and know who is alive."""
+
+    def publish(self, message: Encoded) -> None:
+        """Send bytes out on their key."""
+
+    def subscribe(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
+        """Call the handler, from a thread of the bus, with everything published on matching keys."""
+
+    def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
+        """Call the handler, from a thread of the bus, with every question on matching keys."""
+
+    def ask(self, question: Encoded, timeout_s: float) -> list[Encoded]:
+        """All answers to a question that come within the time."""
+
+    def announce(self, key: str) -> None:
+        """Show a liveliness token until this bus is closed, by whatever means."""
+
+    def watch_alive(self, key_expression: str, handler: Callable[[str, bool], None]) -> None:
+        """Call the handler with (key, True) for tokens that are there or appear, (key, False) when they go."""
+
+    def close(self) -> None:
+        """Send what is still to be sent, and leave."""
+
+
+def matches(key_expression: str, key: str) -> bool:
+    """Whether a key is in a key expression: `*` stands for one part, `**` for any number of parts.
+
+    >>> matches("reactor/*/sample/**", "reactor/cstr/sample/T"), matches("reactor/**", "reactor")
+    (True, True)
+    """
+    pattern = ""
+    for part in key_expression.split("/"):
+        if part == "**":
+            pattern += "(/[^/]+)*"
+        else:
+            pattern += "/" + "[^/]*".join(re.escape(piece) for piece in part.split("*"))
+    return re.fullmatch(pattern, "/" + key) is not None
+
+
+@dataclass(frozen=True)
+class MemoryRequest:
+    """A question within the process, and where its answers are gathered."""
+
+    question: Encoded
+    answers: list[Encoded]
+
+    def reply(self, message: Message) -> None:
+        """Answer it."""
+        self.answers.append(Encoded(self.question.key, *encode_message(message)))
+
+
+@dataclass
+class Exchange:
+    """What the memory buses of one process share."""
+
+    subscriptions: list[tuple[object, str, Callable[[Encoded], None]]] = field(default_factory=list)
+    answerers: list[tuple[object, str, Callable[[Request], None]]] = field(default_factory=list)
+    tokens: list[tuple[object, str]] = field(default_factory=list)
+    watchers: list[tuple[object, str, Callable[[str, bool], None]]] = field(default_factory=list)
+    lock: threading.RLock = field(default_factory=threading.RLock)
+
+
+class MemoryBus:
+    """A bus within one process: every bus on the same exchange hears the others."""
+
+    def __init__(self, exchange: Exchange) -> None:
+        self._exchange = exchange
+
+    def publish(self, message: Encoded) -> None:
+        """See `Bus`; returns when every handler has returned, and holds nothing that they might wait for."""
+        with self._exchange.lock:
+            subscriptions = list(self._exchange.subscriptions)
+        for _, expression, handler in subscriptions:
+            if matches(expression, message.key):
+                handler(message)
+
+    def subscribe(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
+        """See `Bus`."""
+        with self._exchange.lock:
+            self._exchange.subscriptions.append((self, key_expression, handler))
+
+    def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
+        """See `Bus`."""
+        with self._exchange.lock:
+            self._exchange.answerers.append((self, key_expression, handler))
+
+    def ask(self, question: Encoded, timeout_s: float) -> list[Encoded]:
+        """See `Bus`; answers only come from handlers that reply before they return."""
+        answers: list[Encoded] = []
+        with self._exchange.lock:
+            for _, expression, handler in list(self._exchange.answerers):
+                if matches(expression, question.key):
+                    handler(MemoryRequest(question, answers))
+        return answers
+
+    def announce(self, key: str) -> None:
+        """See `Bus`."""
+        with self._exchange.lock:
+            self._exchange.tokens.append((self, key))
+            self._tell(key, alive=True)
+
+    def watch_alive(self, key_expression: str, handler: Callable[[str, bool], None]) -> None:
+        """See `Bus`."""
+        with self._exchange.lock:
+            self._exchange.watchers.append((self, key_expression, handler))
+            for _, key in self._exchange.tokens:
+                if matches(key_expression, key):
+                    handler(key, True)
+
+    def close(self) -> None:
+        """See `Bus`."""
+        exchange = self._exchange
+        with exchange.lock:
+            exchange.subscriptions[:] = [entry for entry in exchange.subscriptions if entry[0] is not self]
+            exchange.answerers[:] = [entry for entry in exchange.answerers if entry[0] is not self]
+            exchange.watchers[:] = [entry for entry in exchange.watchers if entry[0] is not self]
+            gone = [key for owner, key in exchange.tokens if owner is self]
+            exchange.tokens[:] = [entry for entry in exchange.tokens if entry[0] is not self]
+            for key in gone:
+                self._tell(key, alive=False)
+
+    def _tell(self, key: str, *, alive: bool) -> None:
+        for _, expression, handler in list(self._exchange.watchers):
+            if matches(expression, key):
+                handler(key, alive)

@@ -1,0 +1,102 @@
+"""Settings: one frozen structure per node; defaults, then a TOML file, then the command's flags.
+
+One file may serve all nodes, with a table for each:
+
+    [bus]
+    endpoint = "tcp/127.0.0.1:7447"
+
+    [plant]
+    name = "cstr"
+"""
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import msgspec
+
+from reactorwatch.errors import InputError
+
+SECTIONS = ("bus", "plant", "monitor", "recorder", "replay")
+"""The tables that a file may hold."""
+
+
+class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the bus is.
+
+    Attributes:
+        endpoint: the router's address. Loopback unless asked otherwise.
+        congestion: what a publisher does when the network cannot take more: wait (`block`), or throw away (`drop`).
+            With `block` nothing is lost on the way, but one stuck subscriber slows the others.
+    """
+
+    endpoint: str = "tcp/127.0.0.1:7447"
+    congestion: Literal["block", "drop"] = "block"
+
+    def __post_init__(self) -> None:
+        if self.endpoint.count("/") != 1 or ":" not in self.endpoint:
+            raise ValueError(f"endpoint must be like 'tcp/127.0.0.1:7447', got {self.endpoint!r}")
+
+
+Section = TypeVar("Section", bound=msgspec.Struct)
+
+
+def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
+    """The tables of a settings file; empty without a file.
+
+    Raises:
+        InputError: the file is not there, is not TOML, or holds a table of another name.
+    """
+    if path is None:
+        return {}
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"settings file {path}: cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"settings file {path}: is not TOML: {error}") from error
+    for name, table in tables.items():
+        if name not in SECTIONS:
+            raise InputError(f"settings file {path}: {_unknown(name, SECTIONS, 'table')}")
+        if not isinstance(table, dict):
+            raise InputError(f"settings file {path}: '{name}' must be a table, like [{name}]")
+    return tables
+
+
+def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], flags: dict[str, Any]) -> Section:
+    """One node's settings.
+
+    Args:
+        kind: the structure to fill; its defaults hold where nothing else is said. If it has `presets`, settings by
+            name, the key `preset` names one, which holds before the defaults.
+        name: the table of the file that it is filled from.
+        tables: what `read_settings` returned.
+        flags: what was said on the command line; None means not said.
+
+    Raises:
+        InputError: an unknown key or preset, or a value that breaks a rule.
+    """
+    values = {**tables.get(name, {}), **{key: value for key, value in flags.items() if value is not None}}
+    fields = tuple(field.name for field in msgspec.structs.fields(kind))
+    presets: dict[str, dict[str, Any]] | None = getattr(kind, "presets", None)
+    if presets is not None:
+        fields = (*fields, "preset")
+        preset = values.pop("preset", None)
+        if preset is not None:
+            if preset not in presets:
+                raise InputError(f"settings [{name}]: {_unknown(str(preset), tuple(presets), 'preset')}")
+            values = {**presets[preset], **values}
+    for key in values:
+        if key not in fields:
+            raise InputError(f"settings [{name}]: {_unknown(key, fields, 'key')}")
+    try:
+        return msgspec.convert(values, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"settings [{name}]: {error}") from error
+
+
+def _unknown(name: str, valid: tuple[str, ...], what: str) -> str:
+    close = difflib.get_close_matches(name, valid, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"unknown {what} {name!r}{hint} (valid: {', '.join(valid)})"

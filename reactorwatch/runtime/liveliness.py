@@ -1,0 +1,48 @@
+"""Waiting for others to be there: a node shows a liveliness token once it listens."""
+
+import threading
+from collections.abc import Collection
+
+import structlog
+
+from reactorwatch.contract import keys
+from reactorwatch.runtime.bus import Bus
+from reactorwatch.runtime.serve import StopSignal
+
+log = structlog.get_logger()
+
+SAY_AGAIN_S = 30.0
+
+
+def wait_alive(bus: Bus, plant: str, nodes: Collection[str], stop: StopSignal, waiting: str) -> bool:
+    """Wait until nodes of a plant are alive, all at the same time.
+
+    Args:
+        bus: an open bus.
+        plant: its name.
+        nodes: their names.
+        stop: ends the waiting.
+        waiting: who waits, for the log, which is told now and every half minute.
+
+    Returns:
+        Whether they are there; False if a stop was asked for first.
+    """
+    changed = threading.Event()
+    alive: set[str] = set()
+
+    def on_token(key: str, is_alive: bool) -> None:
+        topic = keys.parse(key)
+        if topic is not None:
+            (alive.add if is_alive else alive.discard)(topic.name)
+            changed.set()
+
+    stop.wakes(changed.set)
+    if nodes:
+        bus.watch_alive(keys.all_of(plant, keys.ALIVE), on_token)
+    while True:
+        changed.clear()  # before looking: what changes from here on wakes the wait below
+        missing = [node for node in nodes if node not in alive]
+        if stop.is_set or not missing:
+            return not stop.is_set
+        log.info("waiting", node=waiting, for_=", ".join(missing))
+        changed.wait(SAY_AGAIN_S)

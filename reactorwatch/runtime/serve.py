@@ -1,0 +1,173 @@
+"""The loop of every node: wait for a message, a command or the next moment something is due; hand it to the core.
+
+The core says what it wants published and when it wants to be woken; the loop alone reads the clock, listens to
+signals and touches the bus. Handlers of the bus run in its own threads and only put what came into the inbox.
+"""
+
+import contextlib
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from queue import Empty, SimpleQueue
+from types import FrameType
+from typing import Protocol
+
+from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.runtime.bus import Bus, Request
+
+LONGEST_WAIT_S = 3600.0
+LONGEST_LINGER = 10  # times linger_s: a bus that never falls silent does not keep a node from ending
+LARGEST_INBOX = (
+    100_000  # messages; beyond it the bus is made to wait, and with it who publishes faster than we can hear
+)
+LOOK_AGAIN_S = 0.1
+BATCH = 256  # messages handled before the loop looks at the clock again
+
+
+class Node(Protocol):
+    """What the loop drives: a core, or a core with the files it works on."""
+
+    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
+        """Something was published on a key that the node listens to."""
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
+        """Somebody asked at one of the node's queryables."""
+
+    def on_tick(self, now_ns: int) -> list[Publication]:
+        """The moment named by `next_tick_ns` has come."""
+
+    def next_tick_ns(self) -> int:
+        """When the node wants `on_tick` called next, by the clock that `now_ns` is read from."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether the node has nothing left to do and the loop should end."""
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        """The loop ends; last words."""
+
+
+class StopSignal:
+    """Set once, by a signal or by another thread, and heard by a loop that waits."""
+
+    def __init__(self) -> None:
+        self._set = False
+        self._wake: list[Callable[[], None]] = []
+
+    def set(self) -> None:
+        """Ask the loop to end."""
+        self._set = True
+        for wake in self._wake:
+            wake()
+
+    @property
+    def is_set(self) -> bool:
+        """Whether the loop was asked to end."""
+        return self._set
+
+    def wakes(self, wake: Callable[[], None]) -> None:
+        """Have `wake` called when the signal is set."""
+        self._wake.append(wake)
+
+
+@contextlib.contextmanager
+def stop_on_signals() -> Iterator[StopSignal]:
+    """A stop signal that SIGINT (Ctrl-C) and SIGTERM set, while the context lasts."""
+    stop = StopSignal()
+
+    def handler(_number: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, old in previous.items():
+            signal.signal(number, old)
+
+
+def serve(
+    node: Node,
+    bus: Bus,
+    stop: StopSignal,
+    *,
+    subscriptions: tuple[str, ...] = (),
+    commands: tuple[str, ...] = (),
+    on_ready: Callable[[], None] | None = None,
+    linger_s: float = 0.0,
+) -> None:
+    """Run a node until it is finished or asked to stop.
+
+    Args:
+        node: the node.
+        bus: an open bus; it stays open.
+        stop: ends the loop; what is in the inbox by then is still handled.
+        subscriptions: key expressions whose publications go to `node.on_message`.
+        commands: key expressions of queryables whose questions go to `node.on_command`.
+        on_ready: called once the node listens.
+        linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
+    """
+    inbox: SimpleQueue[Encoded | Request | None] = SimpleQueue()
+    room = threading.Event()
+    stop.wakes(lambda: inbox.put(None))
+    stop.wakes(room.set)
+
+    def receive(item: Encoded | Request) -> None:
+        while inbox.qsize() >= LARGEST_INBOX and not stop.is_set:
+            room.clear()
+            room.wait(LOOK_AGAIN_S)
+        inbox.put(item)
+
+    for expression in subscriptions:
+        bus.subscribe(expression, receive)
+    for expression in commands:
+        bus.answer(expression, receive)
+    if on_ready is not None:
+        on_ready()
+
+    def publish(publications: list[Publication]) -> None:
+        for publication in publications:
+            bus.publish(encode(publication))
+
+    def handle(item: Encoded | Request) -> None:
+        if isinstance(item, Encoded):
+            publish(node.on_message(item, time.time_ns()))
+        else:
+            reply, publications = node.on_command(item.question, time.time_ns())
+            item.reply(reply)
+            publish(publications)
+
+    while not (stop.is_set or node.finished):
+        wait_s = (node.next_tick_ns() - time.time_ns()) / 1e9
+        if wait_s <= 0:
+            publish(node.on_tick(time.time_ns()))
+            wait_s = 0.0
+        for _ in range(BATCH):
+            try:
+                item = inbox.get(timeout=min(wait_s, LONGEST_WAIT_S)) if wait_s > 0 else inbox.get_nowait()
+            except Empty:
+                break
+            if item is None:
+                break
+            handle(item)
+            wait_s = 0.0
+        room.set()
+    deadline = time.monotonic() + LONGEST_LINGER * linger_s
+    remaining = 0
+    while True:  # what was on its way when the end was asked for is not thrown away
+        try:
+            item = inbox.get(timeout=max(0.0, min(linger_s, deadline - time.monotonic())))
+        except Empty:
+            break
+        if item is not None:
+            handle(item)
+        if time.monotonic() >= deadline:
+            remaining = inbox.qsize()
+            break
+    for _ in range(remaining):
+        item = inbox.get_nowait()
+        if item is not None:
+            handle(item)
+    publish(node.on_stop(time.time_ns()))

@@ -1,0 +1,105 @@
+"""What the recorder makes of the messages it receives. Pure: no file, no bus, no clock.
+
+Everything is kept, also what cannot be read: a recording is for finding out what went wrong. What cannot be read is
+kept without a schema, so that it spoils no reader's day, and is counted as refused.
+"""
+
+from collections import Counter
+from typing import Any, NamedTuple
+
+from reactorwatch import __version__
+from reactorwatch.contract import keys
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from recorder.entry import Entry
+from recorder.sequences import SequenceCheck
+
+NODE = "recorder"
+MOST_KEYS = 10_000
+"""Different keys that are kept. More come from a publisher gone wild, and would fill memory and the file's index."""
+
+_NO_SAMPLE = messages.QUALITY_UNSPECIFIED  # which protobuf reads out of bytes that hold something else
+_LARGEST_COUNT = 2**64 - 1  # a sequence number may be any nonsense; the sum of what it skips must still fit its field
+
+
+class Kept(NamedTuple):
+    """An entry for the file; `readable` tells whether the payload is the message that its encoding names."""
+
+    entry: Entry
+    readable: bool
+
+
+class Recorder:
+    """Turns messages into entries and counts what it sees.
+
+    Args:
+        plant: the plant that health is reported under.
+        start_ns: the clock reading at which it begins.
+    """
+
+    def __init__(self, plant: str, start_ns: int) -> None:
+        self._plant = plant
+        self._start_ns = start_ns
+        self._last_ns = start_ns
+        self._received = 0
+        self._reports = 0
+        self._longest_lag_ns = 0
+        self._refused: Counter[str] = Counter()
+        self._checks: dict[str, SequenceCheck | None] = {}  # by key; None for a key that is not one of ours
+
+    def on_message(self, message: Encoded, now_ns: int) -> Kept | None:
+        """The entry for a message; None if it is on one key too many.
+
+        The time of receipt never runs backwards, though a clock that is set may: the order in the file is the order
+        in which things came.
+        """
+        key, payload, encoding, received_ns = message
+        self._received += 1
+        received_ns = received_ns or now_ns
+        self._longest_lag_ns = max(self._longest_lag_ns, now_ns - received_ns)
+        self._last_ns = received_ns = max(received_ns, self._last_ns)
+        if key not in self._checks:
+            if len(self._checks) == MOST_KEYS:
+                self._refused["too many keys"] += 1
+                return None
+            self._checks[key] = SequenceCheck() if keys.parse(key) is not None else None
+        try:
+            decoded: Any = decode(payload, encoding)
+        except DecodeError as error:
+            self._refused[error.reason] += 1
+            return Kept(Entry(key, payload, encoding, received_ns, received_ns), readable=False)
+        check = self._checks[key]
+        if check is None:
+            self._refused["key"] += 1
+        time_ns = getattr(decoded, "time_ns", received_ns)
+        if time_ns < 0:  # before 1970, which a file has no way to say
+            self._refused["time"] += 1
+            time_ns = received_ns
+        elif isinstance(decoded, messages.Sample):
+            if decoded.quality == _NO_SAMPLE:
+                self._refused["payload"] += 1
+            elif check is not None:
+                check.update(decoded.sequence, time_ns)
+        return Kept(Entry(key, payload, encoding, received_ns, time_ns), readable=True)
+
+    def health(self, now_ns: int, phase: str = "recording") -> Publication:
+        """How it does; the lag is the longest between receipt and work since the last call."""
+        checks = [check for check in self._checks.values() if check is not None]
+        self._reports += 1
+        health = messages.Health(
+            time_ns=now_ns,
+            node=NODE,
+            version=__version__,
+            phase=phase,
+            uptime_s=(now_ns - self._start_ns) / 1e9,
+            received=self._received,
+            lost=min(sum(check.lost for check in checks), _LARGEST_COUNT),
+            duplicated=sum(check.duplicated for check in checks),
+            out_of_order=sum(check.out_of_order for check in checks),
+            refused=self._refused.total(),
+            refused_by_reason=self._refused,
+            lag_ms=self._longest_lag_ns / 1e6,
+            published=self._reports,
+        )
+        self._longest_lag_ns = 0
+        return Publication(keys.key(self._plant, keys.HEALTH, NODE), health)

@@ -1,0 +1,203 @@
+"""The index and the chunks of an MCAP file, read so that damage is told in one line.
+
+The message records are taken out of a chunk here (`_messages_of`) and not by the library, which builds an object for
+each and, in order of receipt, sorts them all. That is left to it only where a file needs it: its messages are not in
+the order of receipt, or it has no chunks or no index, as other programs may write it.
+"""
+
+import io
+import itertools
+import struct
+import zlib
+from collections.abc import Iterator, Mapping
+from operator import attrgetter
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import NonSeekingReader, SeekingReader
+from mcap.records import Channel, Chunk, ChunkIndex, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.summary import Summary
+from mcap.well_known import MessageEncoding
+from mcap.writer import MCAP0_MAGIC
+
+from reactorwatch.contract.codec import PREFIX
+from reactorwatch.errors import InputError
+from recorder.entry import Entry
+
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the summary offsets, CRC
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the payload
+
+# what reading damaged bytes raises, in the library and in what it stands on
+_DAMAGE = (
+    McapError,
+    struct.error,
+    zstandard.ZstdError,
+    ValueError,
+    KeyError,
+    IndexError,
+    MemoryError,
+    OverflowError,
+    RuntimeError,
+)
+
+
+def read_summary(path: Path) -> Summary:
+    """The index at the end of the file; empty if the file has none, which the format allows.
+
+    Raises:
+        InputError: the file is not there, is no MCAP file, is cut off, or its index is damaged.
+    """
+    try:
+        size = path.stat().st_size
+        stream = path.open("rb")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    with stream:
+        magic = stream.read(len(MCAP0_MAGIC))
+        if not magic:
+            raise InputError(f"{path}: expected an MCAP recording, got an empty file")
+        if magic != MCAP0_MAGIC[: len(magic)]:
+            raise InputError(f"{path}: expected an MCAP recording, got another kind of file")
+        tail = _FOOTER.size + len(MCAP0_MAGIC)
+        if size < len(MCAP0_MAGIC) + tail:
+            raise _damaged(path, "is cut off")
+        stream.seek(-tail, 2)
+        end = stream.read()
+        opcode, length, start, _, crc = _FOOTER.unpack_from(end)
+        if not end.endswith(MCAP0_MAGIC) or opcode != Opcode.FOOTER or length != _FOOTER.size - _RECORD.size:
+            raise _damaged(path, "is cut off: the recorder was killed, or is still writing it")
+        if not start:
+            return Summary()
+        if start > size - tail:
+            raise _damaged(path, "its index is damaged")
+        stream.seek(start)
+        summary = stream.read(size - tail - start) + end[: _FOOTER.size - 4]
+        if crc and zlib.crc32(summary) != crc:
+            raise _damaged(path, "its index is damaged: the checksum differs")
+        stream.seek(0)
+        try:
+            return SeekingReader(stream, record_size_limit=size).get_summary() or Summary()
+        except _DAMAGE as error:
+            raise _damaged(path, "its index is damaged", error) from error
+
+
+def is_in_order(summary: Summary) -> bool:
+    """Whether the index knows all that is in the chunks, and these follow each other in time."""
+    chunks = _chunks(summary)
+    follow = all(a.message_end_time <= b.message_start_time for a, b in itertools.pairwise(chunks))
+    return _is_indexed(summary) and follow
+
+
+def entries(path: Path, summary: Summary, wanted: set[int]) -> Iterator[Entry]:
+    """The messages of the wanted channels, of a file that is in order.
+
+    Raises:
+        InputError: a chunk is damaged; when the reading comes there.
+    """
+    channels = {number: _channel(summary.channels[number], summary.schemas) for number in wanted}
+    size = path.stat().st_size
+    with path.open("rb") as stream:
+        for index in _chunks(summary):
+            if wanted.isdisjoint(index.message_index_offsets):
+                continue
+            try:
+                data = _uncompressed(stream, index, size)
+                found = list(_messages_of(data, channels))
+            except _DAMAGE as error:
+                where = f"the chunk at byte {index.chunk_start_offset} cannot be read"
+                raise _damaged(path, where, error) from error
+            found.sort(key=attrgetter("log_time_ns"))  # stable, and quick when there is nothing to do
+            yield from found
+
+
+def sorted_entries(path: Path, summary: Summary) -> Iterator[Entry]:
+    """All messages of any MCAP file, in the order of receipt. Without an index all of them are in memory at once.
+
+    Raises:
+        InputError: the file is damaged; when the reading comes there.
+    """
+    with path.open("rb") as stream:
+        try:
+            kind = SeekingReader if _is_indexed(summary) else NonSeekingReader
+            reader = kind(stream, validate_crcs=True, record_size_limit=path.stat().st_size)
+            for schema, channel, message in reader.iter_messages(log_time_order=True):
+                key, encoding = _channel(channel, {schema.id: schema} if schema else {})
+                yield Entry(key, message.data, encoding, message.log_time, message.publish_time)
+        except _DAMAGE as error:
+            raise _damaged(path, "cannot be read", error) from error
+
+
+def metadata_records(path: Path) -> list[Metadata]:
+    """What programs have written into the file about it.
+
+    Raises:
+        InputError: as `read_summary`.
+    """
+    read_summary(path)
+    with path.open("rb") as stream:
+        try:
+            return list(SeekingReader(stream, record_size_limit=path.stat().st_size).iter_metadata())
+        except _DAMAGE as error:
+            raise _damaged(path, "its metadata cannot be read", error) from error
+
+
+def _chunks(summary: Summary) -> list[ChunkIndex]:
+    return sorted(summary.chunk_indexes, key=attrgetter("chunk_start_offset"))
+
+
+def _is_indexed(summary: Summary) -> bool:
+    chunks = summary.chunk_indexes
+    known = {number for number, channel in summary.channels.items() if channel.schema_id in {0, *summary.schemas}}
+    return bool(chunks) and all(
+        chunk.message_index_offsets and known.issuperset(chunk.message_index_offsets) for chunk in chunks
+    )
+
+
+class _Channel(NamedTuple):
+    key: str
+    encoding: str
+
+
+def _channel(channel: Channel, schemas: Mapping[int, Schema]) -> _Channel:
+    if channel.message_encoding == MessageEncoding.Protobuf and channel.schema_id:
+        return _Channel(channel.topic, PREFIX + schemas[channel.schema_id].name)
+    return _Channel(channel.topic, channel.message_encoding)
+
+
+def _uncompressed(stream: IO[bytes], index: ChunkIndex, size: int) -> bytes:
+    if index.chunk_start_offset + index.chunk_length > size:
+        raise ValueError("it reaches beyond the end of the file")
+    stream.seek(index.chunk_start_offset + _RECORD.size)
+    record = stream.read(index.chunk_length - _RECORD.size)  # no more, whatever lengths the chunk claims
+    chunk = Chunk.read(ReadDataStream(io.BytesIO(record)))
+    data, length = get_chunk_data_stream(chunk, validate_crc=True)
+    return data.read(length)
+
+
+def _messages_of(data: bytes, channels: Mapping[int, _Channel]) -> Iterator[Entry]:
+    """The messages in an uncompressed chunk: records of opcode, length and content, one after the other."""
+    record, message = _RECORD.unpack_from, _MESSAGE.unpack_from
+    at, end = 0, len(data)
+    while at < end:
+        opcode, length = record(data, at)
+        at += _RECORD.size
+        if opcode == Opcode.MESSAGE:
+            number, _, log_time, publish_time = message(data, at)
+            channel = channels.get(number)
+            if channel is not None:
+                payload = data[at + _MESSAGE.size : at + length]
+                yield Entry(channel.key, payload, channel.encoding, log_time, publish_time)
+        at += length
+
+
+def _damaged(path: Path, what: str, error: Exception | None = None) -> InputError:
+    why = f" ({str(error) or type(error).__name__})" if error else ""
+    return InputError(f"{path}: {what}{why}; `reactorwatch recover {path}` saves what is whole in it")

@@ -1,0 +1,27 @@
+"""What tests of several parts share."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import structlog
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def daisy_csv() -> Path:
+    """The measured record "CSTR" of the DaISy database, which is not part of this repository."""
+    shared = Path(os.environ.get("REACTORWATCH_SHARED", ROOT.parent / "shared"))
+    path = shared / "data" / "daisy_cstr.csv"
+    if not path.is_file():
+        pytest.skip(f"the DaISy record is not at {path}; name its folder's parent in REACTORWATCH_SHARED")
+    return path
+
+
+@pytest.fixture(autouse=True)
+def _log_as_before() -> Iterator[None]:
+    """What one test configures of the log, which holds on to that test's standard error, is not left to the next."""
+    yield
+    structlog.reset_defaults()

@@ -1,0 +1,174 @@
+"""The command as people and scripts meet it: help, one line for what is wrong, a clean end when asked to stop."""
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.contract.messages_pb2 import CommandReply, InjectFault, SetInput
+from reactorwatch.records.csv_file import read_csv
+from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.serve import StopSignal
+from recorder.mcap_file import read_messages
+
+from .conftest import PATIENCE_S, Command, Start, WaitAlive
+
+COMMANDS = (
+    *("up", "demo", "alarm"),
+    *("plant", "monitor", "record", "replay", "alive"),
+    *("dashboard", "import", "export"),
+    *("simulate", "backtest", "identify", "linearise", "reproduce", "charts"),
+)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(command: Command, name: str) -> None:
+    done = command(name, "--help")
+    assert done.returncode == 0
+    assert done.stdout.startswith(f"Usage: reactorwatch {name} ")
+
+
+def test_help_lists_every_command_and_imports_nothing_slow() -> None:
+    code = (
+        "import sys; sys.argv = ['reactorwatch', '--help']\n"
+        "from reactorwatch.cli.main import main\n"
+        "try: main()\n"
+        "finally: print(*sorted(set(sys.modules) & set(sys.argv[0:0] or "
+        "['numpy', 'scipy', 'casadi', 'rerun', 'zenoh', 'numba', 'rich', 'structlog'])), file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0
+    listed = {line.split()[0] for line in done.stdout.splitlines() if line.startswith("  ") and line.strip()}
+    assert set(COMMANDS) <= listed
+    assert done.stderr.strip() == ""
+
+
+@pytest.fixture
+def record_csv(tmp_path: Path) -> Path:
+    path = tmp_path / "record.csv"
+    path.write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,0.1,440\n0.2,100,0.1,440\n")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["fly"], "No such command 'fly'"),
+        (["replay"], "Missing argument"),
+        (["backtest", "nowhere.csv"], "nowhere.csv: there is no such file"),
+        (["backtest", "."], "is a folder"),
+        (["backtest", "BAD.txt"], "must be a .csv or .mcap file"),
+        (["backtest", "BAD.csv"], "row 3"),
+        (["backtest", "BAD.mcap"], "BAD.mcap"),
+        (["simulate", "RECORD", "-o", "no/such/folder.csv"], "folder"),
+        (["simulate", "RECORD", "-o", "OUT", "--fault", "coolant:step:1@1min"], "unknown cause 'coolant'"),
+        (
+            ["simulate", "RECORD", "-o", "OUT", "--fault", "coolant_flow:step:-3@1min"],
+            "size must be in [-0.99, 4], got -3",
+        ),
+        (["simulate", "RECORD", "-o", "OUT", "--column", "T"], "--column must be signal=column"),
+        (["backtest", "RECORD", "--training", "0"], "training_min must be in"),
+        (["plant", "--speed", "fast"], "--speed must be a positive number or 'max'"),
+        (["plant", "--plant", "a/b"], "plant name must be"),
+        (["plant", "--scenario", "storm"], "storm"),
+        (["plant", "--endpoint", "nowhere"], "endpoint must be like"),
+        (["monitor", "--config", "nowhere.toml"], "nowhere.toml: cannot be read"),
+        (["dashboard", "RECORD", "-o", "no/such/a.rrd"], "folder"),
+        (["import", "RECORD", "-o", "no/such/a.mcap"], "folder"),
+        (["demo", "--fault", "nothing"], "nothing"),
+        (["identify", "RECORD"], "rows"),
+        (["identify", "RECORD", "--output", "pH"], "--output must be C or T"),
+        (["linearise", "900"], "qc must be in [0, 500]"),
+    ],
+)
+def test_what_is_wrong_is_told_in_one_line_and_nothing_is_written(
+    command: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
+) -> None:
+    (tmp_path / "BAD.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,x,440\n")
+    (tmp_path / "BAD.mcap").write_bytes(b"this is no recording")
+    (tmp_path / "BAD.txt").write_text("?")
+    before = sorted(tmp_path.rglob("*"))
+    named = [{"RECORD": str(record_csv), "OUT": str(tmp_path / "out.csv")}.get(item, item) for item in arguments]
+    done = command(*named, cwd=tmp_path)
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert expected in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert done.stderr.startswith("reactorwatch: ")
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_node_without_a_router_waits_says_so_and_can_be_stopped(endpoint: str, start: Start) -> None:
+    process = start("monitor", "--endpoint", endpoint)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    assert "waiting for a router" in line
+    assert endpoint in line
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(30) == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_up_runs_until_it_is_stopped_and_closes_its_files(
+    endpoint: str, start: Start, tmp_path: Path, number: signal.Signals
+) -> None:
+    folder = tmp_path / "runs"
+    process = start("up", "--endpoint", endpoint, "--out", folder, "--speed", "60", "--plant", "R-101")
+    listener = connect(BusConfig(endpoint=endpoint), "test", StopSignal())
+    assert listener is not None
+    sampled = threading.Event()
+    listener.subscribe(keys.all_of("R-101", keys.SAMPLE), lambda _message: sampled.set())
+    assert sampled.wait(PATIENCE_S)
+    listener.close()
+    process.send_signal(number)
+    assert process.wait(60) == 0
+    (recording,) = folder.glob("*.mcap")
+    assert recording.name.startswith("R-101-")
+    assert not list(folder.glob("*.part"))
+    kinds = {entry.key.split("/")[2] for entry in read_messages(recording)}
+    assert {"sample", "health"} <= kinds
+
+
+def test_the_plant_obeys_commands_on_the_bus(bus: ZenohBus, endpoint: str, start: Start, wait_alive: WaitAlive) -> None:
+    process = start("plant", "--endpoint", endpoint, "--speed", "600")
+    wait_alive("cstr", "plant")
+
+    def ask(name: str, message: SetInput | InjectFault) -> CommandReply:
+        question = Encoded(keys.key("cstr", keys.COMMAND, name), *encode_message(message))
+        (answer,) = bus.ask(question, 10.0)
+        return CommandReply.FromString(answer.payload)
+
+    assert ask("set_input", SetInput(signal="qc", value=95.0)).accepted
+    refused = ask("set_input", SetInput(signal="qc", value=-5.0))
+    assert not refused.accepted
+    assert "-5" in refused.text
+    assert ask("inject_fault", InjectFault(specification="coolant_flow:step:-0.05")).accepted
+    assert not ask("inject_fault", InjectFault(specification="magic:step:1")).accepted
+    process.send_signal(signal.SIGINT)
+    assert process.wait(30) == 0
+
+
+def test_a_node_that_is_not_there_is_not_alive(bus: ZenohBus, endpoint: str, command: Command) -> None:
+    done = command("alive", "monitor", "--endpoint", endpoint, "--timeout", "1")
+    assert done.returncode == 1
+    assert "not there" in done.stdout
+
+
+def test_simulate_and_backtest_speak_json_to_machines(command: Command, record_csv: Path, tmp_path: Path) -> None:
+    simulated = command("simulate", record_csv, "-o", tmp_path / "out.csv", "--json")
+    assert simulated.returncode == 0, simulated.stderr
+    assert set(json.loads(simulated.stdout)["rmse"]) == {"C", "T"}
+    assert read_csv(tmp_path / "out.csv").rows == 3
+    tested = command("backtest", record_csv, "--json")
+    assert tested.returncode == 0, tested.stderr
+    said = json.loads(tested.stdout)
+    assert said == {
+        "samples": 3, "span_min": 0.2, "trained_until_min": None, "expected_false_alarms": 0.0, "alarms": [],
+    }  # fmt: skip

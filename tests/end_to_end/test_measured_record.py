@@ -1,0 +1,69 @@
+"""The chain on a record that nobody here made: replayed as a plant, watched, recorded, drawn."""
+
+import json
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reactorwatch.records.csv_file import read_csv
+from reactorwatch.runtime.bus_zenoh import ZenohBus
+
+from .conftest import Command, Start, WaitAlive
+
+
+def test_the_equations_reproduce_the_record(daisy_csv: Path, tmp_path: Path, command: Command) -> None:
+    done = command("simulate", daisy_csv, "-o", tmp_path / "simulated.csv")
+    assert done.returncode == 0, done.stderr
+    measured, simulated = read_csv(daisy_csv), read_csv(tmp_path / "simulated.csv")
+    assert np.array_equal(simulated.time_min, measured.time_min)
+    assert np.array_equal(simulated.columns["qc"], measured.columns["qc"])
+    rmse = {name: np.sqrt(np.mean((simulated.columns[name] - measured.columns[name]) ** 2)) for name in ("C", "T")}
+    assert rmse["C"] <= 2.7e-4
+    assert rmse["T"] <= 0.05
+
+
+def test_replayed_it_is_watched_recorded_and_drawn(
+    daisy_csv: Path, tmp_path: Path, bus: ZenohBus, endpoint: str, start: Start, wait_alive: WaitAlive, command: Command
+) -> None:
+    recording = tmp_path / "daisy.mcap"
+    recorder = start("record", "--endpoint", endpoint, "--out", recording)
+    monitor = start("monitor", "--endpoint", endpoint)
+    wait_alive("cstr", "recorder", "monitor")
+    replayed = command("replay", daisy_csv, "--endpoint", endpoint, "--rate", "max")
+    assert replayed.returncode == 0, replayed.stderr
+    for node in (monitor, recorder):
+        node.send_signal(signal.SIGTERM)
+        assert node.wait(60) == 0
+    exported = tmp_path / "exported.csv"
+    assert command("export", recording, "-o", exported).returncode == 0
+    measured, back = read_csv(daisy_csv), read_csv(exported)
+    for name, values in measured.columns.items():
+        assert np.array_equal(back.columns[name], values), name
+    assert np.allclose(back.time_min, measured.time_min - measured.time_min[0], atol=1e-9)
+
+    drawing = command("dashboard", recording, "-o", tmp_path / "daisy.rrd")
+    assert drawing.returncode == 0, drawing.stderr
+    assert (tmp_path / "daisy.rrd").stat().st_size > 100_000
+
+    said = {}
+    for name, file in (("csv", daisy_csv), ("mcap", recording)):
+        done = command("backtest", file, "--json")
+        assert done.returncode == 0, done.stderr
+        said[name] = json.loads(done.stdout)
+    assert said["csv"]["samples"] == said["mcap"]["samples"] == 7500
+    assert said["csv"]["alarms"] != []
+    assert [alarm["alarm"] for alarm in said["csv"]["alarms"]] == [alarm["alarm"] for alarm in said["mcap"]["alarms"]]
+    first = measured.time_min[0]
+    for ours, theirs in zip(said["csv"]["alarms"], said["mcap"]["alarms"], strict=True):
+        assert ours["raised_min"] == pytest.approx(theirs["raised_min"] + first, abs=1e-9)
+
+
+def test_import_and_export_give_the_same_rows(daisy_csv: Path, tmp_path: Path, command: Command) -> None:
+    recording, exported = tmp_path / "a.mcap", tmp_path / "b.csv"
+    assert command("import", daisy_csv, "-o", recording).returncode == 0
+    assert command("export", recording, "-o", exported).returncode == 0
+    measured, back = read_csv(daisy_csv), read_csv(exported)
+    for name, values in measured.columns.items():
+        assert np.array_equal(back.columns[name], values)

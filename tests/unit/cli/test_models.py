@@ -1,0 +1,108 @@
+"""`identify` and `linearise` say what the contract promises, for machines and for people."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.cli import identification
+from reactorwatch.cli.linear_models import describe
+from reactorwatch.errors import InputError
+from reactorwatch.records.csv_file import read_csv
+from reactorwatch.records.record import Record
+
+
+@pytest.fixture(scope="module")
+def measured() -> Record:
+    return simulate_record(PlantConfig(seed=5), 1500)
+
+
+def identified(measured: Record, **options: object) -> dict[str, object]:
+    settings: dict[str, object] = {"output": "T", "model": "arx", "order": 3, "delay": 1}
+    settings |= {"recursive": False, "report_rows": False, "as_json": True} | options
+    said: dict[str, object] = json.loads(identification.one(measured, **settings))  # type: ignore[arg-type]
+    return said
+
+
+def test_identify_prints_the_object_of_the_contract(measured: Record) -> None:
+    said = identified(measured)
+    assert set(said) == {
+        *("model", "order", "delay", "output", "rows", "recursive"),
+        *("a", "b", "offset", "sd", "fit_percent", "whiteness_minus_log10_p", "checks"),
+    }
+    assert said["rows"] == 750
+    assert len(said["a"]) == len(said["b"]) == 3  # type: ignore[arg-type]
+    assert set(said["fit_percent"]) == {"one_step", "free_run"}  # type: ignore[call-overload]
+
+
+def test_arx_is_least_squares_in_the_file_s_own_units(daisy_csv: Path) -> None:
+    """Parameters and fits against numpy.linalg.lstsq and a recursion written out here."""
+    record = read_csv(daisy_csv)
+    y, u = record.columns["T"], record.columns["qc"]
+    half = y.size // 2
+    k = np.arange(3, half)
+    A = np.column_stack([*(y[k - lag] for lag in (1, 2, 3)), *(u[k - lag] for lag in (1, 2, 3)), np.ones(k.size)])
+    truth = np.linalg.lstsq(A, y[k], rcond=None)[0]
+    said = identified(record)
+    ours = np.array([*said["a"], *said["b"], said["offset"]])  # type: ignore[misc]
+    assert np.allclose(ours, truth, rtol=1e-6)
+    run = y[half:].copy()
+    for row in range(3, run.size):
+        past = u[half + row - 3 : half + row][::-1]
+        run[row] = truth[:3] @ run[row - 3 : row][::-1] + truth[3:6] @ past + truth[6]
+    held_out, run = y[half + 3 :], run[3:]
+    fit = 100 * (1 - np.linalg.norm(held_out - run) / np.linalg.norm(held_out - held_out.mean()))
+    assert said["fit_percent"]["free_run"] == pytest.approx(fit, abs=0.05)  # type: ignore[index]
+
+
+def test_row_by_row_gives_what_all_rows_at_once_give(measured: Record) -> None:
+    once, by_row = identified(measured), identified(measured, recursive=True)
+    assert np.allclose(once["a"], by_row["a"], rtol=1e-6)  # type: ignore[arg-type]
+    assert by_row["recursive"] is True
+
+
+def test_compare_says_which_and_why(measured: Record) -> None:
+    text = identification.compare(measured, "C", 2, 1, neural=False, as_json=False)
+    assert text.splitlines()[-1].endswith(".")
+    said = json.loads(identification.compare(measured, "C", 2, 1, neural=False, as_json=True))
+    assert {(item["family"], item["order"]) for item in said["candidates"]} == {
+        ("arx", 1), ("arx", 2), ("oe", 1), ("oe", 2),
+    }  # fmt: skip
+    assert said["chosen"]["family"] in ("arx", "oe")
+    assert said["reason"]
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"output": "pH"}, "--output must be C or T, got 'pH'"),
+        ({"order": 0}, "order must be at least 1, got 0"),
+        ({"delay": -1}, r"delay \(samples\) must be at least 1, got -1"),
+        ({"model": "armax"}, "model must be one of arx, oe, got 'armax'"),
+        ({"order": 500}, "rows"),
+    ],
+)
+def test_options_that_make_no_model_are_refused(measured: Record, options: dict[str, object], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        identified(measured, **options)
+
+
+def test_linearise_tells_the_table_of_the_plant() -> None:
+    """Eigenvalues as published for qc = 100 and 85 l/min."""
+    points = json.loads(describe(100.0, 1.0, as_json=True))["steady_states"]
+    assert [point["kind"] for point in points] == ["stable node", "saddle", "stable focus"]
+    (re, im), _ = points[-1]["eigenvalues_per_min"]
+    assert (round(re, 3), round(abs(im), 3)) == (-1.983, 3.059)
+    overdamped = json.loads(describe(85.0, 1.0, as_json=True))["steady_states"][-1]
+    assert [round(re, 3) for re, _ in overdamped["eigenvalues_per_min"]] == [-8.769, -2.987]
+    assert points[1]["step_error"] is None
+    assert 0 < points[2]["step_error"]["T"] < 0.02
+
+
+@pytest.mark.parametrize(("qc", "step", "text"), [(-1.0, 1.0, "qc must be in"), (100.0, 0.0, "--step must not be 0")])
+def test_a_flow_or_step_that_cannot_be_is_refused(qc: float, step: float, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        describe(qc, step, as_json=False)

@@ -1,0 +1,159 @@
+"""Checks of a record: what is refused, why, and what is let through."""
+
+import numpy as np
+import pytest
+
+from monitor_node.identification.excitation import (
+    amplitude,
+    check_record,
+    condition_check,
+    conditioning,
+    persistence,
+    response_samples,
+    sampling,
+    variation,
+)
+from monitor_node.identification.structure import Structure
+from reactorwatch.errors import InputError
+from tests.unit.identification.truth import Array, Daisy, NoisyPlant
+
+ROWS = np.arange(3000)
+
+
+def sinusoids(*periods: float) -> Array:
+    return np.asarray(np.sum([np.sin(2.0 * np.pi * ROWS / period) for period in periods], axis=0))
+
+
+@pytest.mark.parametrize("period", [7.0, 21.3, 400.0])
+@pytest.mark.parametrize("mean", [0.0, 100.0])
+def test_a_single_sinusoid_is_refused_for_order_3_with_the_reason(period: float, mean: float) -> None:
+    check = persistence(mean + sinusoids(period), 6)
+    assert not check.passed
+    assert (check.value, check.limit) == (2.0, 6.0)
+    assert "as a single sinusoid does" in check.result
+    assert "at least 3 sinusoids" in check.result
+
+
+def test_a_sinusoid_with_a_little_noise_is_still_a_sinusoid() -> None:
+    rng = np.random.default_rng(1)
+    assert persistence(sinusoids(21.3) + 0.005 * rng.standard_normal(3000), 6).value == 2.0
+
+
+def test_two_sinusoids_excite_order_four() -> None:
+    assert persistence(sinusoids(21.3, 120.0), 6).value == 4.0
+    assert persistence(sinusoids(21.3, 120.0), 4).passed
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [
+        sinusoids(21.3, 62.0, 299.0),
+        sinusoids(100.0, 200.0, 330.0),
+        np.sign(sinusoids(125.7)),
+        np.repeat(np.random.default_rng(2).standard_normal(300), 10),
+        np.random.default_rng(3).standard_normal(3000),
+    ],
+    ids=["three sinusoids", "three slow sinusoids", "square wave", "random steps", "white"],
+)
+def test_sums_of_sinusoids_square_waves_and_random_steps_pass(inputs: Array) -> None:
+    assert persistence(95.0 + inputs, 6).result == "ok"
+
+
+def test_a_constant_input_excites_nothing() -> None:
+    check = persistence(np.full(1000, 98.7), 2)
+    assert check.value == 0.0
+    assert "a constant input excites none" in check.result
+
+
+def test_gaps_do_not_count_as_moves() -> None:
+    """A sinusoid with rows left out and times that say so is still one sinusoid."""
+    kept = np.random.default_rng(4).random(3000) < 0.98
+    assert persistence(sinusoids(21.3)[kept], 6, ROWS[kept].astype(float)).value == 2.0
+
+
+def sampled_plant(period_min: float, noise_sd: float) -> tuple[Array, Array]:
+    """An oscillating plant with the eigenvalues -1.34 +- 3.03i 1/min, its input held about 2 min, 4,000 samples."""
+    rng = np.random.default_rng(5)
+    pole = np.exp(complex(-1.34, 3.03) * period_min)
+    a1, a2 = 2.0 * pole.real, -(abs(pole) ** 2)
+    held = max(1, round(2.0 / period_min))
+    u = np.repeat(rng.standard_normal(4000 // held + 1), held)[:4000]
+    y = np.zeros(4000)
+    for k in range(2, 4000):
+        y[k] = a1 * y[k - 1] + a2 * y[k - 2] + (1.0 - a1 - a2) * u[k - 1]
+    return u, y + noise_sd * rng.standard_normal(4000)
+
+
+@pytest.mark.parametrize("noise_sd", [0.0, 0.05])
+def test_a_sampling_rate_that_is_too_fast_gets_a_decimation_that_is_good(noise_sd: float) -> None:
+    """Noise must not hide it: least squares would take it for fast dynamics."""
+    u, y = sampled_plant(0.01, noise_sd)
+    check = sampling(Structure.of_order(2), u, y)
+    assert not check.passed
+    assert "too fast" in check.result
+    assert check.decimation > 1
+    u, y = sampled_plant(0.01 * check.decimation, noise_sd)
+    assert sampling(Structure.of_order(2), u, y).passed
+
+
+def test_a_good_sampling_rate_passes_and_a_slow_one_is_told() -> None:
+    assert sampling(Structure.of_order(2), *sampled_plant(0.1, 0.05)).passed
+    check = sampling(Structure.of_order(2), *sampled_plant(1.0, 0.05))
+    assert "too slow" in check.result
+    assert check.decimation == 1
+
+
+def test_the_response_time_is_that_of_the_step_response() -> None:
+    """With a = 0.9, 1 - 0.9^k reaches 0.95 at k = 29, whatever the delay; an input without effect has none."""
+    assert response_samples(Structure(1, 1), np.array([0.9, 2.0, 0.0])) == 29.0
+    assert response_samples(Structure(1, 1, delay=4), np.array([0.9, -2.0, 5.0])) == 29.0
+    assert np.isnan(response_samples(Structure(1, 1), np.array([0.9, 0.0, 0.0])))
+    assert np.isnan(response_samples(Structure(1, 1), np.array([1.0, 1.0, 0.0])))
+
+
+def test_the_daisy_record_passes_for_orders_one_to_three(daisy: Daisy) -> None:
+    for output in (daisy.C, daisy.T):
+        for order in (1, 2, 3):
+            checks = check_record(Structure.of_order(order), daisy.qc[:3750], output[:3750], daisy.time[:3750])
+            assert [check.name for check in checks] == [
+                "variation",
+                "excitation",
+                "sampling",
+                "conditioning",
+                "amplitude",
+            ]
+            assert all(check.passed for check in checks)
+
+
+def test_the_amplitude_is_held_against_the_noise(noisy_plant: NoisyPlant) -> None:
+    loud = noisy_plant.clean + 3.0 * np.std(noisy_plant.clean) * np.random.default_rng(6).standard_normal(4000)
+    structure = Structure.of_order(2)
+    check = amplitude(structure, noisy_plant.inputs, loud)
+    assert not check.passed
+    assert check.value == pytest.approx(1.0, abs=0.1)
+    assert amplitude(structure, noisy_plant.inputs, noisy_plant.clean).passed
+
+
+def test_dependent_regressors_are_told_by_their_condition_number() -> None:
+    rng = np.random.default_rng(7)
+    check = conditioning(Structure.of_order(1), np.ones(100), rng.standard_normal(100))
+    assert check.value == np.inf
+    assert "nearly dependent" in check.result
+    assert condition_check(50.0).passed
+    assert not condition_check(1e5).passed
+    with pytest.raises(InputError, match="3 parameters need as many complete rows, got 1"):
+        conditioning(Structure.of_order(1), np.ones(2), np.ones(2))
+
+
+def test_an_output_that_never_moves_ends_the_checks() -> None:
+    checks = check_record(Structure.of_order(1), np.arange(50.0), np.full(50, 441.0))
+    assert [check.name for check in checks] == ["variation"]
+    assert "constant, 441" in checks[0].result
+    assert variation([np.nan]).result == "the output has no measured value"
+
+
+def test_an_input_that_does_not_excite_ends_them_before_what_needs_a_model() -> None:
+    rng = np.random.default_rng(8)
+    checks = check_record(Structure.of_order(3), sinusoids(30.0), sinusoids(30.0) + 0.1 * rng.standard_normal(3000))
+    assert next(check.name for check in checks if not check.passed) == "excitation"
+    assert "sampling" not in [check.name for check in checks]

@@ -1,0 +1,68 @@
+"""Truth for the identification tests: an exact solver, and a plant with known parameters."""
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def exact_least_squares(regressors: Array, outputs: Array) -> Array:
+    """The least squares solution in rational arithmetic, rounded once at the end."""
+    n = regressors.shape[1]
+    rows = [
+        [Fraction(float(value)) for value in (*row, output)] for row, output in zip(regressors, outputs, strict=True)
+    ]
+    equations = [[sum((row[i] * row[j] for row in rows), Fraction(0)) for j in range(n + 1)] for i in range(n)]
+    for i in range(n):
+        for k in range(i + 1, n):
+            factor = equations[k][i] / equations[i][i]
+            for j in range(i, n + 1):
+                equations[k][j] -= factor * equations[i][j]
+    solution = [Fraction(0)] * n
+    for i in range(n - 1, -1, -1):
+        known = sum((equations[i][j] * solution[j] for j in range(i + 1, n)), Fraction(0))
+        solution[i] = (equations[i][n] - known) / equations[i][i]
+    return np.array([float(value) for value in solution])
+
+
+@dataclass(frozen=True)
+class Daisy:
+    """The DaISy CSTR record: times in min, coolant flow qc in l/min, concentration C in mol/l, temperature T in K."""
+
+    time: Array
+    qc: Array
+    C: Array
+    T: Array
+
+
+@dataclass(frozen=True)
+class NoisyPlant:
+    """A plant whose output is measured with white noise: an output-error system.
+
+    Attributes:
+        parameters: a1, a2, b1, b2, c.
+        inputs: shape (rows,).
+        clean: shape (rows,), the output.
+        measured: shape (rows,), the output with noise.
+        noise_sd: of the noise.
+    """
+
+    parameters: Array
+    inputs: Array
+    clean: Array
+    measured: Array
+    noise_sd: float
+
+
+def oscillating_plant(rows: int = 4000, noise_sd: float = 1.0, seed: int = 0) -> NoisyPlant:
+    """Second order, oscillating, poles at 0.75 +- 0.37i; its input is held for five rows at a time."""
+    rng = np.random.default_rng(seed)
+    a1, a2, b1, b2, c = parameters = np.array([1.5, -0.7, 1.0, 0.5, 0.3])
+    inputs = np.repeat(rng.standard_normal(-(-rows // 5)), 5)[:rows]
+    clean = np.zeros(rows)
+    for k in range(2, rows):
+        clean[k] = a1 * clean[k - 1] + a2 * clean[k - 2] + b1 * inputs[k - 1] + b2 * inputs[k - 2] + c
+    return NoisyPlant(parameters, inputs, clean, clean + noise_sd * rng.standard_normal(rows), noise_sd)

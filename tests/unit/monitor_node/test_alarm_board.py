@@ -1,0 +1,228 @@
+"""The alarms of a plant: no chatter, one incident a fault, out of sight but followed, and what a restart keeps."""
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from monitor_node import backtest
+from monitor_node.alarm_states import Event, State
+from monitor_node.config import MonitorConfig
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.contract.codec import encode
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
+from reactorwatch.errors import InputError
+from reactorwatch.records.record import to_time_ns
+from recorder.player import samples_of
+
+from .board import AT_ONCE, Desk
+
+IN, OUT = 0.0, 5.0
+
+
+# --- delays and dead band ------------------------------------------------------------------------------------
+
+
+def test_a_value_that_trembles_at_its_limit_is_one_alarm_with_delays_and_dead_band_and_many_without() -> None:
+    trembling = 3.0 + 0.2 * np.where(np.arange(200) % 4 < 2, 1, -1)  # between 2.8 and 3.2, the limit is 3
+    bare = Desk(msgspec.structs.replace(AT_ONCE, dead_band=0.0))
+    banded = Desk(AT_ONCE)  # back in is below 2.7
+    for row, value in enumerate(trembling):
+        bare.point(row / 10, T=float(value))
+        banded.point(row / 10, T=float(value))
+    assert bare.changes().count(("shewhart/T", "raised")) == 50
+    assert banded.changes() == [("shewhart/T", "raised")]
+
+
+def test_without_dead_band_the_off_delay_alone_rides_over_short_returns() -> None:
+    desk = Desk(msgspec.structs.replace(AT_ONCE, dead_band=0.0, clear_count=3))
+    for row, letter in enumerate("x..x..x...x"):
+        desk.point(row, T=OUT if letter == "x" else IN)
+    assert [alarm.time_ns // to_time_ns(1.0) for alarm in desk.told(Alarm)] == [0, 9, 10]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_back_in_is_a_tenth_within_the_limit_that_was_crossed(sign: int) -> None:
+    desk = Desk(AT_ONCE)
+    for minute, value in enumerate((3.1, 2.71)):
+        desk.point(minute, T=sign * value)
+    assert desk.alarm().memory.state is State.UNACKNOWLEDGED
+    desk.point(2, T=sign * 2.69)
+    assert desk.alarm().memory.state is State.RETURNED_UNACKNOWLEDGED
+
+
+# --- incidents -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_leak_of_the_demonstration_is_one_incident_and_the_temperature_is_first_in(seed: int) -> None:
+    """A leak of 15 %, which raises T once and then C again and again."""
+    plant = PlantConfig(seed=seed, faults=("coolant_flow:step:-0.15@150min",))
+    messages = (encode(item) for item in samples_of(simulate_record(plant, 2400), "cstr"))
+    alarms = backtest.run(messages, MonitorConfig()).alarm_messages
+    raised = [alarm for alarm in alarms if alarm.event == "raised"]
+    assert [alarm.alarm for alarm in raised].count("shewhart/C") >= 3
+    assert {alarm.incident for alarm in alarms} == {1}
+    assert {alarm.alarm for alarm in alarms if alarm.first_in} == {"shewhart/T"}
+
+
+def test_an_alarm_long_after_the_last_change_is_an_incident_of_its_own() -> None:
+    desk = Desk(msgspec.structs.replace(AT_ONCE, incident_min=30.0))
+    for minute, values in (
+        (0, {"T": OUT}),  # incident 1, and T stands on
+        (20, {"C": OUT}),  # within 30 min of the raise of T
+        (45, {"C": IN}),  # clears C
+        (75, {"C": OUT}),  # within 30 min of that
+        (106, {"C": IN}),
+        (137, {"C": OUT}),  # 31 min after it, though T stands
+    ):
+        desk.point(minute, **values)
+    told = [(alarm.alarm[-1], alarm.incident, alarm.first_in) for alarm in desk.told(Alarm) if alarm.event == "raised"]
+    assert told == [("T", 1, True), ("C", 1, False), ("C", 1, False), ("C", 2, True)]
+
+
+def test_a_clock_that_is_set_back_begins_a_new_incident() -> None:
+    desk = Desk()
+    desk.point(100, T=OUT)
+    desk.point(10, C=OUT)
+    assert [alarm.incident for alarm in desk.told(Alarm)] == [1, 2]
+
+
+# --- out of sight --------------------------------------------------------------------------------------------
+
+
+def test_a_shelf_ends_with_its_time_and_a_standing_alarm_comes_up_again() -> None:
+    desk = Desk()
+    desk.point(0, T=OUT)
+    (change, _) = desk.board.shelve("shewhart/T", 10.0, "Anna", "known")
+    assert isinstance(change.message, Alarm)
+    assert change.message.shelved_until_ns == to_time_ns(10.0)
+    desk.point(9.9, T=OUT)
+    assert desk.alarm().memory.state is State.SHELVED
+    desk.point(10.0, T=OUT)
+    last = desk.told(Alarm)[-1]
+    assert (last.event, last.state) == ("shelf time over", AlarmState.ALARM_STATE_UNACKNOWLEDGED)
+    assert (last.incident, last.by, last.comment, last.shelved_until_ns) == (1, "Anna", "known", 0)
+
+
+def test_what_happens_out_of_sight_is_told_and_counts_when_it_comes_up() -> None:
+    desk = Desk()
+    desk.point(0, T=IN)
+    desk.board.act("shewhart/T", Event.SUPPRESS, "Anna", "start-up")
+    desk.point(1, T=OUT)
+    hidden = desk.told(Alarm)[-1]
+    assert (hidden.event, hidden.state, hidden.incident) == ("raised", AlarmState.ALARM_STATE_SUPPRESSED_BY_DESIGN, 0)
+    assert hidden.comment == "start-up"
+    assert desk.figures().alarms_10min == 0
+    change, figures = desk.board.act("shewhart/T", Event.UNSUPPRESS, "Anna", "")
+    desk.said += [change, figures]
+    shown = desk.told(Alarm)[-1]
+    assert (shown.state, shown.incident, shown.first_in) == (AlarmState.ALARM_STATE_UNACKNOWLEDGED, 1, True)
+    assert (shown.time_ns, shown.raised_ns) == (to_time_ns(1.0), to_time_ns(1.0))
+    assert desk.figures().alarms_10min == 1
+
+
+def test_a_clock_that_is_set_back_ends_a_shelf() -> None:
+    desk = Desk()
+    desk.point(100, T=OUT)
+    desk.board.shelve("shewhart/T", 60.0, "Anna", "")
+    desk.point(50, T=OUT)
+    assert desk.alarm().memory.state is State.UNACKNOWLEDGED
+
+
+def test_a_new_occurrence_carries_no_name_from_the_last_one() -> None:
+    desk = Desk()
+    desk.point(0, T=OUT)
+    desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "seen")
+    desk.point(1, T=IN)
+    assert (desk.told(Alarm)[-1].state, desk.told(Alarm)[-1].by) == (AlarmState.ALARM_STATE_NORMAL, "Anna")
+    desk.point(2, T=OUT)
+    assert (desk.told(Alarm)[-1].by, desk.told(Alarm)[-1].comment) == ("", "")
+
+
+# --- over a restart ------------------------------------------------------------------------------------------
+
+
+def busy_desk() -> Desk:
+    """T acknowledged and standing, C shelved until minute 31, one incident."""
+    desk = Desk()
+    desk.point(0, T=OUT)
+    desk.point(1, C=OUT)
+    desk.board.act("shewhart/T", Event.ACKNOWLEDGE, "Anna", "seen")
+    desk.board.shelve("shewhart/C", 30.0, "Ben", "")
+    return desk
+
+
+def test_a_board_that_was_stored_goes_on_as_if_nothing_had_happened() -> None:
+    stayed, gone = busy_desk(), busy_desk()
+    back = Desk()
+    back.board.from_bytes(gone.board.to_bytes())
+    stayed.said.clear()
+    rows: list[tuple[float, dict[str, float]]] = [
+        (2, {"T": OUT, "C": OUT}),
+        (30.9, {"T": IN}),
+        (31, {"C": OUT}),
+        (32, {"T": OUT, "C": IN}),
+    ]
+    for minute, values in rows:
+        stayed.point(minute, **values)
+        back.point(minute, **values)
+    assert back.changes() == [
+        ("shewhart/T", "cleared"),
+        ("shewhart/C", "shelf time over"),
+        ("shewhart/T", "raised"),
+        ("shewhart/C", "cleared"),
+    ]
+    assert [encode(item) for item in stayed.said if isinstance(item.message, Alarm)] == [
+        encode(item) for item in back.said if isinstance(item.message, Alarm)
+    ]
+    assert encode(stayed.said[-1]) == encode(back.said[-1])
+    assert stayed.board.to_bytes() == back.board.to_bytes()
+
+
+def test_an_alarm_that_there_is_no_more_is_left_out() -> None:
+    desk = Desk(signals=("T",))
+    desk.board.from_bytes(busy_desk().board.to_bytes())
+    assert [alarm.alarm for alarm in desk.board.all_alarms()] == ["shewhart/T"]
+    assert desk.alarm().memory.state is State.ACKNOWLEDGED
+
+
+def test_bytes_that_were_cut_anywhere_are_refused_and_change_nothing() -> None:
+    data, desk = busy_desk().board.to_bytes(), Desk()
+    before = desk.board.to_bytes()
+    for length in range(len(data)):
+        with pytest.raises(InputError, match=r"^is no alarm state: "):
+            desk.board.from_bytes(data[:length])
+    assert desk.board.to_bytes() == before
+
+
+@given(st.data())
+@settings(derandomize=True, max_examples=300)
+def test_bytes_that_were_changed_anywhere_are_refused_or_harm_nothing(data: st.DataObject) -> None:
+    stored = bytearray(busy_desk().board.to_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        stored[data.draw(st.integers(0, len(stored) - 1))] = data.draw(st.integers(0, 255))
+    desk = Desk()
+    try:
+        desk.board.from_bytes(bytes(stored))
+    except InputError:
+        return
+    for minute in range(2, 6):
+        desk.point(minute, T=OUT if minute % 2 else IN, C=IN)
+    desk.board.all_alarms()
+    desk.board.to_bytes()
+
+
+def test_a_state_of_another_plant_is_refused() -> None:
+    desk = Desk(msgspec.structs.replace(AT_ONCE, plant="R-101"))
+    with pytest.raises(InputError, match="is the alarm state of plant 'cstr', not of 'R-101'"):
+        desk.board.from_bytes(busy_desk().board.to_bytes())
+
+
+def test_a_state_that_cannot_be_is_refused() -> None:
+    stored = msgspec.msgpack.decode(busy_desk().board.to_bytes())
+    stored["alarms"]["shewhart/T"]["state"] = "normal"
+    with pytest.raises(InputError, match="shewhart/T is normal, but its condition stands"):
+        Desk().board.from_bytes(msgspec.msgpack.encode(stored))

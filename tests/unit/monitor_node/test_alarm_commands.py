@@ -1,0 +1,211 @@
+"""What people ask of the alarms on the bus: done and told, or refused in one line with nothing changed."""
+
+from pathlib import Path
+
+import pytest
+from google.protobuf.message import Message
+
+from monitor_node.__main__ import MonitorNode
+from monitor_node.alarm_commands import COMMANDS
+from monitor_node.config import MonitorConfig
+from plant_node.node import COMMANDS as PLANT_COMMANDS
+from reactorwatch.contract.codec import Encoded, Publication, decode, encode_message
+from reactorwatch.contract.messages_pb2 import (
+    Alarm,
+    AlarmCommand,
+    AlarmKpis,
+    AlarmState,
+    CommandReply,
+    Health,
+    ListAlarms,
+    ShelveAlarm,
+)
+from reactorwatch.errors import InputError
+from reactorwatch.records.record import to_time_ns
+from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
+
+from .samples import PLANT, leaking_run, samples
+
+END_MIN = 140.0
+
+
+@pytest.fixture(scope="module")
+def leak() -> list[Encoded]:
+    """A run whose coolant leaks from minute 130 on; both alarms stand at its end."""
+    return list(samples(*leaking_run(-0.1, 130.0, END_MIN, seed=1)))
+
+
+class Room:
+    """A monitor on a bus within the process, and an operator beside it.
+
+    Attributes:
+        said: what the monitor published because of commands.
+    """
+
+    def __init__(self, config: MonitorConfig, messages: list[Encoded]) -> None:
+        self.node = MonitorNode(config, 0)
+        self.said: list[Publication] = []
+        self._operator = MemoryBus(Exchange())
+        self._operator.answer(f"reactor/{PLANT}/command/*", self._answer)
+        self.hear(messages)
+
+    def hear(self, messages: list[Encoded]) -> list[Publication]:
+        """Samples come."""
+        return [item for message in messages for item in self.node.on_message(message, 0)]
+
+    def ask(self, name: str, message: Message) -> CommandReply:
+        """A person asks."""
+        self.said.clear()
+        question = Encoded(f"reactor/{PLANT}/command/{name}", *encode_message(message))
+        (answer,) = self._operator.ask(question, 1.0)
+        reply = decode(answer.payload, answer.encoding)
+        assert isinstance(reply, CommandReply)
+        return reply
+
+    def _answer(self, request: Request) -> None:
+        reply, publications = self.node.on_command(request.question, 0)
+        self.said += publications
+        request.reply(reply)
+
+
+@pytest.fixture
+def room(leak: list[Encoded]) -> Room:
+    return Room(MonitorConfig(), leak)
+
+
+def by_anna(alarm: str = "shewhart/T", comment: str = "") -> AlarmCommand:
+    return AlarmCommand(alarm=alarm, by="Anna", comment=comment)
+
+
+def test_an_alarm_that_is_acknowledged_is_told_at_the_time_of_the_newest_sample(room: Room) -> None:
+    reply = room.ask("acknowledge", by_anna(comment="seen"))
+    assert (reply.accepted, reply.text) == (True, "alarm shewhart/T: acknowledge by Anna")
+    alarm, figures = (item.message for item in room.said)
+    assert isinstance(alarm, Alarm)
+    assert isinstance(figures, AlarmKpis)
+    assert [item.key for item in room.said] == ["reactor/cstr/alarm/shewhart/T", "reactor/cstr/alarm_kpis/monitor"]
+    assert alarm.time_ns == to_time_ns(END_MIN)
+    assert alarm.state == AlarmState.ALARM_STATE_ACKNOWLEDGED
+    assert (alarm.event, alarm.by, alarm.comment) == ("acknowledge", "Anna", "seen")
+    assert alarm.text.startswith("T is ")
+    assert [item.alarm for item in reply.alarms] == ["shewhart/T"]
+
+
+@pytest.mark.parametrize(
+    ("there", "state", "back"),
+    [
+        ("shelve", AlarmState.ALARM_STATE_SHELVED, "unshelve"),
+        ("suppress", AlarmState.ALARM_STATE_SUPPRESSED_BY_DESIGN, "unsuppress"),
+        ("take_out_of_service", AlarmState.ALARM_STATE_OUT_OF_SERVICE, "return_to_service"),
+    ],
+)
+def test_an_alarm_goes_out_of_sight_and_comes_back(room: Room, there: str, state: AlarmState, back: str) -> None:
+    shelve = ShelveAlarm(alarm="shewhart/T", by="Anna", minutes=30.0)
+    reply = room.ask(there, shelve if there == "shelve" else by_anna())
+    assert (reply.accepted, reply.alarms[0].state) == (True, state)
+    assert reply.alarms[0].shelved_until_ns == (to_time_ns(END_MIN + 30) if there == "shelve" else 0)
+    reply = room.ask(back, by_anna())
+    assert (reply.accepted, reply.alarms[0].state) == (True, AlarmState.ALARM_STATE_UNACKNOWLEDGED)
+
+
+def test_a_comment_changes_nothing_but_the_comment(room: Room) -> None:
+    before = room.ask("list_alarms", ListAlarms()).alarms[1]
+    reply = room.ask("comment", by_anna(comment="valve is stiff"))
+    assert (reply.alarms[0].state, reply.alarms[0].comment) == (before.state, "valve is stiff")
+    assert [type(item.message) for item in room.said] == [Alarm]
+
+
+def test_the_list_has_every_alarm_and_publishes_nothing(room: Room) -> None:
+    reply = room.ask("list_alarms", ListAlarms())
+    assert [alarm.alarm for alarm in reply.alarms] == ["shewhart/C", "shewhart/T"]
+    assert room.said == []
+
+
+REFUSED: list[tuple[str, Message, str]] = [
+    ("acknowledge", by_anna("shewhart/pH"), "there is no alarm 'shewhart/pH' (there are: shewhart/C, shewhart/T)"),
+    ("acknowledge", AlarmCommand(alarm="shewhart/T"), "by must name the person, in 1 to 64 characters, got ''"),
+    ("acknowledge", AlarmCommand(alarm="shewhart/T", by="   "), "by must name the person, in 1 to 64"),
+    ("unshelve", by_anna(), "alarm shewhart/T is not shelved"),
+    ("return_to_service", by_anna(), "alarm shewhart/T is in service"),
+    ("comment", by_anna(comment="  "), "comment must say something, got ''"),
+    ("comment", by_anna(comment="x" * 1001), "comment must have at most 1000 characters, got 1001"),
+    ("shelve", ShelveAlarm(alarm="shewhart/T", by="Anna"), "minutes must be in (0, 480], which longest_shelf_min"),
+    ("shelve", ShelveAlarm(alarm="shewhart/T", by="Anna", minutes=481), "minutes must be in (0, 480]"),
+    ("shelve", ShelveAlarm(alarm="shewhart/T", by="Anna", minutes=float("nan")), "minutes must be in (0, 480]"),
+    ("shelve", by_anna(), "command shelve must carry 'application/protobuf;reactorwatch.v1.ShelveAlarm', got"),
+    ("delete", by_anna(), "unknown command 'delete' (valid: acknowledge, unshelve, "),
+]
+
+
+@pytest.mark.parametrize(("name", "message", "text"), REFUSED, ids=[f"{n}: {t[:30]}" for n, _, t in REFUSED])
+def test_what_cannot_be_done_is_refused_in_one_line_and_changes_nothing(
+    room: Room, name: str, message: Message, text: str
+) -> None:
+    before = room.node.alarms.to_bytes()
+    reply = room.ask(name, message)
+    assert not reply.accepted
+    assert reply.text.startswith(text)
+    assert "\n" not in reply.text
+    assert room.said == []
+    assert room.node.alarms.to_bytes() == before
+    (health,) = room.node.on_tick(1)
+    assert isinstance(health.message, Health)
+    assert health.message.refused == 1
+
+
+def test_before_the_first_sample_nothing_can_be_acknowledged() -> None:
+    reply = Room(MonitorConfig(), []).ask("acknowledge", by_anna())
+    assert not reply.accepted
+    assert reply.text.startswith("no sample has come yet")
+
+
+def test_the_plant_and_the_monitor_share_no_command() -> None:
+    assert not set(COMMANDS) & set(PLANT_COMMANDS)
+
+
+def test_what_was_said_survives_a_restart(tmp_path: Path, leak: list[Encoded]) -> None:
+    """The first monitor is gone without a word: only what it had stored by then is left."""
+    config = MonitorConfig(alarm_state_file=str(tmp_path / "alarms.state"))
+    first = Room(config, leak)
+    first.ask("acknowledge", by_anna(comment="seen"))
+    first.ask("shelve", ShelveAlarm(alarm="shewhart/C", by="Ben", minutes=5.0))
+    del first
+
+    second = Room(config, [])
+    c, t = second.ask("list_alarms", ListAlarms()).alarms
+    assert (t.state, t.by, t.comment, t.incident) == (AlarmState.ALARM_STATE_ACKNOWLEDGED, "Anna", "seen", 1)
+    assert (c.state, c.shelved_until_ns) == (AlarmState.ALARM_STATE_SHELVED, to_time_ns(END_MIN + 5))
+    time_min, columns = leaking_run(0.0, 1.0, 10.0, seed=1)
+    said = second.hear(list(samples(time_min + END_MIN, columns)))
+    (back,) = [item.message for item in said if isinstance(item.message, Alarm)]
+    assert (back.alarm, back.event, back.time_ns) == ("shewhart/C", "shelf time over", to_time_ns(END_MIN + 5))
+    assert second.node.phase == "training"
+
+
+def test_a_damaged_file_is_refused_in_one_line_and_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "alarms.state"
+    path.write_bytes(b"\x87 no state")
+    with pytest.raises(InputError, match=r"^alarm_state_file .*alarms.state: is no alarm state: .*; move it away to"):
+        MonitorNode(MonitorConfig(alarm_state_file=str(path)), 0)
+    assert path.read_bytes() == b"\x87 no state"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        MonitorNode(MonitorConfig(alarm_state_file=str(tmp_path / "none" / "alarms.state")), 0)
+
+
+def test_a_file_that_can_no_longer_be_written_stops_no_watch(
+    tmp_path: Path, leak: list[Encoded], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "gone"
+    folder.mkdir()
+    room = Room(MonitorConfig(alarm_state_file=str(folder / "alarms.state")), leak)
+    (folder / "alarms.state").unlink()
+    folder.rmdir()
+    assert room.ask("acknowledge", by_anna()).accepted
+    assert "does not exist" in capsys.readouterr().out
+    folder.mkdir()
+    room.node.on_tick(1)  # it is tried again
+    assert (folder / "alarms.state").stat().st_size > 0

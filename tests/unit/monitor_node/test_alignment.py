@@ -1,0 +1,154 @@
+"""Samples become rows, whatever happens to them on the way."""
+
+import math
+import random
+
+import pytest
+
+from monitor_node.alignment import Aligner, Row
+
+SIGNALS = ("qc", "C", "T")
+PERIOD = 100
+
+
+def feed(aligner: Aligner, samples: list[tuple[str, int]]) -> list[Row]:
+    """Samples as (signal, row number); the value tells where it came from, the sequence is the row number."""
+    rows: list[Row] = []
+    for signal, number in samples:
+        rows += aligner.update(signal, number * PERIOD, number, number + SIGNALS.index(signal) / 10)
+    return rows
+
+
+def in_order(count: int) -> list[tuple[str, int]]:
+    return [(signal, number) for number in range(count) for signal in SIGNALS]
+
+
+def numbers(rows: list[Row]) -> list[int]:
+    return [row.time_ns // PERIOD for row in rows]
+
+
+def test_samples_in_order_give_every_row_at_its_last_sample() -> None:
+    aligner = Aligner(SIGNALS, 4)
+    assert feed(aligner, in_order(1)[:2]) == []
+    rows = feed(aligner, in_order(10)[2:])
+    assert numbers(rows) == list(range(10))
+    assert rows[3].values == (3.0, 3.1, 3.2)
+    assert [row.restarted for row in rows] == [True] + [False] * 9
+
+
+def test_any_order_within_the_reordering_gives_the_same_rows() -> None:
+    order, samples = random.Random(2), in_order(1)
+    for start in range(3, 600, 6):
+        part = in_order(200)[start : start + 6]
+        order.shuffle(part)
+        samples += part
+    aligner = Aligner(SIGNALS, 4)
+    rows = feed(aligner, samples) + aligner.flush()
+    expected = feed(Aligner(SIGNALS, 4), in_order(200))
+    assert [row[:2] for row in rows] == [row[:2] for row in expected]
+    counts = aligner.state.counts
+    assert counts.lost == counts.late == counts.duplicated == counts.incomplete_rows == 0
+    assert counts.out_of_order > 0
+
+
+def test_a_missing_sample_is_waited_for_and_then_given_up() -> None:
+    aligner = Aligner(SIGNALS, 3)
+    samples = [item for item in in_order(6) if item != ("T", 2)]
+    rows = feed(aligner, samples)
+    assert numbers(rows) == list(range(6))
+    assert math.isnan(rows[2].values[2])
+    assert rows[2].values[:2] == (2.0, 2.1)
+    assert aligner.state.counts.incomplete_rows == 1
+    assert aligner.state.counts.lost == 1
+
+
+def test_a_row_waits_no_longer_than_the_reordering() -> None:
+    aligner = Aligner(SIGNALS, 3)
+    rows = feed(aligner, [item for item in in_order(5) if item != ("T", 2)])
+    assert numbers(rows) == [0, 1]
+    assert numbers(feed(aligner, [("qc", 5)])) == [2, 3, 4]
+
+
+def test_a_row_that_is_lost_altogether_holds_the_others_up_no_longer() -> None:
+    aligner = Aligner(SIGNALS, 3)
+    rows = feed(aligner, [item for item in in_order(5) if item[1] != 2])
+    assert numbers(rows) == [0, 1]
+    assert numbers(feed(aligner, [(signal, 5) for signal in SIGNALS] + [(signal, 6) for signal in SIGNALS])) == [
+        3,
+        4,
+        5,
+        6,
+    ]
+    assert aligner.state.counts.incomplete_rows == 0
+    assert aligner.state.counts.lost == 3
+
+
+def test_rows_apart_in_time_are_not_waited_between() -> None:
+    """A gap in time without a gap in the numbers is the publisher's own."""
+    aligner = Aligner(SIGNALS, 3)
+    rows = [
+        row for number in range(4) for signal in SIGNALS for row in aligner.update(signal, number**2 * 900, number, 0.0)
+    ]
+    assert len(rows) == 4
+
+
+def test_a_sample_of_a_row_that_has_left_is_late_and_changes_nothing() -> None:
+    aligner = Aligner(SIGNALS, 2)
+    feed(aligner, [item for item in in_order(8) if item != ("C", 3)])
+    assert feed(aligner, [("C", 3)]) == []
+    assert aligner.state.counts.late == 1
+    assert aligner.state.counts.lost == 0  # it was late, not lost
+    assert numbers(feed(aligner, [(signal, 8) for signal in SIGNALS])) == [8]
+
+
+@pytest.mark.parametrize("when", [1, 5])
+def test_the_same_sample_twice_is_a_duplicate_before_and_after_its_row_left(when: int) -> None:
+    aligner = Aligner(SIGNALS, 4)
+    samples = in_order(2)
+    samples.insert(when, samples[when - 1])
+    rows = feed(aligner, samples)
+    assert numbers(rows) == [0, 1]
+    assert aligner.state.counts.duplicated == 1
+    assert aligner.state.counts.lost == 0
+
+
+def test_a_duplicate_of_a_complete_row_is_no_late_sample() -> None:
+    aligner = Aligner(SIGNALS, 4)
+    feed(aligner, [*in_order(3), ("C", 1)])
+    assert aligner.state.counts.duplicated == 1
+    assert aligner.state.counts.late == 0
+
+
+def test_a_publisher_that_begins_again_begins_a_new_run() -> None:
+    aligner = Aligner(SIGNALS, 2)
+    feed(aligner, in_order(50))
+    rows = [
+        row for number in range(3) for signal in SIGNALS
+        for row in aligner.update(signal, 10_000 + number * PERIOD, number, 1.0)
+    ]  # fmt: skip
+    assert [row.time_ns for row in rows] == [10_000, 10_100, 10_200]
+    assert rows[0].restarted
+    assert not rows[1].restarted
+    assert aligner.state.counts.restarts == 1
+    assert aligner.state.counts.lost == 0
+
+
+def test_a_publisher_may_begin_again_at_an_earlier_time() -> None:
+    aligner = Aligner(SIGNALS, 2)
+    feed(aligner, in_order(50))
+    assert numbers(feed(aligner, in_order(3))) == [0, 1, 2]
+    assert aligner.state.counts.late == 0
+
+
+def test_memory_is_bounded_whatever_comes() -> None:
+    aligner = Aligner(SIGNALS, 5)
+    source = random.Random(3)
+    for sequence in range(20_000):
+        aligner.update("T", source.randrange(10**15), sequence, 1.0)
+        assert len(aligner.state.pending) <= 5 + 1
+        assert len(aligner.state.left) <= 4 * 5
+
+
+def test_a_reordering_of_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"reorder_rows must be at least 1, got 0"):
+        Aligner(SIGNALS, 0)

@@ -1,0 +1,299 @@
+"""The watch over a plant: it learns, it alarms when something is wrong, and nothing on the bus harms it."""
+
+import math
+import random
+from collections.abc import Iterable
+from typing import TypeVar
+
+import numpy as np
+import pytest
+from google.protobuf.message import Message
+
+from monitor_node import backtest
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.contract.messages_pb2 import (
+    Alarm,
+    AlarmState,
+    ChartPoint,
+    Estimate,
+    Health,
+    ModelSnapshot,
+    Quality,
+    Sample,
+)
+from reactorwatch.records.record import to_time_ns
+
+from .samples import PLANT, leaking_run, sample, samples
+
+M = TypeVar("M", bound=Message)
+CONFIG = MonitorConfig()
+ONSET_MIN = 130.0
+
+
+@pytest.fixture(scope="module")
+def leak() -> list[Encoded]:
+    """A run of 160 min whose coolant leaks a tenth from minute 130 on."""
+    return list(samples(*leaking_run(-0.1, ONSET_MIN, 160.0, seed=1)))
+
+
+def watch(messages: Iterable[Encoded], config: MonitorConfig = CONFIG) -> tuple[Monitor, list[Publication]]:
+    monitor = Monitor(config, 0)
+    said = [publication for message in messages for publication in monitor.on_message(message, 0)]
+    return monitor, said + monitor.finish()
+
+
+def told(said: list[Publication], kind: type[M]) -> list[M]:
+    return [item.message for item in said if isinstance(item.message, kind)]
+
+
+def health(monitor: Monitor) -> Health:
+    (publication,) = monitor.on_tick(1)
+    assert isinstance(publication.message, Health)
+    return publication.message
+
+
+def test_a_leak_raises_an_alarm_soon_after_it_and_none_before(leak: list[Encoded]) -> None:
+    _, said = watch(leak)
+    raised = [alarm for alarm in told(said, Alarm) if alarm.state == AlarmState.ALARM_STATE_UNACKNOWLEDGED]
+    assert raised
+    assert raised[0].alarm == "shewhart/T"
+    assert to_time_ns(ONSET_MIN) <= raised[0].time_ns <= to_time_ns(ONSET_MIN + 5)
+    assert raised[0].raised_ns == raised[0].time_ns
+    assert raised[0].text.startswith("T is ")
+
+
+def test_a_sound_plant_raises_none_in_ten_runs() -> None:
+    """The rate of the rule lets 0.002 alarms be expected in all ten."""
+    expected = 0.0
+    for seed in range(10):
+        result = backtest.run(samples(*leaking_run(0.0, 1.0, 200.0, seed)), CONFIG)
+        assert result.alarm_messages == []
+        expected += result.expected_false_alarms
+    assert expected < 0.02
+
+
+def test_limits_are_three_standard_deviations_of_the_residual(leak: list[Encoded]) -> None:
+    _, said = watch(leak)
+    sound = [
+        point for item, point in ((item, item.message) for item in said)
+        if isinstance(point, ChartPoint) and item.key.endswith("/T") and point.time_ns < to_time_ns(ONSET_MIN)
+    ]  # fmt: skip
+    sd = (sound[0].upper_limit - sound[0].lower_limit) / 6
+    assert np.std([point.statistic for point in sound]) == pytest.approx(sd, rel=0.15)
+    out = np.mean([point.out for point in sound])
+    assert out < 0.02
+
+
+def test_predictions_are_made_before_the_sample_is_seen(leak: list[Encoded]) -> None:
+    """What is predicted for a row does not change when that row's own value does."""
+    half = leak[: 3 * 900]
+    _, plain = watch(half)
+    changed = [*half[:-1], sample("T", 899, 89.9, 500.0)]
+    _, other = watch(changed)
+    predicted = [[e.prediction for e in told(said, Estimate)][-1] for said in (plain, other)]
+    assert predicted[0] == predicted[1]
+
+
+def test_estimates_carry_limits_only_when_they_are_known(leak: list[Encoded]) -> None:
+    _, said = watch(leak)
+    estimates = [item.message for item in said if item.key.endswith("estimate/T")]
+    known = [not math.isnan(e.lower_limit) for e in estimates if isinstance(e, Estimate)]
+    first = known.index(True)
+    assert all(known[first:])
+    assert estimates[first].time_ns == to_time_ns(100.0)
+
+
+def test_models_are_published_in_the_units_of_the_samples(leak: list[Encoded]) -> None:
+    """The parameters predict what the estimates say, from the samples as they are."""
+    time_min, columns = leaking_run(-0.1, ONSET_MIN, 160.0, seed=1)
+    _, said = watch(leak)
+    models = [item.message for item in said if item.key.endswith("model/T")]
+    reference = next(model for model in models if isinstance(model, ModelSnapshot) and model.reference)
+    p = {item.name: item.value for item in reference.parameters}
+    row = 1200
+    T, qc = columns["T"], columns["qc"]
+    by_hand = p["c"] + sum(p[f"a{lag}"] * T[row - lag] + p[f"b{lag}"] * qc[row - lag] for lag in (1, 2, 3))
+    estimate = next(
+        item.message for item in said
+        if item.key.endswith("estimate/T") and item.message.time_ns == to_time_ns(float(time_min[row]))
+    )  # fmt: skip
+    assert isinstance(estimate, Estimate)
+    assert estimate.prediction == pytest.approx(by_hand, rel=1e-9)
+    assert all(item.sd > 0 for item in reference.parameters)
+    assert reference.rows >= 500
+
+
+def reference_of(said: list[Publication]) -> ModelSnapshot:
+    """The reference for T."""
+    models = [item.message for item in said if item.key.endswith("model/T")]
+    return next(model for model in models if isinstance(model, ModelSnapshot) and model.reference)
+
+
+def test_the_reference_says_that_its_rows_were_fit_to_learn_from(leak: list[Encoded]) -> None:
+    checks = {check.name: check.result for check in reference_of(watch(leak)[1]).checks}
+    assert {"variation", "excitation", "sampling", "conditioning", "amplitude", "whiteness", "independence"} <= set(
+        checks
+    )
+    assert checks["excitation"] == checks["variation"] == "ok"
+
+
+def test_the_reference_says_that_a_single_sinusoid_does_not_excite_it() -> None:
+    """A sinusoid excites order 2; three lags of the output and three of the input need 6."""
+    time_min, columns = leaking_run(0.0, 1.0, 110.0, seed=3)
+    columns["qc"] = 100.0 + 5.0 * np.sin(2 * np.pi * time_min / 8.0)
+    _, said = watch(samples(time_min, columns))
+    checks = {check.name: check.result for check in reference_of(said).checks}
+    assert checks["excitation"] != "ok"
+
+
+def test_the_same_samples_give_the_same_bytes(leak: list[Encoded]) -> None:
+    first, second = (
+        [encode(item) for item in watch(leak)[1]] for _ in range(2)
+    )  # fmt: skip
+    assert first == second
+
+
+def test_the_clock_changes_nothing_that_is_said_of_the_plant(leak: list[Encoded]) -> None:
+    monitor = Monitor(CONFIG, 10**18)
+    said = [item for index, message in enumerate(leak) for item in monitor.on_message(message, 10**18 + 7 * index)]
+    assert [encode(item) for item in said] == [encode(item) for item in watch(leak)[1]]
+
+
+def test_order_of_arrival_within_the_reordering_changes_nothing(leak: list[Encoded]) -> None:
+    order = random.Random(4)
+    shuffled = leak[:3]
+    for start in range(3, len(leak), 9):
+        part = leak[start : start + 9]
+        order.shuffle(part)
+        shuffled += part
+    expected = [encode(item) for item in watch(leak)[1]]
+    assert [encode(item) for item in watch(shuffled)[1]] == expected
+
+
+def garbage() -> list[tuple[str, Encoded]]:
+    """What may come on the keys of a plant, and the reason it is counted under."""
+    good = sample("T", 5000, 500.0, 440.0)
+    no_number = sample("T", 5000, 500.0, math.nan)
+    without_end = sample("T", 5000, 500.0, math.inf)
+    bare = Sample(time_ns=to_time_ns(500.0), value=440.0)
+    bad = Sample(time_ns=to_time_ns(500.0), value=440.0, quality=Quality.QUALITY_BAD)
+    key = keys.key(PLANT, keys.SAMPLE, "T")
+    return [
+        ("not_finite", no_number),
+        ("not_finite", without_end),
+        ("payload", good._replace(payload=b"\xff\xff\xff\xff")),
+        ("payload", good._replace(payload=b"")),
+        ("payload", encode(Publication(key, bare))),
+        ("bad_quality", encode(Publication(key, bad))),
+        ("encoding", good._replace(encoding="application/json")),
+        ("encoding", good._replace(encoding="application/protobuf;reactorwatch.v2.Sample")),
+        ("encoding", encode(Publication(key, Health(time_ns=1)))),
+        ("unknown_signal", good._replace(key=keys.key(PLANT, keys.SAMPLE, "pH"))),
+        ("unknown_signal", good._replace(key="reactor/cstr/sample")),
+    ]
+
+
+def test_garbage_is_counted_by_reason_and_harms_nothing(leak: list[Encoded]) -> None:
+    dirty: list[Encoded] = []
+    for index, message in enumerate(leak):
+        dirty.append(message)
+        if index % 300 == 0:
+            dirty += [item for _, item in garbage()]
+    monitor, said = watch(dirty)
+    times = sum(index % 300 == 0 for index in range(len(leak)))
+    counted = health(monitor)
+    reasons: dict[str, int] = {}
+    for reason, _ in garbage():
+        reasons[reason] = reasons.get(reason, 0) + times
+    assert dict(counted.refused_by_reason) == reasons
+    assert counted.refused == sum(reasons.values())
+    assert counted.received == len(dirty)
+    assert [encode(item) for item in said] == [encode(item) for item in watch(leak)[1]]
+
+
+def test_refusals_are_reported_once_a_minute_at_most() -> None:
+    monitor, _ = watch([item for _, item in garbage()])
+    minute = 60_000_000_000
+    report = monitor.refusals.report(10 * minute)
+    assert report is not None
+    assert "not_finite" in report
+    watch_again = monitor.on_message(garbage()[0][1], 0)
+    assert watch_again == []
+    assert monitor.refusals.report(10 * minute + 59 * minute // 60) is None
+    assert monitor.refusals.report(11 * minute) is not None
+    assert monitor.refusals.report(12 * minute) is None  # nothing new since
+
+
+def test_a_run_with_missing_rows_still_finds_the_leak() -> None:
+    time_min, columns = leaking_run(-0.1, ONSET_MIN, 160.0, seed=1)
+    lost = random.Random(6)
+    messages = [message for message in samples(time_min, columns) if lost.random() > 0.02]
+    monitor, said = watch(messages)
+    raised = [alarm for alarm in told(said, Alarm) if alarm.state == AlarmState.ALARM_STATE_UNACKNOWLEDGED]
+    assert raised
+    assert raised[0].time_ns >= to_time_ns(ONSET_MIN)
+    counted = health(monitor)
+    assert counted.lost == 3 * time_min.size - len(messages)
+    assert counted.incomplete_rows > 0
+
+
+def test_a_gap_restarts_the_prediction_instead_of_alarming() -> None:
+    time_min, columns = leaking_run(0.0, 1.0, 160.0, seed=2)
+    keep = (time_min < 120) | (time_min > 125)
+    _, said = watch(samples(time_min[keep], {name: values[keep] for name, values in columns.items()}))
+    assert told(said, Alarm) == []
+    after = [e.time_ns for e in told(said, Estimate) if e.time_ns > to_time_ns(120)]
+    assert min(after) >= to_time_ns(125.3)  # three rows are needed before the next can be predicted
+
+
+@pytest.mark.parametrize("starts_min", [300.0, 0.0])
+def test_a_publisher_that_begins_again_later_or_earlier_is_watched_on(starts_min: float) -> None:
+    time_min, columns = leaking_run(0.0, 1.0, 160.0, seed=2)
+    again = samples(time_min[:300] + starts_min, {name: values[:300] for name, values in columns.items()})
+    monitor, said = watch([*samples(time_min, columns), *again])
+    assert told(said, Alarm) == []
+    counted = health(monitor)
+    assert counted.rows == time_min.size + 300
+    assert counted.late == counted.lost == 0
+    assert len([item for item in said if item.key.endswith("estimate/T")]) == time_min.size - 53 + 300 - 3
+
+
+def test_a_constant_plant_neither_fails_nor_alarms() -> None:
+    time_min = np.arange(2000) / 10
+    columns = {"qc": np.full(2000, 100.0), "C": np.full(2000, 0.1), "T": np.full(2000, 438.54)}
+    monitor, said = watch(samples(time_min, columns))
+    assert monitor.phase == "watching"
+    assert told(said, Alarm) == []
+
+
+def test_a_record_shorter_than_the_training_is_never_judged() -> None:
+    result = backtest.run(samples(*leaking_run(-0.1, 30.0, 60.0, seed=1)), CONFIG)
+    assert result.watching_since_ns is None
+    assert result.alarm_messages == []
+
+
+@pytest.mark.parametrize(
+    ("setting", "text"),
+    [
+        ({"order": 0}, r"order must be in \[1, 20\], got 0"),
+        ({"forgetting": 1.2}, r"forgetting must be in \[0.5, 1\], got 1.2"),
+        ({"raise_count": 6}, r"raise_count must be in \[1, window\]"),
+        ({"plant": "a/b"}, r"plant name must be"),
+        ({"outputs": ("qc",)}, r"outputs must be"),
+        ({"priorities": {"pH": "high"}}, r"priorities are by output"),
+    ],
+)
+def test_settings_that_break_a_rule_are_refused(setting: dict[str, object], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        MonitorConfig(**setting)  # type: ignore[arg-type]
+
+
+def test_a_training_full_of_holes_is_told_and_harms_nothing() -> None:
+    time_min, columns = leaking_run(0.0, 1.0, 160.0, seed=4)
+    kept = np.arange(time_min.size) % 9 != 0
+    monitor, said = watch(samples(time_min[kept], {name: values[kept] for name, values in columns.items()}))
+    assert monitor.phase == "watching"
+    assert [check.name for check in reference_of(said).checks] == ["record"]

@@ -1,0 +1,131 @@
+"""Process noise: of the size asked for, a stream of its own, and carried on by the plant."""
+
+from dataclasses import replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from scipy.linalg import expm, solve_discrete_lyapunov
+from scipy.stats import chi2, kstest
+
+from plant_node.config import NoiseSd, PlantConfig
+from plant_node.controllers import LevelControl
+from plant_node.core import Plant
+from plant_node.disturbances import ProcessNoise
+from plant_node.record import plant_from, simulate_record
+from reactorwatch.errors import InputError
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.linearise import linearise
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.steady_state import steady_states
+
+QUIET = NoiseSd(C=0.0, T=0.0, qc=0.0)
+ROWS = 4000
+
+
+def still() -> ProcessModel:
+    """A plant in which nothing happens: what moves is noise."""
+    return replace(cstr(), rhs=(ca.SX(0), ca.SX(0)))
+
+
+def states(name: str, count: int = ROWS, model: ProcessModel | None = None, **settings: Any) -> Array:
+    values = {"noise_sd": QUIET, "scenario": "constant", "start": {"C": 1.0, "T": 440.0}, **settings}
+    plant = plant_from(PlantConfig(**values), model or still())
+    found = []
+    for _ in range(count):
+        found.append(plant.state[name])
+        plant.next_row()
+    return np.array(found)
+
+
+@pytest.mark.parametrize("period_min", [0.1, 0.4])
+@pytest.mark.parametrize(("name", "sd"), [("C", 1e-4), ("T", 0.2)])
+def test_increments_are_normal_with_variance_sd_squared_times_the_period(
+    name: str, sd: float, period_min: float
+) -> None:
+    """(n - 1) s^2 / sigma^2 is chi-square: within its 1e-4 quantiles; successive ones do not correlate."""
+    found = np.diff(states(name, process_noise_sd={name: sd}, period_min=period_min))
+    sigma, free = sd * np.sqrt(period_min), found.size - 1
+    assert chi2.ppf(1e-4, free) < free * np.var(found, ddof=1) / sigma**2 < chi2.isf(1e-4, free)
+    assert kstest(found / sigma, "norm").pvalue > 1e-3
+    assert abs(np.corrcoef(found[1:], found[:-1])[0, 1]) < 4 / np.sqrt(found.size)
+
+
+def test_each_state_and_each_sensor_has_a_stream_of_its_own() -> None:
+    both = {"C": 1e-4, "T": 0.2}
+    of_T = states("T", process_noise_sd=both)
+    np.testing.assert_array_equal(of_T, states("T", process_noise_sd={"T": 0.2}))
+    np.testing.assert_array_equal(of_T, states("T", process_noise_sd=both, noise_sd=NoiseSd()))
+    assert np.all(np.diff(of_T) != np.diff(states("T", process_noise_sd=both, seed=1)))
+    config = PlantConfig(noise_sd=NoiseSd(T=1.0), scenario="constant", start={"C": 1.0, "T": 440.0})
+    of_sensor = simulate_record(config, ROWS, still()).columns["T"] - 440.0
+    for one, other in ((np.diff(of_T), of_sensor[1:]), (np.diff(of_T), np.diff(states("C", process_noise_sd=both)))):
+        for lag in (0, 1):
+            assert abs(np.corrcoef(one[lag:], other[: other.size - lag])[0, 1]) < 4 / np.sqrt(ROWS)
+
+
+def test_none_is_what_the_plant_was_without_it_bit_for_bit() -> None:
+    one, other = (simulate_record(PlantConfig(seed=3, process_noise_sd=sd), 200) for sd in ({}, {"T": 0.0}))
+    for signal in ("qc", "C", "T"):
+        np.testing.assert_array_equal(one.columns[signal], other.columns[signal])
+
+
+def test_the_first_row_is_the_start_and_the_rows_do_not_depend_on_how_many_there_are() -> None:
+    config = PlantConfig(seed=3, process_noise_sd={"C": 1e-3, "T": 0.3}, start={"C": 0.1, "T": 438.54}, noise_sd=QUIET)
+    long, short = simulate_record(config, 200), simulate_record(config, 50)
+    assert (long.columns["C"][0], long.columns["T"][0]) == (0.1, 438.54)
+    np.testing.assert_array_equal(long.columns["T"][:50], short.columns["T"])
+
+
+def test_the_plant_carries_it_on_as_its_linear_model_says() -> None:
+    """The stationary covariance P = Phi P Phi' + Q of the sampled linear model, here for small noise."""
+    sd, qc, period_min = np.array([1e-5, 0.02]), np.array([95.0]), 0.1
+    point = steady_states(cstr(), qc)[-1]
+    phi = expm(linearise(cstr(), point.state, qc).A * period_min)
+    expected = np.sqrt(np.diag(solve_discrete_lyapunov(phi, np.diag(sd**2 * period_min))))
+    settings: dict[str, Any] = {
+        "process_noise_sd": dict(zip("CT", sd.tolist(), strict=True)),
+        "scenario": {"kind": "constant", "level_l_min": 95.0},
+        "start": "operating",
+    }
+    for name, size in zip("CT", expected, strict=True):
+        # 400 min are some 1000 correlation times: the standard error is a few per cent.
+        assert np.std(states(name, model=cstr(), **settings)) == pytest.approx(size, rel=0.1)
+
+
+def test_a_concentration_does_not_go_below_nothing() -> None:
+    found = states("C", 1000, process_noise_sd={"C": 0.5}, start={"C": 0.1, "T": 440.0})
+    assert found.min() == 0.0
+    assert np.mean(found == 0.0) < 0.5
+    assert found.max() <= 2.0
+
+
+@pytest.mark.parametrize(("value", "farthest"), [(710.0, max), (240.0, min)])
+def test_a_state_that_is_out_of_its_bounds_by_itself_is_not_pulled_back(value: float, farthest: Any) -> None:
+    noise = ProcessNoise("T", 1.0, 0.1, 250.0, 700.0, seed=0)
+    moved = [noise.moved(value, row) for row in range(200)]
+    assert farthest(moved) == value
+    assert 0.0 < abs(np.mean(moved) - value) < 1.0
+
+
+def test_while_the_state_is_held_it_is_held() -> None:
+    never_a_number = ca.sqrt(ca.SX(-1))
+    model = replace(cstr(), rhs=(ca.SX(0), never_a_number))
+    found = states("T", 10, model=model, process_noise_sd={"T": 0.2}, start={"C": 0.1, "T": 600.0})
+    assert set(found) == {600.0}
+
+
+def test_the_level_may_be_noisy_too_and_a_fault_leaves_the_streams_alone() -> None:
+    settings: dict[str, Any] = {"level_control": LevelControl(), "process_noise_sd": {"V": 0.5}, "start": "operating"}
+    found = states("V", 2000, model=cstr(), **settings)
+    # An AR(1) with the factor exp(-Kc h) and innovations of variance sd^2 h.
+    assert np.std(found) == pytest.approx(0.5 * np.sqrt(0.1 / (1 - np.exp(-2 * 5.0 * 0.1))), rel=0.1)
+    faulty = states("V", 2000, model=cstr(), faults=("temperature_bias:step:2@10min",), **settings)
+    np.testing.assert_array_equal(found, faulty)
+
+
+def test_a_state_that_there_is_not_is_refused() -> None:
+    with pytest.raises(InputError) as caught:
+        Plant(PlantConfig(process_noise_sd={"V": 0.1}), cstr(), PlantConfig().scenario_settings())  # type: ignore[arg-type]
+    assert str(caught.value) == "process_noise_sd: cstr has no state 'V' (valid: C, T)"

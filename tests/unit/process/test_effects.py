@@ -1,0 +1,170 @@
+"""What every effect of the catalogue is held to; a new one inherits it."""
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import reactorwatch.process.effects as catalogue
+from reactorwatch.process.cstr import OPERATING_STATE, cstr
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.effects.heat_transfer import HeatTransfer
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import CONSTANT, PROFILES, RAMP, STEP, Profile
+from reactorwatch.process.simulate import Simulator
+
+SHAPE = {"onset": 1.2, "end": 3.4, "time_constant": 0.5, "period": 2.5, "phase": 0.4}  # on samples, where min
+TIMES = np.round(np.arange(60, dtype=np.float64) * 0.1, 9)
+FLOWS = np.repeat(np.random.default_rng(5).uniform(95, 108, 12), 5)
+START = np.array(OPERATING_STATE)
+
+of_every_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
+with_every_profile = pytest.mark.parametrize("profile", PROFILES, ids=lambda profile: profile.name)
+
+
+def shaped(effect: Effect, profile: Profile) -> ProcessModel:
+    return effect.extend(cstr(), profile).with_values(
+        {f"{effect.name}.{item.name}": SHAPE[item.name] for item in profile.parameters}
+    )
+
+
+def test_every_file_of_the_folder_is_in_the_catalogue() -> None:
+    folder = Path(catalogue.__file__).parent
+    found: set[type[Effect]] = set()
+    for file in folder.glob("*.py"):
+        module = importlib.import_module(f"{catalogue.__name__}.{file.stem}") if file.stem != "__init__" else catalogue
+        here = {item for item in vars(module).values() if isinstance(item, type) and issubclass(item, Effect)}
+        here = {item for item in here if item.__module__ == module.__name__}
+        assert here or file.stem == "__init__", f"{file.name} holds no effect"
+        if file.stem != "base":
+            found |= here
+    assert found == {type(effect) for effect in EFFECTS}
+    assert all(effect.name == type(effect).__module__.rpartition(".")[2] for effect in EFFECTS)
+
+
+@of_every_effect
+@with_every_profile
+def test_at_its_neutral_size_it_is_the_base_model(effect: Effect, profile: Profile) -> None:
+    """To the last bit, in every state and at any time, and so in a run."""
+    base, extended = cstr(), shaped(effect, profile)
+    of_base, of_extended = base.function(), extended.function()
+    rng = np.random.default_rng(6)
+    for time_min in (-700.0, 0.0, 1.2, 2.0, 3.4, 5000.0):
+        x = [rng.uniform(0, 1), rng.uniform(340, 560)]
+        u = rng.uniform(0, 200)
+        expected = of_base(x, u, base.values(), time_min, time_min)
+        found = of_extended(x, u, extended.values(), time_min, time_min)
+        for one, other in zip(expected, found, strict=True):
+            np.testing.assert_array_equal(np.array(one), np.array(other))
+    expected_run, found_run = (Simulator(model).run(TIMES, FLOWS, START) for model in (base, extended))
+    np.testing.assert_array_equal(found_run.states, expected_run.states)
+    np.testing.assert_array_equal(found_run.outputs, expected_run.outputs)
+
+
+@of_every_effect
+@with_every_profile
+def test_before_its_onset_nothing_is_different_and_after_it_something_is(effect: Effect, profile: Profile) -> None:
+    size = effect.neutral + 0.005 * (effect.upper - effect.neutral)
+    model = shaped(effect, profile).with_values({f"{effect.name}.size": size})
+    expected, found = (Simulator(item).run(TIMES, FLOWS, START).outputs for item in (cstr(), model))
+    onset = 0 if profile is CONSTANT else int(np.searchsorted(TIMES, SHAPE["onset"]))
+    np.testing.assert_array_equal(found[:onset], expected[:onset])
+    assert np.any(found[onset + 1] != expected[onset + 1])
+
+
+@of_every_effect
+def test_its_facts_make_sense(effect: Effect) -> None:
+    assert effect.lower <= effect.neutral <= effect.upper
+    assert effect.label
+    assert effect.location
+    assert set(effect.labels) <= {profile.name for profile in PROFILES}
+    for profile in PROFILES:
+        assert effect.label_with(profile) == effect.labels.get(profile.name, effect.label)
+
+
+@of_every_effect
+def test_twice_in_a_model_it_gets_a_number(effect: Effect) -> None:
+    model = effect.extend(effect.extend(cstr(), STEP), RAMP)
+    new = model.parameter_names[len(cstr().parameters) :]
+    name = effect.name
+    assert new == (f"{name}.size", f"{name}.onset", f"{name}_2.size", f"{name}_2.onset", f"{name}_2.end")
+
+
+def test_all_effects_together_at_neutral_are_the_base_model() -> None:
+    model = cstr()
+    for effect in EFFECTS:
+        model = effect.extend(model)
+    expected, found = (Simulator(item).run(TIMES, FLOWS, START).outputs for item in (cstr(), model))
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_coolant_flow_is_the_command_times_one_plus_its_size() -> None:
+    model = CoolantFlow().extend(cstr()).with_values({"coolant_flow.size": -0.05})
+    found = Simulator(model).run(TIMES, FLOWS, START).states
+    np.testing.assert_allclose(found, Simulator(cstr()).run(TIMES, 0.95 * FLOWS, START).states, rtol=1e-12)
+
+
+def test_heat_transfer_is_k3() -> None:
+    model = HeatTransfer().extend(cstr()).with_values({"heat_transfer.size": -0.3})
+    found = Simulator(model).run(TIMES, FLOWS, START).states
+    np.testing.assert_allclose(found, Simulator(cstr()).run(TIMES, FLOWS, START, {"K3": 490.0}).states, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("cause", "changes"),
+    [
+        ("reaction_rate", {"k0": 7.2e10 * 1.02, "K1": 1.44e13 * 1.02}),
+        ("activation_energy", {"E_R": 1e4 * 1.02}),
+        ("reaction_heat", {"K1": 1.44e13 * 1.02}),
+        ("feed_flow", {"q": 102.0}),
+        ("feed_temperature", {"Tf": 350.02}),
+        ("feed_concentration", {"Cf": 1.02}),
+        ("coolant_temperature", {"Tcf": 350.02}),
+    ],
+)
+def test_effects_on_a_constant_are_that_constant_changed(cause: str, changes: dict[str, float]) -> None:
+    effect = next(item for item in EFFECTS if item.name == cause)
+    found = Simulator(effect.extend(cstr())).run(TIMES, FLOWS, START, {f"{cause}.size": 0.02}).states
+    np.testing.assert_allclose(found, Simulator(cstr()).run(TIMES, FLOWS, START, changes).states, rtol=1e-12)
+
+
+def test_heat_loss_is_newton_s_cooling_to_the_surroundings() -> None:
+    """With neither reaction nor coolant: dT/dt = q/V (Tf - T) - m (T - 298), whose solution is an exponential."""
+    effect = next(item for item in EFFECTS if item.name == "heat_loss")
+    model = effect.extend(cstr()).with_values({"k0": 0.0, "K1": 0.0, "K2": 0.0, "heat_loss.size": 0.5})
+    rest = (350.0 + 0.5 * 298.0) / 1.5
+    found = Simulator(model).run(TIMES, FLOWS, START).outputs[:, 1]
+    np.testing.assert_allclose(found, rest + (START[1] - rest) * np.exp(-1.5 * TIMES), rtol=0, atol=1e-5)
+
+
+def test_effects_on_the_analyser_change_what_it_shows_and_nothing_else() -> None:
+    nominal = Simulator(cstr()).run(TIMES, FLOWS, START)
+    for cause, factor, shift in (("concentration_bias", 1.0, 0.01), ("concentration_gain", 1.01, 0.0)):
+        effect = next(item for item in EFFECTS if item.name == cause)
+        run = Simulator(effect.extend(cstr())).run(TIMES, FLOWS, START, {f"{cause}.size": 0.01})
+        np.testing.assert_array_equal(run.states, nominal.states)
+        np.testing.assert_array_equal(run.outputs[:, 1], nominal.outputs[:, 1])
+        np.testing.assert_allclose(run.outputs[:, 0], factor * nominal.outputs[:, 0] + shift, rtol=1e-14)
+
+
+def test_profiles_go_in_time_as_they_say() -> None:
+    """Read off the bias of the thermometer, which is the profile itself."""
+    bias = next(item for item in EFFECTS if item.name == "temperature_bias")
+    since = np.maximum(TIMES - 1.2, 0)
+    on = TIMES >= 1.2
+    expected = {
+        "constant": np.full(60, 3.0),
+        "step": 3.0 * on,
+        "ramp": 3.0 * np.minimum(since / 2.2, 1),
+        "decay": 3.0 * on * (1 - np.exp(-since / 0.5)),
+        "sine": 3.0 * on * np.sin(2 * np.pi * since / 2.5 + 0.4),
+    }
+    nominal = Simulator(cstr()).run(TIMES, FLOWS, START).outputs
+    assert {profile.name for profile in PROFILES} == set(expected)
+    for profile in PROFILES:
+        run = Simulator(shaped(bias, profile)).run(TIMES, FLOWS, START, {"temperature_bias.size": 3.0})
+        np.testing.assert_allclose(run.outputs[:, 1] - nominal[:, 1], expected[profile.name], atol=1e-9)
+        np.testing.assert_array_equal(run.outputs[:, 0], nominal[:, 0])

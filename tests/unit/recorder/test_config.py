@@ -1,0 +1,69 @@
+"""The settings of the recorder and of the replay, and what a file is called."""
+
+import math
+import sys
+from datetime import datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+
+from reactorwatch.errors import InputError
+from reactorwatch.runtime.config import section
+from reactorwatch.runtime.entry import main
+from recorder.__main__ import file_for, run
+from recorder.config import RecorderConfig, ReplayConfig
+
+NOON_IN_BERLIN = datetime(2026, 7, 1, 12, 0, 5, tzinfo=timezone(timedelta(hours=2)))
+
+
+def test_the_defaults_record_everything() -> None:
+    config = section(RecorderConfig, "recorder", {}, {})
+    assert (config.plant, config.key_expression, config.health_period_s) == ("cstr", "reactor/**", 5.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"plant": "a/b"}, "plant name must be"),
+        ({"health_period_s": 0.0}, "health_period_s must be positive and finite, got 0.0"),
+        ({"flush_period_s": math.inf}, "flush_period_s must be positive and finite, got inf"),
+        ({"period": 1}, "unknown key 'period'"),
+    ],
+)
+def test_a_setting_that_makes_no_sense_is_told_in_one_line(values: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        section(RecorderConfig, "recorder", {"recorder": values}, {})
+
+
+def test_a_replay_may_be_as_fast_as_it_goes_but_not_stand_still() -> None:
+    assert section(ReplayConfig, "replay", {}, {"file": "x.csv", "rate": math.inf}).rate == math.inf
+    with pytest.raises(InputError, match=r"rate must be positive, got 0\.0"):
+        section(ReplayConfig, "replay", {}, {"file": "x.csv", "rate": 0.0})
+    with pytest.raises(InputError, match="file"):
+        section(ReplayConfig, "replay", {}, {})
+
+
+def test_a_file_is_named_after_the_plant_and_the_time_in_utc(tmp_path: Path) -> None:
+    config = RecorderConfig(plant="cstr", out=str(tmp_path))
+    assert file_for(config, NOON_IN_BERLIN) == tmp_path / "cstr-20260701T100005Z.mcap"
+
+
+def test_out_may_name_the_file(tmp_path: Path) -> None:
+    config = RecorderConfig(out=str(tmp_path / "run.mcap"))
+    assert file_for(config, NOON_IN_BERLIN) == tmp_path / "run.mcap"
+
+
+def test_the_process_ends_with_2_and_one_line_before_it_looks_for_a_router(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text(f'[recorder]\nout = "{tmp_path}/none/run.mcap"\n')
+    monkeypatch.setattr(sys, "argv", ["recorder", str(settings)])
+    assert main("recorder", "recorder", RecorderConfig, run) == 2
+    assert (
+        capsys.readouterr().err
+        == f"recorder: recording {tmp_path}/none/run.mcap: the folder {tmp_path}/none does not exist\n"
+    )
+    monkeypatch.setattr(sys, "argv", ["recorder", "a", "b"])
+    assert main("recorder", "recorder", RecorderConfig, run) == 2
+    assert "usage: python -m recorder [settings.toml]" in capsys.readouterr().err

@@ -1,0 +1,92 @@
+"""Import and export: between records and recordings."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.records.record import Record
+from recorder.convert import export_csv, import_csv
+from recorder.mcap_file import read_messages, read_metadata, read_record
+from tests.unit.records.test_csv_file import assert_same
+
+
+@given(
+    steps=st.lists(st.integers(1, 10**9), min_size=1, max_size=30),
+    start_us=st.integers(0, 10**12),
+    values=arrays(np.float64, (3, 30), elements=st.floats(allow_infinity=False)),
+    zero_ns=st.sampled_from([0, 1_700_000_000_123_456_789]),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=30)
+def test_import_and_then_export_give_the_identical_rows(
+    tmp_path: Path, steps: list[int], start_us: int, values: np.ndarray, zero_ns: int
+) -> None:
+    """Times in whole microseconds, as decimal minutes or as seconds over 60."""
+    times = (start_us + np.cumsum(steps)) / 60e6
+    columns = {signal: values[number, : times.size] for number, signal in enumerate(("qc", "C", "T"))}
+    record = Record(times, columns, "run.csv")
+    write_csv(tmp_path / "run.csv", record)
+    assert import_csv(tmp_path / "run.csv", tmp_path / "run.mcap", "cstr", zero_ns=zero_ns) == record.rows
+    assert export_csv(tmp_path / "run.mcap", tmp_path / "again.csv") == record.rows
+    assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "run.csv").read_bytes()
+    assert_same(read_record(tmp_path / "run.mcap"), read_csv(tmp_path / "run.csv"))
+
+
+def test_the_measured_record_comes_back_identical(tmp_path: Path, daisy_csv: Path) -> None:
+    rows = import_csv(daisy_csv, tmp_path / "daisy.mcap", "cstr")
+    assert rows == export_csv(tmp_path / "daisy.mcap", tmp_path / "daisy.csv", "cstr") == 7500
+    assert_same(read_csv(tmp_path / "daisy.csv"), read_csv(daisy_csv))
+
+
+def test_an_imported_record_is_a_recording_received_when_it_was_measured(tmp_path: Path) -> None:
+    csv, mcap = tmp_path / "run.csv", tmp_path / "run.mcap"
+    csv.write_text("t,qc,C,T\n6,1,2,3\n12,4,5,6\n")
+    import_csv(csv, mcap, "site", {"time_s": "t"}, zero_ns=1000)
+    entries = list(read_messages(mcap))
+    assert [entry.key.rsplit("/", 1)[1] for entry in entries] == ["qc", "C", "T"] * 2
+    assert {entry.key.split("/")[1] for entry in entries} == {"site"}
+    assert [entry.log_time_ns for entry in entries] == [6_000_001_000] * 3 + [12_000_001_000] * 3
+    assert [entry.publish_time_ns for entry in entries] == [entry.log_time_ns for entry in entries]
+    metadata = read_metadata(mcap)
+    assert (metadata["plant"], metadata["source"], metadata["zero_ns"]) == ("site", "run.csv", "1000")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("time_min,qc,C,T\n0,1,2,3\n1,x,2,3\n", "row 3, column 'qc'"),
+        (
+            "time_min,qc,C,T\n-1,1,2,3\n1,1,2,3\n",
+            "times must lie between 1970 and 2262 to be recorded, got -60000000000 ns",
+        ),
+        ("time_min,qc,C,T\n0,1,2,3\n1e12,1,2,3\n", "times must lie between 1970 and 2262"),
+        ("time_s,qc,C,T\n0,1,2,3\n1e-9,1,2,3\n", "at least 1 microsecond apart to be recorded, got 0.0 and"),
+    ],
+)
+def test_a_record_that_cannot_be_recorded_leaves_nothing_behind(tmp_path: Path, text: str, said: str) -> None:
+    csv = tmp_path / "run.csv"
+    csv.write_text(text)
+    with pytest.raises(InputError, match=said):
+        import_csv(csv, tmp_path / "run.mcap", "cstr")
+    assert list(tmp_path.iterdir()) == [csv]
+
+
+def test_a_bad_name_of_a_plant_leaves_nothing_behind(tmp_path: Path) -> None:
+    csv = tmp_path / "run.csv"
+    csv.write_text("time_min,qc,C,T\n0,1,2,3\n")
+    with pytest.raises(InputError, match="plant name must be"):
+        import_csv(csv, tmp_path / "run.mcap", "a/b")
+    assert list(tmp_path.iterdir()) == [csv]
+
+
+def test_an_older_recording_is_replaced(tmp_path: Path) -> None:
+    csv, mcap = tmp_path / "run.csv", tmp_path / "run.mcap"
+    csv.write_text("time_min,qc,C,T\n0,1,2,3\n")
+    mcap.write_text("old")
+    assert import_csv(csv, mcap, "cstr") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.csv", "run.mcap"]

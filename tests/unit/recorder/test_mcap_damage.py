@@ -1,0 +1,100 @@
+"""Damaged recordings: one clear line, never a traceback, and never a wrong message."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from reactorwatch.errors import InputError
+from recorder.entry import Entry
+from recorder.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
+from tests.unit.recorder import golden
+
+ENTRIES = [entry for entry in golden.entries() if "/sample/" in entry.key][:60]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A recording of three chunks."""
+    path = tmp_path_factory.mktemp("whole") / "run.mcap"
+    with RecordingWriter(path, {}) as writer:
+        for number, entry in enumerate(ENTRIES):
+            writer.write(entry)
+            if number % 20 == 19:
+                writer.flush()
+    return path.read_bytes()
+
+
+def read(path: Path) -> list[Entry] | str:
+    """What is in a file, or the line that says why it cannot be told."""
+    try:
+        return list(read_messages(path))
+    except InputError as error:
+        return str(error)
+
+
+def reads_as(path: Path, contents: Iterator[bytes]) -> list[list[Entry] | str]:
+    found = []
+    for content in contents:
+        path.write_bytes(content)
+        found.append(read(path))
+    return found
+
+
+def test_a_file_that_is_cut_off_anywhere_is_known_as_such(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    for said in reads_as(path, (whole[:length] for length in range(8, len(whole), 7))):
+        assert isinstance(said, str)
+        assert said.startswith(f"{path}: is cut off")
+        assert f"`reactorwatch recover {path}`" in said
+
+
+def test_a_byte_that_is_wrong_is_found_or_does_no_harm(tmp_path: Path, whole: bytes) -> None:
+    def wrong() -> Iterator[bytes]:
+        for place in range(0, len(whole), 3):
+            yield whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :]
+
+    results = reads_as(tmp_path / "run.mcap", wrong())
+    assert all(isinstance(result, str) or result == ENTRIES for result in results)
+    said = "\n".join(result for result in results if isinstance(result, str))
+    assert "another kind of file" in said
+    assert "is cut off" in said
+    assert "its index is damaged" in said
+    assert "the chunk at byte" in said
+    assert len(said.splitlines()) == sum(isinstance(result, str) for result in results)
+
+
+def test_a_chunk_of_zeros_names_its_place_and_keeps_what_came_before(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    at = whole.index(b"\x28\xb5\x2f\xfd", whole.index(b"\x28\xb5\x2f\xfd") + 1)  # second frame of zstd
+    path.write_bytes(whole[:at] + bytes(50) + whole[at + 50 :])
+    messages = read_messages(path)
+    assert [next(messages) for _ in range(20)] == ENTRIES[:20]
+    with pytest.raises(InputError, match=r"the chunk at byte \d+ cannot be read .*recover"):
+        next(messages)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "expected an MCAP recording, got an empty file"),
+        (b"time_min,qc,C,T\n", "expected an MCAP recording, got another kind of file"),
+        (b"PK\x03\x04", "expected an MCAP recording, got another kind of file"),
+    ],
+)
+def test_what_is_no_recording_is_told_as_such_and_offers_no_rescue(tmp_path: Path, content: bytes, said: str) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(content)
+    assert read(path) == f"{path}: {said}"
+
+
+def test_every_way_of_reading_says_the_same_and_says_it_at_the_call(tmp_path: Path, whole: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(whole[:-1])
+    for reading in (read_messages, read_record, read_metadata, plants_in):
+        with pytest.raises(InputError, match="is cut off"):
+            reading(path)
+        with pytest.raises(InputError, match="there is no such file"):
+            reading(tmp_path / "none.mcap")
+        with pytest.raises(InputError, match="cannot be read: Is a directory"):
+            reading(tmp_path)

@@ -1,0 +1,103 @@
+"""The recorder as a node on a bus within the process."""
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from reactorwatch.contract import keys
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import Encoded, decode, encode
+from reactorwatch.runtime.bus import Exchange, MemoryBus
+from reactorwatch.runtime.serve import StopSignal, serve
+from recorder.core import Recorder
+from recorder.entry import Entry
+from recorder.mcap_file import RecordingWriter, read_messages
+from recorder.node import RecorderNode
+from tests.unit.recorder import golden
+
+SECOND = 10**9
+
+
+def node_on(path: Path, start_ns: int = 0) -> tuple[RecorderNode, RecordingWriter]:
+    writer = RecordingWriter(path, {})
+    return RecorderNode(Recorder("cstr", start_ns), writer, 5 * SECOND, 1 * SECOND, start_ns), writer
+
+
+def of_health(entry: Entry) -> messages.Health:
+    health = decode(entry.payload, entry.encoding)
+    assert isinstance(health, messages.Health)
+    return health
+
+
+def test_all_that_is_published_is_in_the_file_in_order_and_health_is_in_it_once(tmp_path: Path) -> None:
+    exchange, stop, ready = Exchange(), StopSignal(), threading.Event()
+    node, writer = node_on(tmp_path / "run.mcap")
+    reports: list[Encoded] = []
+    MemoryBus(exchange).subscribe("reactor/cstr/health/recorder", reports.append)
+
+    def run() -> None:
+        with writer:
+            serve(node, MemoryBus(exchange), stop, subscriptions=(keys.EVERYTHING,), on_ready=ready.set)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    assert ready.wait(10)
+    plant = MemoryBus(exchange)
+    published = [encode(publication) for publication in golden.publications()]
+    for message in published:
+        plant.publish(message)
+    plant.publish(Encoded("elsewhere/x", b"", ""))
+    stop.set()
+    thread.join(10)
+    entries = list(read_messages(tmp_path / "run.mcap"))
+    own = [entry for entry in entries if entry.key == "reactor/cstr/health/recorder"]
+    others = [entry for entry in entries if entry not in own]
+    assert [entry[:3] for entry in others] == [message[:3] for message in published]
+    assert [entry.payload for entry in own] == [report.payload for report in reports]
+    assert of_health(own[-1]).phase == "stopped"
+    assert of_health(own[-1]).received == len(entries) - 1  # all but this report itself
+    assert entries[-1] == own[-1]
+
+
+def test_it_reports_at_once_and_then_every_period_and_flushes_between(tmp_path: Path) -> None:
+    node, writer = node_on(tmp_path / "run.mcap", start_ns=100 * SECOND)
+    part = tmp_path / "run.mcap.part"
+    with writer:
+        reported, grown = [], []
+        while node.next_tick_ns() < 112 * SECOND:
+            now = node.next_tick_ns()
+            node.on_message(encode(next(golden.publications())), now)
+            size = part.stat().st_size
+            if node.on_tick(now):
+                reported.append(now // SECOND)
+            if part.stat().st_size > size:
+                grown.append(now // SECOND)
+    assert reported == [100, 105, 110]
+    assert grown == list(range(101, 112))
+
+
+def test_it_takes_no_commands(tmp_path: Path) -> None:
+    node, writer = node_on(tmp_path / "run.mcap")
+    with writer:
+        reply, published = node.on_command(Encoded("reactor/cstr/command/x", b"", ""), 0)
+    assert not reply.accepted
+    assert published == []
+
+
+def test_the_file_is_closed_when_the_loop_ends_by_an_exception(tmp_path: Path) -> None:
+    class Broken(MemoryBus):
+        def subscribe(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
+            handler(message)
+            stop.set()
+
+        def publish(self, message: Encoded) -> None:
+            raise ConnectionError("the link is gone")
+
+    stop = StopSignal()
+    message = encode(next(golden.publications()))
+    node, writer = node_on(tmp_path / "run.mcap")
+    with pytest.raises(ConnectionError), writer:
+        serve(node, Broken(Exchange()), stop, subscriptions=(keys.EVERYTHING,))
+    assert next(read_messages(tmp_path / "run.mcap")).payload == message.payload

@@ -1,0 +1,58 @@
+"""A file that is written beside its place."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.atomic import replacing
+
+
+def test_the_new_file_takes_the_place_of_the_old_when_the_block_ends(tmp_path: Path) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("old")
+    with replacing(path) as temporary:
+        temporary.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
+def test_an_exception_leaves_the_old_file_and_nothing_beside_it(tmp_path: Path, error: BaseException) -> None:
+    path = tmp_path / "run.csv"
+    path.write_text("old")
+
+    def fail() -> None:
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise error
+
+    with pytest.raises(type(error)):
+        fail()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("no/such/run.csv", "the folder .*no/such does not exist"),
+        ("a_file/run.csv", "the folder .*a_file does not exist"),
+        ("a_folder", "it is a folder"),
+        ("x" * 300, "File name too long"),
+    ],
+)
+def test_where_nothing_can_be_written_it_says_so_before_the_work(tmp_path: Path, name: str, said: str) -> None:
+    (tmp_path / "a_file").write_text("")
+    (tmp_path / "a_folder").mkdir()
+    with pytest.raises(InputError, match=said), replacing(tmp_path / name):
+        pytest.fail("the block must not run")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_without_permission_is_an_input_error(tmp_path: Path) -> None:
+    tmp_path.chmod(0o500)
+    with pytest.raises(InputError, match="Permission denied"), replacing(tmp_path / "run.csv"):
+        pytest.fail("the block must not run")

@@ -1,0 +1,188 @@
+"""Records as CSV."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.records.record import Record
+
+PLAIN = "time_min,qc,C,T\n0.1,100,0.1,438\n0.2,101,0.2,439\n0.5,102,0.3,440\n"
+
+
+def written(folder: Path, text: str | bytes) -> Path:
+    path = folder / "run.csv"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def assert_same(record: Record, other: Record) -> None:
+    assert np.array_equal(record.time_min, other.time_min)
+    assert list(record.columns) == list(other.columns)
+    for signal, values in record.columns.items():
+        assert np.array_equal(values, other.columns[signal], equal_nan=True)
+
+
+def test_columns_are_found_by_name(tmp_path: Path) -> None:
+    record = read_csv(written(tmp_path, "T,comment,C,time_min,qc\n438,a,0.1,0.1,100\n439,b b,0.2,0.25,101\n"))
+    assert record.time_min.tolist() == [0.1, 0.25]
+    assert {name: values.tolist() for name, values in record.columns.items()} == {
+        "qc": [100.0, 101.0],
+        "C": [0.1, 0.2],
+        "T": [438.0, 439.0],
+    }
+    assert record.name == "run.csv"
+
+
+def test_the_file_may_have_other_names(tmp_path: Path) -> None:
+    path = written(tmp_path, "t,flow,conc,reactor_temp\n6,100,0.1,438\n12,101,0.2,439\n")
+    record = read_csv(path, {"time_s": "t", "qc": "flow", "C": "conc", "T": "reactor_temp"})
+    assert record.time_min.tolist() == [0.1, 0.2]
+    assert record.columns["T"].tolist() == [438.0, 439.0]
+
+
+def test_seconds_are_divided_by_sixty(tmp_path: Path) -> None:
+    record = read_csv(written(tmp_path, "time_s,qc,C,T\n7,1,2,3\n61,1,2,3\n"))
+    assert record.time_min.tolist() == [7 / 60, 61 / 60]
+
+
+CLOTHES = {
+    "plain": PLAIN,
+    "BOM": "\ufeff" + PLAIN,
+    "CRLF": PLAIN.replace("\n", "\r\n"),
+    "CR": PLAIN.replace("\n", "\r"),
+    "no last newline": PLAIN.rstrip("\n"),
+    "blank end": PLAIN + "\n \n",
+    "blank start": "\n" + PLAIN,
+    "quoted header": PLAIN.replace("time_min,qc,C,T", '"time_min","qc","C","T"'),
+    "spaces": PLAIN.replace(",", " , "),
+    "quoted cell": PLAIN.replace("101", '"101"'),
+}
+
+
+@pytest.mark.parametrize("text", CLOTHES.values(), ids=list(CLOTHES))
+def test_the_same_record_in_the_clothes_of_other_programs(tmp_path: Path, text: str) -> None:
+    record = read_csv(written(tmp_path, text))
+    assert record.time_min.tolist() == [0.1, 0.2, 0.5]
+    assert record.columns["qc"].tolist() == [100.0, 101.0, 102.0]
+
+
+@pytest.mark.parametrize("quote", ["", '"'], ids=["at once", "row by row"])
+def test_an_empty_cell_was_not_measured(tmp_path: Path, quote: str) -> None:
+    record = read_csv(written(tmp_path, f"time_min,qc,C,T\n0,{quote}1{quote},,\n1,,,3\n2,,4,nan\n3,5, ,6"))
+    assert np.array_equal(record.columns["qc"], [1, np.nan, np.nan, 5], equal_nan=True)
+    assert np.array_equal(record.columns["C"], [np.nan, np.nan, 4, np.nan], equal_nan=True)
+    assert np.array_equal(record.columns["T"], [np.nan, 3, np.nan, 6], equal_nan=True)
+
+
+def test_a_signal_that_is_not_required_may_be_absent(tmp_path: Path) -> None:
+    record = read_csv(written(tmp_path, "time_min,qc\n0,1\n"), required=("qc",))
+    assert list(record.columns) == ["qc"]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "expected a header and rows, got an empty file"),
+        (" \n\n", "expected a header and rows, got an empty file"),
+        ('""\n', "row 1: expected a column 'time_min' or 'time_s' in the header"),
+        ("time_min,qc,C,T\n", "expected rows below the header, got none"),
+        ("time_min,qc,C,T", "expected rows below the header, got none"),
+        ("time_min;qc;C;T\n0;1;2;3\n", "the cells must be separated by commas"),
+        (
+            "t,qc,C,T\n0,1,2,3\n",
+            "row 1: expected a column 'time_min' or 'time_s' in the header, got 't', 'qc'",
+        ),
+        ("time_min,qc,C\n0,1,2\n", "row 1: expected a column 'T' in the header, got 'time_min', 'qc', 'C'"),
+        ("time_min,qc,C,T,C\n0,1,2,3,4\n", "row 1: expected each column name once, got 'C' more than once"),
+        (PLAIN.replace("0.2,101", "0.2,1o1"), "row 3, column 'qc': expected a finite number or nothing, got '1o1'"),
+        (PLAIN.replace("0.2,101", "0.2,inf"), "row 3, column 'qc': expected a finite number or nothing, got 'inf'"),
+        (PLAIN.replace("0.2,101", "0.2,1_0"), "row 3, column 'qc': expected a finite number or nothing, got '1_0'"),
+        (PLAIN.replace("0.2,", "x,"), "row 3, column 'time_min': expected a finite number, got 'x'"),
+        (
+            PLAIN.replace("0.2,", ","),
+            "row 3, column 'time_min': expected a time after 0.1, that of the row before, got ''",
+        ),
+        (PLAIN.replace("0.1,100", ",100"), "row 2, column 'time_min': expected a time, got ''"),
+        (
+            PLAIN.replace("0.2,", "0.1,"),
+            "row 3, column 'time_min': expected a time after 0.1, that of the row before, got",
+        ),
+        (PLAIN.replace("0.5,", "0.15,"), "row 4, column 'time_min': expected a time after 0.2"),
+        (PLAIN.replace("\n0.5", "\n\n\n0.15"), "row 6, column 'time_min': expected a time after 0.2"),
+        (PLAIN.replace(",440", ""), "row 4: expected 4 cells as in the header, got 3"),
+        (PLAIN.replace("101,0.2", "101,0,2"), "row 3: expected 4 cells as in the header, got 5"),
+        (PLAIN + '0.6,"1,2,3\n', "row 5: expected comma separated cells"),
+        (b"time_min,qc,C,T\n0,1,2,\xb0\n", "row 2: expected UTF-8 text, got byte 0xb0"),
+        (PLAIN.encode("utf-16"), "expected a CSV file, got binary data"),
+        (b"\x89MCAP0\r\n" + bytes(100), "expected a CSV file, got an MCAP recording"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_told_in_one_line(tmp_path: Path, text: str | bytes, said: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(InputError) as error:
+        read_csv(path)
+    assert said in str(error.value)
+    assert str(error.value).startswith(str(path))
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_cannot_be_opened_is_told_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no such file"):
+        read_csv(tmp_path / "none.csv")
+    with pytest.raises(InputError, match="expected a CSV file, got a folder"):
+        read_csv(tmp_path)
+
+
+def test_a_name_that_is_asked_for_must_be_there_and_be_known(tmp_path: Path) -> None:
+    path = written(tmp_path, PLAIN)
+    with pytest.raises(InputError, match="expected a column 'temp' in the header"):
+        read_csv(path, {"T": "temp"})
+    with pytest.raises(InputError, match=r"unknown column 'Q' asked for \(valid: time_min, time_s, qc, C, T\)"):
+        read_csv(path, {"Q": "qc"})
+
+
+def test_reading_row_by_row_gives_what_reading_at_once_gives(tmp_path: Path) -> None:
+    """A quoted cell is what sends a file the slow way."""
+    generator = np.random.default_rng(1)
+    values = generator.normal(size=(200, 3))
+    rows = [f"{number * 0.1!r},{','.join(map(repr, row))}" for number, row in enumerate(values.tolist())]
+    text = "time_min,qc,C,T\n" + "\n".join(rows)
+    at_once = read_csv(written(tmp_path, text))
+    assert_same(read_csv(written(tmp_path, text.replace("\n0.0,", '\n"0.0",'))), at_once)
+    assert np.array_equal(at_once.columns["T"], values[:, 2])
+
+
+def test_writing_replaces_what_was_there_and_names_the_columns(tmp_path: Path) -> None:
+    path = written(tmp_path, "old")
+    write_csv(path, Record(np.array([0.1, 0.2]), {"qc": np.array([100.0, np.nan]), "T": np.array([1e-5, 438.54])}, "x"))
+    assert path.read_text() == "time_min,qc,T\n0.1,100.0,1e-05\n0.2,,438.54\n"
+
+
+def test_an_infinite_value_is_not_written(tmp_path: Path) -> None:
+    record = Record(np.array([0.1]), {"qc": np.array([np.inf])}, "x")
+    with pytest.raises(ValueError, match="column 'qc' must be finite or NaN"):
+        write_csv(tmp_path / "run.csv", record)
+    assert not list(tmp_path.iterdir())
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(
+    times=st.lists(finite, min_size=1, max_size=20, unique=True).map(sorted),
+    values=arrays(np.float64, (3, 20), elements=st.floats(allow_infinity=False)),
+)
+def test_what_is_written_reads_back_exactly(
+    tmp_path_factory: pytest.TempPathFactory, times: list[float], values: np.ndarray
+) -> None:
+    path = tmp_path_factory.mktemp("csv") / "run.csv"
+    columns = {signal: values[number, : len(times)] for number, signal in enumerate(("qc", "C", "T"))}
+    record = Record(np.array(times), columns, "run.csv")
+    write_csv(path, record)
+    assert_same(read_csv(path), record)

@@ -1,0 +1,67 @@
+"""The bus within a process behaves like the real one: the same keys reach the same ears."""
+
+import pytest
+
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.runtime.bus import Exchange, MemoryBus, Request, matches
+
+
+@pytest.mark.parametrize(
+    ("expression", "key", "expected"),
+    [
+        ("a/b", "a/b", True),
+        ("a/*", "a/b", True),
+        ("a/*", "a/b/c", False),
+        ("a/**", "a/b/c", True),
+        ("a/**", "a", True),
+        ("**", "a/b", True),
+        ("a/**/c", "a/c", True),
+        ("a/**/c", "a/b/b/c", True),
+        ("a/**/c", "a/b", False),
+        ("a/b*", "a/bc", True),
+        ("a.b/c", "aXb/c", False),
+    ],
+)
+def test_key_expressions_match_as_zenoh_says(expression: str, key: str, expected: bool) -> None:
+    """https://zenoh.io/docs/manual/abstractions/#key-expression."""
+    import zenoh
+
+    assert matches(expression, key) is expected
+    if "b*" not in expression:  # Zenoh writes a part of a part as $*
+        assert zenoh.KeyExpr(expression).intersects(zenoh.KeyExpr(key)) is expected
+
+
+def test_what_one_publishes_the_others_hear() -> None:
+    exchange, heard = Exchange(), list[Encoded]()
+    listener, speaker = MemoryBus(exchange), MemoryBus(exchange)
+    listener.subscribe("reactor/*/sample/**", heard.append)
+    message = Encoded("reactor/cstr/sample/T", b"1", "x")
+    speaker.publish(message)
+    speaker.publish(Encoded("reactor/cstr/health/plant", b"2", "x"))
+    assert heard == [message]
+    listener.close()
+    speaker.publish(message)
+    assert heard == [message]
+
+
+def test_a_question_is_answered_by_who_listens_there() -> None:
+    exchange = Exchange()
+    server, client = MemoryBus(exchange), MemoryBus(exchange)
+
+    def reply(request: Request) -> None:
+        request.reply(CommandReply(accepted=True, text=request.question.key))
+
+    server.answer("reactor/cstr/command/*", reply)
+    (answer,) = client.ask(Encoded("reactor/cstr/command/set_input", b"", ""), 1.0)
+    assert CommandReply.FromString(answer.payload).text == "reactor/cstr/command/set_input"
+    assert client.ask(Encoded("reactor/other/command/set_input", b"", ""), 1.0) == []
+
+
+def test_a_token_is_seen_by_those_who_come_late_and_goes_with_its_bus() -> None:
+    exchange, seen = Exchange(), list[tuple[str, bool]]()
+    node, watcher = MemoryBus(exchange), MemoryBus(exchange)
+    node.announce("reactor/cstr/alive/monitor")
+    watcher.watch_alive("reactor/cstr/alive/*", lambda key, alive: seen.append((key, alive)))
+    node.close()
+    assert seen == [("reactor/cstr/alive/monitor", True), ("reactor/cstr/alive/monitor", False)]

@@ -1,0 +1,189 @@
+"""The loop of the nodes: nothing that arrives is lost, ticks come when they are due, a stop is heard at once."""
+
+import threading
+import time
+
+import pytest
+
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import CommandReply, Health
+from reactorwatch.runtime.bus import Exchange, MemoryBus
+from reactorwatch.runtime.serve import StopSignal, serve
+
+FAR = 10**19
+
+
+class Echo:
+    """A node that publishes a Health for all that happens to it."""
+
+    def __init__(self, ticks: int = 0, messages: int | None = None) -> None:
+        self.heard: list[Encoded] = []
+        self.ticks: list[int] = []
+        self.stopped = False
+        self._ticks, self._messages = ticks, messages
+
+    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
+        self.heard.append(message)
+        return [Publication("out/message", Health(time_ns=now_ns))]
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
+        return CommandReply(accepted=True, text=question.payload.decode()), []
+
+    def on_tick(self, now_ns: int) -> list[Publication]:
+        self.ticks.append(now_ns)
+        return [Publication("out/tick", Health(time_ns=now_ns))]
+
+    def next_tick_ns(self) -> int:
+        return 0 if len(self.ticks) < self._ticks else FAR
+
+    @property
+    def finished(self) -> bool:
+        ticked = self._messages is None and len(self.ticks) == self._ticks > 0
+        return ticked or (self._messages is not None and len(self.heard) >= self._messages)
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        self.stopped = True
+        return [Publication("out/stop", Health(time_ns=now_ns))]
+
+
+def test_a_node_that_is_finished_ends_the_loop_with_its_last_words() -> None:
+    exchange, said = Exchange(), list[str]()
+    MemoryBus(exchange).subscribe("out/*", lambda message: said.append(message.key))
+    node = Echo(ticks=3)
+    serve(node, MemoryBus(exchange), StopSignal())
+    assert said == ["out/tick"] * 3 + ["out/stop"]
+
+
+def test_every_message_is_handed_over_in_order() -> None:
+    exchange = Exchange()
+    node, speaker, ready = Echo(messages=5000), MemoryBus(exchange), threading.Event()
+    thread = threading.Thread(
+        target=serve,
+        args=(node, MemoryBus(exchange), StopSignal()),
+        kwargs={"subscriptions": ("in/**",), "on_ready": ready.set},
+    )
+    thread.start()
+    assert ready.wait(10)
+    for number in range(5000):
+        speaker.publish(Encoded(f"in/{number}", b"", ""))
+    thread.join(20)
+    assert not thread.is_alive()
+    assert [message.key for message in node.heard] == [f"in/{number}" for number in range(5000)]
+
+
+def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The inbox stays within its bound, and nothing is lost."""
+    monkeypatch.setattr("reactorwatch.runtime.serve.LARGEST_INBOX", 100)
+    exchange, count = Exchange(), 5000
+    handled, ahead = [0], [0]
+
+    class Slow(Echo):
+        def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
+            sum(range(2000))
+            handled[0] += 1
+            return super().on_message(message, now_ns)
+
+    node, speaker, ready = Slow(messages=count), MemoryBus(exchange), threading.Event()
+    thread = threading.Thread(
+        target=serve,
+        args=(node, MemoryBus(exchange), StopSignal()),
+        kwargs={"subscriptions": ("in/**",), "on_ready": ready.set},
+    )
+    thread.start()
+    assert ready.wait(10)
+    for number in range(count):
+        speaker.publish(Encoded(f"in/{number}", b"", ""))
+        ahead[0] = max(ahead[0], number + 1 - handled[0])
+    thread.join(60)
+    assert not thread.is_alive()
+    assert len(node.heard) == count
+    assert ahead[0] <= 100 + 2
+
+
+def test_a_stop_wakes_a_loop_that_waits_for_nothing() -> None:
+    stop, node = StopSignal(), Echo()
+    thread = threading.Thread(target=serve, args=(node, MemoryBus(Exchange()), stop))
+    thread.start()
+    stop.set()
+    thread.join(20)
+    assert not thread.is_alive()
+    assert node.stopped
+
+
+def test_what_arrived_before_the_stop_is_still_handled() -> None:
+    exchange, stop, node = Exchange(), StopSignal(), Echo()
+    bus, speaker = MemoryBus(exchange), MemoryBus(exchange)
+
+    def arrive_and_stop() -> None:
+        for number in range(1000):
+            speaker.publish(Encoded(f"in/{number}", b"", ""))
+        stop.set()
+
+    serve(node, bus, stop, subscriptions=("in/**",), on_ready=arrive_and_stop)
+    assert len(node.heard) == 1000
+
+
+def test_lingering_hears_what_comes_within_it() -> None:
+    exchange, stop, node = Exchange(), StopSignal(), Echo()
+    bus, speaker = MemoryBus(exchange), MemoryBus(exchange)
+    said: list[threading.Thread] = []
+
+    def later() -> None:
+        thread = threading.Thread(target=lambda: speaker.publish(Encoded("in/late", b"", "")))
+        said.append(thread)
+        stop.set()
+        thread.start()
+
+    serve(node, bus, stop, subscriptions=("in/**",), on_ready=later, linger_s=1.0)
+    said[0].join()
+    assert [message.key for message in node.heard] == ["in/late"]
+
+
+def test_a_bus_that_never_falls_silent_does_not_keep_a_node_from_ending() -> None:
+    exchange, stop, node = Exchange(), StopSignal(), Echo()
+    bus, speaker = MemoryBus(exchange), MemoryBus(exchange)
+    ended = threading.Event()
+
+    def chatter() -> None:
+        while not ended.is_set():
+            speaker.publish(Encoded("in/x", b"", ""))
+            time.sleep(0)  # let the loop have its turn
+
+    thread = threading.Thread(target=chatter)
+
+    def ready() -> None:
+        thread.start()
+        stop.set()
+
+    try:
+        serve(node, bus, stop, subscriptions=("in/**",), on_ready=ready, linger_s=0.01)
+    finally:
+        ended.set()
+        thread.join()
+    assert node.stopped
+
+
+def test_a_question_is_answered_by_the_node() -> None:
+    exchange, stop, node, ready = Exchange(), StopSignal(), Echo(), threading.Event()
+    answered = threading.Event()
+
+    class Question:
+        question = Encoded("command/x", b"hello", "")
+        answer: CommandReply | None = None
+
+        def reply(self, message: CommandReply) -> None:
+            self.answer = message
+            answered.set()
+
+    asked = Question()
+    bus = MemoryBus(exchange)
+    thread = threading.Thread(
+        target=serve, args=(node, bus, stop), kwargs={"commands": ("command/*",), "on_ready": ready.set}
+    )
+    thread.start()
+    assert ready.wait(10)
+    exchange.answerers[0][2](asked)  # type: ignore[arg-type]
+    assert answered.wait(10)
+    stop.set()
+    thread.join(20)
+    assert asked.answer == CommandReply(accepted=True, text="hello")

@@ -1,0 +1,33 @@
+"""Every file of a family is in its catalogue, and every file of a catalogue's folder is of the family."""
+
+from pathlib import Path
+
+import pytest
+
+import monitor_node.charts
+import reactorwatch.process.effects
+import recorder.panels
+from recorder.panels.base import Panel
+
+FAMILIES = {
+    "effects": (reactorwatch.process.effects, {type(e).__module__ for e in reactorwatch.process.effects.EFFECTS}),
+    "charts": (monitor_node.charts, {chart.__module__ for chart in monitor_node.charts.CHARTS}),
+    "panels": (recorder.panels, {panel.draw.__module__ for panel in recorder.panels.PANELS}),
+}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_file_of_the_folder_is_listed(family: str) -> None:
+    package, listed = FAMILIES[family]
+    assert package.__file__ is not None
+    files = {path.stem for path in Path(package.__file__).parent.glob("*.py")} - {"__init__", "base"}
+    assert {name.rpartition(".")[2] for name in listed} == files
+
+
+def test_names_in_a_catalogue_differ() -> None:
+    for names in (
+        [effect.name for effect in reactorwatch.process.effects.EFFECTS],
+        [chart.name for chart in monitor_node.charts.CHARTS],
+        [panel.title for panel in recorder.panels.PANELS if isinstance(panel, Panel)],
+    ):
+        assert len(set(names)) == len(names)
