@@ -74,18 +74,32 @@ class StopSignal:
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[StopSignal]:
-    """A stop signal that SIGINT (Ctrl-C) and SIGTERM set, while the context lasts."""
+    """A stop signal that SIGINT (Ctrl-C) and SIGTERM set, while the context lasts.
+
+    A handler runs in the main thread between two of its instructions, whatever lock that thread holds just then; waking
+    others takes locks, of an event for instance, and would wait for itself for ever. So the handler only puts a word
+    into a queue whose `put` may interrupt itself (`queue.SimpleQueue`), and a thread of its own does the waking.
+    """
     stop = StopSignal()
+    asked: SimpleQueue[bool] = SimpleQueue()
 
     def handler(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
+        asked.put(True)
 
+    def wake_when_asked() -> None:
+        while asked.get():
+            stop.set()
+
+    waker = threading.Thread(target=wake_when_asked, name="stop", daemon=True)
+    waker.start()
     previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield stop
     finally:
         for number, old in previous.items():
             signal.signal(number, old)
+        asked.put(False)
+        waker.join()
 
 
 def serve(

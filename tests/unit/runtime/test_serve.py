@@ -1,5 +1,6 @@
 """The loop of the nodes: nothing that arrives is lost, ticks come when they are due, a stop is heard at once."""
 
+import signal
 import threading
 import time
 
@@ -8,9 +9,10 @@ import pytest
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply, Health
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-from reactorwatch.runtime.serve import StopSignal, serve
+from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 
 FAR = 10**19
+WITHIN_S = 10.0
 
 
 class Echo:
@@ -187,3 +189,30 @@ def test_a_question_is_answered_by_the_node() -> None:
     stop.set()
     thread.join(20)
     assert asked.answer == CommandReply(accepted=True, text="hello")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_comes_while_the_main_thread_holds_a_lock_still_wakes_who_needs_that_lock(
+    number: signal.Signals,
+) -> None:
+    lock, woken = threading.Lock(), threading.Event()
+
+    def wake() -> None:
+        if lock.acquire(timeout=WITHIN_S):  # as an event's does; a handler that came here itself would never get it
+            lock.release()
+            woken.set()
+
+    with stop_on_signals() as stop:
+        stop.wakes(wake)
+        with lock:
+            signal.raise_signal(number)
+            assert not woken.is_set()
+        assert woken.wait(WITHIN_S)
+        assert stop.is_set
+
+
+def test_signals_are_handled_as_before_once_the_context_is_left() -> None:
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    with stop_on_signals():
+        assert signal.getsignal(signal.SIGINT) != before[0]
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
