@@ -71,7 +71,13 @@ def main() -> None:
     configure(logging.WARNING)
     config = BusConfig(endpoint=free_endpoint())
     monitor = MonitorConfig(
-        outputs=("T",), training_min=TRAINING_ROWS / 10, raise_count=1, window=1, clear_count=1, width=6.0
+        outputs=("T",),
+        reference="arx",
+        charts=("shewhart",),
+        training_min=TRAINING_ROWS / 10,
+        raise_count=1,
+        window=1,
+        clear_count=1,
     )
     hub = router(config)
     with tempfile.TemporaryDirectory() as folder:

@@ -64,14 +64,17 @@ class MonitorNode(Monitor):
         report = self.refusals.report(now_ns)
         if report is not None:
             log.warning(report)
-        self._keep([])
-        return super().on_tick(now_ns)
+        publications = super().on_tick(now_ns)
+        self._keep(publications)
+        return publications
 
     def _keep(self, publications: list[Publication]) -> None:
         for publication in publications:
             alarm = publication.message
             if isinstance(alarm, Alarm):
                 log.info("alarm", alarm=alarm.alarm, change=alarm.event, by=alarm.by, text=alarm.text)
+        while self.notes:
+            log.warning(self.notes.pop(0))
         if self._file is None:
             return
         try:
@@ -95,7 +98,7 @@ def run(config: MonitorConfig, bus_config: BusConfig) -> None:
         if bus is None:
             return
         try:
-            log.info("watching", plant=config.plant, training_min=config.training_min)
+            log.info("listening", plant=config.plant, training_min=config.training_min)
             serve(
                 node,
                 bus,

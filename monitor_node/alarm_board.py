@@ -4,6 +4,7 @@ Alarms change when samples come, when a person says so, and when a shelf's time 
 so what is said of alarms that nobody touched follows from the samples alone.
 """
 
+from collections.abc import Callable
 from math import isfinite
 from typing import Literal
 
@@ -11,9 +12,9 @@ import msgspec
 
 from monitor_node.alarm_kpis import Counted, KpiCounter, KpiState
 from monitor_node.alarm_states import Event, State, fits
-from monitor_node.alarms import LAST_NS, AlarmMemory, ChartAlarm, TimeNs
+from monitor_node.alarms import LAST_NS, AlarmMemory, ChartAlarm, Explanation, TimeNs
 from monitor_node.charts.base import Judgement
-from monitor_node.config import MonitorConfig
+from monitor_node.config import MonitorConfig, PriorityName
 from monitor_node.incidents import Incident, Incidents
 from monitor_node.persistence import Persistence
 from reactorwatch.contract import keys
@@ -24,6 +25,9 @@ from reactorwatch.records.record import MINUTE_NS
 
 KPIS = "monitor"
 """The name in the key of the figures."""
+
+SUSPECTED = "suspected"
+"""The event of an alarm whose suspects are new."""
 
 
 class BoardState(msgspec.Struct, forbid_unknown_fields=True):
@@ -63,22 +67,50 @@ class AlarmBoard:
         self._incidents = Incidents(config.incident_min)
         self._kpis = KpiCounter()
         self._kpi_key = keys.key(config.plant, keys.ALARM_KPIS, KPIS)
+        self._shelved: list[ChartAlarm] = []
         self._kpi_minute: int | None = None
         self._kpis_changed = False
         self.time_ns: int | None = None
         self.changes = 0
 
-    def declare(self, chart: str, signal: str) -> ChartAlarm:
-        """A new alarm, for a chart of a signal."""
+    def declare(
+        self,
+        chart: str,
+        signal: str,
+        *,
+        at_once: bool = False,
+        over_at_once: bool = False,
+        tells_cause: bool = False,
+        priority: PriorityName | None = None,
+    ) -> ChartAlarm:
+        """A new alarm, for a chart.
+
+        Args:
+            chart: its name.
+            signal: what it is of.
+            at_once: whether one point out raises it, and not `raise_count` among `window`.
+            over_at_once: whether one point back in clears it, and not `clear_count`.
+            tells_cause: whether it says itself what its cause is.
+            priority: that of the signal if not given.
+        """
         config = self._config
-        rule = Persistence(config.raise_count, config.window, config.clear_count)
-        alarm = ChartAlarm(chart, signal, config.priorities.get(signal, "medium"), rule, config.dead_band)
+        count, window = (1, 1) if at_once else (config.raise_count, config.window)
+        rule = Persistence(count, window, 1 if over_at_once else config.clear_count)
+        urgency = priority or config.priorities.get(signal, "medium")
+        alarm = ChartAlarm(chart, signal, urgency, rule, config.dead_band, tells_cause=tells_cause)
         self._alarms[alarm.name] = alarm
         return alarm
 
     # --- what samples do -------------------------------------------------------------------------------------
 
-    def judge(self, alarm: ChartAlarm, time_ns: int, judgement: Judgement, unit: str) -> list[Publication]:
+    def judge(
+        self,
+        alarm: ChartAlarm,
+        time_ns: int,
+        judgement: Judgement,
+        unit: str,
+        explain: Callable[[Judgement], Explanation] | None = None,
+    ) -> list[Publication]:
         """Take the point of an alarm's chart in; returns the alarm if it changes.
 
         Args:
@@ -86,8 +118,9 @@ class AlarmBoard:
             time_ns: of the sample.
             judgement: of the chart.
             unit: of the statistic.
+            explain: asked for what to say if it is raised.
         """
-        event = alarm.judge(time_ns, judgement, unit)
+        event = alarm.judge(time_ns, judgement, unit, explain)
         if event is None:
             return []
         self._change(alarm, event, time_ns)
@@ -101,15 +134,33 @@ class AlarmBoard:
         """
         self.time_ns = time_ns
         publications: list[Publication] = []
-        for alarm in self._alarms.values():
+        for alarm in self._shelved:
             memory = alarm.memory
             # A clock that was set back ends a shelf as well, which otherwise would last as much longer.
-            if memory.state is State.SHELVED and not memory.shelved_ns <= time_ns < memory.shelved_until_ns:
+            if not memory.shelved_ns <= time_ns < memory.shelved_until_ns:
                 self._change(alarm, Event.SHELF_TIME_OVER, time_ns)
                 publications.append(self._publication(alarm, Event.SHELF_TIME_OVER, time_ns))
         minute = time_ns // MINUTE_NS
         if self._kpis_changed or minute != self._kpi_minute:
             publications.append(self._figures(time_ns))
+        return publications
+
+    def suspect(self, time_ns: int, suspects: list[tuple[str, float]]) -> list[Publication]:
+        """Tell what the standing alarms of the latest incident may come from.
+
+        Args:
+            time_ns: of the row that this was found at.
+            suspects: causes and their probabilities, the likeliest first.
+        """
+        publications: list[Publication] = []
+        for alarm in self._alarms.values():
+            memory = alarm.memory
+            if alarm.tells_cause:
+                continue
+            if memory.rule.standing and memory.incident == self._incidents.state.number and memory.incident:
+                memory.suspects = list(suspects)
+                self.changes += 1
+                publications.append(self._publication(alarm, SUSPECTED, time_ns))
         return publications
 
     # --- what people do --------------------------------------------------------------------------------------
@@ -209,6 +260,7 @@ class AlarmBoard:
         for name, memory in state.alarms.items():
             if name in self._alarms:
                 self._alarms[name].memory = memory
+        self._note_shelved()
         self.time_ns = state.time_ns
         self._incidents.state = state.incident
         self._kpis.state = state.kpis
@@ -244,8 +296,12 @@ class AlarmBoard:
             if not memory.incident:
                 memory.incident = self._incidents.came_up(time_ns, alarm.name)
                 memory.first_in = self._incidents.state.first_in == alarm.name
+        self._note_shelved()
         self.changes += 1
         self._kpis_changed = True
+
+    def _note_shelved(self) -> None:
+        self._shelved = [alarm for alarm in self._alarms.values() if alarm.memory.state is State.SHELVED]
 
     def _publication(self, alarm: ChartAlarm, event: str, time_ns: int) -> Publication:
         return Publication(keys.key(self._config.plant, keys.ALARM, alarm.name), alarm.message(time_ns, event))

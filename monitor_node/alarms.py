@@ -1,7 +1,7 @@
 """One alarm: the chart that it comes from, the rule that raises and clears it, and the state that the operator sees."""
 
-from collections.abc import Mapping
-from typing import Annotated, TypeAlias
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, NamedTuple, TypeAlias
 
 import msgspec
 
@@ -10,7 +10,7 @@ from monitor_node.charts.base import Judgement
 from monitor_node.incidents import Count
 from monitor_node.persistence import Persistence, PersistenceState
 from reactorwatch.contract import keys
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Contribution, Priority
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Contribution, Priority, Suspect
 
 PRIORITIES: Mapping[str, Priority] = {
     "low": Priority.PRIORITY_LOW,
@@ -46,6 +46,8 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
         above: whether it was the upper one.
         unit: of both.
         text: what is wrong, in one sentence; empty before the first time.
+        contributions: each signal's share of it.
+        suspects: causes and their probabilities, the likeliest first; empty while nobody has looked.
         incident: number of its incident; 0: it has not come up since it was raised.
         first_in: whether it began that incident.
         shelved_ns: when it was shelved; 0 if it is not.
@@ -63,6 +65,8 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
     above: bool = False
     unit: str = ""
     text: str = ""
+    contributions: dict[str, float] = msgspec.field(default_factory=dict)
+    suspects: list[tuple[str, float]] = msgspec.field(default_factory=list)
     incident: Count = 0
     first_in: bool = False
     shelved_ns: TimeNs = 0
@@ -71,25 +75,51 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
     comment: str = ""
 
 
+class Explanation(NamedTuple):
+    """What an alarm says when it is raised.
+
+    Attributes:
+        text: what is wrong, in one sentence.
+        contributions: each signal's share of it.
+        suspects: causes and their probabilities, where the alarm itself says what it is.
+    """
+
+    text: str
+    contributions: dict[str, float]
+    suspects: Sequence[tuple[str, float]] = ()
+
+
 class ChartAlarm:
-    """The alarm of one chart of one signal.
+    """The alarm of one chart.
 
     Args:
         chart: the chart's name.
-        signal: the signal's name.
+        signal: what it is of: a signal's name, or another word in its key.
         priority: a key of `PRIORITIES`.
         rule: when points become an alarm.
         dead_band: a point is back in if it is within (1 - dead_band) of the way from the centre to the limit that was
             crossed.
+        tells_cause: whether it says itself what its cause is.
 
     Attributes:
         name: as in its key: `shewhart/T`.
         priority: as in its messages.
+        tells_cause: as given.
     """
 
-    def __init__(self, chart: str, signal: str, priority: str, rule: Persistence, dead_band: float) -> None:
+    def __init__(
+        self,
+        chart: str,
+        signal: str,
+        priority: str,
+        rule: Persistence,
+        dead_band: float,
+        *,
+        tells_cause: bool = False,
+    ) -> None:
         self.name = keys.chart_name(chart, signal)
         self.priority = PRIORITIES[priority]
+        self.tells_cause = tells_cause
         self._signal = signal
         self._rule = rule
         self._reach = 1 - dead_band
@@ -105,13 +135,22 @@ class ChartAlarm:
         self._memory = memory
         self._rule.state = memory.rule
 
-    def judge(self, time_ns: int, judgement: Judgement, unit: str) -> Event | None:
+    @property
+    def at_rest(self) -> bool:
+        """Whether a point that is not out would change nothing."""
+        rule = self._memory.rule
+        return not (rule.standing or rule.recent)
+
+    def judge(
+        self, time_ns: int, judgement: Judgement, unit: str, explain: Callable[[Judgement], Explanation] | None = None
+    ) -> Event | None:
         """Follow the condition.
 
         Args:
             time_ns: of the sample.
             judgement: of the chart.
             unit: of the statistic.
+            explain: asked for what to say if the alarm is raised; without it, what a residual's chart says.
 
         Returns:
             `RAISED` or `CLEARED`, to be applied, if the condition changes.
@@ -123,7 +162,7 @@ class ChartAlarm:
         memory.value, memory.unit = judgement.statistic, unit
         if not change:
             memory.cleared_ns = time_ns
-            memory.text = f"{self._signal} is again what the model expects"
+            memory.text = f"{self.name} is back within its limits"
             return Event.CLEARED
         memory.above = judgement.statistic > judgement.centre
         memory.limit = judgement.upper_limit if memory.above else judgement.lower_limit
@@ -131,11 +170,9 @@ class ChartAlarm:
         memory.incident, memory.first_in = 0, False
         if memory.state is State.NORMAL:
             memory.by = memory.comment = ""
-        off, allowed = abs(judgement.statistic - judgement.centre), abs(memory.limit - judgement.centre)
-        memory.text = (
-            f"{self._signal} is {off:.3g} {unit} {'above' if memory.above else 'below'} what the model expects "
-            f"(allowed: {allowed:.3g} {unit})"
-        )
+        explanation = explain(judgement) if explain is not None else self._plainly(judgement, unit)
+        memory.text, memory.contributions = explanation.text, explanation.contributions
+        memory.suspects = list(explanation.suspects)
         return Event.RAISED
 
     def apply(self, event: Event) -> None:
@@ -167,7 +204,8 @@ class ChartAlarm:
             value=memory.value,
             limit=memory.limit,
             unit=memory.unit,
-            contributions=[Contribution(signal=self._signal, share=1.0)],
+            contributions=[Contribution(signal=name, share=share) for name, share in memory.contributions.items()],
+            suspects=[Suspect(cause=cause, probability=probability) for cause, probability in memory.suspects],
             text=memory.text,
             event=event,
             incident=memory.incident,
@@ -176,6 +214,15 @@ class ChartAlarm:
             comment=memory.comment,
             by=memory.by,
         )
+
+    def _plainly(self, judgement: Judgement, unit: str) -> Explanation:
+        off = judgement.statistic - judgement.centre
+        allowed = abs(self._memory.limit - judgement.centre)
+        text = (
+            f"{self._signal} is {abs(off):.3g} {unit} {'above' if off > 0 else 'below'} what the model expects "
+            f"(allowed: {allowed:.3g} {unit})"
+        )
+        return Explanation(text, {self._signal: 1.0})
 
     def _is_back_in(self, judgement: Judgement) -> bool:
         if judgement.out:

@@ -3,11 +3,14 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from monitor_node.alarm_states import Event
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
+from reactorwatch.contract.messages_pb2 import Alarm
+
+RAISED = Event.RAISED.value
 
 
 @dataclass
@@ -22,6 +25,7 @@ class Backtest:
         expected_false_alarms: see `Monitor.expected_false_alarms`.
         alarm_messages: every change of an alarm, in order.
         refused: counts by reason.
+        notes: what people are to be told of the training.
     """
 
     rows: int
@@ -31,17 +35,25 @@ class Backtest:
     expected_false_alarms: float
     alarm_messages: list[Alarm]
     refused: dict[str, int]
+    notes: list[str]
 
     @property
     def raised(self) -> list[tuple[Alarm, int | None]]:
-        """Each alarm as it was raised, and when it was cleared (None: it still stands)."""
+        """Each alarm as it was raised, with the suspects known last, and when it was cleared (None: it still stands)."""
         found: list[tuple[Alarm, int | None]] = []
-        for index, alarm in enumerate(self.alarm_messages):
-            if alarm.state != AlarmState.ALARM_STATE_UNACKNOWLEDGED:
-                continue
-            later = (other for other in self.alarm_messages[index + 1 :] if other.alarm == alarm.alarm)
-            cleared = next((other.cleared_ns for other in later if other.cleared_ns), None)
-            found.append((alarm, cleared))
+        last: dict[str, int] = {}
+        for message in self.alarm_messages:
+            if message.event == RAISED:
+                last[message.alarm] = len(found)
+                alarm = Alarm()
+                alarm.CopyFrom(message)
+                found.append((alarm, None))
+            elif message.alarm in last:
+                alarm, cleared_ns = found[last[message.alarm]]
+                if message.raised_ns == alarm.raised_ns and message.suspects:
+                    del alarm.suspects[:]
+                    alarm.suspects.extend(message.suspects)
+                found[last[message.alarm]] = (alarm, cleared_ns or message.cleared_ns or None)
         return found
 
 
@@ -53,7 +65,7 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
         config: of the monitor.
     """
     prefix = keys.key(config.plant, keys.SAMPLE, "")
-    monitor = Monitor(config, start_ns=0)
+    monitor = Monitor(config, start_ns=0, points=False)
     alarms: list[Alarm] = []
 
     def keep(publications: list[Publication]) -> None:
@@ -71,4 +83,5 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
         expected_false_alarms=monitor.expected_false_alarms,
         alarm_messages=alarms,
         refused=dict(monitor.refusals.by_reason),
+        notes=monitor.notes,
     )

@@ -7,6 +7,7 @@ import msgspec
 from monitor_node.persistence import check_rule
 from reactorwatch.contract.keys import checked_plant
 
+ChartName = Literal["shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe"]
 PriorityName = Literal["low", "medium", "high", "critical"]
 
 
@@ -22,8 +23,19 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         forgetting: of the model that adapts, in (0, 1]; 1 forgets nothing.
         training_min: how long it learns before it watches, in minutes of the plant.
         identification_share: the part of the training that the model learns in; the rest teaches the limits.
-        width: of the limits, in standard deviations of the residual.
-        raise_count: an alarm is raised when this many of the last `window` points are out ...
+        reference: what a row is expected by: `process`, the filter of the reactor's equations; `arx`, the identified
+            model as it was at the end of its training; `auto`, the first where it predicts the training at least about
+            as well as the second, else the second.
+        charts: that watch the residuals.
+        false_alarms_per_30_days: how many alarms chance may raise in 30 days of the plant, all alarms together.
+        ewma_weight: of the newest row in the EWMA chart, in (0, 1].
+        mewma_weight: of the newest row in the MEWMA chart, in [0.01, 1].
+        cusum_allowance: k of the CUSUM chart, in standard deviations.
+        smallest_sd: standard deviation of the residual that is taken at least, by output, in its unit: what is smaller
+            is of no interest.
+        isolation: whether the cause of an alarm is looked for, where the reference is the reactor's equations.
+        isolation_rows: the newest rows that it is looked for in.
+        raise_count: the Shewhart chart's alarm is raised when this many of the last `window` points are out ...
         window: ... of so many ...
         clear_count: ... and cleared after this many in a row are back in ...
         dead_band: ... which they are within (1 - dead_band) of the limit, in [0, 0.9].
@@ -34,6 +46,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         reorder_rows: how many newer rows may begin before an incomplete one is given up.
         snapshot_min: how often the models are published, in minutes of the plant.
         health_period_s: how often health is published, in seconds.
+        silence_periods: a plant that sends no row for so many sampling periods is silent.
         priorities: of the alarms, by signal; those not named are medium.
     """
 
@@ -45,7 +58,15 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     forgetting: float = 0.999
     training_min: float = 100.0
     identification_share: float = 0.6
-    width: float = 3.0
+    reference: Literal["auto", "process", "arx"] = "auto"
+    charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
+    false_alarms_per_30_days: float = 1.0
+    ewma_weight: float = 0.1
+    mewma_weight: float = 0.02
+    cusum_allowance: float = 0.25
+    smallest_sd: dict[str, float] = msgspec.field(default_factory=lambda: {"C": 2e-4, "T": 0.05})
+    isolation: bool = True
+    isolation_rows: int = 600
     raise_count: int = 3
     window: int = 5
     clear_count: int = 20
@@ -54,6 +75,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     longest_shelf_min: float = 480.0
     alarm_state_file: str | None = None
     reorder_rows: int = 8
+    silence_periods: float = 5.0
     snapshot_min: float = 5.0
     health_period_s: float = 5.0
     priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: {"T": "high"})
@@ -71,7 +93,12 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             ("forgetting", self.forgetting, 0.5, 1.0),
             ("training_min", self.training_min, 1e-3, 1e6),
             ("identification_share", self.identification_share, 0.1, 0.9),
-            ("width", self.width, 0.5, 20.0),
+            ("false_alarms_per_30_days", self.false_alarms_per_30_days, 1e-3, 1e6),
+            ("ewma_weight", self.ewma_weight, 1e-3, 1.0),
+            ("mewma_weight", self.mewma_weight, 0.01, 1.0),
+            ("cusum_allowance", self.cusum_allowance, 0.05, 5.0),
+            ("isolation_rows", self.isolation_rows, 50, 10_000),
+            ("silence_periods", self.silence_periods, 1.5, 1e6),
             ("dead_band", self.dead_band, 0.0, 0.9),
             ("incident_min", self.incident_min, 0.0, 1e6),
             ("longest_shelf_min", self.longest_shelf_min, 1e-3, 1e6),
@@ -81,6 +108,11 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         ):
             if not low <= value <= high:
                 raise ValueError(f"{what} must be in [{low:g}, {high:g}], got {value:g}")
+        if len(set(self.charts)) != len(self.charts) or not self.charts:
+            raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
+        for signal, sd in self.smallest_sd.items():
+            if not 0 <= sd < 1e6:
+                raise ValueError(f"smallest_sd of {signal} must be in [0, 1e6), got {sd:g}")
         for signal in self.priorities:
             if signal not in self.outputs:
                 raise ValueError(f"priorities are by output, {self.outputs}, got {signal!r}")

@@ -1,12 +1,7 @@
 """The watch over one plant: samples in; estimates, chart points, models, alarms and health out.
 
-A plant's life with its monitor has three phases, told by the time of the samples alone:
-
-- *training*, first part: an ARX model of each output is identified by recursive least squares.
-- *training*, second part: the model is held as the reference, and its residuals on rows that it has not learned from
-  give the mean and the spread that limits are made of.
-- *watching*: every residual of the reference is charted. A model goes on adapting beside it, and is published;
-  but it judges nothing, because a model that adapts would learn the fault and call it normal.
+A plant's life with its monitor has three phases, told by the time of the samples alone: it waits for the first row, it
+is in training, and it watches (see `watch`).
 
 Nothing here reads a clock: `now_ns` only counts up-time and says when health is due. What is published about the
 plant follows from the samples and from what people said of its alarms, so a replay of a run in which nobody said
@@ -19,9 +14,8 @@ from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_commands import obey
 from monitor_node.alignment import Aligner, Row
 from monitor_node.config import MonitorConfig
-from monitor_node.output_watch import OutputWatch
 from monitor_node.refusals import Refusals
-from monitor_node.sampling import SamplingPeriod
+from monitor_node.watch import PlantWatch
 from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
@@ -40,6 +34,10 @@ class Monitor:
     Args:
         config: how it is watched.
         start_ns: now.
+        points: whether estimates and points of charts are published; a back-test does without.
+
+    Raises:
+        InputError: settings that do not fit together.
 
     Attributes:
         refusals: what could not be used.
@@ -48,20 +46,18 @@ class Monitor:
         last_ns: time of the last row; None before the first.
     """
 
-    def __init__(self, config: MonitorConfig, start_ns: int) -> None:
+    def __init__(self, config: MonitorConfig, start_ns: int, *, points: bool = True) -> None:
         self.config = config
         self.refusals = Refusals()
         self._signals = (config.input, *config.outputs)
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
         self._aligner = Aligner(self._signals, config.reorder_rows)
-        self._sampling = SamplingPeriod()
         self.alarms = AlarmBoard(config)
-        self._watches = [OutputWatch(config, signal, self.alarms) for signal in config.outputs]
+        self._watch = PlantWatch(config, self.alarms, points=points)
         self._units = dict.fromkeys(self._signals, "")
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self._watching_since_ns: int | None = None
-        self._rows_watched = 0
         self._received = 0
         self._published = 0
         self._lag_ns = 0
@@ -107,7 +103,10 @@ class Monitor:
             return []
         self._units[signal] = sample.unit
         publications: list[Publication] = []
-        for row in self._aligner.update(signal, sample.time_ns, sample.sequence, sample.value):
+        rows = self._aligner.update(signal, sample.time_ns, sample.sequence, sample.value)
+        if rows:
+            self._watch.signals.received(now_ns)
+        for row in rows:
             self._on_row(row, publications)
         self._published += len(publications)
         return publications
@@ -125,13 +124,18 @@ class Monitor:
         return reply, publications
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """Publish health."""
-        self._health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
-        return [self._health(now_ns, self.phase)]
+        """Publish health if it is due, and a silence of the plant."""
+        publications = self._watch.signals.check(now_ns)
+        self._published += len(publications)
+        if now_ns >= self._health_due_ns:
+            self._health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
+            publications.append(self._health(now_ns, self.phase))
+        return publications
 
     def next_tick_ns(self) -> int:
-        """When health is due."""
-        return self._health_due_ns
+        """When health is due, or the plant overdue."""
+        overdue_ns = self._watch.signals.due_ns()
+        return self._health_due_ns if overdue_ns is None else min(self._health_due_ns, overdue_ns)
 
     @property
     def finished(self) -> bool:
@@ -163,8 +167,13 @@ class Monitor:
 
     @property
     def expected_false_alarms(self) -> float:
-        """Alarms that chance alone would have raised by now, were the residuals independent and normal."""
-        return sum(watch.false_alarm_rate for watch in self._watches) * self._rows_watched
+        """Alarms that chance alone would have raised by now, on average."""
+        return self._watch.expected_false_alarms
+
+    @property
+    def notes(self) -> list[str]:
+        """What people are to be told of the training; whoever tells them empties it."""
+        return self._watch.notes
 
     # --- rows ------------------------------------------------------------------------------------------------
 
@@ -177,39 +186,19 @@ class Monitor:
 
     def _on_row(self, row: Row, publications: list[Publication]) -> None:
         config = self.config
-        follows = self._sampling.follows(row.time_ns) and not row.restarted
         if self.first_ns is None or row.time_ns < self.first_ns:
             self.first_ns = row.time_ns
         self.last_ns = row.time_ns
-        trained_min = (row.time_ns - self.first_ns) / MINUTE_NS
-        identifying = trained_min < config.identification_share * config.training_min
-        training = trained_min < config.training_min
-        input_value = row.values[0]
-        watching = self._watching_since_ns is not None
-        for watch, value in zip(self._watches, row.values[1:], strict=True):
-            watch.update(
-                row.time_ns,
-                input_value,
-                value,
-                self._units[watch.signal],
-                follows=follows,
-                identifying=identifying,
-                training=training,
-                publications=publications,
-            )
-            watching = watching or watch.watching
+        self._watch.update(row, [self._units[signal] for signal in config.outputs], publications)
         publications.extend(self.alarms.end_row(row.time_ns))
-        if watching:
-            self._rows_watched += 1
-            if self._watching_since_ns is None:
-                self._watching_since_ns = row.time_ns
+        if self._watching_since_ns is None and self._watch.watching:
+            self._watching_since_ns = row.time_ns
         if (
             self._snapshot_due_ns is None
             or not 0 <= self._snapshot_due_ns - row.time_ns <= config.snapshot_min * MINUTE_NS
         ):
             if self._snapshot_due_ns is not None:
-                for watch in self._watches:
-                    publications.extend(watch.snapshots(row.time_ns))
+                publications.extend(self._watch.snapshots(row.time_ns))
             self._snapshot_due_ns = row.time_ns + int(config.snapshot_min * MINUTE_NS)
 
     def _health(self, now_ns: int, phase: str) -> Publication:

@@ -1,23 +1,37 @@
-"""Does this row follow its predecessor by one sampling period? A linear model of lagged samples holds only then."""
+"""How often rows come, and what is between this one and the one before.
+
+A row *follows* if it is one sampling period after its predecessor, to a tenth: a linear model of lagged samples holds
+only then. A *gap* is more than two and a half periods, or a step back in time: what was known of the rows just
+before is then too old to tell chance from change.
+"""
 
 from dataclasses import dataclass, field
 from statistics import median
 
 LEARN_FROM = 32  # spacings
 TOLERANCE = 0.1  # of the period
+LARGEST_GAP = 2.5  # periods
 
 
 @dataclass
 class SamplingState:
-    """What is remembered: the last row's time, the spacings seen while the period is being learned, the period."""
+    """What is remembered.
+
+    Attributes:
+        last_ns: time of the last row; None before the first.
+        spacings_ns: seen while the period is being learned.
+        period_ns: learned; None before.
+        spacing_ns: between the last row and the one before it; None before the second.
+    """
 
     last_ns: int | None = None
     spacings_ns: list[int] = field(default_factory=list)
     period_ns: float | None = None
+    spacing_ns: int | None = None
 
 
 class SamplingPeriod:
-    """Learns the period from the first rows, and tells which rows follow regularly.
+    """Learns the period from the first rows, and tells how each row comes after the one before.
 
     While the period is not known yet, a row follows if it comes no later than half again the shortest spacing so far.
     """
@@ -26,17 +40,28 @@ class SamplingPeriod:
         self.state = SamplingState()
 
     def follows(self, time_ns: int) -> bool:
-        """Whether the row at this time follows the one before it by one period."""
+        """Take a row in; whether it follows the one before it by one period."""
         state = self.state
         last, state.last_ns = state.last_ns, time_ns
-        if last is None:
+        state.spacing_ns = None if last is None else time_ns - last
+        if state.spacing_ns is None or state.spacing_ns <= 0:
             return False
-        spacing = time_ns - last
-        if spacing <= 0:
-            return False
+        spacing = state.spacing_ns
         if state.period_ns is None:
             state.spacings_ns.append(spacing)
             if len(state.spacings_ns) == LEARN_FROM:
                 state.period_ns = float(median(state.spacings_ns))
             return spacing <= 1.5 * min(state.spacings_ns)
         return abs(spacing - state.period_ns) <= TOLERANCE * state.period_ns
+
+    @property
+    def period_ns(self) -> float:
+        """The sampling period; before it is known, the shortest spacing so far; 0 before the second row."""
+        state = self.state
+        return state.period_ns if state.period_ns is not None else float(min(state.spacings_ns, default=0))
+
+    @property
+    def gap(self) -> bool:
+        """Whether there is a gap before the row that was taken in last."""
+        spacing = self.state.spacing_ns
+        return spacing is not None and (spacing <= 0 or spacing > LARGEST_GAP * self.period_ns)

@@ -30,6 +30,9 @@ from monitor_node.charts.base import (
 from reactorwatch.compiled import compiled
 from reactorwatch.errors import InputError
 
+CEILING = 2.0
+"""Times the limit: the sums stop there, so that after a large change they are soon back. Run lengths are untouched."""
+
 _MEMORIES = 2
 _MEAN, _ALLOWANCE, _LIMIT, _START = range(SETTINGS, SETTINGS + 4)
 _HIGH, _LOW, _END = range(_START + _MEMORIES, _START + _MEMORIES + 3)
@@ -41,8 +44,8 @@ def _judge(columns: Array) -> None:
         present = columns[PRESENT, p] > 0.0
         allowance, limit = columns[_ALLOWANCE, p], columns[_LIMIT, p]
         off = columns[X, p] - columns[_MEAN, p]
-        high = max(0.0, columns[_HIGH, p] + off - allowance)
-        low = max(0.0, columns[_LOW, p] - off - allowance)
+        high = min(max(0.0, columns[_HIGH, p] + off - allowance), CEILING * limit)
+        low = min(max(0.0, columns[_LOW, p] - off - allowance), CEILING * limit)
         columns[_HIGH, p] = high if present else columns[_HIGH, p]
         columns[_LOW, p] = low if present else columns[_LOW, p]
         columns[STATISTIC, p] = high if high >= low else -low

@@ -79,6 +79,15 @@ class Mewma:
         statistic = float(self._average @ self._average) * (2.0 - self.weight) / self.weight
         return Judgement(statistic, float(self._average.size), 0.0, self.limit, statistic > self.limit)
 
+    def contributions(self) -> Array:
+        """Each signal's part of the statistic, shape (p,); their sum is the statistic, one may be negative.
+
+        The partial decomposition, as for `T2.contributions`, of the average instead of the newest vector.
+        """
+        matrix = self.whitening.matrix
+        off = np.linalg.solve(matrix, self._average)
+        return np.asarray(off * (matrix.T @ self._average) * (2.0 - self.weight) / self.weight)
+
     def restart(self) -> None:
         """Forget the vectors seen."""
         self._average = np.zeros(self._average.size)

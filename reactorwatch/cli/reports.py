@@ -9,6 +9,9 @@ from monitor_node.backtest import Backtest
 from reactorwatch.contract.messages_pb2 import Alarm, Priority
 from reactorwatch.records.record import to_minutes
 
+WORTH_TELLING = 0.05
+"""Probability below which a suspect is not told to people."""
+
 
 def backtest_object(result: Backtest, zero_ns: int) -> dict[str, Any]:
     """The object that `backtest --json` prints.
@@ -59,12 +62,21 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     for alarm, cleared_ns in result.raised:
         end = f"cleared at {to_minutes(cleared_ns, zero_ns):g} min" if cleared_ns else "still standing at the end"
         raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
-        lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}")
+        lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}{_suspects(alarm)}")
+    lines += [f"  note: {note}" for note in result.notes]
     if not result.raised and said["trained_until_min"] is not None:
         lines.append("no alarms")
     if result.refused:
         lines.append("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items())))
     return "\n".join(lines)
+
+
+def _suspects(alarm: Alarm) -> str:
+    """The likeliest causes, as the end of a sentence."""
+    likely = [item for item in alarm.suspects if item.probability >= WORTH_TELLING]
+    if not likely:
+        return ""
+    return "; suspect: " + ", ".join(f"{item.cause} ({100 * item.probability:.0f} %)" for item in likely)
 
 
 def priority_word(alarm: Alarm) -> str:

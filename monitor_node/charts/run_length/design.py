@@ -9,6 +9,7 @@ is rounded to three digits and the limit found for that. A chart without memory 
 """
 
 from collections.abc import Callable, Iterable
+from functools import cache
 from math import exp, log
 
 import msgspec
@@ -113,17 +114,20 @@ def shewhart_limit(arl0: float, rules: Iterable[int] = (1,)) -> float:
     return _root(lambda limit: shewhart(0.0, limit, wanted), arl0, 0.5, 30.0)
 
 
+@cache
 def cusum_limit(arl0: float, k: float) -> float:
     """The limit h of the two-sided CUSUM of allowance k for an in-control run length."""
     # The run length grows about as exp(2 k h).
     return _root(lambda h: cusum(0.0, k, h), arl0, 0.5 / min(max(k, 0.01), 1.0), LARGEST_LIMIT)
 
 
+@cache
 def ewma_limit(arl0: float, weight: float) -> float:
     """The limit L of the EWMA of weight lambda for an in-control run length."""
     return _root(lambda limit: ewma(0.0, weight, limit), arl0, 0.5, 10.0)
 
 
+@cache
 def mewma_limit(arl0: float, dimension: int, weight: float) -> float:
     """The limit H of the MEWMA of weight lambda for an in-control run length."""
     return _root(lambda limit: mewma(0.0, dimension, weight, limit), arl0, 2.0, LARGEST_MEWMA_LIMIT)

@@ -59,32 +59,40 @@ def test_a_leak_raises_an_alarm_soon_after_it_and_none_before(leak: list[Encoded
     _, said = watch(leak)
     raised = [alarm for alarm in told(said, Alarm) if alarm.state == AlarmState.ALARM_STATE_UNACKNOWLEDGED]
     assert raised
-    assert raised[0].alarm == "shewhart/T"
-    assert to_time_ns(ONSET_MIN) <= raised[0].time_ns <= to_time_ns(ONSET_MIN + 5)
+    assert "shewhart/T" in {alarm.alarm for alarm in raised}
+    assert to_time_ns(ONSET_MIN) <= raised[0].time_ns <= to_time_ns(ONSET_MIN + 1)
     assert raised[0].raised_ns == raised[0].time_ns
     assert raised[0].text.startswith("T is ")
 
 
 def test_a_sound_plant_raises_none_in_ten_runs() -> None:
-    """The rate of the rule lets 0.002 alarms be expected in all ten."""
+    """One in 30 days lets 0.023 alarms be expected in the ten times 100 minutes."""
     expected = 0.0
     for seed in range(10):
         result = backtest.run(samples(*leaking_run(0.0, 1.0, 200.0, seed)), CONFIG)
         assert result.alarm_messages == []
         expected += result.expected_false_alarms
-    assert expected < 0.02
+    assert expected == pytest.approx(1000 / (30 * 24 * 60), rel=0.01)
 
 
-def test_limits_are_three_standard_deviations_of_the_residual(leak: list[Encoded]) -> None:
+def test_limits_are_in_standard_deviations_of_the_residual(leak: list[Encoded]) -> None:
+    """Before the fault the charted residual has the variance one, and the estimate's limits are its own in kelvin."""
     _, said = watch(leak)
     sound = [
         point for item, point in ((item, item.message) for item in said)
-        if isinstance(point, ChartPoint) and item.key.endswith("/T") and point.time_ns < to_time_ns(ONSET_MIN)
+        if isinstance(point, ChartPoint) and item.key.endswith("shewhart/T") and point.time_ns < to_time_ns(ONSET_MIN)
     ]  # fmt: skip
-    sd = (sound[0].upper_limit - sound[0].lower_limit) / 6
-    assert np.std([point.statistic for point in sound]) == pytest.approx(sd, rel=0.15)
-    out = np.mean([point.out for point in sound])
-    assert out < 0.02
+    assert np.std([point.statistic for point in sound]) == pytest.approx(1.0, rel=0.15)
+    estimates = [
+        item.message for item in said if isinstance(item.message, Estimate) and item.key.endswith("estimate/T")
+    ]
+    by_time = {estimate.time_ns: estimate for estimate in estimates}
+    for point in sound:
+        estimate = by_time[point.time_ns]
+        middle = 0.5 * (estimate.lower_limit + estimate.upper_limit)
+        reach = 0.5 * (estimate.upper_limit - estimate.lower_limit)
+        off = (estimate.prediction + estimate.residual - middle) / reach
+        assert off == pytest.approx(point.statistic / point.upper_limit, abs=1e-9)
 
 
 def test_predictions_are_made_before_the_sample_is_seen(leak: list[Encoded]) -> None:
@@ -109,7 +117,7 @@ def test_estimates_carry_limits_only_when_they_are_known(leak: list[Encoded]) ->
 def test_models_are_published_in_the_units_of_the_samples(leak: list[Encoded]) -> None:
     """The parameters predict what the estimates say, from the samples as they are."""
     time_min, columns = leaking_run(-0.1, ONSET_MIN, 160.0, seed=1)
-    _, said = watch(leak)
+    _, said = watch(leak, MonitorConfig(reference="arx"))
     models = [item.message for item in said if item.key.endswith("model/T")]
     reference = next(model for model in models if isinstance(model, ModelSnapshot) and model.reference)
     p = {item.name: item.value for item in reference.parameters}
@@ -240,25 +248,29 @@ def test_a_run_with_missing_rows_still_finds_the_leak() -> None:
     assert counted.incomplete_rows > 0
 
 
-def test_a_gap_restarts_the_prediction_instead_of_alarming() -> None:
+def test_a_gap_is_a_silence_and_nothing_else() -> None:
     time_min, columns = leaking_run(0.0, 1.0, 160.0, seed=2)
     keep = (time_min < 120) | (time_min > 125)
     _, said = watch(samples(time_min[keep], {name: values[keep] for name, values in columns.items()}))
-    assert told(said, Alarm) == []
-    after = [e.time_ns for e in told(said, Estimate) if e.time_ns > to_time_ns(120)]
-    assert min(after) >= to_time_ns(125.3)  # three rows are needed before the next can be predicted
+    assert {alarm.alarm for alarm in told(said, Alarm)} == {"silence/plant"}
+    after = [
+        item.message.time_ns
+        for item in said
+        if isinstance(item.message, ChartPoint) and item.message.time_ns > to_time_ns(120)
+    ]
+    assert min(after) >= to_time_ns(125.1)  # the first row only tells where the plant is
 
 
-@pytest.mark.parametrize("starts_min", [300.0, 0.0])
-def test_a_publisher_that_begins_again_later_or_earlier_is_watched_on(starts_min: float) -> None:
+@pytest.mark.parametrize(("starts_min", "alarms"), [(300.0, {"silence/plant"}), (0.0, set[str]())])
+def test_a_publisher_that_begins_again_later_or_earlier_is_watched_on(starts_min: float, alarms: set[str]) -> None:
     time_min, columns = leaking_run(0.0, 1.0, 160.0, seed=2)
     again = samples(time_min[:300] + starts_min, {name: values[:300] for name, values in columns.items()})
     monitor, said = watch([*samples(time_min, columns), *again])
-    assert told(said, Alarm) == []
+    assert {alarm.alarm for alarm in told(said, Alarm)} == alarms
     counted = health(monitor)
     assert counted.rows == time_min.size + 300
     assert counted.late == counted.lost == 0
-    assert len([item for item in said if item.key.endswith("estimate/T")]) == time_min.size - 53 + 300 - 3
+    assert told(said, Estimate)[-1].time_ns == to_time_ns(float(time_min[299]) + starts_min)
 
 
 def test_a_constant_plant_neither_fails_nor_alarms() -> None:

@@ -1,0 +1,163 @@
+"""One number, how often a false alarm may come, shared over everything that can raise an alarm.
+
+A plant is watched by many charts, and each adds its false alarms: at k charts of a plain 3-sigma limit they come k
+times as often. Here the number is promised for the plant, in alarms per 30 days, and every chart gets the same share of
+it. Whatever the charts have in common, the expected number of alarms is the sum of theirs, so the promise is not a
+bound but an expectation. (Alarms that come together are one incident: of these there are fewer.)
+
+Limits for a share come from the run lengths in `charts.run_length`, which hold when mean and standard deviation are
+known. They are learned from n rows, and a limit that ignores it is too tight: Jones, Champ & Rigdon (2001), The
+performance of exponentially weighted moving average charts with estimated parameters, Technometrics 43, find
+a run length of 200 fall to 145. An average of weight lambda has the variance lambda / (2 - lambda); the mean that was
+learned adds 1 / n to it, and the standard deviation that was learned makes a normal number into one of Student's, with
+the degrees of freedom nu that belong to the variance 1 / (2 nu) of its relative error. So the limit L becomes
+
+    sqrt(1 + (2 - lambda) / (lambda n)) t_nu^-1(Phi(L)),
+
+the one that a new average crosses as rarely as L is crossed when all is known. That is Student's prediction interval
+(Hahn 1970, Additional factors for calculating prediction intervals, J. Amer. Statist. Assoc. 65), and for several
+signals Hotelling's F. It holds on average over trainings: one plant may have been lucky with its training, another
+not.
+"""
+
+from math import comb, exp, isfinite, log, sqrt
+
+import numpy as np
+from scipy import optimize, special
+
+from monitor_node.charts.base import Array
+from monitor_node.charts.run_length.design import LONGEST_DESIGN, SHORTEST, cusum_limit, ewma_limit, mewma_limit
+from monitor_node.persistence import false_alarm_rate
+from monitor_node.prewhitening import Prewhitening
+from reactorwatch.errors import InputError
+
+DAYS = 30
+DAYS_MIN = DAYS * 24 * 60.0
+
+
+def share_arl0(per_30_days: float, alarms: int, period_min: float) -> float:
+    """The run length that each of a plant's alarms is to have without a fault, in rows.
+
+    Args:
+        per_30_days: false alarms of the plant that are promised.
+        alarms: number of alarms that share them.
+        period_min: of the rows.
+
+    Raises:
+        InputError: no chart has such a run length.
+    """
+    arl0 = DAYS_MIN / period_min * alarms / per_30_days
+    if not 10 * SHORTEST <= arl0 <= LONGEST_DESIGN:
+        fewest, most = (DAYS_MIN / period_min * alarms / bound for bound in (LONGEST_DESIGN, 10 * SHORTEST))
+        raise InputError(
+            f"false_alarms_per_30_days must be in [{fewest:.2g}, {most:.2g}] for {alarms} alarms and rows every "
+            f"{period_min:g} min, got {per_30_days:g}"
+        )
+    return arl0
+
+
+def point_probability(arl0: float, raise_count: int, window: int) -> float:
+    """How often a single point may be out if an alarm takes `raise_count` of them among `window`.
+
+    Args:
+        arl0: run length to the alarm without a fault.
+        raise_count: see `persistence`.
+        window: see `persistence`.
+    """
+
+    def off(log_p: float) -> float:
+        return false_alarm_rate(raise_count, window, exp(log_p)) * arl0 - 1.0
+
+    # A point completes at most so many patterns, each as rare as its points together.
+    lowest = -log(arl0 * comb(window - 1, raise_count - 1)) / raise_count
+    return exp(float(optimize.brentq(off, lowest - 0.1, -0.01)))
+
+
+def shewhart_width(p: float, learned: Prewhitening) -> float:
+    """The width L that a point is beyond with the probability p.
+
+    Args:
+        p: of a single point.
+        learned: the training.
+    """
+    return _wider(float(-special.ndtri(0.5 * p)), 1.0, learned)
+
+
+def ewma_width(arl0: float, weight: float, learned: Prewhitening) -> float:
+    """The width L of an EWMA of weight lambda.
+
+    Args:
+        arl0: its run length without a fault.
+        weight: lambda.
+        learned: the training.
+    """
+    return _wider(ewma_limit(arl0, weight), weight, learned)
+
+
+def cusum_height(arl0: float, k: float, learned: Prewhitening) -> float:
+    """The limit h of a two-sided CUSUM with the allowance k, in standard deviations.
+
+    An error of the mean does not add to a CUSUM as it does to an average, so here the rate of false alarms is averaged
+    over the errors that the training may have made. How it changes with them is told by Siegmund's approximation (1985,
+    Sequential Analysis, sec. 2.6), which costs nothing and is good where run lengths are long.
+
+    Args:
+        arl0: its run length without a fault.
+        k: the allowance.
+        learned: the training.
+    """
+    places, weights = np.polynomial.hermite_e.hermegauss(15)
+    shift, log_scale = np.meshgrid(places / sqrt(learned.rows), places * sqrt(_scale_variance(learned, 0.0)))
+    share = np.outer(weights, weights) / weights.sum() ** 2
+    scale = np.exp(log_scale)
+    known = cusum_limit(arl0, k)
+
+    def off(h: float) -> float:
+        return log(float(np.sum(share * _cusum_rate(shift / scale, k / scale, h / scale))) / wanted)
+
+    wanted = float(_cusum_rate(np.zeros(1), np.full(1, k), np.full(1, known))[0])
+    return float(optimize.brentq(off, known, 10.0 * known + 10.0, xtol=1e-6 * known))
+
+
+def joint_limit(arl0: float, dimension: int, weight: float, learned: list[Prewhitening]) -> float:
+    """The limit of a MEWMA's, or with the weight 1 of a T2's, statistic.
+
+    Args:
+        arl0: its run length without a fault.
+        dimension: number of signals.
+        weight: lambda.
+        learned: the training of each signal.
+    """
+    known = mewma_limit(arl0, dimension, weight)
+    rows = min(item.rows for item in learned)
+    freedom = min(_freedom(item, weight) for item in learned)
+    within = float(special.chdtr(dimension, known))
+    wider = dimension * freedom / (freedom - dimension + 1.0)
+    limit = wider * float(special.fdtri(dimension, freedom - dimension + 1.0, within))
+    mean = 1.0 + (2.0 - weight) / (weight * rows)
+    return mean * limit if isfinite(limit) else mean * known * wider
+
+
+def _cusum_rate(shift: Array, k: Array, h: Array) -> Array:
+    """How often a two-sided CUSUM signals, a row, after Siegmund."""
+    rate = np.zeros(shift.shape)
+    for side in (1.0, -1.0):
+        off = side * shift - k
+        off = np.where(np.abs(off) < 1e-6, 1e-6, off)
+        exponent = np.clip(-2.0 * off * (h + 1.166), -700.0, 700.0)
+        rate += 2.0 * off * off / (np.exp(exponent) - exponent - 1.0)
+    return rate
+
+
+def _wider(limit: float, weight: float, learned: Prewhitening) -> float:
+    student = -float(special.stdtrit(_freedom(learned, weight), float(special.ndtr(-limit))))
+    return sqrt(1.0 + (2.0 - weight) / (weight * learned.rows)) * student
+
+
+def _freedom(learned: Prewhitening, weight: float) -> float:
+    return max(0.5 / _scale_variance(learned, weight), 5.0)
+
+
+def _scale_variance(learned: Prewhitening, weight: float) -> float:
+    """Of the relative error of the standard deviation, as a chart whose newest value weighs `weight` feels it."""
+    return learned.sd_variance + (1.0 - weight) ** 2 * learned.passed_variance

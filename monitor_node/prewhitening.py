@@ -1,0 +1,163 @@
+"""What chance does to a residual when nothing is wrong, and the residual with that taken out.
+
+Run lengths hold for independent values. The residuals of a plant are not: the model leaves something out, noise has a
+memory. A CUSUM that promises a false alarm every 465 samples gives one every 118 if neighbours are correlated by 0.25
+(Johnson & Bagshaw 1974, The effect of serial correlation on the performance of CUSUM tests, Technometrics 16). So an
+autoregression of the residual on its own past is learned from the training, and what the charts see is what that
+cannot predict, in units of its standard deviation (Alwan & Roberts 1988, Time-series modeling for statistical process
+control, J. Business & Economic Statistics 6):
+
+    e[k] = (z[k] - c - a1 z[k-1] - ... - ap z[k-p]) / sigma.
+
+A lasting shift of z by d shows in e as d (1 - a1 - ... - ap) / sigma: a plant whose residual wanders by itself hides
+small faults, and that is honest. Mean, standard deviation and coefficients come from a finite training, and charts
+with a long memory feel their errors; how large these are is kept beside them, and limits are made wider by it (see
+`false_alarm_budget`).
+"""
+
+from collections import deque
+from math import isfinite, nan
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LARGEST_ORDER = 6
+ROWS_A_COEFFICIENT = 10
+"""An autoregression has at most one coefficient for so many rows."""
+
+LARGEST_SUM = 0.98
+"""Of the coefficients. Nearer to 1 the residual is a random walk, and nothing would ever be a shift."""
+
+
+class Prewhitening(msgspec.Struct, frozen=True):
+    """An autoregression of a residual, learned from its training.
+
+    Attributes:
+        constant: c, in the units of z.
+        coefficients: a1, ..., ap.
+        sd: sigma, in the units of z.
+        rows: that it was learned from.
+        sd_variance: variance of the relative error of sigma.
+        passed_variance: variance of the relative error of 1 - a1 - ... - ap; a chart with a long memory feels it as if
+            it were one of sigma.
+    """
+
+    constant: float
+    coefficients: tuple[float, ...]
+    sd: float
+    rows: int
+    sd_variance: float
+    passed_variance: float
+
+    @property
+    def passed(self) -> float:
+        """The part of a lasting shift that is left in e, 1 - a1 - ... - ap."""
+        return 1.0 - sum(self.coefficients)
+
+
+def learn(z: Array, smallest_sd: float) -> Prewhitening:
+    """The autoregression of a residual, its order by Akaike's criterion, at least 1.
+
+    The order is never 0: a correlation too small to be sure of still changes the run length of a chart with a long
+    memory, and a coefficient that is learned carries its uncertainty with it.
+
+    Args:
+        z: shape (n,), in order of time; NaN where it is not known or not to be learned from.
+        smallest_sd: sigma is at least this.
+    """
+    known = int(np.count_nonzero(np.isfinite(z)))
+    largest = min(LARGEST_ORDER, known // ROWS_A_COEFFICIENT - 1)
+    fits = []
+    if largest >= 1:
+        lagged = np.column_stack([z[largest - lag : z.size - lag] for lag in range(largest + 1)])
+        rows = lagged[np.all(np.isfinite(lagged), axis=1)]
+        fits = [_fitted(rows, order, smallest_sd) for order in range(1, largest + 1) if len(rows) > 3 * (order + 1)]
+    if not fits:
+        return _constant(z[np.isfinite(z)], smallest_sd)
+    return min(fits, key=lambda fit: fit.rows * np.log(fit.sd) + len(fit.coefficients))
+
+
+def _constant(z: Array, smallest_sd: float) -> Prewhitening:
+    sd = float(np.std(z, ddof=1)) if z.size > 1 else 0.0
+    return Prewhitening(
+        float(np.mean(z)) if z.size else 0.0, (), max(sd, smallest_sd), z.size, 1.0 / (2.0 * max(z.size, 1)), 0.0
+    )
+
+
+def _fitted(rows: Array, order: int, smallest_sd: float) -> Prewhitening:
+    target, past = rows[:, 0], rows[:, 1 : order + 1]
+    centre = past.mean(axis=0)
+    centred = past - centre
+    gram = centred.T @ centred
+    # A residual that does not vary has no past to learn from: the least ridge makes its coefficients 0.
+    gram[np.diag_indices(order)] += 1e-9 * np.trace(gram) / order + smallest_sd**2
+    a = np.linalg.solve(gram, centred.T @ (target - target.mean()))
+    if a.sum() > LARGEST_SUM:
+        a *= LARGEST_SUM / a.sum()
+    error = target - target.mean() - centred @ a
+    freedom = len(rows) - order - 1
+    variance = float(error @ error) / freedom
+    sd = max(variance**0.5, smallest_sd)
+    passed = 1.0 - float(a.sum())
+    fourth = float(np.mean(error**4)) / max(float(np.mean(error**2)) ** 2, 1e-300) if variance > 0 else 3.0
+    of_sum = variance * float(np.sum(np.linalg.inv(gram)))
+    return Prewhitening(
+        constant=float(target.mean() - centre @ a),
+        coefficients=tuple(a.tolist()),
+        sd=sd,
+        rows=len(rows),
+        sd_variance=max(fourth - 1.0, 0.5) / (4.0 * freedom),
+        passed_variance=of_sum / passed**2,
+    )
+
+
+class Prewhitener:
+    """Takes the predictable part out of a residual, value by value.
+
+    Args:
+        learned: from the training.
+    """
+
+    def __init__(self, learned: Prewhitening) -> None:
+        self.learned = learned
+        self.past: deque[float] = deque(maxlen=max(len(learned.coefficients), 1))
+        """The last values, newest first: all that it remembers."""
+        self._expected = 0.0
+
+    def expected(self) -> float:
+        """What z is going to be as far as its past can tell; without a past that is long enough: its mean."""
+        learned = self.learned
+        if len(self.past) < len(learned.coefficients):
+            return learned.constant / learned.passed
+        value = learned.constant
+        for coefficient, z in zip(learned.coefficients, self.past, strict=False):
+            value += coefficient * z
+        return value
+
+    def update(self, z: float) -> float:
+        """The next value in units of sigma with what was to be expected taken out; NaN for NaN.
+
+        After a gap the past is forgotten, and until it is there again the values are not judged: NaN.
+
+        Args:
+            z: NaN if it is missing.
+        """
+        if not isfinite(z):
+            self.past.clear()
+            return nan
+        known = len(self.past) >= len(self.learned.coefficients)
+        self._expected = self.expected()
+        e = (z - self._expected) / self.learned.sd if known else nan
+        self.past.appendleft(z)
+        return e
+
+    def withhold(self) -> None:
+        """Take the last value for an outlier: what was expected instead is remembered."""
+        self.past[0] = self._expected
+
+    def restart(self) -> None:
+        """Forget the values seen."""
+        self.past.clear()

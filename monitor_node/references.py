@@ -1,0 +1,202 @@
+"""What a row is expected to be: the reference that residuals are taken against. It is frozen when the training ends.
+
+Two kinds. `ProcessReference` is the extended Kalman filter of the reactor's equations: it knows how the plant bends,
+so a coolant flow that it has never seen is no surprise to it, and irregular rows are none either. `ArxReference` is the
+identified model: it holds for any plant, but only where it was trained, so rows whose input lies outside of that
+are not judged.
+"""
+
+from math import isfinite, nan
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.errors import InputError
+from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.noise import tune
+from reactorwatch.records.record import MINUTE_NS
+
+Array = NDArray[np.float64]
+
+GATE = 6.0
+"""A value so many standard deviations off does not correct the filter until the next one confirms it."""
+
+MARGIN = 0.1
+"""Of the range of the input in training, by which it may be left on either side."""
+
+
+class Expected(NamedTuple):
+    """What was expected of a row before it was seen, and how sure that was.
+
+    Attributes:
+        prediction: one an output, in its unit; NaN where nothing can be said.
+        sd: of the residual, in the output's unit: as far as the reference knows it, 1 if it does not.
+    """
+
+    prediction: list[float]
+    sd: list[float]
+
+
+class Reference(Protocol):
+    """What rows are expected by.
+
+    Attributes:
+        kind: as in the settings.
+    """
+
+    kind: str
+
+    def update(self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...]) -> Expected:
+        """Take a row in.
+
+        Args:
+            time_ns: of the row.
+            input_value: of the plant's input; NaN if missing.
+            values: of the outputs; NaN where missing.
+            accept: outputs that the reference is to follow however far off they are.
+        """
+
+    def restart(self) -> None:
+        """Begin anew with the next row: the plant's clock was set, or it was away for long."""
+
+
+class ProcessReference:
+    """The filter of the reactor's equations.
+
+    Args:
+        model: of the plant.
+        outputs: the names of those that are watched, in order.
+        noise: of the plant and its sensors.
+
+    Raises:
+        InputError: the model lacks an output.
+    """
+
+    kind = "process"
+
+    def __init__(self, model: ProcessModel, outputs: tuple[str, ...], noise: NoiseLevels) -> None:
+        self.model, self.noise = model, noise
+        self._filter = Filter(model, noise)
+        self._places = places(model, outputs)
+        self._count = len(model.outputs)
+        self._accept_all = len(outputs) == self._count and self._places == list(range(self._count))
+        self._last_input, self._guessed = nan, False
+
+    def update(self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...]) -> Expected:
+        """See `Reference`.
+
+        An input that is missing is taken to be as it was. If it comes back as another, nobody knows since when, and the
+        filter begins anew.
+        """
+        if isfinite(input_value):
+            if self._guessed and input_value != self._last_input:
+                self._filter.restart()
+            self._last_input, self._guessed = input_value, False
+        elif isfinite(self._last_input):
+            self._guessed = True
+        else:
+            nothing = [nan] * len(values)
+            return Expected(nothing, nothing)
+        if self._accept_all:
+            found = self._filter.update(time_ns / MINUTE_NS, (self._last_input,), values, gate=GATE, accept=accept)
+            return Expected(list(found.prediction), list(found.sd))
+        measured, followed = [nan] * self._count, [False] * self._count
+        for place, value, follow in zip(self._places, values, accept, strict=True):
+            measured[place], followed[place] = value, follow
+        found = self._filter.update(
+            time_ns / MINUTE_NS, (self._last_input,), measured, gate=GATE, accept=tuple(followed)
+        )
+        return Expected(
+            [found.prediction[place] for place in self._places], [found.sd[place] for place in self._places]
+        )
+
+    def restart(self) -> None:
+        """See `Reference`."""
+        self._filter.restart()
+
+    def run(self, time_min: Array, inputs: Array, measured: Array) -> tuple[Array, Array]:
+        """Take many rows in; returns the residuals, and the same in standard deviations, each of shape (n, outputs).
+
+        Args:
+            time_min: shape (n,).
+            inputs: shape (n,).
+            measured: shape (n, outputs).
+        """
+        residuals, z = np.full(measured.shape, np.nan), np.full(measured.shape, np.nan)
+        accept = (False,) * measured.shape[1]
+        for row, values in enumerate(measured.tolist()):
+            expected = self.update(round(time_min[row] * MINUTE_NS), float(inputs[row]), values, accept)
+            off = [value - prediction for value, prediction in zip(values, expected.prediction, strict=True)]
+            residuals[row] = off
+            z[row] = [size / sd for size, sd in zip(off, expected.sd, strict=True)]
+            accept = tuple(abs(size) > GATE for size in z[row].tolist())
+        return residuals, z
+
+
+class ArxReference:
+    """Identified models, one an output; their predictions are handed in.
+
+    Args:
+        inputs: that were seen in training, shape (n,).
+    """
+
+    kind = "arx"
+
+    def __init__(self, inputs: Array) -> None:
+        known = inputs[np.isfinite(inputs)]
+        low, high = (float(known.min()), float(known.max())) if known.size else (-np.inf, np.inf)
+        margin = MARGIN * (high - low)
+        self._low, self._high = low - margin, high + margin
+        self.predictions: list[float] = []
+        """Of the row that is to come, one an output."""
+
+    def update(self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...]) -> Expected:
+        """See `Reference`. Outside of what it was trained on, nothing can be said."""
+        if self._low <= input_value <= self._high:
+            return Expected(self.predictions, [1.0] * len(values))
+        return Expected([nan] * len(values), [1.0] * len(values))
+
+    def restart(self) -> None:
+        """Nothing: the models begin anew by themselves."""
+
+
+def places(model: ProcessModel, outputs: tuple[str, ...]) -> list[int]:
+    """Where the outputs are among those of the model.
+
+    Raises:
+        InputError: one is not among them.
+    """
+    for output in outputs:
+        if output not in model.output_names:
+            raise InputError(
+                f"reference 'process' needs outputs of the reactor, {', '.join(model.output_names)}, got {output!r}; "
+                f'set reference = "arx"'
+            )
+    return [model.output_names.index(output) for output in outputs]
+
+
+def tuned(
+    model: ProcessModel,
+    outputs: tuple[str, ...],
+    time_min: Array,
+    inputs: Array,
+    measured: Array,
+    smallest_sd: list[float],
+) -> NoiseLevels:
+    """The noise of a plant and its sensors, from its training.
+
+    Args:
+        model: of the plant.
+        outputs: the watched ones.
+        time_min: shape (n,).
+        inputs: shape (n,).
+        measured: shape (n, outputs); NaN where missing or not to be learned from.
+        smallest_sd: of the sensors, one an output.
+    """
+    whole = np.full((time_min.size, len(model.outputs)), np.nan)
+    smallest = [1e-6] * len(model.outputs)
+    for place, column, sd in zip(places(model, outputs), measured.T, smallest_sd, strict=True):
+        whole[:, place], smallest[place] = column, sd
+    return tune(model, time_min, inputs, whole, smallest)

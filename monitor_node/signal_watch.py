@@ -1,0 +1,181 @@
+"""Faults of the signals themselves, told as what they are: a stuck sensor, a spike, silence.
+
+None of them needs a model of what a fault looks like in the process, and each is told at once: a stuck sensor after as
+many equal readings as its noise makes impossible, a spike with the value after it, a silence when the next sample
+is overdue.
+"""
+
+from math import isfinite
+
+from monitor_node.alarm_board import AlarmBoard
+from monitor_node.alarms import ChartAlarm, Explanation
+from monitor_node.charts.base import Judgement
+from monitor_node.config import MonitorConfig
+from monitor_node.silence import NOTHING, Change, Silence
+from monitor_node.spike import Spike, spike_limit
+from monitor_node.stuck import Stuck
+from reactorwatch.contract.codec import Publication
+
+PLANT = "plant"
+"""What the silence of all signals together is of."""
+
+READINGS = "readings"
+
+FEWEST_FOR_SPIKES = 50
+
+
+class SignalWatch:
+    """Watches the signals of one plant.
+
+    Args:
+        config: of the monitor.
+        board: the alarms of the plant; those of the signals are declared here.
+    """
+
+    def __init__(self, config: MonitorConfig, board: AlarmBoard) -> None:
+        self._board = board
+        outputs = config.outputs
+        self._names = (PLANT, config.input, *outputs)
+        self._silences = [Silence(config.silence_periods) for _ in self._names]
+        self._silent = [
+            board.declare(Silence.name, name, at_once=True, over_at_once=True, priority="high", tells_cause=True)
+            for name in self._names
+        ]
+        self._outputs = outputs
+        self._stuck_alarms = [board.declare(Stuck.name, name, at_once=True, tells_cause=True) for name in outputs]
+        self._spike_alarms = [
+            board.declare(Spike.name, name, at_once=True, priority="low", tells_cause=True) for name in outputs
+        ]
+        self._stuck: list[Stuck] = []
+        self._spikes: list[Spike | None] = []
+
+    @staticmethod
+    def chance_alarms(config: MonitorConfig) -> int:
+        """How many of its alarms chance can raise."""
+        return 2 * len(config.outputs)
+
+    def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
+        """Learn from the training.
+
+        Args:
+            values: readings of each output, in order of time; NaN where missing.
+            e: prewhitened residuals of each output; NaN where there are none.
+            arl0: run length of each alarm without a fault, in rows.
+        """
+        self._stuck, self._spikes = [], []
+        for readings, residuals in zip(values, e, strict=True):
+            stuck = Stuck(arl0)
+            for reading in readings:
+                if isfinite(reading):
+                    stuck.learn(reading)
+            self._stuck.append(stuck)
+            known = [size for size in residuals if isfinite(size)]
+            enough = len(known) >= FEWEST_FOR_SPIKES
+            self._spikes.append(Spike(spike_limit(known, arl0)) if enough else None)
+
+    # --- rows ------------------------------------------------------------------------------------------------
+
+    def hear(self, time_ns: int, input_value: float, values: list[float]) -> list[Publication]:
+        """Look for silence in a row.
+
+        Args:
+            time_ns: of the row.
+            input_value: NaN if missing.
+            values: of the outputs; NaN where missing.
+        """
+        plant, *signals = self._silences
+        change = plant.update(time_ns, present=True)
+        publications = self._tell(0, change) if change is not NOTHING else []
+        for index, (silence, value) in enumerate(zip(signals, (input_value, *values), strict=True), start=1):
+            if change is not NOTHING:
+                silence.excuse(time_ns)
+            own = silence.update(time_ns, present=isfinite(value))
+            if own is not NOTHING:
+                publications += self._tell(index, own)
+        return publications
+
+    def look(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
+        """Look for stuck sensors in a row."""
+        publications: list[Publication] = []
+        for stuck, alarm, name, value, unit in zip(
+            self._stuck, self._stuck_alarms, self._outputs, values, units, strict=True
+        ):
+            if not isfinite(value):
+                continue
+            judgement = stuck.update(value)
+            if judgement.out or not alarm.at_rest:
+                text = f"{name} is stuck: it has read {value:.6g} {unit} {judgement.statistic:.0f} times in a row"
+                publications += self._judge(alarm, time_ns, judgement, READINGS, text, name, cause="stuck_sensor")
+        return publications
+
+    def withheld(
+        self, time_ns: int, e: list[float], scales: list[float], units: list[str]
+    ) -> tuple[list[bool], list[Publication]]:
+        """Look for spikes in a row; tells which of its values must not enter a memory yet.
+
+        Args:
+            time_ns: of the row.
+            e: prewhitened residuals; NaN where there are none.
+            scales: what one standard deviation is, in the outputs' units.
+            units: of the outputs.
+        """
+        flags, publications = [], list[Publication]()
+        for index, (spike, alarm, name) in enumerate(zip(self._spikes, self._spike_alarms, self._outputs, strict=True)):
+            if spike is None or not isfinite(e[index]):
+                flags.append(False)
+                continue
+            verdict = spike.update(e[index])
+            flags.append(verdict.withhold)
+            if verdict.spike or not alarm.at_rest:
+                size = verdict.size if verdict.spike else 0.0
+                judgement = Judgement(size, 0.0, -spike.limit, spike.limit, verdict.spike)
+                text = (
+                    f"{name} had a spike of {size * scales[index]:+.3g} {units[index]} one row before; it was left out"
+                )
+                publications += self._judge(alarm, time_ns, judgement, "sd", text, name, cause="spike")
+        return flags, publications
+
+    def restart(self) -> None:
+        """Forget the rows seen, as after a gap."""
+        for stuck in self._stuck:
+            stuck.restart()
+        for spike in self._spikes:
+            if spike is not None:
+                spike.restart()
+
+    # --- the clock of receipt --------------------------------------------------------------------------------
+
+    def received(self, now_ns: int) -> None:
+        """Note that something came from the plant."""
+        self._silences[0].received(now_ns)
+
+    def due_ns(self) -> int | None:
+        """When to `check`, unless something comes before; None: there is nothing to wait for."""
+        return self._silences[0].due_ns()
+
+    def check(self, now_ns: int) -> list[Publication]:
+        """Look whether the plant is silent, by the clock of receipt."""
+        change = self._silences[0].check(now_ns)
+        return self._tell(0, change) if change is not NOTHING else []
+
+    # --- within ----------------------------------------------------------------------------------------------
+
+    def _tell(self, index: int, change: Change) -> list[Publication]:
+        name, alarm = self._names[index], self._silent[index]
+        publications: list[Publication] = []
+        if change.raised_ns is not None:
+            text = "the plant is silent: no sample of it comes" if index == 0 else f"{name} is silent: the others go on"
+            raised = Judgement(1.0, 0.0, 0.0, 0.0, True)
+            publications += self._judge(alarm, change.raised_ns, raised, "", text, name, cause="silence")
+        if change.cleared_ns is not None:
+            over = Judgement(0.0, 0.0, 0.0, 0.0, False)
+            publications += self._judge(alarm, change.cleared_ns, over, "", "", name, cause="silence")
+        return publications
+
+    def _judge(
+        self, alarm: ChartAlarm, time_ns: int, judgement: Judgement, unit: str, text: str, name: str, *, cause: str
+    ) -> list[Publication]:
+        def explain(_: Judgement) -> Explanation:
+            return Explanation(text, {} if name == PLANT else {name: 1.0}, [(cause, 1.0)])
+
+        return self._board.judge(alarm, time_ns, judgement, unit, explain)

@@ -1,0 +1,237 @@
+"""The watch over a plant, row by row: it learns what is normal, then judges what comes.
+
+A row goes this way: the identified models predict it and learn from it; while the plant is in training it is kept, and
+afterwards the reference predicts it, its residuals are prewhitened, and the charts judge what remains. The reference is
+frozen: a model that goes on adapting would learn a fault and call it normal. It goes on adapting beside it, and how
+far it has gone from the reference is told as drift.
+"""
+
+from math import isfinite, nan
+
+from monitor_node import false_alarm_budget
+from monitor_node.alarm_board import AlarmBoard
+from monitor_node.alignment import Row
+from monitor_node.chart_watch import ChartWatch, alarm_names
+from monitor_node.config import MonitorConfig
+from monitor_node.predictor import ArxPredictor
+from monitor_node.prewhitening import Prewhitener
+from monitor_node.references import ArxReference, Reference
+from monitor_node.sampling import SamplingPeriod
+from monitor_node.signal_watch import SignalWatch
+from monitor_node.training import MOST_REFUSALS, Trained, Training
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Check, Estimate, ModelSnapshot
+from reactorwatch.errors import InputError
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import MINUTE_NS
+
+
+class PlantWatch:
+    """Watches one plant.
+
+    Args:
+        config: of the monitor.
+        board: the alarms of the plant.
+        points: whether estimates, charts' points and models are to be published.
+
+    Raises:
+        InputError: the settings ask for the process model of a plant that it is not of.
+
+    Attributes:
+        notes: what people are to be told, oldest first; whoever tells them empties it.
+        rows_watched: rows that were judged.
+        signals: the watch over the signals themselves.
+    """
+
+    def __init__(self, config: MonitorConfig, board: AlarmBoard, *, points: bool = True) -> None:
+        self._config = config
+        self._points = points
+        self._model = _model(config)
+        self._sampling = SamplingPeriod()
+        self._charts = ChartWatch(config, board)
+        self.signals = SignalWatch(config, board)
+        self._chance_alarms = len(alarm_names(config)) + self.signals.chance_alarms(config)
+        self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
+        self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
+        self._refusals = 0
+        self._checks: list[Check] = []
+        self._reference: Reference | None = None
+        self._whiteners: list[Prewhitener] = []
+        self._arl0 = 0.0
+        self._withheld = [False] * len(config.outputs)
+        self._begin_training(None)
+        self.notes: list[str] = []
+        self.rows_watched = 0
+
+    @property
+    def watching(self) -> bool:
+        """Whether rows are judged."""
+        return self._reference is not None
+
+    @property
+    def expected_false_alarms(self) -> float:
+        """Alarms that chance alone would have raised by now, on average."""
+        return self.rows_watched * self._chance_alarms / self._arl0 if self._arl0 else 0.0
+
+    def update(self, row: Row, units: list[str], publications: list[Publication]) -> None:
+        """Take a row in.
+
+        Args:
+            row: input first, then the outputs.
+            units: of the outputs.
+            publications: what is to be published is added here.
+        """
+        time_ns, input_value, values = row.time_ns, row.values[0], list(row.values[1:])
+        follows = self._sampling.follows(time_ns) and not row.restarted
+        publications.extend(self.signals.hear(time_ns, input_value, values))
+        if self._reference is None:
+            self._train(time_ns, input_value, values, units, publications, follows=follows)
+        else:
+            self._judge(time_ns, input_value, values, units, publications, follows=follows)
+
+    def snapshots(self, time_ns: int) -> list[Publication]:
+        """The identified models as they are now: those that adapt and, once there are, the references."""
+        told: list[Publication] = []
+        if not self._points:
+            return told
+        for key, predictor in zip(self._model_keys, self._predictors, strict=True):
+            adaptive, reference = predictor.adaptive(), predictor.reference()
+            if adaptive is not None:
+                told.append(Publication(key, ModelSnapshot(time_ns=time_ns, reference=False, **adaptive)))
+            if reference is not None:
+                snapshot = ModelSnapshot(time_ns=time_ns, reference=True, **reference)
+                snapshot.checks.extend(self._checks)
+                told.append(Publication(key, snapshot))
+        return told
+
+    # --- training --------------------------------------------------------------------------------------------
+
+    def _begin_training(self, time_ns: int | None) -> None:
+        config = self._config
+        self._began_ns = time_ns
+        self._training = Training(config, self._model)
+        self._predictors = [ArxPredictor(config.order, config.delay, config.forgetting) for _ in config.outputs]
+
+    def _train(
+        self,
+        time_ns: int,
+        input_value: float,
+        values: list[float],
+        units: list[str],
+        publications: list[Publication],
+        *,
+        follows: bool,
+    ) -> None:
+        config = self._config
+        if self._began_ns is None or time_ns < self._began_ns:
+            self._began_ns = time_ns
+        trained_min = (time_ns - self._began_ns) / MINUTE_NS
+        hold = trained_min >= config.identification_share * config.training_min
+        if trained_min >= config.training_min and self._training.enough:
+            trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
+            if trained.refused:
+                self._refusals += 1
+                self.notes.append(f"the training begins anew: {trained.refused}")
+                self._begin_training(time_ns)
+            else:
+                self._start(trained)
+                self._judge(time_ns, input_value, values, units, publications, follows=follows)
+                publications.extend(self.snapshots(time_ns))
+                return
+        had_reference = [predictor.has_reference for predictor in self._predictors]
+        predictions = [
+            predictor.update(time_ns, input_value, value, follows=follows, hold_reference=hold)
+            for predictor, value in zip(self._predictors, values, strict=True)
+        ]
+        residuals = [value - prediction for value, prediction in zip(values, predictions, strict=True)]
+        judged = [size if held else nan for size, held in zip(residuals, had_reference, strict=True)]
+        self._training.add(time_ns, input_value, values, judged)
+        if self._points:
+            for key, prediction, residual, unit in zip(self._estimate_keys, predictions, residuals, units, strict=True):
+                if isfinite(residual):
+                    publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
+
+    def _start(self, trained: Trained) -> None:
+        config = self._config
+        period_ns = self._sampling.period_ns
+        self._arl0 = false_alarm_budget.share_arl0(
+            config.false_alarms_per_30_days, self._chance_alarms, period_ns / MINUTE_NS
+        )
+        self._reference, self._checks = trained.reference, trained.checks
+        self._whiteners = [Prewhitener(item) for item in trained.learned]
+        self._charts.start(trained.learned, trained.e, self._arl0)
+        self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
+        notes = [check.result for check in trained.checks if check.result != "ok"]
+        self.notes += [f"training: {note}" for note in notes]
+
+    # --- watching --------------------------------------------------------------------------------------------
+
+    def _judge(
+        self,
+        time_ns: int,
+        input_value: float,
+        values: list[float],
+        units: list[str],
+        publications: list[Publication],
+        *,
+        follows: bool,
+    ) -> None:
+        reference = self._reference
+        assert reference is not None
+        predictions = [
+            predictor.update(time_ns, input_value, value, follows=follows, hold_reference=True)
+            for predictor, value in zip(self._predictors, values, strict=True)
+        ]
+        if isinstance(reference, ArxReference):
+            reference.predictions = predictions
+        if self._sampling.gap:  # nobody knows what the input did in it
+            reference.restart()
+            self.signals.restart()
+            for whitener in self._whiteners:
+                whitener.restart()
+        expected = reference.update(time_ns, input_value, values, tuple(self._withheld))
+        e: list[float] = []
+        for index, whitener in enumerate(self._whiteners):
+            residual, sd = values[index] - expected.prediction[index], expected.sd[index]
+            if self._points and isfinite(residual):
+                usual = expected.prediction[index] + sd * whitener.expected()
+                reach = sd * whitener.learned.sd * self._charts.widths[index]
+                estimate = _estimate(time_ns, expected.prediction[index], residual, units[index])
+                estimate.residual_sd = sd * whitener.learned.sd
+                estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach
+                publications.append(Publication(self._estimate_keys[index], estimate))
+            e.append(whitener.update(residual / sd))
+        scales = [sd * whitener.learned.sd for sd, whitener in zip(expected.sd, self._whiteners, strict=True)]
+        self.rows_watched += 1
+        publications.extend(self.signals.look(time_ns, values, units))
+        self._withheld, told = self.signals.withheld(time_ns, e, scales, units)
+        publications.extend(told)
+        for whitener, withheld in zip(self._whiteners, self._withheld, strict=True):
+            if withheld:
+                whitener.withhold()
+        self._charts.update(time_ns, e, self._withheld, scales, units, publications, points=self._points)
+
+
+def _model(config: MonitorConfig) -> ProcessModel | None:
+    """The process model that the plant may be watched by."""
+    if config.reference == "arx":
+        return None
+    model = cstr()
+    fits = (config.input,) == model.input_names and set(config.outputs) <= set(model.output_names)
+    if fits:
+        return model
+    if config.reference == "auto":
+        return None
+    raise InputError(
+        f"reference 'process' needs the reactor's signals, input {', '.join(model.input_names)} and outputs of "
+        f"{', '.join(model.output_names)}, got {config.input} and {', '.join(config.outputs)}; "
+        'set reference = "arx"'
+    )
+
+
+def _estimate(time_ns: int, prediction: float, residual: float, unit: str) -> Estimate:
+    return Estimate(
+        time_ns=time_ns, prediction=prediction, residual=residual, lower_limit=nan, upper_limit=nan, unit=unit
+    )

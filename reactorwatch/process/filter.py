@@ -1,0 +1,396 @@
+"""The extended Kalman filter of a process model: what the next measurement should be, and how sure that is.
+
+Between two rows the state follows the model's equations and its covariance their linearisation: with F the Jacobian of
+the way and Q the process noise of a minute (see `NoiseLevels`)
+
+    x <- Phi(x, u),    P <- F P F' + Q h,
+
+with the input of the row before, which was held until now. The measurements of a row, whose noise is independent of
+each other's, then correct it one after the other, in the form of Joseph (Bucy & Joseph 1968, Filtering for Stochastic
+Processes with Applications to Guidance), which keeps P symmetric and positive definite over months:
+
+    K = P H' / (H P H' + R),    x <- x + K (y - yhat),    P <- (1 - K H) P (1 - K H)' + K R K'.
+
+The innovation y - yhat is white with the covariance S = H P H' + R if the model is right (Kailath 1968, An innovations
+approach to least-squares estimation, IEEE Trans. Automatic Control 13), so L^-1 (y - yhat) with L L' = S is standard
+normal and its components are independent of each other. All that is done for a row is one compiled function.
+
+What is out of the ordinary is handled like this:
+
+- A value that is missing is NaN; it corrects nothing. One that is far off corrects nothing until the caller says that
+  it is to be followed: one outlier would pull the filter away for minutes.
+- A row more than `LONGEST_STEP_MIN` after the one before is walked to in steps. After a gap of more than
+  `LONGEST_GAP_MIN`, or a step back in time, the filter begins anew: on an unstable stretch the uncertainty grows without
+  bound, and the model does not know what was done to the plant meanwhile.
+- It begins anew as well where the equations leave the bounds of the states, or are no numbers any more. A correction
+  that leads out of the bounds is cut off there.
+- It begins at what is measured, very uncertain of it, and says nothing of that row. If not all states can be read off
+  what is measured, the others begin at the steady state that is nearest to it; as long as nothing is, it waits.
+"""
+
+import struct
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from math import ceil, inf, log, nan, pi
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.process.filter_step import chained, output_function, row_function, walk_function
+from reactorwatch.process.integrate import LONGEST_STEP_MIN
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.steady_state import steady_states
+
+LONGEST_GAP_MIN = 30.0
+
+START_SD = 3.0
+"""Standard deviation at the start of a state that no sensor shows, in its scales."""
+
+START_SDS = 10.0
+"""Standard deviation at the start of a state that a sensor shows, in those of the sensor: it may be an outlier."""
+
+LEAST_PROCESS_SD = 1e-6
+"""Of the scale of a state. Without any process noise its covariance would shrink below what a number can hold."""
+
+CHUNK, UNROLLED = 32, 8
+"""Rows in one compiled chain, and how many of them are one expression."""
+
+_BEGINNINGS = 5  # corrections that it takes to find the state where an output is no linear function of it
+_LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded
+
+
+class NoiseLevels(msgspec.Struct, frozen=True):
+    """The noise of a process and of its sensors.
+
+    Attributes:
+        measurement_sd: one an output, in its unit.
+        process_sd: one a state, in its unit per square root of a minute: dx = f(x) dt + sd dW.
+    """
+
+    measurement_sd: tuple[float, ...]
+    process_sd: tuple[float, ...]
+
+
+class Innovation(NamedTuple):
+    """What a row's measurements were off by, one number an output. In the row that a filter begins with all are NaN.
+
+    Attributes:
+        prediction: before the row was seen.
+        residual: measured less predicted; NaN where nothing was measured.
+        sd: standard deviation of the residual if the model is right.
+        whitened: independent of each other and standard normal if the model is right; NaN where nothing was measured.
+    """
+
+    prediction: tuple[float, ...]
+    residual: tuple[float, ...]
+    sd: tuple[float, ...]
+    whitened: tuple[float, ...]
+
+
+class Innovations(NamedTuple):
+    """What a record was off by. In rows that the filter begins with all are NaN.
+
+    Attributes:
+        prediction: shape (rows, n_y), like the next three; as for `Innovation`.
+        residual: likewise.
+        sd: likewise.
+        whitened: likewise.
+        log_likelihood: of the record under the model.
+        x: the state after each row, shape (rows, n_x).
+        P: its covariance, shape (rows, n_x, n_x).
+    """
+
+    prediction: Array
+    residual: Array
+    sd: Array
+    whitened: Array
+    log_likelihood: float
+    x: Array
+    P: Array
+
+
+class FilterState(msgspec.Struct, frozen=True):
+    """Everything that a filter remembers.
+
+    Attributes:
+        time_min: of the last row; None before the first.
+        inputs: of the last row.
+        x: the state there.
+        P: its covariance, row by row.
+    """
+
+    time_min: float | None
+    inputs: tuple[float, ...]
+    x: tuple[float, ...]
+    P: tuple[float, ...]
+
+
+class Filter:
+    """Follows one plant. Not for two threads at once.
+
+    Args:
+        model: of the plant.
+        noise: of the plant and its sensors.
+        changes: parameters that differ from the model's values.
+
+    Raises:
+        ValueError: noise of another size than the model, or that is not positive (of a state: negative); a change that
+            names no parameter, or is out of its bounds.
+    """
+
+    def __init__(self, model: ProcessModel, noise: NoiseLevels, changes: Mapping[str, float] | None = None) -> None:
+        self.model = model
+        self._n_x, self._n_y = len(model.states), len(model.outputs)
+        self._nothing = Innovation(*((nan,) * self._n_y,) * 4)
+        self._row_function = row_function(model)
+        self._row = ArrayFunction(self._row_function)
+        self._memory, new, self._constants = (item[0] for item in self._row.arguments)
+        after, told = (item[0] for item in self._row.results)
+        self._memory_view, self._new, self._after, self._told = (
+            memoryview(item) for item in (self._memory, new, after, told)
+        )
+        self._pack, self._unpack = struct.Struct(f"{new.size}d").pack_into, struct.Struct(f"{told.size}d").unpack
+        self._time_min: float | None = None
+        self._inputs: tuple[float, ...] = ()
+        self._breaks: tuple[float, ...] = ()
+        self.noise = noise
+        self.change(changes or {})
+
+    @property
+    def noise(self) -> NoiseLevels:
+        """Of the plant and its sensors."""
+        return self._noise
+
+    @noise.setter
+    def noise(self, noise: NoiseLevels) -> None:
+        n_x, n_y = self._n_x, self._n_y
+        if len(noise.measurement_sd) != n_y or not all(0 < sd < inf for sd in noise.measurement_sd):
+            raise ValueError(f"measurement_sd must be {n_y} positive numbers, got {noise.measurement_sd}")
+        if len(noise.process_sd) != n_x or not all(0 <= sd < inf for sd in noise.process_sd):
+            raise ValueError(f"process_sd must be {n_x} numbers of at least 0, got {noise.process_sd}")
+        self._noise = noise
+        least = [LEAST_PROCESS_SD * state.scale for state in self.model.states]
+        sds = np.concatenate([noise.measurement_sd, np.maximum(noise.process_sd, least)])
+        self._constants[len(self.model.parameters) :] = np.square(sds)
+
+    def change(self, changes: Mapping[str, float]) -> None:
+        """From the next row on, these parameters differ from the model's values, and no others do.
+
+        Raises:
+            ValueError: one names no parameter, or is out of its bounds.
+        """
+        values = self.model.values(changes)
+        self._changes = dict(changes)
+        self._constants[: values.size] = values
+        names = self.model.parameter_names
+        self._breaks = tuple(sorted({float(values[names.index(name)]) for name in self.model.breakpoints}))
+
+    def restart(self) -> None:
+        """Begin anew with the next row."""
+        self._time_min = None
+
+    @property
+    def state(self) -> FilterState:
+        """Everything that it remembers."""
+        memory = tuple(self._memory.tolist())
+        return FilterState(self._time_min, self._inputs, memory[: self._n_x], memory[self._n_x :])
+
+    @state.setter
+    def state(self, state: FilterState) -> None:
+        self._time_min, self._inputs = state.time_min, state.inputs
+        self._memory[:] = [*state.x, *state.P]
+
+    def update(
+        self,
+        time_min: float,
+        inputs: Sequence[float],
+        measured: Sequence[float],
+        *,
+        gate: float = inf,
+        accept: Sequence[bool] = (),
+    ) -> Innovation:
+        """Take a row in.
+
+        Args:
+            time_min: of the row.
+            inputs: that hold from this row on.
+            measured: one an output; NaN: missing.
+            gate: standard deviations beyond which a measurement does not correct the state ...
+            accept: ... unless this says so for its output; empty: for none.
+        """
+        n, before = self._n_y, self._time_min
+        if before is None or not 0.0 < time_min - before <= LONGEST_GAP_MIN:
+            return self._begin(time_min, inputs, measured)
+        step = 0.5 * (time_min - before)
+        steps = (before, step, step)
+        if self._breaks or 2.0 * step > _LONGEST_ROW_MIN:
+            steps = self._walk_to_last_steps(before, time_min)
+        limits = [inf if follow else gate for follow in accept] if accept else [gate] * n
+        self._pack(self._new, 0, *self._inputs, *inputs, *steps, *measured, *limits)
+        self._row()
+        told = self._unpack(self._told)
+        if not told[-1]:
+            return self._begin(time_min, inputs, measured)
+        self._memory_view[:] = self._after
+        self._time_min, self._inputs = time_min, tuple(inputs)
+        return Innovation(told[:n], told[n : 2 * n], told[2 * n : 3 * n], told[3 * n : 4 * n])
+
+    def run(
+        self,
+        time_min: Array,
+        inputs: Array,
+        measured: Array,
+        *,
+        gate: float = inf,
+        accept: NDArray[np.bool_] | None = None,
+        start: FilterState | None = None,
+    ) -> Innovations:
+        """Take a whole record in; the numbers are those of `update`, several times faster.
+
+        Args:
+            time_min: shape (rows,).
+            inputs: shape (rows, n_u) or (rows,) for one input.
+            measured: shape (rows, n_y); NaN where missing.
+            gate: as for `update`.
+            accept: likewise, shape (rows, n_y).
+            start: what the filter remembers of the row before the first; None: it begins with the first row.
+        """
+        rows, n = time_min.size, self._n_y
+        inputs = inputs.reshape(rows, -1)
+        limits = np.where(accept, inf, gate) if accept is not None else np.full((rows, n), gate)
+        told = np.full((rows, 4 * n + 2), nan)
+        memory = np.full((rows, self._memory.size), nan)
+        if start is None:
+            self.restart()
+        else:
+            self.state = start
+        length = np.diff(time_min, prepend=nan if self._time_min is None else self._time_min)
+        plain = (length > 0) & (length <= _LONGEST_ROW_MIN)
+        for point in self._breaks:
+            plain &= ~((point > time_min - length) & (point < time_min))
+        before = np.vstack([self._inputs or inputs[0], inputs[:-1]])
+        new = np.column_stack([before, inputs, time_min - length, 0.5 * length, 0.5 * length, measured, limits])
+        ends = np.append(np.flatnonzero(~plain), rows)
+        row = 0
+        while row < rows:
+            done = 0
+            if self._time_min is not None and plain[row]:
+                stop = min(int(ends[np.searchsorted(ends, row)]), row + CHUNK)
+                done = self._run_chunk(new[row:stop], told[row:stop], memory[row:stop])
+            if done:
+                row += done
+                self._time_min, self._inputs = float(time_min[row - 1]), tuple(inputs[row - 1].tolist())
+                continue
+            values, follow = measured[row].tolist(), np.isinf(limits[row]).tolist()
+            if (
+                self.update(float(time_min[row]), inputs[row].tolist(), values, gate=gate, accept=follow)
+                is self._nothing
+            ):
+                memory[row] = self._memory if self._time_min is not None else nan
+            else:
+                told[row], memory[row] = self._told, self._memory
+            row += 1
+        x, P = memory[:, : self._n_x], memory[:, self._n_x :].reshape(rows, self._n_x, self._n_x)
+        whitened = told[:, 3 * n : 4 * n]
+        known = np.isfinite(whitened)
+        log_likelihood = -0.5 * np.sum(whitened[known] ** 2 + log(2 * pi)) - np.nansum(told[:, 4 * n])
+        return Innovations(
+            told[:, :n], told[:, n : 2 * n], told[:, 2 * n : 3 * n], whitened, float(log_likelihood), x, P
+        )
+
+    def _run_chunk(self, new: Array, told: Array, memory: Array) -> int:
+        """Take a chunk of rows in at once; returns how many of them, up to the first that did not go well."""
+        rows, chunk = len(new), self._chunk
+        chunk.arguments[0][0], chunk.arguments[2][0] = self._memory, self._constants
+        chunk.arguments[1][:rows] = new
+        chunk()
+        after, found = (result[:rows] for result in chunk.results)
+        good = found[:, -1] > 0.0
+        done = rows if good.all() else int(np.argmin(good))
+        if done:
+            told[:done], memory[:done] = found[:done], after[:done]
+            self._memory[:] = after[done - 1]
+        return done
+
+    @cached_property
+    def _chunk(self) -> ArrayFunction:
+        return chained(self._row_function, CHUNK, UNROLLED)
+
+    @cached_property
+    def _walk(self) -> ArrayFunction:
+        return ArrayFunction(walk_function(self.model))
+
+    def _walk_to_last_steps(self, before: float, time_min: float) -> tuple[float, float, float]:
+        """Predict up to the last two steps of the way; returns when the first of them begins, and their lengths."""
+        edges = [before]
+        for end in (*(point for point in self._breaks if before < point < time_min), time_min):
+            count, begin = ceil((end - edges[-1]) / (0.5 * _LONGEST_ROW_MIN)), edges[-1]
+            edges += [begin + (end - begin) * number / count for number in range(1, count)]
+            edges.append(end)
+        if len(edges) % 2 == 0:
+            edges.append(edges[-1])
+        walk = self._walk
+        walk.arguments[2][0] = self._constants
+        for place in range(0, len(edges) - 3, 2):
+            begin, middle, end = edges[place : place + 3]
+            walk.arguments[0][0] = self._memory
+            walk.arguments[1][0] = [*self._inputs, begin, middle - begin, end - middle]
+            walk()
+            self._memory[:] = walk.results[0][0]
+        begin, middle, end = edges[-3:]
+        return begin, middle - begin, end - middle
+
+    # --- beginning -------------------------------------------------------------------------------------------
+
+    @cached_property
+    def _outputs(self) -> ArrayFunction:
+        return ArrayFunction(output_function(self.model))
+
+    def _begin(self, time_min: float, inputs: Sequence[float], measured: Sequence[float]) -> Innovation:
+        """Begin at what is measured, if anything is."""
+        self._time_min = None
+        y = np.asarray(measured, dtype=float)
+        known = np.isfinite(y)
+        if known.any() and np.all(np.isfinite(inputs)):
+            states, outputs = self.model.states, self._outputs
+            lower, upper = np.array([state.lower for state in states]), np.array([state.upper for state in states])
+            wide = np.diag(np.square([START_SD * state.scale for state in states]))
+            R = np.diag(np.square(self._noise.measurement_sd))[np.ix_(known, known)]
+            x = 0.5 * (lower + upper)
+            for attempt in range(_BEGINNINGS):
+                expected, H = self._shown(x, inputs, time_min)
+                H = H[known]
+                if attempt == 0 and np.linalg.matrix_rank(H) < x.size:
+                    x = self._nearest_steady_state(inputs, time_min, y, x)
+                    expected, H = self._shown(x, inputs, time_min)
+                    H = H[known]
+                K = wide @ H.T @ np.linalg.inv(H @ wide @ H.T + R)
+                x = np.clip(x + K @ (y - expected)[known], lower, upper)
+            K = wide @ H.T @ np.linalg.inv(H @ wide @ H.T + START_SDS**2 * R)
+            rest = np.eye(x.size) - K @ H
+            P = rest @ wide @ rest.T + START_SDS**2 * K @ R @ K.T
+            self._memory[:] = [*x, *P.ravel()]
+            self._time_min, self._inputs = time_min, tuple(inputs)
+        return self._nothing
+
+    def _shown(self, x: Array, inputs: Sequence[float], time_min: float) -> tuple[Array, Array]:
+        """The outputs of a state, and their derivatives with respect to it."""
+        outputs = self._outputs
+        outputs.arguments[0][0], outputs.arguments[1][0] = x, inputs
+        outputs.arguments[2][0], outputs.arguments[3][0] = self._constants[: len(self.model.parameters)], time_min
+        outputs()
+        return outputs.results[0][0].copy(), outputs.results[1].T.copy()
+
+    def _nearest_steady_state(self, inputs: Sequence[float], time_min: float, y: Array, otherwise: Array) -> Array:
+        """The steady state whose outputs are nearest to what is measured, in standard deviations of the sensors."""
+        found = steady_states(self.model.with_values(self._changes), np.asarray(inputs, dtype=float), time_min)
+        if not found:
+            return otherwise
+
+        def distance(outputs: Array) -> float:
+            return float(np.nansum(((outputs - y) / self._noise.measurement_sd) ** 2))
+
+        return min(found, key=lambda point: distance(point.outputs)).state

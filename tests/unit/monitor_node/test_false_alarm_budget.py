@@ -1,0 +1,120 @@
+"""What is promised of false alarms is kept on average over trainings, for white residuals and autocorrelated ones."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from monitor_node import false_alarm_budget as budget
+from monitor_node.charts.base import Bank, SignalChart
+from monitor_node.charts.cusum import Cusum
+from monitor_node.charts.ewma import Ewma
+from monitor_node.charts.mewma import Mewma
+from monitor_node.charts.run_length.design import ewma_limit, mewma_limit
+from monitor_node.charts.shewhart import Shewhart
+from monitor_node.persistence import Persistence
+from monitor_node.prewhitening import Prewhitening, learn
+from reactorwatch.errors import InputError
+
+KNOWN = Prewhitening(0.0, (), 1.0, 10**12, 1e-13, 0.0)
+ARL0, TRAINING, WATCHED, PLANTS = 2000.0, 600, 6000, 300
+
+
+def residuals(phi: float, seed: int, signals: int = 1) -> np.ndarray:
+    """Shape (plants, signals, training and watched rows), of unit variance of what drives them."""
+    rows = TRAINING + WATCHED
+    noise = np.random.default_rng(seed).normal(size=(PLANTS, signals, rows + 200))
+    return np.asarray(lfilter([1.0], [1.0, -phi], noise, axis=-1))[..., 200:]
+
+
+def prewhitened(z: np.ndarray) -> tuple[Prewhitening, np.ndarray]:
+    """The training of one residual, and the rows after it in standard deviations."""
+    learned = learn(z[:TRAINING], 1e-9)
+    order = len(learned.coefficients)
+    e = z[TRAINING:] - learned.constant
+    for lag, a in enumerate(learned.coefficients, start=1):
+        e -= a * z[TRAINING - lag : z.size - lag]
+    assert order >= 1
+    return learned, e / learned.sd
+
+
+def rate_of_one(charts: list[SignalChart], e: np.ndarray) -> float:
+    """Alarms a row, over charts of many plants; each begins anew after its alarm."""
+    bank, alarms = Bank(charts), 0
+    for values in e.T:
+        out = bank.update(values).out
+        if out.any():
+            alarms += int(np.count_nonzero(out))
+            bank.restart(out)
+    return alarms / e.size
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.5])
+@pytest.mark.parametrize("chart", ["ewma", "cusum", "shewhart"])
+def test_each_chart_alarms_as_often_as_its_share_allows(chart: str, phi: float) -> None:
+    """300 trainings of 600 rows; 900 alarms are expected, clustered by training, so to a tenth or so."""
+    pairs = [prewhitened(z[0]) for z in residuals(phi, seed=1)]
+    charts: list[SignalChart] = []
+    for learned, _ in pairs:
+        if chart == "ewma":
+            charts.append(Ewma(0.0, 1.0, 0.1, budget.ewma_width(ARL0, 0.1, learned)))
+        elif chart == "cusum":
+            charts.append(Cusum(0.0, 1.0, 0.5, budget.cusum_height(ARL0, 0.5, learned)))
+        else:
+            charts.append(Shewhart(0.0, 1.0, budget.shewhart_width(1 / ARL0, learned)))
+    rate = rate_of_one(charts, np.array([e for _, e in pairs]))
+    assert 1 / 1.3 < rate * ARL0 < 1.3
+
+
+def test_without_the_correction_for_the_training_it_alarms_too_often() -> None:
+    """What the limits of known parameters do: the reason for the correction."""
+    pairs = [prewhitened(z[0]) for z in residuals(0.5, seed=1)]
+    plain = ewma_limit(ARL0, 0.03)
+    e = np.array([e for _, e in pairs])
+    assert rate_of_one([Ewma(0.0, 1.0, 0.03, plain) for _ in pairs], e) * ARL0 > 1.5
+    corrected: list[SignalChart] = [Ewma(0.0, 1.0, 0.03, budget.ewma_width(ARL0, 0.03, item)) for item, _ in pairs]
+    assert 1 / 1.4 < rate_of_one(corrected, e) * ARL0 < 1.4
+
+
+def test_the_chart_of_all_outputs_alarms_as_often_as_its_share_allows() -> None:
+    """Fewer plants, for it is slower: 150 alarms are expected."""
+    alarms = rows = 0
+    for z in residuals(0.3, seed=2, signals=2)[:50]:
+        pairs = [prewhitened(column) for column in z]
+        chart = Mewma([0.0, 0.0], np.eye(2), 0.05, budget.joint_limit(ARL0, 2, 0.05, [item for item, _ in pairs]))
+        for values in np.column_stack([e for _, e in pairs]).tolist():
+            rows += 1
+            if chart.update(values).out:
+                alarms += 1
+                chart.restart()
+    assert 1 / 1.5 < alarms / rows * ARL0 < 1.5
+
+
+def test_when_all_is_known_limits_are_those_of_the_run_lengths() -> None:
+    assert budget.ewma_width(5000.0, 0.1, KNOWN) == pytest.approx(ewma_limit(5000.0, 0.1), rel=1e-6)
+    assert budget.joint_limit(5000.0, 2, 0.1, [KNOWN, KNOWN]) == pytest.approx(mewma_limit(5000.0, 2, 0.1), rel=1e-4)
+    assert budget.shewhart_width(0.0026997960632602, KNOWN) == pytest.approx(3.0, abs=1e-6)
+
+
+def test_the_width_of_a_rule_of_several_points_gives_its_rate() -> None:
+    """Three of five points, on normal values: the rule itself is run."""
+    width = budget.shewhart_width(budget.point_probability(3000.0, 3, 5), KNOWN)
+    out = np.abs(np.random.default_rng(5).normal(size=1_000_000)) > width
+    alarms = 0
+    rule = Persistence(3, 5, 1)
+    for point in out.tolist():
+        if rule.update(point):
+            alarms += 1
+            rule = Persistence(3, 5, 1)
+    assert alarms * 3000.0 / out.size == pytest.approx(1.0, abs=4 / np.sqrt(333))
+
+
+def test_the_budget_is_shared_equally_and_counts_rows() -> None:
+    """One alarm in 30 days of rows every 6 s is one in 432,000 rows; of five charts each has one in five times that."""
+    assert budget.share_arl0(1.0, 5, 0.1) == pytest.approx(5 * 432_000)
+    assert budget.share_arl0(30.0, 5, 0.1) == pytest.approx(72_000)
+
+
+@pytest.mark.parametrize("per_30_days", [1e-3, 1e6])
+def test_a_budget_that_no_chart_can_keep_is_refused_with_the_range_that_it_can(per_30_days: float) -> None:
+    with pytest.raises(InputError, match=r"false_alarms_per_30_days must be in \[0.02.*, 4.3e\+04\] for 5 alarms"):
+        budget.share_arl0(per_30_days, 5, 0.1)
