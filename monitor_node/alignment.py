@@ -185,11 +185,13 @@ class Aligner:
     def _restart(self, index: int, time_ns: int, sequence: int) -> list[Row]:
         """If the publisher was restarted, begin anew; returns the rows that were waiting."""
         position = self.state.sequences[index]
-        if position.expected is None or sequence >= position.expected:
+        if position.expected is None:
             return []
+        ahead = sequence >= position.expected
+        set_back = ahead and time_ns < position.newest_ns  # a late sample has an old number, too
         fell_back = sequence < position.expected - REMEMBERED * self._reorder_rows
-        began_again = sequence == 0 and time_ns > position.newest_ns
-        if not (fell_back or began_again):
+        began_again = not ahead and sequence == 0 and time_ns > position.newest_ns
+        if not (set_back or fell_back or began_again):
             return []
         rows = self.flush()
         self.state.counts.restarts += 1

@@ -11,22 +11,18 @@ A chart with a memory begins anew when its alarm is cleared, so that false alarm
 """
 
 from collections.abc import Callable
-from math import isfinite, sqrt
-from typing import TypeAlias
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node import false_alarm_budget as budget
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import ChartAlarm, Explanation
-from monitor_node.charts.base import Judgement, SignalChart
-from monitor_node.charts.cusum import Cusum
+from monitor_node.chart_design import ChartDesign, VectorChart
+from monitor_node.charts.base import Bank, Judgement, SignalChart
 from monitor_node.charts.ewma import Ewma
 from monitor_node.charts.mewma import Mewma
-from monitor_node.charts.pca import PcaModel, PcaSpe, PcaT2
 from monitor_node.charts.shewhart import Shewhart
-from monitor_node.charts.t2 import T2
 from monitor_node.config import MonitorConfig, PriorityName
 from monitor_node.prewhitening import Prewhitening
 from reactorwatch.contract import keys
@@ -47,9 +43,6 @@ WITHOUT_MEMORY = ("shewhart", "t2", "pca_t2", "pca_spe")
 """An alarm of theirs takes several points, so that a single outlier raises none."""
 
 
-VectorChart: TypeAlias = T2 | Mewma | PcaT2 | PcaSpe
-
-
 def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
     """(chart, of what) of every alarm that the charts of a plant can raise."""
     of_all = OF_ALL if len(config.outputs) > 1 else ()
@@ -62,59 +55,89 @@ def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
     return names
 
 
-class _OneOutput:
-    """A chart of one output."""
+class _OfEach:
+    """Charts of one kind, one an output."""
 
-    def __init__(self, chart: SignalChart, index: int, signal: str, passed: float) -> None:
-        self.chart, self.index, self._signal, self._passed = chart, index, signal, passed
+    def __init__(self, name: str, charts: list[SignalChart], signals: tuple[str, ...], passed: list[float]) -> None:
+        self._name, self._signals, self._passed = name, signals, passed
+        self._bank = Bank(charts)
+        self._shows_outliers = name in WITHOUT_MEMORY
 
-    def update(self, e: list[float], withheld: list[bool]) -> Judgement | None:
-        """Judge the output; None if there is nothing to judge."""
-        x = e[self.index]
-        if not isfinite(x) or (withheld[self.index] and not isinstance(self.chart, Shewhart)):
-            return None
-        return self.chart.update(x)
+    def update(self, e: list[float], known: list[bool], withheld: list[bool]) -> bool:
+        """Take a row in; whether any chart is out."""
+        if True in withheld and not self._shows_outliers:
+            known = [here and not outlier for here, outlier in zip(known, withheld, strict=True)]
+        self._known = known
+        return True in self._bank.judge(e, known)
 
-    def explain(self, judgement: Judgement, scales: list[float], units: list[str]) -> Explanation:
+    def judgement(self, place: int) -> Judgement | None:
+        """Of one of the charts; None if it had nothing to judge."""
+        return self._bank.judgement(place) if self._known[place] else None
+
+    def restart(self, place: int) -> None:
+        """Let one of the charts forget."""
+        self._bank.restart(np.arange(len(self._signals)) == place)
+
+    def explain(self, place: int, judgement: Judgement, scales: list[float], units: list[str]) -> Explanation:
         """What to say of a point that is out."""
-        above = judgement.statistic > judgement.centre
-        # What the chart sees, as the shift of the output that would look like that if it lasted.
-        size = abs(judgement.statistic) * scales[self.index]
-        side = "above" if above else "below"
-        unit = units[self.index]
-        if isinstance(self.chart, Shewhart):
-            allowed = judgement.upper_limit * scales[self.index]
-            text = f"{self._signal} is {size:.3g} {unit} {side} what the model expects (allowed: {allowed:.3g} {unit})"
-        elif isinstance(self.chart, Ewma):
-            text = f"{self._signal} is on average {size / self._passed:.3g} {unit} {side} what the model expects"
+        signal, unit = self._signals[place], units[place]
+        side = "above" if judgement.statistic > judgement.centre else "below"
+        size = abs(judgement.statistic) * scales[place]
+        if self._name == Shewhart.name:
+            allowed = judgement.upper_limit * scales[place]
+            text = f"{signal} is {size:.3g} {unit} {side} what the model expects (allowed: {allowed:.3g} {unit})"
+        elif self._name == Ewma.name:
+            # As the lasting shift of the output that would look like this.
+            text = f"{signal} is on average {size / self._passed[place]:.3g} {unit} {side} what the model expects"
         else:
-            text = f"{self._signal} has drifted {side} what the model expects"
-        return Explanation(text, {self._signal: 1.0})
+            text = f"{signal} has been {side} what the model expects for long"
+        return Explanation(text, {signal: 1.0})
 
 
-class _AllOutputs:
+class _OfAll:
     """A chart of all outputs together."""
 
     def __init__(self, chart: VectorChart, signals: tuple[str, ...]) -> None:
-        self.chart, self._signals = chart, signals
+        self._chart, self._signals = chart, signals
         self._last: list[float] = []
+        self._judgement: Judgement | None = None
 
-    def update(self, e: list[float], withheld: list[bool]) -> Judgement | None:
-        """Judge the row; None if an output is missing in it."""
-        if True in withheld or not all(map(isfinite, e)):
-            return None
+    def update(self, e: list[float], known: list[bool], withheld: list[bool]) -> bool:
+        """Take a row in; whether the chart is out. A row in which an output is missing is left out."""
+        if False in known or True in withheld:
+            self._judgement = None
+            return False
         self._last = e
-        return self.chart.update(e)
+        self._judgement = self._chart.update(e)
+        return self._judgement.out
 
-    def explain(self, judgement: Judgement, scales: list[float], units: list[str]) -> Explanation:
+    def judgement(self, place: int) -> Judgement | None:
+        """None if it had nothing to judge."""
+        return self._judgement
+
+    def restart(self, place: int) -> None:
+        """Let the chart forget."""
+        self._chart.restart()
+
+    def explain(self, place: int, judgement: Judgement, scales: list[float], units: list[str]) -> Explanation:
         """What to say of a point that is out."""
-        chart = self.chart
+        chart = self._chart
         parts = chart.contributions() if isinstance(chart, Mewma) else chart.contributions(self._last)
         shares = np.maximum(parts, 0.0) / np.sum(np.maximum(parts, 0.0))
         order = np.argsort(-shares)
         told = " and ".join(f"{self._signals[index]} ({100 * shares[index]:.0f} %)" for index in order)
         text = f"what the model leaves unexplained is unlike the training: {told}"
         return Explanation(text, {self._signals[index]: float(shares[index]) for index in order})
+
+
+@dataclass
+class _Watched:
+    """Charts, with the alarm and the key of each."""
+
+    charts: _OfEach | _OfAll
+    alarms: list[ChartAlarm]
+    keys: list[str]
+    at_rest: bool = True
 
 
 class ChartWatch:
@@ -132,7 +155,7 @@ class ChartWatch:
             pair: board.declare(*pair, at_once=pair[0] not in WITHOUT_MEMORY, priority=self._priority(pair[1]))
             for pair in alarm_names(config)
         }
-        self._watched: list[tuple[_OneOutput | _AllOutputs, ChartAlarm, str]] = []
+        self._watched: list[_Watched] = []
         self.widths: list[float] = []
         """Of the Shewhart limits, one an output, in standard deviations; they are shown about the predictions."""
 
@@ -151,51 +174,19 @@ class ChartWatch:
             arl0: run length of each alarm without a fault, in rows.
         """
         config = self._config
-        p = budget.point_probability(arl0, config.raise_count, config.window)
-        self.widths = [budget.shewhart_width(p, item) for item in learned]
-        memory = _long_memory(e, config)
-        covariance = _correlation(e)
+        design = ChartDesign(config, learned, e, arl0)
+        self.widths = design.widths
+        passed = [item.passed for item in learned]
         self._watched = []
-        for (name, signal), alarm in self._alarms.items():
-            watched: _OneOutput | _AllOutputs
+        for name in dict.fromkeys(chart for chart, _ in self._alarms):
+            pairs = [pair for pair in self._alarms if pair[0] == name]
+            charts: _OfEach | _OfAll
             if name in OF_ONE:
-                index = config.outputs.index(signal)
-                chart = self._of_one(name, learned[index], memory[index], arl0, self.widths[index])
-                watched = _OneOutput(chart, index, signal, learned[index].passed)
+                charts = _OfEach(name, design.of_each(name), config.outputs, passed)
             else:
-                watched = _AllOutputs(self._of_all(name, learned, e, covariance, memory, arl0, p), config.outputs)
-            key = keys.key(config.plant, keys.CHART, keys.chart_name(name, signal))
-            self._watched.append((watched, alarm, key))
-
-    def _of_one(self, name: str, learned: Prewhitening, memory: float, arl0: float, width: float) -> SignalChart:
-        config = self._config
-        if name == Shewhart.name:
-            return Shewhart(0.0, 1.0, width)
-        if name == Ewma.name:
-            weight = config.ewma_weight
-            return Ewma(0.0, memory, weight, budget.ewma_width(arl0, weight, learned))
-        k = config.cusum_allowance
-        return Cusum(0.0, memory, k, budget.cusum_height(arl0, k, learned))
-
-    def _of_all(
-        self,
-        name: str,
-        learned: list[Prewhitening],
-        e: Array,
-        covariance: Array,
-        memory: list[float],
-        arl0: float,
-        p: float,
-    ) -> VectorChart:
-        weight, mean = self._config.mewma_weight, [0.0] * len(learned)
-        if name == Mewma.name:
-            scale = np.diag(memory)
-            limit = budget.joint_limit(arl0, len(learned), weight, learned)
-            return Mewma(mean, scale @ covariance @ scale, weight, limit)
-        if name == T2.name:
-            return T2(mean, covariance, budget.joint_limit(1.0 / p, len(learned), 1.0, learned))
-        model = PcaModel.fit(e, len(learned) - 1, p)
-        return PcaT2(model) if name == PcaT2.name else PcaSpe(model)
+                charts = _OfAll(design.of_all(name), config.outputs)
+            paths = [keys.key(config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
+            self._watched.append(_Watched(charts, [self._alarms[pair] for pair in pairs], paths))
 
     def update(
         self,
@@ -223,57 +214,33 @@ class ChartWatch:
             Whether an alarm was raised.
         """
         raised = False
-        for watched, alarm, key in self._watched:
-            judgement = watched.update(e, withheld)
-            if judgement is None:
+        known = [size == size for size in e]  # NaN is not equal to itself
+        for watched in self._watched:
+            out = watched.charts.update(e, known, withheld)
+            if not (out or points) and watched.at_rest:
                 continue
-            if points:
-                publications.append(Publication(key, _point(time_ns, judgement)))
-            if not judgement.out and alarm.at_rest:
-                continue
-            stood = alarm.memory.rule.standing
-            explain = _explaining(watched, scales, units)
-            publications.extend(self._board.judge(alarm, time_ns, judgement, SD, explain))
-            stands = alarm.memory.rule.standing
-            raised |= stands and not stood
-            if stood and not stands:
-                watched.chart.restart()
+            for place, alarm in enumerate(watched.alarms):
+                judgement = watched.charts.judgement(place)
+                if judgement is None:
+                    continue
+                if points:
+                    publications.append(Publication(watched.keys[place], _point(time_ns, judgement)))
+                if judgement.out or not alarm.at_rest:
+                    explain = _explaining(watched.charts, place, scales, units)
+                    stood = alarm.memory.rule.standing
+                    publications.extend(self._board.judge(alarm, time_ns, judgement, SD, explain))
+                    stands = alarm.memory.rule.standing
+                    raised |= stands and not stood
+                    if stood and not stands:
+                        watched.charts.restart(place)
+            watched.at_rest = all(alarm.at_rest for alarm in watched.alarms)
         return raised
 
 
-def _correlation(e: Array) -> Array:
-    """Of the outputs' residuals, shape (outputs, outputs); none with one that does not vary."""
-    off = e - e.mean(axis=0) if len(e) else np.zeros((1, e.shape[1]))
-    lengths = np.linalg.norm(off, axis=0)
-    matrix = off.T @ off / np.where(lengths > 0, np.outer(lengths, lengths), 1.0)
-    matrix = 0.5 * (matrix + matrix.T)
-    matrix[np.diag_indices(e.shape[1])] = 1.0
-    return np.asarray(matrix)
-
-
 def _explaining(
-    watched: _OneOutput | _AllOutputs, scales: list[float], units: list[str]
+    charts: _OfEach | _OfAll, place: int, scales: list[float], units: list[str]
 ) -> Callable[[Judgement], Explanation]:
-    return lambda judgement: watched.explain(judgement, scales, units)
-
-
-def _long_memory(e: Array, config: MonitorConfig) -> list[float]:
-    """What a chart with a memory must take for one standard deviation of each output; 1 if the residual is white.
-
-    An autoregression of few coefficients may miss a correlation over many rows. It shows in averages: theirs should
-    have the variance weight / (2 - weight). Where it is larger by more than chance allows, limits follow it.
-    """
-    weight = config.ewma_weight
-    found = []
-    for column in e.T:
-        average, squares = 0.0, 0.0
-        for value in column.tolist():
-            average += weight * (value - average)
-            squares += average * average
-        ratio = squares / max(len(column), 1) * (2.0 - weight) / weight
-        independent = max(len(column) * weight / 2.0, 1.0)
-        found.append(sqrt(ratio) if ratio > 1.0 + 3.0 * sqrt(2.0 / independent) else 1.0)
-    return found
+    return lambda judgement: charts.explain(place, judgement, scales, units)
 
 
 def _point(time_ns: int, judgement: Judgement) -> ChartPoint:

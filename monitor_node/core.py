@@ -25,6 +25,9 @@ from reactorwatch.records.record import MINUTE_NS
 
 NODE = "monitor"
 
+HEARD_AGAIN_NS = 1_000_000
+"""Samples nearer to each other are one sign of life: the signals of a row come together."""
+
 UNSPECIFIED, BAD = Quality.QUALITY_UNSPECIFIED, Quality.QUALITY_BAD  # looked up once, not at every sample
 
 
@@ -60,6 +63,7 @@ class Monitor:
         self._watching_since_ns: int | None = None
         self._received = 0
         self._published = 0
+        self._heard_ns = 0
         self._lag_ns = 0
         self._start_ns = start_ns
         self._health_due_ns = start_ns
@@ -103,10 +107,10 @@ class Monitor:
             return []
         self._units[signal] = sample.unit
         publications: list[Publication] = []
-        rows = self._aligner.update(signal, sample.time_ns, sample.sequence, sample.value)
-        if rows:
+        if now_ns >= self._heard_ns + HEARD_AGAIN_NS:
+            self._heard_ns = now_ns
             self._watch.signals.received(now_ns)
-        for row in rows:
+        for row in self._aligner.update(signal, sample.time_ns, sample.sequence, sample.value):
             self._on_row(row, publications)
         self._published += len(publications)
         return publications

@@ -3,6 +3,9 @@
 One adapts at every row. The other is a copy of it, made once and held: the reference that residuals are judged by.
 Until the copy is made, the prediction is that of the model that adapts, made before it sees the row.
 
+Where residuals are not judged by these models, the one that adapts has time: rows are put by, and learned from together
+when somebody asks what it has come to.
+
 Signals are scaled by the mean and the spread of the first rows, so that the estimator works with numbers of the order
 of one; what is told of the models is in the signals' own units again.
 """
@@ -25,6 +28,12 @@ SCALING_ROWS = 50
 ROWS_A_PARAMETER = 10
 """The reference is not made from fewer rows than this times its parameters."""
 
+MOST_PUT_BY = 1000
+"""Rows that wait to be learned from; memory stays bounded."""
+
+_BREAK = (-(2**63), nan, nan)
+"""Stands between two rows of which the later does not follow the earlier."""
+
 
 class ArxPredictor:
     """Predicts one output.
@@ -33,14 +42,16 @@ class ArxPredictor:
         order: of the models.
         delay: of the input, in samples.
         forgetting: of the model that adapts.
+        described: whether anybody will ask what the models are like.
     """
 
-    def __init__(self, order: int, delay: int, forgetting: float) -> None:
+    def __init__(self, order: int, delay: int, forgetting: float, *, described: bool = True) -> None:
         self._structure = Structure.of_order(order, delay)
         self._rls = RecursiveLeastSquares(self._structure.parameters, forgetting)
         self._buffer = RegressorBuffer(self._structure)
         self._first_rows: list[tuple[float, float]] = []
-        self._training = TrainingRecord()
+        self._training = TrainingRecord() if described else None
+        self._put_by: list[tuple[int, float, float]] = []
         self._scaling: Scaling | None = None
         self._scales = (0.0, 1.0, 0.0, 1.0)
         self._reference: NDArray[np.float64] | None = None
@@ -73,21 +84,46 @@ class ArxPredictor:
         scaled = (value - centre) / spread
         regressor = self._buffer.update(time_ns, [(input_value - input_centre) / input_spread], [scaled])
         if regressor is None:
-            if self._reference is None:
+            if self._reference is None and self._training is not None:
                 self._training.add(time_ns, input_value, value, nan)
             return nan
         innovation = self._rls.update(regressor, scaled)
         if self._reference is not None:
             return centre + spread * float(self._reference @ regressor)
-        self._training.add(time_ns, input_value, value, spread * innovation.residual)
+        if self._training is not None:
+            self._training.add(time_ns, input_value, value, spread * innovation.residual)
         if hold_reference and self._rls.rows >= ROWS_A_PARAMETER * self._structure.parameters:
             self._reference = self._rls.parameters
-            checks = self._training.checks(self._structure)
-            self._reference_model = self._describe() | {"checks": checks}
+            if self._training is not None:
+                checks = self._training.checks(self._structure)
+                self._reference_model = self._describe() | {"checks": checks}
         return centre + spread * innovation.prediction
+
+    def put_by(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> None:
+        """Take a row in that is to be learned from later; arguments as for `update`, after the scaling is known."""
+        if not follows:
+            self._put_by.append(_BREAK)
+        self._put_by.append((time_ns, input_value, value))
+        if len(self._put_by) >= MOST_PUT_BY:
+            self.catch_up()
+
+    def catch_up(self) -> None:
+        """Learn from the rows that were put by."""
+        rows, self._put_by = self._put_by, []
+        input_centre, input_spread, centre, spread = self._scales
+        buffer, learn = self._buffer, self._rls.update
+        for time_ns, input_value, value in rows:
+            if time_ns == _BREAK[0]:
+                buffer.restart()
+                continue
+            scaled = (value - centre) / spread
+            regressor = buffer.update(time_ns, [(input_value - input_centre) / input_spread], [scaled])
+            if regressor is not None:
+                learn(regressor, scaled)
 
     def adaptive(self) -> dict[str, Any] | None:
         """The model that adapts, as the fields of a `ModelSnapshot`; None before it has learned anything."""
+        self.catch_up()
         return self._describe() if self._rls.rows else None
 
     def reference(self) -> dict[str, Any] | None:

@@ -83,6 +83,8 @@ class ProcessReference:
         self._count = len(model.outputs)
         self._accept_all = len(outputs) == self._count and self._places == list(range(self._count))
         self._last_input, self._guessed = nan, False
+        self.typical_sd = [1.0] * len(outputs)
+        """Standard deviation of a residual by the filter, in the outputs' units, as it mostly was in the last `run`."""
 
     def update(self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...]) -> Expected:
         """See `Reference`.
@@ -125,13 +127,15 @@ class ProcessReference:
             measured: shape (n, outputs).
         """
         residuals, z = np.full(measured.shape, np.nan), np.full(measured.shape, np.nan)
+        sds = np.full(measured.shape, np.nan)
         accept = (False,) * measured.shape[1]
         for row, values in enumerate(measured.tolist()):
             expected = self.update(round(time_min[row] * MINUTE_NS), float(inputs[row]), values, accept)
             off = [value - prediction for value, prediction in zip(values, expected.prediction, strict=True)]
-            residuals[row] = off
+            residuals[row], sds[row] = off, expected.sd
             z[row] = [size / sd for size, sd in zip(off, expected.sd, strict=True)]
             accept = tuple(abs(size) > GATE for size in z[row].tolist())
+        self.typical_sd = np.nan_to_num(np.nanmedian(sds, axis=0), nan=1.0).tolist()
         return residuals, z
 
 

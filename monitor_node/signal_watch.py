@@ -136,12 +136,16 @@ class SignalWatch:
         return flags, publications
 
     def restart(self) -> None:
-        """Forget the rows seen, as after a gap."""
-        for stuck in self._stuck:
-            stuck.restart()
+        """Forget what is withheld, as after a gap. Equal readings are counted on: a gap makes them no likelier."""
         for spike in self._spikes:
             if spike is not None:
                 spike.restart()
+
+    def begin_anew(self) -> None:
+        """Forget the rows seen: the publisher began again."""
+        self.restart()
+        for stuck in self._stuck:
+            stuck.restart()
 
     # --- the clock of receipt --------------------------------------------------------------------------------
 

@@ -92,6 +92,11 @@ class Spacing(msgspec.Struct, forbid_unknown_fields=True):
             return None
         return int(limit * (self.mean_ns + DEVIATIONS * self.deviation_ns))
 
+    @property
+    def steady(self) -> bool:
+        """Whether all spacings were the same."""
+        return self.count == MEMORY and self.deviation_ns == 0.0
+
     def learn(self, spacing_ns: float) -> None:
         """Take the next spacing in."""
         self.count = min(self.count + 1, MEMORY)
@@ -178,13 +183,17 @@ class Silence:
         if last_ns is None or time_ns <= last_ns:
             self._last_ns = time_ns
             return self._change(None, time_ns) if present else NOTHING
-        allowed_ns, spacing_ns = self._rows.allowed_ns(self._limit), time_ns - last_ns
+        rows, spacing_ns = self._rows, time_ns - last_ns
+        if present and spacing_ns == rows.mean_ns and rows.steady and not self.standing:
+            self._last_ns = time_ns  # there is nothing to learn
+            return NOTHING
+        allowed_ns = rows.allowed_ns(self._limit)
         raised_ns = None
         if allowed_ns is not None and spacing_ns > allowed_ns and not self.standing:
             self.standing, raised_ns = True, last_ns + allowed_ns
         if not present:
             return NOTHING if raised_ns is None else Change(raised_ns, None)
-        self._rows.learn(spacing_ns if allowed_ns is None else min(spacing_ns, allowed_ns))
+        rows.learn(spacing_ns if allowed_ns is None else min(spacing_ns, allowed_ns))
         self._last_ns = time_ns
         return self._change(raised_ns, max(time_ns, last_ns + (allowed_ns or 0)))
 

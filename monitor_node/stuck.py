@@ -159,7 +159,8 @@ class Stuck:
         if self._learning:
             self._end_run()
             self._learning = False
-        self._take(value)
+        if self._take(value) or not self._repeats:
+            return Judgement(1.0, 0.0, 0.0, self.limit, False)
         equal = self._repeats + 1.0
         moved = len(self._steps) == STRETCH and self._movement() >= AT_REST * self._quietest
         limit = self.limit if moved else inf

@@ -31,11 +31,9 @@ FEWEST_ROWS = 50
 
 MOST_REFUSALS = 2
 
-AS_WELL = 1.2
-"""`auto` takes the process model if its residuals are at most so many times as large as those of the identified one."""
-
-SUMMED_ROWS = 10
-"""Rows whose sums are compared for that: a model that is off for long is worse than one that is off for a row."""
+AS_WELL = 1.5
+"""`auto` takes the process model if its residuals, prewhitened, are at most so many times as large as those of the
+identified one. The doubt is in its favour: where the input goes beyond the training, it still holds."""
 
 
 class Trained(NamedTuple):
@@ -71,6 +69,7 @@ class Training:
         self._model = model
         self._rows: deque[tuple[int, float, list[float], list[float]]] = deque(maxlen=MOST_ROWS)
         self._residuals = [0] * len(config.outputs)
+        self._values = [0] * len(config.outputs)
 
     def add(self, time_ns: int, input_value: float, values: list[float], residuals: list[float]) -> None:
         """Take a row in.
@@ -83,15 +82,17 @@ class Training:
         """
         if self._rows and time_ns <= self._rows[-1][0]:  # the publisher began again: so does the record
             self._rows.clear()
-            self._residuals = [0] * len(values)
+            self._residuals, self._values = [0] * len(values), [0] * len(values)
         self._rows.append((time_ns, input_value, values, residuals))
-        for index, residual in enumerate(residuals):
+        for index, (value, residual) in enumerate(zip(values, residuals, strict=True)):
+            self._values[index] += isfinite(value)
             self._residuals[index] += isfinite(residual)
 
     @property
     def enough(self) -> bool:
         """Whether there are enough rows to learn from."""
-        return min(self._residuals) >= FEWEST_ROWS
+        counts = self._residuals if self._model is None else self._values
+        return min(counts) >= FEWEST_ROWS
 
     def finish(self, *, last_chance: bool) -> Trained:
         """Learn; the rows are then forgotten.
@@ -145,9 +146,10 @@ class Training:
 
 def _smallest(config: MonitorConfig, reference: Reference) -> list[float]:
     """The least standard deviation of the residuals, in the units that they are in."""
+    smallest = [max(config.smallest_sd.get(signal, 0.0), 1e-12) for signal in config.outputs]
     if isinstance(reference, ProcessReference):
-        return [1e-3] * len(config.outputs)  # the filter's own has its floor already
-    return [max(config.smallest_sd.get(signal, 0.0), 1e-12) for signal in config.outputs]
+        return [sd / of_filter for sd, of_filter in zip(smallest, reference.typical_sd, strict=True)]
+    return smallest
 
 
 def _whitened(z: Array, learned: Prewhitening) -> Array:
@@ -159,16 +161,12 @@ def _whitened(z: Array, learned: Prewhitening) -> Array:
 
 
 def _as_well(process: Array, identified: Array) -> bool:
-    """Whether the process model predicts about as well as the identified one, row by row and on average over rows."""
+    """Whether the process model predicts about as well as the identified one."""
     both = np.isfinite(process) & np.isfinite(identified)
     for ours, theirs, known in zip(process.T, identified.T, both.T, strict=True):
-        pairs = np.column_stack([ours[known], theirs[known]])
-        if len(pairs) < FEWEST_ROWS:
-            continue
-        blocks = pairs[: len(pairs) // SUMMED_ROWS * SUMMED_ROWS].reshape(-1, SUMMED_ROWS, 2).sum(axis=1)
-        for of_rows in (pairs, blocks):
-            size, peer = np.sqrt(np.mean(of_rows**2, axis=0))
-            if size > AS_WELL * peer:
+        if np.count_nonzero(known) >= FEWEST_ROWS:
+            sizes = [learn(np.where(known, column, np.nan), 1e-12).sd for column in (ours, theirs)]
+            if sizes[0] > AS_WELL * sizes[1]:
                 return False
     return True
 

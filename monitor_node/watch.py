@@ -89,6 +89,8 @@ class PlantWatch:
         if self._reference is None:
             self._train(time_ns, input_value, values, units, publications, follows=follows)
         else:
+            if row.restarted:
+                self.signals.begin_anew()
             self._judge(time_ns, input_value, values, units, publications, follows=follows)
 
     def snapshots(self, time_ns: int) -> list[Publication]:
@@ -112,7 +114,9 @@ class PlantWatch:
         config = self._config
         self._began_ns = time_ns
         self._training = Training(config, self._model)
-        self._predictors = [ArxPredictor(config.order, config.delay, config.forgetting) for _ in config.outputs]
+        self._predictors = [
+            ArxPredictor(config.order, config.delay, config.forgetting, described=self._points) for _ in config.outputs
+        ]
 
     def _train(
         self,
@@ -180,12 +184,14 @@ class PlantWatch:
     ) -> None:
         reference = self._reference
         assert reference is not None
-        predictions = [
-            predictor.update(time_ns, input_value, value, follows=follows, hold_reference=True)
-            for predictor, value in zip(self._predictors, values, strict=True)
-        ]
         if isinstance(reference, ArxReference):
-            reference.predictions = predictions
+            reference.predictions = [
+                predictor.update(time_ns, input_value, value, follows=follows, hold_reference=True)
+                for predictor, value in zip(self._predictors, values, strict=True)
+            ]
+        elif self._points:
+            for predictor, value in zip(self._predictors, values, strict=True):
+                predictor.put_by(time_ns, input_value, value, follows=follows)
         if self._sampling.gap:  # nobody knows what the input did in it
             reference.restart()
             self.signals.restart()

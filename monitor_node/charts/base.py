@@ -271,6 +271,24 @@ class Bank(Generic[Kind]):
         said[:, ~present] = np.nan
         return Judgements(said[0], said[1], said[2], said[3], present & (columns[OUT] > 0.0))
 
+    def judge(self, values: list[float], present: list[bool]) -> list[bool]:
+        """As `update`, for the few charts of one plant at every row: which are out; `judgement` says the rest.
+
+        Args:
+            values: one a chart, finite where present.
+            present: False leaves a chart as it is.
+        """
+        columns = self._columns
+        columns[X] = values
+        columns[PRESENT] = present
+        self._kind.kernel(columns)
+        return [here and out > 0.0 for here, out in zip(present, columns[OUT].tolist(), strict=True)]
+
+    def judgement(self, plant: int) -> Judgement:
+        """What a chart said of its last value."""
+        statistic, centre, lower, upper, out = self._columns[STATISTIC:SETTINGS, plant].tolist()
+        return Judgement(statistic, centre, lower, upper, out > 0.0)
+
     def restart(self, plants: NDArray[np.bool_] | None = None) -> None:
         """Forget the values seen, of all plants or of those that are True."""
         _restart(self._columns, self._kind.memories, slice(None) if plants is None else plants)

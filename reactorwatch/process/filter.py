@@ -20,8 +20,8 @@ What is out of the ordinary is handled like this:
 - A value that is missing is NaN; it corrects nothing. One that is far off corrects nothing until the caller says that
   it is to be followed: one outlier would pull the filter away for minutes.
 - A row more than `LONGEST_STEP_MIN` after the one before is walked to in steps. After a gap of more than
-  `LONGEST_GAP_MIN`, or a step back in time, the filter begins anew: on an unstable stretch the uncertainty grows without
-  bound, and the model does not know what was done to the plant meanwhile.
+  `LONGEST_GAP_MIN`, or a step back in time, the filter begins anew: on an unstable stretch the uncertainty grows
+  without bound, and the model does not know what was done to the plant meanwhile.
 - It begins anew as well where the equations leave the bounds of the states, or are no numbers any more. A correction
   that leads out of the bounds is cut off there.
 - It begins at what is measured, very uncertain of it, and says nothing of that row. If not all states can be read off
@@ -55,7 +55,7 @@ START_SDS = 10.0
 LEAST_PROCESS_SD = 1e-6
 """Of the scale of a state. Without any process noise its covariance would shrink below what a number can hold."""
 
-CHUNK, UNROLLED = 32, 8
+CHUNK, UNROLLED = 64, 8
 """Rows in one compiled chain, and how many of them are one expression."""
 
 _BEGINNINGS = 5  # corrections that it takes to find the state where an output is no linear function of it
@@ -98,7 +98,7 @@ class Innovations(NamedTuple):
         residual: likewise.
         sd: likewise.
         whitened: likewise.
-        log_likelihood: of the record under the model.
+        log_likelihood: of what was measured in each row under the model, shape (rows,).
         x: the state after each row, shape (rows, n_x).
         P: its covariance, shape (rows, n_x, n_x).
     """
@@ -107,7 +107,7 @@ class Innovations(NamedTuple):
     residual: Array
     sd: Array
     whitened: Array
-    log_likelihood: float
+    log_likelihood: Array
     x: Array
     P: Array
 
@@ -226,7 +226,7 @@ class Filter:
             return self._begin(time_min, inputs, measured)
         step = 0.5 * (time_min - before)
         steps = (before, step, step)
-        if self._breaks or 2.0 * step > _LONGEST_ROW_MIN:
+        if 2.0 * step > _LONGEST_ROW_MIN or (self._breaks and self._within(before, time_min)):
             steps = self._walk_to_last_steps(before, time_min)
         limits = [inf if follow else gate for follow in accept] if accept else [gate] * n
         self._pack(self._new, 0, *self._inputs, *inputs, *steps, *measured, *limits)
@@ -267,12 +267,13 @@ class Filter:
             self.restart()
         else:
             self.state = start
-        length = np.diff(time_min, prepend=nan if self._time_min is None else self._time_min)
-        plain = (length > 0) & (length <= _LONGEST_ROW_MIN)
+        since = np.append(nan if self._time_min is None else self._time_min, time_min[:-1])
+        half = 0.5 * (time_min - since)
+        plain = (half > 0) & (2.0 * half <= _LONGEST_ROW_MIN)
         for point in self._breaks:
-            plain &= ~((point > time_min - length) & (point < time_min))
+            plain &= (point <= since) | (point >= time_min)
         before = np.vstack([self._inputs or inputs[0], inputs[:-1]])
-        new = np.column_stack([before, inputs, time_min - length, 0.5 * length, 0.5 * length, measured, limits])
+        new = np.column_stack([before, inputs, since, half, half, measured, limits])
         ends = np.append(np.flatnonzero(~plain), rows)
         row = 0
         while row < rows:
@@ -295,11 +296,9 @@ class Filter:
             row += 1
         x, P = memory[:, : self._n_x], memory[:, self._n_x :].reshape(rows, self._n_x, self._n_x)
         whitened = told[:, 3 * n : 4 * n]
-        known = np.isfinite(whitened)
-        log_likelihood = -0.5 * np.sum(whitened[known] ** 2 + log(2 * pi)) - np.nansum(told[:, 4 * n])
-        return Innovations(
-            told[:, :n], told[:, n : 2 * n], told[:, 2 * n : 3 * n], whitened, float(log_likelihood), x, P
-        )
+        squares = np.where(np.isfinite(whitened), whitened**2 + log(2 * pi), 0.0)
+        log_likelihood = -0.5 * np.sum(squares, axis=1) - told[:, 4 * n]
+        return Innovations(told[:, :n], told[:, n : 2 * n], told[:, 2 * n : 3 * n], whitened, log_likelihood, x, P)
 
     def _run_chunk(self, new: Array, told: Array, memory: Array) -> int:
         """Take a chunk of rows in at once; returns how many of them, up to the first that did not go well."""
@@ -323,10 +322,14 @@ class Filter:
     def _walk(self) -> ArrayFunction:
         return ArrayFunction(walk_function(self.model))
 
+    def _within(self, before: float, time_min: float) -> list[float]:
+        """The breakpoints between two rows."""
+        return [point for point in self._breaks if before < point < time_min]
+
     def _walk_to_last_steps(self, before: float, time_min: float) -> tuple[float, float, float]:
         """Predict up to the last two steps of the way; returns when the first of them begins, and their lengths."""
         edges = [before]
-        for end in (*(point for point in self._breaks if before < point < time_min), time_min):
+        for end in (*self._within(before, time_min), time_min):
             count, begin = ceil((end - edges[-1]) / (0.5 * _LONGEST_ROW_MIN)), edges[-1]
             edges += [begin + (end - begin) * number / count for number in range(1, count)]
             edges.append(end)
@@ -355,7 +358,7 @@ class Filter:
         y = np.asarray(measured, dtype=float)
         known = np.isfinite(y)
         if known.any() and np.all(np.isfinite(inputs)):
-            states, outputs = self.model.states, self._outputs
+            states = self.model.states
             lower, upper = np.array([state.lower for state in states]), np.array([state.upper for state in states])
             wide = np.diag(np.square([START_SD * state.scale for state in states]))
             R = np.diag(np.square(self._noise.measurement_sd))[np.ix_(known, known)]

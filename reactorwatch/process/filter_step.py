@@ -7,7 +7,7 @@ What a filter remembers is one vector: the state x, then its covariance P, colum
 vector as well: the parameters, the variances of the sensors, the variances of the process in a minute.
 """
 
-from math import nan
+from math import inf, nan
 
 import casadi as ca
 import numpy as np
@@ -22,10 +22,10 @@ def row_function(model: ProcessModel) -> ca.Function:
 
     new: [inputs of the row before, inputs, time of the row before, first step, second step, measured, limits], where
     NaN is a value that is missing, and a limit is how many standard deviations off a value may be to correct the state.
-    told: [prediction, its standard deviations, the whitened residual, log determinant, 1 if all went well], where the
-    log determinant is half that of the covariance of what was measured.
+    told: [prediction, residual, its standard deviations, whitened residual, log determinant, 1 if all went well], where
+    the log determinant is half that of the covariance of what was measured.
     """
-    n_x, n_u, n_y = len(model.states), len(model.inputs), len(model.outputs)
+    n_u, n_y = len(model.inputs), len(model.outputs)
     memory, new, constants = _symbols(model, 2 * n_u + 3 + 2 * n_y)
     p, r, q = _constants(model, constants)
     parts = np.cumsum([0, n_u, n_u, 1, 1, 1, n_y, n_y]).tolist()
@@ -34,14 +34,14 @@ def row_function(model: ProcessModel) -> ca.Function:
     inside = ca.logic_and(ca.mmin(x - _bounds(model)[0]) >= 0, ca.mmin(_bounds(model)[1] - x) >= 0)
     expected, H = output_function(model)(x, u, p, t + first + second)
     covariance = H @ P @ H.T + ca.diag(r)
-    known = measured == measured  # noqa: PLR0124 # NaN is not equal to itself
+    known = ca.fabs(measured) < inf  # false for NaN; CasADi takes x == x for true
     off = ca.if_else(known, measured - expected, 0.0)
     whitened, log_determinant = _whitened(off, covariance, known)
     sd = ca.sqrt(ca.diag(covariance))
     x, P = _corrected(x, P, H, off, r, ca.logic_and(known, ca.fabs(off) <= limits * sd))
-    good = ca.logic_and(inside, ca.fabs(ca.sum1(x) + ca.sum1(ca.vec(P))) < ca.inf)
+    good = ca.logic_and(inside, ca.fabs(ca.sum1(x) + ca.sum1(ca.vec(P))) < inf)
     x = ca.fmin(ca.fmax(x, _bounds(model)[0]), _bounds(model)[1])
-    told = ca.vertcat(expected, sd, ca.if_else(known, whitened, nan), log_determinant, good)
+    told = ca.vertcat(expected, measured - expected, sd, ca.if_else(known, whitened, nan), log_determinant, good)
     results = ca.cse([ca.densify(ca.vertcat(x, ca.vec(P))), ca.densify(told)])
     return ca.Function("row", [memory, new, constants], results, ["memory", "new", "constants"], ["after", "told"])
 

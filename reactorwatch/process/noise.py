@@ -2,49 +2,84 @@
 
 The filter's gain follows from two kinds of noise: that of the sensors, and that of the process, which stands for all
 that moves the state and is not in the model. Both are chosen by the likelihood of the innovations (Schweppe 1965,
-Evaluation of likelihood functions for Gaussian signals, IEEE Trans. Information Theory 11): with the process noise
-given on a coarse grid, one state after the other, the sensors' follows from the innovations, whose mean square has to
-be what the filter expects. Without process noise as one of the choices, a plant that the model describes perfectly is
-described so. What is far off counts as `CLIP` standard deviations (Huber 1964), so that outliers do not pass for noise.
+Evaluation of likelihood functions for Gaussian signals, IEEE Trans. Information Theory 11). It is climbed by scoring
+(Gupta & Mehra 1974, Computational aspects of maximum likelihood estimation and reduction in sensitivity function
+calculations, IEEE Trans. Automatic Control 19): with theta the logarithms of all standard deviations, w the whitened
+innovations and d half the log determinants of their covariances, differences of a few runs of the filter give
+
+    gradient = sum(d' + w w'),    information = sum(w'^2 + d'^2),    step = -gradient / information,
+
+and steps are shortened until they gain. The search begins with a process noise that moves every state alike, the best
+of a few; the sensors' noise there is what makes the mean square of the innovations what the filter expects. In the end
+a state whose noise the record does not need has none: a plant that the model describes perfectly is described so.
+
+Outliers do not pass for noise: the filter does not follow them, and beyond `CLIP` standard deviations it does not
+matter how far off a value is. So as not to take the tails of normal noise for outliers, squares are compared with those
+of normal values that are cut off likewise (Huber 1981, Robust Statistics, ch. 5).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Sequence
+from math import erf, exp, inf, log, pi, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.model import Array, ProcessModel
 
-SHARES = (0.0, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3, 1.0)
-"""Process noise to choose from, in scales of the state per square root of a minute."""
+SHARES = (0.3, 0.03, 0.003)
+"""Process noise to begin with, in scales of the state per square root of a minute; the noisiest finds its way best."""
 
-CLIP = 2.5
-"""Standard deviations that a value counts as at most."""
+LEAST_SHARE = 1e-5
+"""Less is none."""
+
+CLIP = 4.0
+"""Standard deviations beyond which it does not matter how far off a value is."""
 
 GATE = 6.0
-MOST_STEPS, MOST_SWEEPS = 6, 3
-SETTLED = 0.01
-LEAST_GAIN = 1.0
-"""In log likelihood: less does not make a plant noisier."""
+FIRST_ROWS = 300
+"""The search goes its first steps on so many rows alone."""
+
+MOST_STEPS, MOST_CUTS = 8, 4
+LONGEST_STEP = 1.2
+"""Of a logarithm."""
+
+DIFFERENCE = 0.01
+"""Of a logarithm, for the derivatives."""
+
+SETTLED = 0.2
+"""In log likelihood: a smaller gain ends the search."""
+
+LEAST_GAIN = 2.0
+"""In log likelihood: less does not make a plant noisy."""
 
 BURN_IN = 20
 """Rows at the start in which the filter still finds its state."""
 
-_OF_THIRD_DIFFERENCES = 0.6745 * np.sqrt(20.0)  # their median size, for white noise of unit variance
-_MEAN_SQUARE_CLIPPED = 0.9776  # of normal values clipped at CLIP
+_CUT, _RIDGE = 0.4, 1e-3
+_OF_THIRD_DIFFERENCES = 0.6745 * sqrt(20.0)  # their median size, for white noise of unit variance
+_CUT_MEAN_SQUARE = erf(CLIP / sqrt(2)) - CLIP * sqrt(2 / pi) * exp(-(CLIP**2) / 2)  # of w where |w| < CLIP, else 0
 
 
-@dataclass(frozen=True)
-class _Trial:
-    """Noise levels, how unlikely they make the record, and what the sensors' noise then looks like."""
+class _Trial(NamedTuple):
+    """The logarithms of some noise levels, and what they make of the record.
 
-    noise: NoiseLevels
+    Attributes:
+        theta: shape (n_y + n_x,), the sensors first.
+        loss: minus the log likelihood.
+        w: the whitened innovations, shape (rows, n_y); 0 where there are none.
+        d: half the log determinant of their covariances, shape (rows,).
+    """
+
+    theta: Array
     loss: float
-    sensors: tuple[float, ...]
+    w: Array
+    d: Array
 
 
-def tune(model: ProcessModel, time_min: Array, inputs: Array, measured: Array, smallest_sd: list[float]) -> NoiseLevels:
+def tune(
+    model: ProcessModel, time_min: Array, inputs: Array, measured: Array, smallest_sd: Sequence[float]
+) -> NoiseLevels:
     """The noise levels under which a record is likeliest.
 
     Args:
@@ -52,66 +87,106 @@ def tune(model: ProcessModel, time_min: Array, inputs: Array, measured: Array, s
         time_min: shape (rows,), increasing.
         inputs: shape (rows,) or (rows, n_u).
         measured: shape (rows, n_y); NaN where missing or not to be learned from.
-        smallest_sd: of the sensors, one an output, in its unit: theirs are at least so large.
+        smallest_sd: of the sensors, one an output, in its unit, above 0: theirs are at least so large.
     """
-    smallest = np.asarray(smallest_sd)
-    scales = np.array([state.scale for state in model.states])
-    kalman = Filter(model, NoiseLevels(tuple(np.maximum(_rough(measured), smallest).tolist()), (0.0,) * scales.size))
+    return _Tuning(model, time_min, inputs, measured, np.asarray(smallest_sd, dtype=float)).found()
 
-    def tried(noise: NoiseLevels) -> _Trial:
-        kalman.noise = noise
-        found = kalman.run(time_min, inputs, measured, gate=GATE)
-        residual, sd = found.residual, found.sd
-        residual, sd = residual[BURN_IN:], sd[BURN_IN:]
-        squares = np.minimum((residual / sd) ** 2, CLIP**2)
-        loss = float(np.nansum(np.log(sd) + 0.5 * squares))
-        # Only the sensors' part of the variance is scaled; the process' has been given.
-        variance = np.square(noise.measurement_sd)
-        of_process = np.nanmean(sd**2, axis=0) - variance
-        wanted = np.nanmean(squares, axis=0) / _MEAN_SQUARE_CLIPPED * (variance + of_process) - of_process
-        sensors = np.sqrt(np.maximum(np.nan_to_num(wanted), smallest**2))
-        return _Trial(noise, loss if np.isfinite(loss) else np.inf, tuple(sensors.tolist()))
 
-    def settled(best: _Trial) -> _Trial:
-        """With the sensors' noise that belongs to it."""
+class _Tuning:
+    """The search for the noise levels of one record."""
+
+    def __init__(
+        self, model: ProcessModel, time_min: Array, inputs: Array, measured: Array, smallest_sd: Array
+    ) -> None:
+        self._whole, self._rows = (time_min, inputs, measured), time_min.size
+        self._take(FIRST_ROWS)
+        self._n_y = len(model.outputs)
+        self._scales = np.array([state.scale for state in model.states])
+        self._lowest = np.log(np.concatenate([smallest_sd, LEAST_SHARE * self._scales]))
+        self._first = np.maximum(_rough(measured), smallest_sd)
+        self._filter = Filter(model, NoiseLevels(tuple(self._first.tolist()), (0.0,) * self._scales.size))
+
+    def found(self) -> NoiseLevels:
+        """The best noise levels."""
+        best = self._climbed(self._begun())
+        if self._rows > FIRST_ROWS:
+            self._take(self._rows)
+            best = self._climbed(self._tried(best.theta))
+        for index in range(self._n_y, best.theta.size):
+            theta = best.theta.copy()
+            theta[index] = self._lowest[index]
+            without = self._tried(theta)
+            if without.loss < best.loss + LEAST_GAIN:
+                best = without
+        return self._levels(self._stepped(best, range(self._n_y)).theta)
+
+    def _take(self, rows: int) -> None:
+        """Go on with so many rows from the beginning."""
+        time_min, inputs, measured = self._whole
+        self._record = time_min[:rows], inputs[:rows], measured[:rows]
+
+    def _climbed(self, best: _Trial) -> _Trial:
+        """The best that steps of scoring find."""
         for _ in range(MOST_STEPS):
-            if np.allclose(best.sensors, best.noise.measurement_sd, rtol=SETTLED):
+            before, best = best.loss, self._stepped(best, range(best.theta.size))
+            if best.loss > before - SETTLED:
                 break
-            best = tried(NoiseLevels(best.sensors, best.noise.process_sd))
         return best
 
-    best = settled(tried(kalman.noise))
-    places = [0] * scales.size
-    for _ in range(MOST_SWEEPS):
-        before = best.loss
-        for state in range(scales.size):
-            for step in (1, -1):
-                best, places[state] = _climbed(tried, best, places[state], state, step, float(scales[state]))
-        best = settled(best)
-        if best.loss >= before:
-            break
-    return best.noise
+    def _begun(self) -> _Trial:
+        """The best of those that move every state alike."""
+        sensors, tried = np.log(self._first), []
+        for share in SHARES:
+            trial = self._tried(np.concatenate([sensors, np.log(share * self._scales)]))
+            inside = (trial.w != 0.0) & (np.abs(trial.w) < CLIP)
+            mean_square = np.sum(trial.w**2 * inside, axis=0) / np.maximum(np.sum(inside, axis=0), 1)
+            sensors = sensors + 0.5 * np.log(np.maximum(mean_square, 1e-6))
+            sensors = np.maximum(sensors, self._lowest[: self._n_y])
+            tried.append(trial)
+        return min(tried, key=lambda trial: trial.loss)
 
+    def _stepped(self, best: _Trial, chosen: range) -> _Trial:
+        """After a step of scoring in the chosen components of theta; `best` if no step is better."""
+        of_w, of_d = np.empty((len(chosen), *best.w.shape)), np.empty((len(chosen), best.d.size))
+        for place, index in enumerate(chosen):
+            theta = best.theta.copy()
+            theta[index] += DIFFERENCE
+            near = self._tried(theta)
+            of_w[place], of_d[place] = (near.w - best.w) / DIFFERENCE, (near.d - best.d) / DIFFERENCE
+        counted = np.where(np.abs(best.w) < CLIP, 1.0 / _CUT_MEAN_SQUARE, 0.0)
+        gradient = np.sum(of_d, axis=1) + np.sum(of_w * best.w * counted, axis=(1, 2))
+        flat = (of_w * np.sqrt(counted)).reshape(len(chosen), -1)
+        information = flat @ flat.T + of_d @ of_d.T
+        free = (best.theta[chosen] > self._lowest[chosen]) | (gradient < 0.0)
+        gradient[~free], information[~free], information[:, ~free] = 0.0, 0.0, 0.0
+        step = np.zeros(best.theta.size)
+        step[chosen] = -np.linalg.solve(information + np.diag(_RIDGE * np.diag(information) + 1.0), gradient)
+        step *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(step))), LONGEST_STEP))
+        for _ in range(MOST_CUTS):
+            trial = self._tried(np.maximum(best.theta + step, self._lowest))
+            if trial.loss < best.loss:
+                return trial
+            step *= _CUT
+        return best
 
-def _climbed(
-    tried: Callable[[NoiseLevels], _Trial], best: _Trial, place: int, state: int, step: int, scale: float
-) -> tuple[_Trial, int]:
-    """Along the shares of one state, until two in a row are no better."""
-    worse, at = 0, place + step
-    while 0 <= at < len(SHARES) and worse < 2:
-        process = list(best.noise.process_sd)
-        process[state] = SHARES[at] * scale
-        trial = tried(NoiseLevels(best.noise.measurement_sd, tuple(process)))
-        if trial.loss < best.loss - LEAST_GAIN:
-            best, place, worse = trial, at, 0
-        else:
-            worse += 1
-        at += step
-    return best, place
+    def _levels(self, theta: Array) -> NoiseLevels:
+        sds = np.exp(theta)
+        sds[self._n_y :] *= theta[self._n_y :] > self._lowest[self._n_y :]
+        return NoiseLevels(tuple(sds[: self._n_y].tolist()), tuple(sds[self._n_y :].tolist()))
+
+    def _tried(self, theta: Array) -> _Trial:
+        self._filter.noise = self._levels(theta)
+        run = self._filter.run(*self._record, gate=GATE)
+        w, likelihood = run.whitened[BURN_IN:], run.log_likelihood[BURN_IN:]
+        known = np.isfinite(w)
+        w = np.where(known, w, 0.0)
+        d = -np.nan_to_num(likelihood) - 0.5 * np.sum(w**2 + known * log(2 * pi), axis=1)
+        loss = float(np.sum(d) + 0.5 * np.sum(np.minimum(w**2, CLIP**2)) / _CUT_MEAN_SQUARE)
+        return _Trial(theta, loss if np.isfinite(loss) else inf, w, d)
 
 
 def _rough(measured: Array) -> Array:
     """A first guess of the sensors' noise: third differences leave little of what the process does."""
     third = np.abs(np.diff(measured, n=3, axis=0))
-    with np.errstate(all="ignore"):
-        return np.asarray(np.nan_to_num(np.nanmedian(third, axis=0) / _OF_THIRD_DIFFERENCES))
+    known = [column[np.isfinite(column)] for column in third.T]
+    return np.array([np.median(column) if column.size else 0.0 for column in known]) / _OF_THIRD_DIFFERENCES

@@ -271,6 +271,16 @@ def test_a_clock_that_is_set_forward_raises_no_alarm_and_the_plant_is_watched_on
     assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= said.estimated.keys()
 
 
+@pytest.mark.parametrize("by_min", [-0.5, -3.0, -10.0, -79.0])
+def test_a_clock_that_is_set_back_raises_no_alarm_and_the_plant_is_watched_on(sound: Run, by_min: float) -> None:
+    """The numbers go on, so the samples are new, however old their times."""
+    said = watched(sound.moved(EVENT, by_min).messages())
+    assert said.raised == []
+    assert said.health.rows == ROWS
+    assert said.health.late == said.health.lost == said.health.duplicated == 0
+    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= said.estimated.keys()
+
+
 @pytest.mark.parametrize("rows", [5, 100])
 def test_a_gap_in_the_samples_is_counted_and_raises_no_alarm(sound: Run, rows: int) -> None:
     said = watched(sound.lacking(EVENT, EVENT + rows - 1).messages())
