@@ -82,6 +82,7 @@ class AlarmBoard:
         over_at_once: bool = False,
         tells_cause: bool = False,
         priority: PriorityName | None = None,
+        dead_band: float | None = None,
     ) -> ChartAlarm:
         """A new alarm, for a chart.
 
@@ -92,12 +93,14 @@ class AlarmBoard:
             over_at_once: whether one point back in clears it, and not `clear_count`.
             tells_cause: whether it says itself what its cause is.
             priority: that of the signal if not given.
+            dead_band: as set if not given.
         """
         config = self._config
         count, window = (1, 1) if at_once else (config.raise_count, config.window)
         rule = Persistence(count, window, 1 if over_at_once else config.clear_count)
         urgency = priority or config.priorities.get(signal, "medium")
-        alarm = ChartAlarm(chart, signal, urgency, rule, config.dead_band, tells_cause=tells_cause)
+        band = config.dead_band if dead_band is None else dead_band
+        alarm = ChartAlarm(chart, signal, urgency, rule, band, tells_cause=tells_cause)
         self._alarms[alarm.name] = alarm
         return alarm
 

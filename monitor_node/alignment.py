@@ -136,6 +136,8 @@ class Aligner:
             waiting = state.pending[time_ns] = Waiting([None] * empty, [None] * empty)
         waiting.values[index] = value
         waiting.numbers[index] = sequence
+        if None in waiting.values and len(state.pending) == 1:  # as mostly: the next sample of the row is on its way
+            return rows
         return rows + self._release()
 
     def flush(self) -> list[Row]:

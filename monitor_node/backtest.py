@@ -39,7 +39,7 @@ class Backtest:
 
     @property
     def raised(self) -> list[tuple[Alarm, int | None]]:
-        """Each alarm as it was raised, with the suspects known last, and when it was cleared (None: it still stands)."""
+        """Each alarm as raised, with the suspects known last, and when it was cleared (None: it still stands)."""
         found: list[tuple[Alarm, int | None]] = []
         last: dict[str, int] = {}
         for message in self.alarm_messages:

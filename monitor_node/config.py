@@ -7,7 +7,7 @@ import msgspec
 from monitor_node.persistence import check_rule
 from reactorwatch.contract.keys import checked_plant
 
-ChartName = Literal["shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe"]
+ChartName = Literal["shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe", "parameters"]
 PriorityName = Literal["low", "medium", "high", "critical"]
 
 
@@ -22,7 +22,6 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         delay: of the input, in samples; 1 means that it acts on the next sample.
         forgetting: of the model that adapts, in (0, 1]; 1 forgets nothing.
         training_min: how long it learns before it watches, in minutes of the plant.
-        identification_share: the part of the training that the model learns in; the rest teaches the limits.
         reference: what a row is expected by: `process`, the filter of the reactor's equations; `arx`, the identified
             model as it was at the end of its training; `auto`, the first where it predicts the training at least about
             as well as the second, else the second.
@@ -57,7 +56,6 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     delay: int = 1
     forgetting: float = 0.999
     training_min: float = 100.0
-    identification_share: float = 0.6
     reference: Literal["auto", "process", "arx"] = "auto"
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
     false_alarms_per_30_days: float = 1.0
@@ -92,7 +90,6 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             ("delay", self.delay, 1, 100),
             ("forgetting", self.forgetting, 0.5, 1.0),
             ("training_min", self.training_min, 1e-3, 1e6),
-            ("identification_share", self.identification_share, 0.1, 0.9),
             ("false_alarms_per_30_days", self.false_alarms_per_30_days, 1e-3, 1e6),
             ("ewma_weight", self.ewma_weight, 1e-3, 1.0),
             ("mewma_weight", self.mewma_weight, 0.01, 1.0),

@@ -1,7 +1,7 @@
 """One-step predictions of an output from its past and the input's, by two ARX models of the same structure.
 
-One adapts at every row. The other is a copy of it, made once and held: the reference that residuals are judged by.
-Until the copy is made, the prediction is that of the model that adapts, made before it sees the row.
+One adapts at every row. The other is fitted to the whole training at its end, and held: the reference that residuals
+are judged by. Until then the prediction is that of the model that adapts, made before it sees the row.
 
 Where residuals are not judged by these models, the one that adapts has time: rows are put by, and learned from together
 when somebody asks what it has come to.
@@ -10,17 +10,23 @@ Signals are scaled by the mean and the spread of the first rows, so that the est
 of one; what is told of the models is in the signals' own units again.
 """
 
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.identification.regressor import RegressorBuffer
+from monitor_node.charts.base import Judgement
+from monitor_node.charts.parameters import ParameterT2
+from monitor_node.drift import learn
+from monitor_node.identification.regressor import RegressorBuffer, Rows, rows_of
 from monitor_node.identification.rls import RecursiveLeastSquares
 from monitor_node.identification.structure import Scaling, Structure
-from monitor_node.training_record import TrainingRecord
+from monitor_node.training_record import checks_of
 from reactorwatch.contract.messages_pb2 import Parameter
+from reactorwatch.errors import InputError
+
+Array = NDArray[np.float64]
 
 SCALING_ROWS = 50
 """Rows that the scaling is made from; nothing is predicted before."""
@@ -50,19 +56,17 @@ class ArxPredictor:
         self._rls = RecursiveLeastSquares(self._structure.parameters, forgetting)
         self._buffer = RegressorBuffer(self._structure)
         self._first_rows: list[tuple[float, float]] = []
-        self._training = TrainingRecord() if described else None
+        self._described = described
         self._put_by: list[tuple[int, float, float]] = []
         self._scaling: Scaling | None = None
         self._scales = (0.0, 1.0, 0.0, 1.0)
-        self._reference: NDArray[np.float64] | None = None
+        self._reference: Array | None = None
         self._reference_model: dict[str, Any] | None = None
+        self._fitted: Rows | None = None
+        self._drift: ParameterT2 | None = None
+        self._drifted: Judgement | None = None
 
-    @property
-    def has_reference(self) -> bool:
-        """Whether the reference has been made."""
-        return self._reference is not None
-
-    def update(self, time_ns: int, input_value: float, value: float, *, follows: bool, hold_reference: bool) -> float:
+    def update(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> float:
         """Take a row in.
 
         Args:
@@ -70,7 +74,6 @@ class ArxPredictor:
             input_value: NaN if missing.
             value: of the output, NaN if missing.
             follows: whether the row before was one period ago.
-            hold_reference: make the reference now if there is none and enough has been learned.
 
         Returns:
             What was to be expected of the output before it was seen; NaN where that can't be said.
@@ -84,20 +87,75 @@ class ArxPredictor:
         scaled = (value - centre) / spread
         regressor = self._buffer.update(time_ns, [(input_value - input_centre) / input_spread], [scaled])
         if regressor is None:
-            if self._reference is None and self._training is not None:
-                self._training.add(time_ns, input_value, value, nan)
             return nan
         innovation = self._rls.update(regressor, scaled)
         if self._reference is not None:
+            self._compare(regressor)
             return centre + spread * float(self._reference @ regressor)
-        if self._training is not None:
-            self._training.add(time_ns, input_value, value, spread * innovation.residual)
-        if hold_reference and self._rls.rows >= ROWS_A_PARAMETER * self._structure.parameters:
-            self._reference = self._rls.parameters
-            if self._training is not None:
-                checks = self._training.checks(self._structure)
-                self._reference_model = self._describe() | {"checks": checks}
         return centre + spread * innovation.prediction
+
+    def hold(self, time_min: Array, inputs: Array, outputs: Array) -> Array:
+        """Fit the reference to a training, by least squares.
+
+        Args:
+            time_min: shape (rows,).
+            inputs: shape (rows,); NaN where missing.
+            outputs: shape (rows,); NaN where missing or not to be learned from.
+
+        Returns:
+            The residual of each row, shape (rows,), as large as those of rows that it has not learned from; NaN where
+            there is none. Of too few rows there is no reference, and all are NaN.
+        """
+        residual = np.full(time_min.size, nan)
+        if self._scaling is None:
+            return residual
+        input_centre, input_spread, centre, spread = self._scales
+        rows = rows_of(self._structure, (inputs - input_centre) / input_spread, (outputs - centre) / spread, time_min)
+        parameters = self._structure.parameters
+        if len(rows.outputs) < ROWS_A_PARAMETER * parameters:
+            return residual
+        y = rows.outputs[:, 0]
+        theta: Array = np.asarray(np.linalg.lstsq(rows.regressors, y, rcond=1e-10)[0], dtype=np.float64)
+        # With n parameters fitted to N rows, a row it has seen is off by sqrt((N - n) / (N + n)) of one it has not.
+        seen = np.sqrt((len(y) - parameters) / (len(y) + parameters))
+        residual[rows.position] = spread * (y - rows.regressors @ theta) / seen
+        self._reference, self._fitted = theta, rows
+        if self._described:
+            covariance = _covariance(rows.regressors, y, theta)
+            singular = np.linalg.svd(rows.regressors, compute_uv=False)
+            condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else inf
+            checks = checks_of(self._structure, time_min, inputs, outputs, residual)
+            self._reference_model = self._told(theta, covariance, condition, len(y), 1.0) | {"checks": checks}
+        return residual
+
+    def compare(self, arl0: float) -> None:
+        """Begin to compare the model that adapts with the reference, by a chart on their parameters.
+
+        Args:
+            arl0: its run length without a fault, in rows.
+
+        Raises:
+            InputError: the training was too short for that, or the model does not forget.
+        """
+        rows, self._fitted = self._fitted, None
+        if rows is None:
+            raise InputError("there is no reference to compare with")
+        assert self._reference is not None
+        names, lags = self._structure.parameter_names(), self._structure.output_lags
+        residual = rows.outputs[:, 0] - rows.regressors @ self._reference
+        self._drift = learn(rows.regressors, residual, self._rls.forgetting, len(residual), arl0, names, lags)
+
+    def drift(self) -> tuple[Judgement, dict[str, float]] | None:
+        """How far the two models are from each other, and each parameter's part of that; None: they are not compared."""
+        self.catch_up()
+        if self._drift is None or self._drifted is None or self._reference is None:
+            return None
+        parts = self._drift.contributions(self._rls.parameters - self._reference)
+        return self._drifted, dict(zip(self._drift.names, parts.tolist(), strict=True))
+
+    def _compare(self, regressor: Array) -> None:
+        if self._drift is not None and self._reference is not None:
+            self._drifted = self._drift.update(self._rls.parameters - self._reference, regressor)
 
     def put_by(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> None:
         """Take a row in that is to be learned from later; arguments as for `update`, after the scaling is known."""
@@ -111,7 +169,7 @@ class ArxPredictor:
         """Learn from the rows that were put by."""
         rows, self._put_by = self._put_by, []
         input_centre, input_spread, centre, spread = self._scales
-        buffer, learn = self._buffer, self._rls.update
+        buffer, learn_row = self._buffer, self._rls.update
         for time_ns, input_value, value in rows:
             if time_ns == _BREAK[0]:
                 buffer.restart()
@@ -119,7 +177,8 @@ class ArxPredictor:
             scaled = (value - centre) / spread
             regressor = buffer.update(time_ns, [(input_value - input_centre) / input_spread], [scaled])
             if regressor is not None:
-                learn(regressor, scaled)
+                learn_row(regressor, scaled)
+                self._compare(regressor)
 
     def adaptive(self) -> dict[str, Any] | None:
         """The model that adapts, as the fields of a `ModelSnapshot`; None before it has learned anything."""
@@ -146,13 +205,18 @@ class ArxPredictor:
             self._first_rows.clear()
 
     def _describe(self) -> dict[str, Any]:
+        rls = self._rls
+        return self._told(rls.parameters, rls.parameter_covariance, rls.condition, rls.rows, rls.forgetting)
+
+    def _told(
+        self, scaled: Array, scaled_covariance: Array, condition: float, rows: int, forgetting: float
+    ) -> dict[str, Any]:
         assert self._scaling is not None
         matrix, shift = self._scaling.undoing(self._structure)
-        covariance = matrix @ self._rls.parameter_covariance @ matrix.T
-        values = matrix @ self._rls.parameters + shift
+        covariance = matrix @ scaled_covariance @ matrix.T
+        values = matrix @ scaled + shift
         with np.errstate(invalid="ignore"):
             deviations = np.sqrt(np.diag(covariance))
-        condition = self._rls.condition
         return {
             "structure": "arx",
             "order": self._structure.output_lags,
@@ -161,8 +225,19 @@ class ArxPredictor:
                 Parameter(name=name, value=value, sd=sd)
                 for name, value, sd in zip(self._structure.parameter_names(), values, deviations, strict=True)
             ],
-            "rows": self._rls.rows,
-            "forgetting": self._rls.forgetting,
+            "rows": rows,
+            "forgetting": forgetting,
             "excitation": 1.0 / condition,
             "condition": condition,
         }
+
+
+def _covariance(regressors: Array, outputs: Array, theta: Array) -> Array:
+    """Of the parameters, by least squares; NaN where the rows do not tell them."""
+    residual = outputs - regressors @ theta
+    variance = float(residual @ residual) / max(len(outputs) - theta.size, 1)
+    gram = regressors.T @ regressors
+    try:
+        return np.asarray(variance * np.linalg.inv(gram))
+    except np.linalg.LinAlgError:
+        return np.full(gram.shape, nan)

@@ -28,7 +28,8 @@ LARGEST_ORDER = 6
 ROWS_A_COEFFICIENT = 10
 """An autoregression has at most one coefficient for so many rows."""
 
-BATCHES = 20
+BATCHES = 10
+"""That the squares of a training are averaged over: longer than what they have in common lasts."""
 
 LARGEST_SUM = 0.98
 """Of the coefficients. Nearer to 1 the residual is a random walk, and nothing would ever be a shift."""

@@ -83,15 +83,18 @@ class SignalWatch:
             input_value: NaN if missing.
             values: of the outputs; NaN where missing.
         """
-        plant, *signals = self._silences
-        change = plant.update(time_ns, present=True)
+        silences = self._silences
+        change = silences[0].update(time_ns, present=True)
         publications = self._tell(0, change) if change is not NOTHING else []
-        for index, (silence, value) in enumerate(zip(signals, (input_value, *values), strict=True), start=1):
+        index = 1
+        for value in (input_value, *values):
+            silence = silences[index]
             if change is not NOTHING:
                 silence.excuse(time_ns)
-            own = silence.update(time_ns, present=isfinite(value))
+            own = silence.update(time_ns, present=value == value)  # NaN is not equal to itself
             if own is not NOTHING:
                 publications += self._tell(index, own)
+            index += 1
         return publications
 
     def look(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:

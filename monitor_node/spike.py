@@ -63,6 +63,9 @@ class Verdict(NamedTuple):
     size: float
 
 
+NO_SPIKE = Verdict(False, False, 0.0)
+
+
 class SpikeState(StoredState, frozen=True):
     """All that is set and remembered.
 
@@ -123,6 +126,8 @@ class Spike:
         Raises:
             ValueError: it is not finite.
         """
+        if self._phase == "quiet" and abs(z) <= self.limit:  # as nearly always
+            return NO_SPIKE
         beyond, back = abs(finite(z)) > self.limit, abs(z) <= BACK * self.limit
         held, self._held = self._held, 0.0
         if self._phase in ("quiet", "changed"):

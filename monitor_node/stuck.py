@@ -108,6 +108,7 @@ class Stuck:
         self._steps: deque[float] = deque(maxlen=STRETCH)
         self._learning = False
         self._limit: float | None = None
+        self._single: Judgement | None = None  # of a reading that is unlike the one before, made once
 
     @classmethod
     def from_state(cls, state: StuckState) -> "Stuck":
@@ -145,7 +146,7 @@ class Stuck:
         Raises:
             ValueError: it is not finite; leave a missing sample out.
         """
-        self._learning, self._limit = True, None
+        self._learning, self._limit, self._single = True, None, None
         if self._take(finite(value)) and len(self._steps) == STRETCH:
             self._quietest = min(self._quietest, self._movement())
 
@@ -160,7 +161,9 @@ class Stuck:
             self._end_run()
             self._learning = False
         if self._take(value) or not self._repeats:
-            return Judgement(1.0, 0.0, 0.0, self.limit, False)
+            if self._single is None:
+                self._single = Judgement(1.0, 0.0, 0.0, self.limit, False)
+            return self._single
         equal = self._repeats + 1.0
         moved = len(self._steps) == STRETCH and self._movement() >= AT_REST * self._quietest
         limit = self.limit if moved else inf
@@ -189,7 +192,7 @@ class Stuck:
         return True
 
     def _end_run(self) -> None:
-        self._limit = None
+        self._limit = self._single = None
         self._runs[self._repeats] = self._runs.get(self._repeats, 0) + 1
 
     def _movement(self) -> float:

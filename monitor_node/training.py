@@ -7,6 +7,7 @@ that remain teach what is normal. A training of which too much is disturbed is r
 """
 
 from collections import deque
+from collections.abc import Callable
 from math import isfinite, log10
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.config import MonitorConfig
+from monitor_node.predictor import ArxPredictor
 from monitor_node.prewhitening import Prewhitening, learn
 from monitor_node.references import ArxReference, ProcessReference, Reference, tuned
 from monitor_node.undisturbed import Undisturbed, undisturbed
@@ -30,6 +32,10 @@ FEWEST_ROWS = 50
 """Fewer residuals than this teach nothing; the training goes on until they are there."""
 
 MOST_REFUSALS = 2
+
+MINOR = 0.2
+"""A stretch is not disturbed if it is off by less than a few times this, in the smallest standard deviation that counts
+of an identified model's residuals, or in standard deviations of the filter's."""
 
 AS_WELL = 1.5
 """`auto` takes the process model if its residuals, prewhitened, are at most so many times as large as those of the
@@ -62,37 +68,35 @@ class Training:
     Args:
         config: of the monitor.
         model: of the plant; None if only the identified model is to be taken.
+        predictors: the identified models, one an output.
     """
 
-    def __init__(self, config: MonitorConfig, model: ProcessModel | None) -> None:
+    def __init__(self, config: MonitorConfig, model: ProcessModel | None, predictors: list[ArxPredictor]) -> None:
         self._config = config
         self._model = model
-        self._rows: deque[tuple[int, float, list[float], list[float]]] = deque(maxlen=MOST_ROWS)
-        self._residuals = [0] * len(config.outputs)
-        self._values = [0] * len(config.outputs)
+        self._predictors = predictors
+        self._rows: deque[tuple[int, float, list[float]]] = deque(maxlen=MOST_ROWS)
+        self._known = [0] * len(config.outputs)
 
-    def add(self, time_ns: int, input_value: float, values: list[float], residuals: list[float]) -> None:
+    def add(self, time_ns: int, input_value: float, values: list[float]) -> None:
         """Take a row in.
 
         Args:
             time_ns: of the row.
             input_value: NaN if missing.
             values: of the outputs; NaN where missing.
-            residuals: of the identified models on rows that they have not learned from; NaN where there are none.
         """
         if self._rows and time_ns <= self._rows[-1][0]:  # the publisher began again: so does the record
             self._rows.clear()
-            self._residuals, self._values = [0] * len(values), [0] * len(values)
-        self._rows.append((time_ns, input_value, values, residuals))
-        for index, (value, residual) in enumerate(zip(values, residuals, strict=True)):
-            self._values[index] += isfinite(value)
-            self._residuals[index] += isfinite(residual)
+            self._known = [0] * len(values)
+        self._rows.append((time_ns, input_value, values))
+        for index, value in enumerate(values):
+            self._known[index] += isfinite(value)
 
     @property
     def enough(self) -> bool:
         """Whether there are enough rows to learn from."""
-        counts = self._residuals if self._model is None else self._values
-        return min(counts) >= FEWEST_ROWS
+        return min(self._known) >= FEWEST_ROWS
 
     def finish(self, *, last_chance: bool) -> Trained:
         """Learn; the rows are then forgotten.
@@ -104,48 +108,70 @@ class Training:
         time_min = np.array([row[0] for row in rows]) / MINUTE_NS
         inputs = np.array([row[1] for row in rows])
         measured = np.array([row[2] for row in rows])
-        identified = np.array([row[3] for row in rows])
-        reference, z, found = self._reference(time_min, inputs, measured, identified)
-        refused = _refused(self._config.outputs, time_min, found)
-        if refused and last_chance:
-            found = [Undisturbed(np.isfinite(column), [], [], 0) for column in z.T]
-        z = np.where(np.column_stack([item.usable for item in found]), z, np.nan)
+        reference, z, found = self._reference(time_min, inputs, measured)
+        refused = _refused(self._config.outputs, z, found)
+        if refused and last_chance and _enough(z):
+            refused, found = "", [Undisturbed(np.isfinite(column), [], [], 0) for column in z.T]
+        usable = np.column_stack([item.usable for item in found])
+        z = np.where(usable, z, np.nan)
         smallest = _smallest(self._config, reference)
         learned = [learn(column, sd) for column, sd in zip(z.T, smallest, strict=True)]
         e = np.column_stack([_whitened(column, item) for column, item in zip(z.T, learned, strict=True)])
-        checks = [Check(name="training", result=refused or _left_out(self._config.outputs, time_min, found) or "ok")]
-        usable = np.where(np.isfinite(z), measured, np.nan)
         complete = e[np.all(np.isfinite(e), axis=1)]
-        return Trained(reference, learned, complete, usable, checks, "" if last_chance else refused)
+        checks = [Check(name="training", result=refused or _left_out(self._config.outputs, time_min, found) or "ok")]
+        return Trained(reference, learned, complete, np.where(usable, measured, np.nan), checks, refused)
 
-    def _reference(
-        self, time_min: Array, inputs: Array, measured: Array, identified: Array
-    ) -> tuple[Reference, Array, list[Undisturbed]]:
+    def _reference(self, time_min: Array, inputs: Array, measured: Array) -> tuple[Reference, Array, list[Undisturbed]]:
         """The reference, its residuals in its own standard deviations, and what can be learned from them."""
-        if self._model is not None:
-            process, z, residuals = self._process_reference(self._model, time_min, inputs, measured)
-            found = [undisturbed(column) for column in z.T]
-            if any(item.stretches or item.outliers for item in found) and not any(item.refused for item in found):
-                usable = np.where(np.column_stack([item.usable for item in found]), measured, np.nan)
-                process, z, residuals = self._process_reference(self._model, time_min, inputs, usable)
-                z = np.where(np.isfinite(measured), z, np.nan)
-            if self._config.reference == "process" or _as_well(residuals, identified):
-                return process, z, found
-        return ArxReference(inputs), identified, [undisturbed(column) for column in identified.T]
+        smallest = [MINOR * sd for sd in _smallest(self._config, None)]
+        identified, found = _twice(lambda rows: self._identified(time_min, inputs, rows), measured, smallest)
+        if self._model is None:
+            return ArxReference(inputs), identified, found
+        process: list[ProcessReference] = []
 
-    def _process_reference(
-        self, model: ProcessModel, time_min: Array, inputs: Array, measured: Array
-    ) -> tuple[ProcessReference, Array, Array]:
+        def innovations(rows: Array) -> Array:
+            process.append(self._process_reference(time_min, inputs, rows))
+            return process[-1].run(time_min, inputs, measured)[1]
+
+        z, found_by_process = _twice(innovations, measured, [MINOR] * measured.shape[1])
+        residuals = z * np.array(process[-1].typical_sd)
+        if self._config.reference == "process" or _as_well(residuals, identified):
+            return process[-1], z, found_by_process
+        return ArxReference(inputs), identified, found
+
+    def _identified(self, time_min: Array, inputs: Array, measured: Array) -> Array:
+        """The residuals of the identified models."""
+        columns = zip(self._predictors, measured.T, strict=True)
+        return np.column_stack([predictor.hold(time_min, inputs, column) for predictor, column in columns])
+
+    def _process_reference(self, time_min: Array, inputs: Array, measured: Array) -> ProcessReference:
         config = self._config
+        assert self._model is not None
         smallest = [config.smallest_sd.get(signal, 0.0) for signal in config.outputs]
-        noise = tuned(model, config.outputs, time_min, inputs, measured, smallest)
-        reference = ProcessReference(model, config.outputs, noise)
-        residuals, z = reference.run(time_min, inputs, measured)
-        return reference, z, residuals
+        noise = tuned(self._model, config.outputs, time_min, inputs, measured, smallest)
+        return ProcessReference(self._model, config.outputs, noise)
 
 
-def _smallest(config: MonitorConfig, reference: Reference) -> list[float]:
-    """The least standard deviation of the residuals, in the units that they are in."""
+def _twice(
+    residuals: Callable[[Array], Array], measured: Array, smallest: list[float]
+) -> tuple[Array, list[Undisturbed]]:
+    """Residuals of a model that was learned without the rows that were disturbed, and which rows these were.
+
+    Args:
+        residuals: learns from rows and gives residuals of all.
+        measured: shape (n, outputs).
+        smallest: standard deviation, one an output, in the residuals' units.
+    """
+    z = residuals(measured)
+    found = [undisturbed(column, sd) for column, sd in zip(z.T, smallest, strict=True)]
+    if not any(item.stretches or item.outliers for item in found) or any(item.refused for item in found):
+        return z, found
+    kept = np.column_stack([item.usable for item in found]) | ~np.isfinite(z)
+    return residuals(np.where(kept, measured, np.nan)), found
+
+
+def _smallest(config: MonitorConfig, reference: Reference | None) -> list[float]:
+    """The least standard deviation of the residuals, in the units that they are in: the outputs' or the filter's."""
     smallest = [max(config.smallest_sd.get(signal, 0.0), 1e-12) for signal in config.outputs]
     if isinstance(reference, ProcessReference):
         return [sd / of_filter for sd, of_filter in zip(smallest, reference.typical_sd, strict=True)]
@@ -171,11 +197,17 @@ def _as_well(process: Array, identified: Array) -> bool:
     return True
 
 
-def _refused(outputs: tuple[str, ...], time_min: Array, found: list[Undisturbed]) -> str:
+def _enough(z: Array) -> bool:
+    return bool(np.min(np.count_nonzero(np.isfinite(z), axis=0)) >= FEWEST_ROWS)
+
+
+def _refused(outputs: tuple[str, ...], z: Array, found: list[Undisturbed]) -> str:
+    if not _enough(z):
+        return (
+            f"of too few rows could be told what to expect, {FEWEST_ROWS} are needed: do rows come one by one period?"
+        )
     refused = [name for name, item in zip(outputs, found, strict=True) if item.refused]
-    if not refused:
-        return ""
-    return f"more than a third of it was disturbed in {' and '.join(refused)}"
+    return f"more than a third of it was disturbed in {' and '.join(refused)}" if refused else ""
 
 
 def _left_out(outputs: tuple[str, ...], time_min: Array, found: list[Undisturbed]) -> str:

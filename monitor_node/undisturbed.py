@@ -54,35 +54,37 @@ class Undisturbed(NamedTuple):
         return left_out > MOST_LEFT_OUT * self.usable.size
 
 
-def undisturbed(z: Array) -> Undisturbed:
+def undisturbed(z: Array, smallest_sd: float = 0.0) -> Undisturbed:
     """The part of a residual that can be learned from.
 
     Args:
         z: shape (n,), in order of time; NaN where it is not known.
+        smallest_sd: standard deviations of values, and of the means of blocks, are taken as at least this: what is
+            smaller is of no interest.
     """
     known = np.isfinite(z)
     if not known.any():
         return Undisturbed(known, [], [], 0)
     centre = float(np.median(z[known]))
-    sd = _TO_SD * float(np.median(np.abs(z[known] - centre)))
+    sd = max(_TO_SD * float(np.median(np.abs(z[known] - centre))), smallest_sd)
     size = max(SMALLEST_BLOCK, z.size // BLOCKS)
     starts = np.arange(0, z.size - size + 1, size)
     disturbed = np.zeros(z.size, dtype=np.bool_)
     if starts.size >= 4 and sd > 0:
         edges = [*starts.tolist(), z.size]  # the last block takes the rest
         blocks = [z[a:b][known[a:b]] for a, b in pairwise(edges)]
-        for index in _strange(blocks, centre, sd):
+        for index in _strange(blocks, centre, sd, smallest_sd):
             disturbed[edges[index] : edges[index + 1]] = True
     stretches = _stretches(disturbed)
     rest = known & ~disturbed
     centre = float(np.median(z[rest]))
-    sd = _TO_SD * float(np.median(np.abs(z[rest] - centre)))
+    sd = max(_TO_SD * float(np.median(np.abs(z[rest] - centre))), smallest_sd)
     shifts = [float(np.nanmean(z[first : last + 1]) - centre) / max(sd, 1e-300) for first, last in stretches]
     single = rest & (np.abs(np.where(known, z, centre) - centre) > OUTLIER * sd) & (sd > 0)
     return Undisturbed(rest & ~single, stretches, shifts, int(np.count_nonzero(single)))
 
 
-def _strange(blocks: list[Array], centre: float, sd: float) -> list[int]:
+def _strange(blocks: list[Array], centre: float, sd: float, smallest_sd: float) -> list[int]:
     """Numbers of the blocks whose mean or spread is unlike the others'."""
     filled = [index for index, block in enumerate(blocks) if block.size >= SMALLEST_BLOCK // 2]
     if len(filled) < 4:
@@ -90,9 +92,9 @@ def _strange(blocks: list[Array], centre: float, sd: float) -> list[int]:
     # Outliers are not what makes a block strange; without the clip a single one would.
     clipped = [np.clip(blocks[index], centre - OUTLIER * sd, centre + OUTLIER * sd) for index in filled]
     means = np.array([block.mean() for block in clipped])
-    spreads = np.log(np.array([max(float(block.std()), 1e-3 * sd) for block in clipped]))
+    spreads = np.log(np.array([max(float(block.std()), smallest_sd, 1e-3 * sd) for block in clipped]))
     rows = float(np.median([block.size for block in clipped]))
-    strange = _far(means, sd / np.sqrt(rows)) | _far(spreads, 1.0 / np.sqrt(2.0 * rows))
+    strange = _far(means, max(sd / np.sqrt(rows), smallest_sd)) | _far(spreads, 1.0 / np.sqrt(2.0 * rows))
     return [filled[number] for number in np.flatnonzero(strange)]
 
 

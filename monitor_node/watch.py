@@ -13,6 +13,7 @@ from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alignment import Row
 from monitor_node.chart_watch import ChartWatch, alarm_names
 from monitor_node.config import MonitorConfig
+from monitor_node.drift_watch import DriftWatch
 from monitor_node.predictor import ArxPredictor
 from monitor_node.prewhitening import Prewhitener
 from monitor_node.references import ArxReference, Reference
@@ -52,7 +53,8 @@ class PlantWatch:
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self.signals = SignalWatch(config, board)
-        self._chance_alarms = len(alarm_names(config)) + self.signals.chance_alarms(config)
+        self._drift = DriftWatch(config, board, told=points)
+        self._chance_alarms = len(alarm_names(config)) + self.signals.chance_alarms(config) + self._drift.chance_alarms
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
         self._refusals = 0
@@ -113,10 +115,10 @@ class PlantWatch:
     def _begin_training(self, time_ns: int | None) -> None:
         config = self._config
         self._began_ns = time_ns
-        self._training = Training(config, self._model)
         self._predictors = [
             ArxPredictor(config.order, config.delay, config.forgetting, described=self._points) for _ in config.outputs
         ]
+        self._training = Training(config, self._model, self._predictors)
 
     def _train(
         self,
@@ -132,7 +134,6 @@ class PlantWatch:
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
         trained_min = (time_ns - self._began_ns) / MINUTE_NS
-        hold = trained_min >= config.identification_share * config.training_min
         if trained_min >= config.training_min and self._training.enough:
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
@@ -144,16 +145,14 @@ class PlantWatch:
                 self._judge(time_ns, input_value, values, units, publications, follows=follows)
                 publications.extend(self.snapshots(time_ns))
                 return
-        had_reference = [predictor.has_reference for predictor in self._predictors]
+        self._training.add(time_ns, input_value, values)
         predictions = [
-            predictor.update(time_ns, input_value, value, follows=follows, hold_reference=hold)
+            predictor.update(time_ns, input_value, value, follows=follows)
             for predictor, value in zip(self._predictors, values, strict=True)
         ]
-        residuals = [value - prediction for value, prediction in zip(values, predictions, strict=True)]
-        judged = [size if held else nan for size, held in zip(residuals, had_reference, strict=True)]
-        self._training.add(time_ns, input_value, values, judged)
         if self._points:
-            for key, prediction, residual, unit in zip(self._estimate_keys, predictions, residuals, units, strict=True):
+            for key, prediction, value, unit in zip(self._estimate_keys, predictions, values, units, strict=True):
+                residual = value - prediction
                 if isfinite(residual):
                     publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
 
@@ -167,6 +166,7 @@ class PlantWatch:
         self._whiteners = [Prewhitener(item) for item in trained.learned]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
+        self.notes += self._drift.start(self._predictors, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
 
@@ -186,10 +186,10 @@ class PlantWatch:
         assert reference is not None
         if isinstance(reference, ArxReference):
             reference.predictions = [
-                predictor.update(time_ns, input_value, value, follows=follows, hold_reference=True)
+                predictor.update(time_ns, input_value, value, follows=follows)
                 for predictor, value in zip(self._predictors, values, strict=True)
             ]
-        elif self._points:
+        elif self._drift.wanted:
             for predictor, value in zip(self._predictors, values, strict=True):
                 predictor.put_by(time_ns, input_value, value, follows=follows)
         if self._sampling.gap:  # nobody knows what the input did in it
@@ -218,6 +218,7 @@ class PlantWatch:
             if withheld:
                 whitener.withhold()
         self._charts.update(time_ns, e, self._withheld, scales, units, publications, points=self._points)
+        publications.extend(self._drift.update(time_ns, self._predictors))
 
 
 def _model(config: MonitorConfig) -> ProcessModel | None:

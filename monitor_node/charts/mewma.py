@@ -11,9 +11,26 @@ where Sz is the covariance of z in the long run. z is kept in coordinates in whi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from monitor_node.charts.base import Array, ChartState, Judgement, positive
+from monitor_node.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, positive, vector
 from monitor_node.charts.t2 import Whitening
+from reactorwatch.compiled import compiled
 from reactorwatch.errors import InputError
+
+
+@compiled
+def _move(average: Array, x: Array, mean: Array, matrix: Array, weight: float) -> float:
+    """Take x into the average, in white coordinates; returns its squared length, -1 if x cannot be taken."""
+    for value in x:
+        if not abs(value) < LARGEST_VALUE:
+            return -1.0
+    squares = 0.0
+    for i in range(average.size):
+        white = 0.0
+        for j in range(i + 1):  # the matrix is lower triangular
+            white += matrix[i, j] * (x[j] - mean[j])
+        average[i] = (1.0 - weight) * average[i] + weight * white
+        squares += average[i] * average[i]
+    return squares
 
 
 class MewmaState(ChartState, frozen=True):
@@ -75,8 +92,14 @@ class Mewma:
 
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""
-        self._average = (1.0 - self.weight) * self._average + self.weight * self.whitening.of(x)
-        statistic = float(self._average @ self._average) * (2.0 - self.weight) / self.weight
+        values = np.asarray(x, dtype=np.float64)
+        if values.shape != self._average.shape:
+            raise ValueError(f"a sample must have shape {self._average.shape}, got {values.shape}")
+        whitening = self.whitening
+        squares = _move(self._average, values, whitening.mean, whitening.matrix, self.weight)
+        if squares < 0.0:
+            vector(x, self._average.size)  # says which value it is
+        statistic = squares * (2.0 - self.weight) / self.weight
         return Judgement(statistic, float(self._average.size), 0.0, self.limit, statistic > self.limit)
 
     def contributions(self) -> Array:

@@ -24,8 +24,7 @@ What is out of the ordinary is handled like this:
   without bound, and the model does not know what was done to the plant meanwhile.
 - It begins anew as well where the equations leave the bounds of the states, or are no numbers any more. A correction
   that leads out of the bounds is cut off there.
-- It begins at what is measured, very uncertain of it, and says nothing of that row. If not all states can be read off
-  what is measured, the others begin at the steady state that is nearest to it; as long as nothing is, it waits.
+- It begins at what is measured (see `filter_start`), and says nothing of that row; as long as nothing is, it waits.
 """
 
 import struct
@@ -39,26 +38,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.array_function import ArrayFunction
-from reactorwatch.process.filter_step import chained, output_function, row_function, walk_function
+from reactorwatch.process.filter_start import Beginning
+from reactorwatch.process.filter_step import chained, row_function, walk_function
 from reactorwatch.process.integrate import LONGEST_STEP_MIN
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.process.steady_state import steady_states
 
 LONGEST_GAP_MIN = 30.0
-
-START_SD = 3.0
-"""Standard deviation at the start of a state that no sensor shows, in its scales."""
-
-START_SDS = 10.0
-"""Standard deviation at the start of a state that a sensor shows, in those of the sensor: it may be an outlier."""
 
 LEAST_PROCESS_SD = 1e-6
 """Of the scale of a state. Without any process noise its covariance would shrink below what a number can hold."""
 
-CHUNK, UNROLLED = 64, 8
+CHUNK, UNROLLED = 32, 8
 """Rows in one compiled chain, and how many of them are one expression."""
 
-_BEGINNINGS = 5  # corrections that it takes to find the state where an output is no linear function of it
 _LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded
 
 
@@ -98,6 +90,7 @@ class Innovations(NamedTuple):
         residual: likewise.
         sd: likewise.
         whitened: likewise.
+        conditional_sd: likewise; the standard deviation of the residual if those of the outputs before it are known.
         log_likelihood: of what was measured in each row under the model, shape (rows,).
         x: the state after each row, shape (rows, n_x).
         P: its covariance, shape (rows, n_x, n_x).
@@ -107,6 +100,7 @@ class Innovations(NamedTuple):
     residual: Array
     sd: Array
     whitened: Array
+    conditional_sd: Array
     log_likelihood: Array
     x: Array
     P: Array
@@ -226,8 +220,8 @@ class Filter:
             return self._begin(time_min, inputs, measured)
         step = 0.5 * (time_min - before)
         steps = (before, step, step)
-        if 2.0 * step > _LONGEST_ROW_MIN or (self._breaks and self._within(before, time_min)):
-            steps = self._walk_to_last_steps(before, time_min)
+        if 2.0 * step > _LONGEST_ROW_MIN or self._breaks:
+            steps = self._steps(before, time_min, step)
         limits = [inf if follow else gate for follow in accept] if accept else [gate] * n
         self._pack(self._new, 0, *self._inputs, *inputs, *steps, *measured, *limits)
         self._row()
@@ -261,19 +255,22 @@ class Filter:
         rows, n = time_min.size, self._n_y
         inputs = inputs.reshape(rows, -1)
         limits = np.where(accept, inf, gate) if accept is not None else np.full((rows, n), gate)
-        told = np.full((rows, 4 * n + 2), nan)
+        told = np.full((rows, 5 * n + 1), nan)
         memory = np.full((rows, self._memory.size), nan)
         if start is None:
             self.restart()
         else:
             self.state = start
         since = np.append(nan if self._time_min is None else self._time_min, time_min[:-1])
-        half = 0.5 * (time_min - since)
-        plain = (half > 0) & (2.0 * half <= _LONGEST_ROW_MIN)
+        first = 0.5 * (time_min - since)
+        second, plain = first.copy(), (first > 0) & (2.0 * first <= _LONGEST_ROW_MIN)
         for point in self._breaks:
-            plain &= (point <= since) | (point >= time_min)
+            row = int(np.searchsorted(time_min, point))
+            if row < rows and since[row] < point < time_min[row]:
+                plain[row] &= len(self._within(since[row], time_min[row])) == 1
+                first[row], second[row] = point - since[row], time_min[row] - point
         before = np.vstack([self._inputs or inputs[0], inputs[:-1]])
-        new = np.column_stack([before, inputs, since, half, half, measured, limits])
+        new = np.column_stack([before, inputs, since, first, second, measured, limits])
         ends = np.append(np.flatnonzero(~plain), rows)
         row = 0
         while row < rows:
@@ -294,11 +291,11 @@ class Filter:
             else:
                 told[row], memory[row] = self._told, self._memory
             row += 1
+        prediction, residual, sd, whitened, conditional_sd = np.split(told[:, :-1], 5, axis=1)
+        known = np.isfinite(whitened)
+        parts = np.where(known, 0.5 * whitened**2 + 0.5 * log(2 * pi) + np.log(conditional_sd), 0.0)
         x, P = memory[:, : self._n_x], memory[:, self._n_x :].reshape(rows, self._n_x, self._n_x)
-        whitened = told[:, 3 * n : 4 * n]
-        squares = np.where(np.isfinite(whitened), whitened**2 + log(2 * pi), 0.0)
-        log_likelihood = -0.5 * np.sum(squares, axis=1) - told[:, 4 * n]
-        return Innovations(told[:, :n], told[:, n : 2 * n], told[:, 2 * n : 3 * n], whitened, log_likelihood, x, P)
+        return Innovations(prediction, residual, sd, whitened, conditional_sd, -np.sum(parts, axis=1), x, P)
 
     def _run_chunk(self, new: Array, told: Array, memory: Array) -> int:
         """Take a chunk of rows in at once; returns how many of them, up to the first that did not go well."""
@@ -326,6 +323,13 @@ class Filter:
         """The breakpoints between two rows."""
         return [point for point in self._breaks if before < point < time_min]
 
+    def _steps(self, before: float, time_min: float, half: float) -> tuple[float, float, float]:
+        """When the last two steps of a way begin, and their lengths; up to there it is walked."""
+        within = self._within(before, time_min)
+        if 2.0 * half > _LONGEST_ROW_MIN or len(within) > 1:
+            return self._walk_to_last_steps(before, time_min)
+        return (before, within[0] - before, time_min - within[0]) if within else (before, half, half)
+
     def _walk_to_last_steps(self, before: float, time_min: float) -> tuple[float, float, float]:
         """Predict up to the last two steps of the way; returns when the first of them begins, and their lengths."""
         edges = [before]
@@ -346,54 +350,16 @@ class Filter:
         begin, middle, end = edges[-3:]
         return begin, middle - begin, end - middle
 
-    # --- beginning -------------------------------------------------------------------------------------------
-
     @cached_property
-    def _outputs(self) -> ArrayFunction:
-        return ArrayFunction(output_function(self.model))
+    def _beginning(self) -> Beginning:
+        return Beginning(self.model)
 
     def _begin(self, time_min: float, inputs: Sequence[float], measured: Sequence[float]) -> Innovation:
         """Begin at what is measured, if anything is."""
         self._time_min = None
-        y = np.asarray(measured, dtype=float)
-        known = np.isfinite(y)
-        if known.any() and np.all(np.isfinite(inputs)):
-            states = self.model.states
-            lower, upper = np.array([state.lower for state in states]), np.array([state.upper for state in states])
-            wide = np.diag(np.square([START_SD * state.scale for state in states]))
-            R = np.diag(np.square(self._noise.measurement_sd))[np.ix_(known, known)]
-            x = 0.5 * (lower + upper)
-            for attempt in range(_BEGINNINGS):
-                expected, H = self._shown(x, inputs, time_min)
-                H = H[known]
-                if attempt == 0 and np.linalg.matrix_rank(H) < x.size:
-                    x = self._nearest_steady_state(inputs, time_min, y, x)
-                    expected, H = self._shown(x, inputs, time_min)
-                    H = H[known]
-                K = wide @ H.T @ np.linalg.inv(H @ wide @ H.T + R)
-                x = np.clip(x + K @ (y - expected)[known], lower, upper)
-            K = wide @ H.T @ np.linalg.inv(H @ wide @ H.T + START_SDS**2 * R)
-            rest = np.eye(x.size) - K @ H
-            P = rest @ wide @ rest.T + START_SDS**2 * K @ R @ K.T
+        found = self._beginning.at(time_min, inputs, measured, self._noise.measurement_sd, self._changes)
+        if found is not None:
+            x, P = found
             self._memory[:] = [*x, *P.ravel()]
             self._time_min, self._inputs = time_min, tuple(inputs)
         return self._nothing
-
-    def _shown(self, x: Array, inputs: Sequence[float], time_min: float) -> tuple[Array, Array]:
-        """The outputs of a state, and their derivatives with respect to it."""
-        outputs = self._outputs
-        outputs.arguments[0][0], outputs.arguments[1][0] = x, inputs
-        outputs.arguments[2][0], outputs.arguments[3][0] = self._constants[: len(self.model.parameters)], time_min
-        outputs()
-        return outputs.results[0][0].copy(), outputs.results[1].T.copy()
-
-    def _nearest_steady_state(self, inputs: Sequence[float], time_min: float, y: Array, otherwise: Array) -> Array:
-        """The steady state whose outputs are nearest to what is measured, in standard deviations of the sensors."""
-        found = steady_states(self.model.with_values(self._changes), np.asarray(inputs, dtype=float), time_min)
-        if not found:
-            return otherwise
-
-        def distance(outputs: Array) -> float:
-            return float(np.nansum(((outputs - y) / self._noise.measurement_sd) ** 2))
-
-        return min(found, key=lambda point: distance(point.outputs)).state

@@ -22,8 +22,8 @@ def row_function(model: ProcessModel) -> ca.Function:
 
     new: [inputs of the row before, inputs, time of the row before, first step, second step, measured, limits], where
     NaN is a value that is missing, and a limit is how many standard deviations off a value may be to correct the state.
-    told: [prediction, residual, its standard deviations, whitened residual, log determinant, 1 if all went well], where
-    the log determinant is half that of the covariance of what was measured.
+    told: [prediction, residual, its standard deviations, whitened residual, what that was divided by, 1 if all went
+    well]; see `filter.Innovations`.
     """
     n_u, n_y = len(model.inputs), len(model.outputs)
     memory, new, constants = _symbols(model, 2 * n_u + 3 + 2 * n_y)
@@ -36,12 +36,12 @@ def row_function(model: ProcessModel) -> ca.Function:
     covariance = H @ P @ H.T + ca.diag(r)
     known = ca.fabs(measured) < inf  # false for NaN; CasADi takes x == x for true
     off = ca.if_else(known, measured - expected, 0.0)
-    whitened, log_determinant = _whitened(off, covariance, known)
+    whitened, divisors = _whitened(off, covariance, known)
     sd = ca.sqrt(ca.diag(covariance))
     x, P = _corrected(x, P, H, off, r, ca.logic_and(known, ca.fabs(off) <= limits * sd))
     good = ca.logic_and(inside, ca.fabs(ca.sum1(x) + ca.sum1(ca.vec(P))) < inf)
     x = ca.fmin(ca.fmax(x, _bounds(model)[0]), _bounds(model)[1])
-    told = ca.vertcat(expected, measured - expected, sd, ca.if_else(known, whitened, nan), log_determinant, good)
+    told = ca.vertcat(expected, measured - expected, sd, ca.if_else(known, whitened, nan), divisors, good)
     results = ca.cse([ca.densify(ca.vertcat(x, ca.vec(P))), ca.densify(told)])
     return ca.Function("row", [memory, new, constants], results, ["memory", "new", "constants"], ["after", "told"])
 
@@ -106,7 +106,7 @@ def _predicted(
         middle = begin + 0.5 * h
         after = step(x, u, p, begin, middle, h)[0]
         M = 0.5 * h * (slope(x, u, p, begin, middle) + slope(after, u, p, begin + h, middle))
-        F, x = _exponential(M) @ F, after
+        F, x = exponential(M) @ F, after
     return x, F @ P @ F.T + ca.diag(q * (first + second))
 
 
@@ -116,7 +116,7 @@ def _jacobian(model: ProcessModel) -> ca.Function:
     return ca.Function("jacobian", symbols, [ca.densify(ca.jacobian(ca.vertcat(*model.rhs), symbols[0]))])
 
 
-def _exponential(M: ca.SX) -> ca.SX:
+def exponential(M: ca.SX) -> ca.SX:
     """1 + M + M^2/2 + M^3/6 + M^4/24."""
     result = ca.SX.eye(M.size1())
     for divisor in (4, 3, 2, 1):
@@ -137,7 +137,7 @@ def _corrected(x: ca.SX, P: ca.SX, H: ca.SX, off: ca.SX, r: ca.SX, used: ca.SX) 
 
 
 def _whitened(off: ca.SX, covariance: ca.SX, known: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """L^-1 off, where L L' is the covariance of what is known; and the sum of log L_ii over what is known."""
+    """L^-1 off, where L L' is the covariance of what is known; and the diagonal of L, 1 where nothing is known."""
     n = off.numel()
     masked = ca.SX(n, n)
     for i in range(n):
@@ -146,7 +146,4 @@ def _whitened(off: ca.SX, covariance: ca.SX, known: ca.SX) -> tuple[ca.SX, ca.SX
                 ca.if_else(known[i], covariance[i, i], 1.0) if i == j else known[i] * known[j] * covariance[i, j]
             )
     L = ca.chol(masked).T
-    log_determinant = ca.SX(0)
-    for i in range(n):
-        log_determinant += ca.log(L[i, i])
-    return ca.solve(L, off), log_determinant
+    return ca.solve(L, off), ca.diag(L)

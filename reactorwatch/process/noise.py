@@ -5,7 +5,7 @@ that moves the state and is not in the model. Both are chosen by the likelihood 
 Evaluation of likelihood functions for Gaussian signals, IEEE Trans. Information Theory 11). It is climbed by scoring
 (Gupta & Mehra 1974, Computational aspects of maximum likelihood estimation and reduction in sensitivity function
 calculations, IEEE Trans. Automatic Control 19): with theta the logarithms of all standard deviations, w the whitened
-innovations and d half the log determinants of their covariances, differences of a few runs of the filter give
+innovations and d the logarithms of what they were divided by, differences of a few runs of the filter give
 
     gradient = sum(d' + w w'),    information = sum(w'^2 + d'^2),    step = -gradient / information,
 
@@ -13,13 +13,13 @@ and steps are shortened until they gain. The search begins with a process noise 
 of a few; the sensors' noise there is what makes the mean square of the innovations what the filter expects. In the end
 a state whose noise the record does not need has none: a plant that the model describes perfectly is described so.
 
-Outliers do not pass for noise: the filter does not follow them, and beyond `CLIP` standard deviations it does not
+Outliers do not pass for noise: those beyond `GATE` standard deviations are left out, and beyond `CLIP` it does not
 matter how far off a value is. So as not to take the tails of normal noise for outliers, squares are compared with those
 of normal values that are cut off likewise (Huber 1981, Robust Statistics, ch. 5).
 """
 
 from collections.abc import Sequence
-from math import erf, exp, inf, log, pi, sqrt
+from math import erf, exp, inf, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -68,7 +68,7 @@ class _Trial(NamedTuple):
         theta: shape (n_y + n_x,), the sensors first.
         loss: minus the log likelihood.
         w: the whitened innovations, shape (rows, n_y); 0 where there are none.
-        d: half the log determinant of their covariances, shape (rows,).
+        d: logarithms of what the innovations were divided by to be so, likewise.
     """
 
     theta: Array
@@ -108,10 +108,10 @@ class _Tuning:
 
     def found(self) -> NoiseLevels:
         """The best noise levels."""
-        best = self._climbed(self._begun())
+        best = self._climbed(self._without_outliers(self._begun()))
         if self._rows > FIRST_ROWS:
             self._take(self._rows)
-            best = self._climbed(self._tried(best.theta))
+            best = self._climbed(self._without_outliers(best))
         for index in range(self._n_y, best.theta.size):
             theta = best.theta.copy()
             theta[index] = self._lowest[index]
@@ -124,6 +124,15 @@ class _Tuning:
         """Go on with so many rows from the beginning."""
         time_min, inputs, measured = self._whole
         self._record = time_min[:rows], inputs[:rows], measured[:rows]
+
+    def _without_outliers(self, best: _Trial) -> _Trial:
+        """The same noise levels on the record without its outliers: an outlier of one sensor whitens into all."""
+        time_min, inputs, measured = self._record
+        self._filter.noise = self._levels(best.theta)
+        run = self._filter.run(*self._record, gate=GATE)
+        with np.errstate(invalid="ignore"):
+            self._record = time_min, inputs, np.where(np.abs(run.residual) > GATE * run.sd, np.nan, measured)
+        return self._tried(best.theta)
 
     def _climbed(self, best: _Trial) -> _Trial:
         """The best that steps of scoring find."""
@@ -147,16 +156,16 @@ class _Tuning:
 
     def _stepped(self, best: _Trial, chosen: range) -> _Trial:
         """After a step of scoring in the chosen components of theta; `best` if no step is better."""
-        of_w, of_d = np.empty((len(chosen), *best.w.shape)), np.empty((len(chosen), best.d.size))
+        of_w, of_d = np.empty((2, len(chosen), *best.w.shape))
         for place, index in enumerate(chosen):
             theta = best.theta.copy()
             theta[index] += DIFFERENCE
             near = self._tried(theta)
             of_w[place], of_d[place] = (near.w - best.w) / DIFFERENCE, (near.d - best.d) / DIFFERENCE
         counted = np.where(np.abs(best.w) < CLIP, 1.0 / _CUT_MEAN_SQUARE, 0.0)
-        gradient = np.sum(of_d, axis=1) + np.sum(of_w * best.w * counted, axis=(1, 2))
-        flat = (of_w * np.sqrt(counted)).reshape(len(chosen), -1)
-        information = flat @ flat.T + of_d @ of_d.T
+        gradient = np.sum(of_d + of_w * best.w * counted, axis=(1, 2))
+        of_w, of_d = (of_w * np.sqrt(counted)).reshape(len(chosen), -1), of_d.reshape(len(chosen), -1)
+        information = of_w @ of_w.T + of_d @ of_d.T
         free = (best.theta[chosen] > self._lowest[chosen]) | (gradient < 0.0)
         gradient[~free], information[~free], information[:, ~free] = 0.0, 0.0, 0.0
         step = np.zeros(best.theta.size)
@@ -177,10 +186,9 @@ class _Tuning:
     def _tried(self, theta: Array) -> _Trial:
         self._filter.noise = self._levels(theta)
         run = self._filter.run(*self._record, gate=GATE)
-        w, likelihood = run.whitened[BURN_IN:], run.log_likelihood[BURN_IN:]
+        w, sd = run.whitened[BURN_IN:], run.conditional_sd[BURN_IN:]
         known = np.isfinite(w)
-        w = np.where(known, w, 0.0)
-        d = -np.nan_to_num(likelihood) - 0.5 * np.sum(w**2 + known * log(2 * pi), axis=1)
+        w, d = np.where(known, w, 0.0), np.log(np.where(known, sd, 1.0))
         loss = float(np.sum(d) + 0.5 * np.sum(np.minimum(w**2, CLIP**2)) / _CUT_MEAN_SQUARE)
         return _Trial(theta, loss if np.isfinite(loss) else inf, w, d)
 

@@ -29,6 +29,8 @@ from monitor_node.charts.run_length.limits import checked_shift, told, within
 from monitor_node.charts.run_length.t2 import LARGEST_DIMENSION, t2
 
 SMALLEST_WEIGHT = 0.01
+SMALLEST_WEIGHT_WITHOUT_SHIFT = 1e-4
+"""One dimension has so few nodes that a far longer memory can be computed."""
 LARGEST_LIMIT = 200.0
 
 
@@ -41,7 +43,7 @@ def mewma(shift: float, dimension: int, weight: float, limit: float, *, steady_s
     Args:
         shift: of the mean: its distance measured by the covariance (Mahalanobis).
         dimension: number of signals, p, at most 50.
-        weight: lambda, in [0.01, 1].
+        weight: lambda, in [0.01, 1]; without a shift in [0.0001, 1].
         limit: H, of the statistic, at most 200.
         steady_state: whether the chart has long run when the shift comes.
 
@@ -49,18 +51,18 @@ def mewma(shift: float, dimension: int, weight: float, limit: float, *, steady_s
         InputError: an argument out of its range.
     """
     within("dimension", dimension, 1, LARGEST_DIMENSION)
-    within("weight (lambda)", weight, SMALLEST_WEIGHT, 1.0)
-    within("limit", positive("limit", limit), 1e-6, LARGEST_LIMIT)
     size = checked_shift(shift)
+    within("weight (lambda)", weight, SMALLEST_WEIGHT if size > 0.0 else SMALLEST_WEIGHT_WITHOUT_SHIFT, 1.0)
+    within("limit", positive("limit", limit), 1e-6, LARGEST_LIMIT)
     if weight == 1.0:
         return t2(size, dimension, limit)
-    if dimension == 1:
-        return ewma(size, weight, sqrt(limit), steady_state=steady_state)
     # The radius in units of lambda, in which each step has unit variance.
     radius = sqrt(limit / (weight * (2.0 - weight)))
     rest = 1.0 - weight
     if size == 0.0:
         return _without_shift(dimension, rest, radius, steady_state=steady_state)
+    if dimension == 1:
+        return ewma(size, weight, sqrt(limit), steady_state=steady_state)
     disc = _HalfDisc(radius, dimension - 1)
     sideways = disc.sideways(rest)
     lengths = run_lengths(_normal(rest * disc.along + size, disc.along) * sideways)

@@ -11,6 +11,7 @@ from monitor_node.charts import run_length
 from monitor_node.charts.cusum import Cusum
 from monitor_node.charts.ewma import Ewma
 from monitor_node.charts.mewma import Mewma
+from monitor_node.charts.parameters import ParameterT2
 from monitor_node.charts.pca import PcaModel, PcaSpe, PcaT2
 from monitor_node.charts.shewhart import Shewhart
 from monitor_node.charts.t2 import T2
@@ -49,6 +50,10 @@ def vector(rng: np.random.Generator, rows: int) -> Array:
     return MEANS + white @ ROOT.T
 
 
+def difference(rng: np.random.Generator, rows: int) -> Array:
+    return np.asarray(vector(rng, rows) - MEANS)
+
+
 def related(rng: np.random.Generator, rows: int) -> Array:
     """Six signals driven by two, with noise of its own in each: the eigenvalues left out are equal."""
     driving = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]])
@@ -69,6 +74,11 @@ MEMBERS: dict[type, Member] = {
     ),
     T2: Member(lambda: T2(MEANS, COVARIANCE, 10.0), vector, run_length.t2(SHIFT, 3, 10.0)),
     Mewma: Member(lambda: Mewma(MEANS, COVARIANCE, 0.2, 11.0), vector, run_length.mewma(SHIFT, 3, 0.2, 11.0)),
+    ParameterT2: Member(
+        lambda: ParameterT2(["a1", "b1", "c"], np.linalg.inv(ROOT), 10.0, np.eye(3)[1:]),
+        difference,
+        run_length.t2(SHIFT, 3, 10.0),
+    ),
     PcaT2: Member(lambda: PcaT2(MODEL), related, 20.0),
     PcaSpe: Member(lambda: PcaSpe(MODEL), related, 20.0),
 }

@@ -4,7 +4,7 @@ from math import floor, log10
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, special, stats
 
 from monitor_node.charts import run_length
 from monitor_node.charts.base import Bank
@@ -150,6 +150,21 @@ def test_a_vanishing_shift_of_the_mewma_is_none(dimension: int) -> None:
         assert with_shift == pytest.approx(without, rel=1e-5)
 
 
+@pytest.mark.parametrize("dimension", [1, 2, 7, 20])
+@pytest.mark.parametrize("weight", [1e-3, 1e-4])
+def test_a_mewma_of_long_memory_is_an_ornstein_uhlenbeck_process(dimension: int, weight: float) -> None:
+    """Its mean exit time from a ball, which Siegmund (1985) widens by 0.5826 steps for discrete time: to 0.1 %."""
+    limit = float(stats.chi2.isf(1e-4, dimension))
+
+    def integrand(r: float) -> float:
+        inside = special.gammainc(0.5 * dimension, 0.5 * r * r) * special.gamma(0.5 * dimension)
+        return float(inside * 2.0 ** (0.5 * dimension - 1.0) * r ** (1.0 - dimension) * np.exp(0.5 * r * r))
+
+    radius = np.sqrt(limit) + 0.5826 * np.sqrt(weight * (2.0 - weight))
+    exit_time = integrate.quad(integrand, 1e-12, radius, limit=400)[0] / -np.log1p(-weight)
+    assert run_length.mewma(0.0, dimension, weight, limit) == pytest.approx(exit_time, rel=1e-3)
+
+
 def test_charts_that_are_another_agree() -> None:
     """EWMA of lambda 1 and CUSUM of no height are Shewhart; MEWMA of one signal is EWMA, near lambda 1 it is T2."""
     for shift in (0.0, 1.0):
@@ -214,6 +229,8 @@ def test_far_shifts_are_seen_at_once() -> None:
         (lambda: run_length.ewma(0.0, 0.0), r"weight \(lambda\) must be in \(0, 1\], got 0.0"),
         (lambda: run_length.ewma(float("nan")), r"shift must be in \[-100, 100\] sigma, got nan"),
         (lambda: run_length.mewma(0.0, 0, 0.1, 8.0), r"dimension must be in \[1, 50\], got 0"),
+        (lambda: run_length.mewma(1.0, 2, 1e-3, 8.0), r"weight \(lambda\) must be in \[0.01, 1\], got 0.001"),
+        (lambda: run_length.mewma(0.0, 2, 1e-5, 8.0), r"weight \(lambda\) must be in \[0.0001, 1\], got 1e-05"),
         (lambda: run_length.shewhart(0.0, 30.0), r"the run length must be below 1e\+12 samples"),
         (lambda: run_length.t2(0.0, 2, -1.0), "limit must be a positive number, got -1.0"),
     ],

@@ -308,4 +308,4 @@ def test_a_training_full_of_holes_is_told_and_harms_nothing() -> None:
     kept = np.arange(time_min.size) % 9 != 0
     monitor, said = watch(samples(time_min[kept], {name: values[kept] for name, values in columns.items()}))
     assert monitor.phase == "watching"
-    assert [check.name for check in reference_of(said).checks] == ["record"]
+    assert [check.name for check in reference_of(said).checks] == ["record", "training"]

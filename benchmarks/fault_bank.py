@@ -1,0 +1,157 @@
+"""How soon does the monitor find a fault, beside the report's method and an oracle, and how often is it wrong?
+
+Every fault of the bank (`benchmarks/faults/bank.py`) in three sizes and for many seeds: 100 minutes of training, 200
+without a fault, then the fault for 150. All detectors watch the same records at the same promised rate of false alarms:
+
+- the oracle, which knows the fault (`benchmarks/faults/oracle.py`): nobody can be much faster;
+- the monitor, as it is configured by default;
+- the report's method (`benchmarks/faults/report_method.py`), with limits widened to that rate, and at its own 3 sigma.
+
+Then runs without a fault, with white and with autocorrelated noise: the realised rate of false alarms.
+
+    python benchmarks/fault_bank.py [--quick] [--jobs N] [--json FILE] [--budgets 1 30]
+
+Goals: the median delay at most half that of the report's method at an equal rate of false alarms; that rate kept.
+"""
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks.faults.bank import PERIOD_MIN, cases
+from benchmarks.faults.report_method import METHODS, calibrated_width
+from benchmarks.faults.score import rows_to_false_alarm
+from benchmarks.faults.study import Widths, fault_free_statistics, run_case, run_fault_free
+from benchmarks.faults.tables import as_json, print_fault_free, print_summary, print_table
+
+SEEDS, FAULT_FREE_RUNS, CALIBRATION_RUNS = 20, 200, 400
+QUICK_SEEDS, QUICK_FAULT_FREE_RUNS, QUICK_CALIBRATION_RUNS = 2, 6, 60
+FAULT_FREE_ROWS = round(750 / PERIOD_MIN)
+CALIBRATION_ROWS = 20_000
+CALIBRATION_SEED, FAULT_FREE_SEED = 500_000, 700_000
+PHIS = (0.0, 0.5)
+
+Result = TypeVar("Result")
+
+
+def main() -> None:
+    """Run the benchmark and print it."""
+    chosen = arguments()
+    seeds, quiet_runs, calibration_runs = (
+        (QUICK_SEEDS, QUICK_FAULT_FREE_RUNS, QUICK_CALIBRATION_RUNS)
+        if chosen.quick
+        else (SEEDS, FAULT_FREE_RUNS, CALIBRATION_RUNS)
+    )
+    budgets = tuple(chosen.budgets)
+    began = time.perf_counter()
+    with workers(chosen.jobs) as everywhere:
+        widths = report_widths(everywhere, calibration_runs, budgets)
+        found = everywhere.do("faults", partial(run_case, budgets=budgets, widths=widths), cases(seeds))
+        quiet = everywhere.do(
+            "fault-free runs",
+            partial(run_fault_free, rows=FAULT_FREE_ROWS, budgets=budgets, widths=widths),
+            [FAULT_FREE_SEED + number for _ in PHIS for number in range(quiet_runs)],
+            [phi for phi in PHIS for _ in range(quiet_runs)],
+        )
+    console = Console(width=200)
+    for budget in budgets:
+        print_table(console, found, budget)
+        print_summary(console, found, budget, widths)
+        print_fault_free(console, quiet, budget)
+    console.print(f"\n{len(found)} runs with a fault, {len(quiet)} without, {time.perf_counter() - began:.0f} s")
+    if chosen.json is not None:
+        chosen.json.write_text(json.dumps(as_json(found, quiet, budgets, widths), indent=1) + "\n")
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
+    parser = argparse.ArgumentParser(description="The monitor against a bank of faults.")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK_SEEDS} seeds, for a try")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
+    parser.add_argument("--json", type=Path, help="where the numbers are written, run by run")
+    parser.add_argument(
+        "--budgets", type=float, nargs="+", default=[1.0, 30.0], help="false alarms in 30 days that are promised"
+    )
+    return parser.parse_args()
+
+
+class Workers:
+    """Does a piece of work for many arguments, in several processes or in this one.
+
+    Args:
+        executor: of the processes; None: this one.
+        progress: that is shown.
+    """
+
+    def __init__(self, executor: ProcessPoolExecutor | None, progress: Progress) -> None:
+        self._executor = executor
+        self._progress = progress
+
+    def do(self, title: str, work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
+        """The results, in order.
+
+        Args:
+            title: what a person reads meanwhile.
+            work: to be done.
+            arguments: for each argument of it, its values.
+        """
+        results = (
+            map(work, *arguments)
+            if self._executor is None
+            else self._executor.map(work, *arguments, chunksize=max(1, min(10, len(arguments[0]) // 20)))
+        )
+        return list(self._progress.track(results, total=len(arguments[0]), description=title))
+
+
+@contextmanager
+def workers(jobs: int) -> Iterator[Workers]:
+    """Processes that do the work.
+
+    Args:
+        jobs: how many.
+    """
+    # The matrices are small: threads of the linear algebra would only wait for each other.
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    with Progress(console=Console(stderr=True)) as progress:
+        if jobs == 1:
+            yield Workers(None, progress)
+        else:
+            with ProcessPoolExecutor(jobs, get_context("spawn")) as executor:
+                yield Workers(executor, progress)
+
+
+def report_widths(everywhere: Workers, runs: int, budgets: Sequence[float]) -> Widths:
+    """The widths at which the report's limits keep the promised rates in runs without a fault.
+
+    Args:
+        everywhere: does the work.
+        runs: of how many.
+        budgets: false alarms in 30 days that are promised.
+    """
+    statistics = everywhere.do(
+        "limits of the report's method",
+        partial(fault_free_statistics, rows=CALIBRATION_ROWS),
+        [CALIBRATION_SEED + number for number in range(runs)],
+    )
+    return {
+        method.name: {
+            budget: calibrated_width([item[method.name] for item in statistics], rows_to_false_alarm(budget))
+            for budget in budgets
+        }
+        for method in METHODS
+    }
+
+
+if __name__ == "__main__":
+    main()

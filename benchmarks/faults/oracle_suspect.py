@@ -1,0 +1,78 @@
+"""The best anyone could say of the cause: what the monitor's suspects have to be compared with.
+
+Some causes imitate each other so well (see `bank.TWINS`) that nobody tells them apart in the noise of a run. This
+oracle knows the onset, the profile, the equations, the state before the onset, the spread of the noise, and the run to
+its end. For every effect of the catalogue it fits the size, by least squares over the noise of the measurements
+(Gauss and Newton's steps, halved until they gain), and it suspects the one that fits best: for independent normal noise
+the likeliest, if all were equally likely before. Where a fault puts the reactor out those steps may end in a local
+minimum; so that the true cause is not missed for that, its true size is tried as well.
+"""
+
+from math import inf
+
+import numpy as np
+
+from benchmarks.faults.bank import BANK, Case
+from benchmarks.faults.runs import NOISE_SD, Truth, measured_of, profile_changes, simulator_of
+from plant_node.scenario import SIGNAL
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.integrate import SimulationError
+from reactorwatch.process.model import Array
+from reactorwatch.records.record import Record
+
+REACH = 3.0
+"""Sizes up to this times the large one of the bank are tried."""
+
+_STEPS, _HALVINGS, _GAIN = 25, 8, 0.1
+
+
+def oracle_suspect(case: Case, record: Record, truth: Truth) -> str:
+    """The cause that explains a run best.
+
+    Args:
+        case: of the bank.
+        record: of that case.
+        truth: of that case.
+    """
+    since = int(np.argmax(record.time_min >= case.onset_min)) - 1
+    misfits = {effect.name: _misfit(effect, case, record, truth, since) for effect in EFFECTS}
+    at_true_size = float(np.sum(((measured_of(record) - truth.faulty)[since:] / NOISE_SD) ** 2))
+    misfits[case.fault.cause] = min(misfits[case.fault.cause], at_true_size)
+    return min(misfits, key=misfits.__getitem__)
+
+
+def _misfit(effect: Effect, case: Case, record: Record, truth: Truth, since: int) -> float:
+    """The least sum of squares that an effect of any size leaves from a row on, over the variance of the noise."""
+    time_min, flows = record.time_min[since:], record.columns[SIGNAL][since:]
+    measured, start = measured_of(record)[since:], truth.nominal_states[since]
+    simulator = simulator_of(effect.name, case.fault.profile)
+    name = f"{effect.name}.size"
+    shape = profile_changes(case, effect.name)
+
+    def at(size: float) -> tuple[float, Array, Array]:
+        """Sum of squares, residuals and their derivatives but for the sign."""
+        try:
+            run, sensitivities = simulator.run_with_sensitivities(time_min, flows, start, [name], shape | {name: size})
+        except SimulationError:  # no plant goes there
+            return inf, np.zeros(1), np.zeros(1)
+        residuals = ((measured - run.outputs) / NOISE_SD).ravel()
+        return float(residuals @ residuals), residuals, (sensitivities.outputs[:, :, 0] / NOISE_SD).ravel()
+
+    largest = REACH * next(item.sizes[-1] for item in BANK if item.cause == effect.name)
+    lower, upper = max(effect.lower, -largest), min(effect.upper, largest)
+    size = 0.0
+    squares, residuals, slopes = at(size)
+    for _ in range(_STEPS):
+        gradient, curvature = float(residuals @ slopes), float(slopes @ slopes)
+        if not gradient**2 > _GAIN * curvature:  # what the step would gain, were the effect linear in its size
+            break
+        for halving in range(_HALVINGS):
+            candidate = min(max(size + gradient / curvature * 0.5**halving, lower), upper)
+            found = at(candidate)
+            if found[0] < squares:
+                break
+        if not squares - found[0] > _GAIN:
+            break
+        size, (squares, residuals, slopes) = candidate, found
+    return squares

@@ -1,0 +1,139 @@
+"""The work of the benchmark, a run at a time: each function here is what one process does with one run."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.faults.bank import AFTER_MIN, PERIOD_MIN, Case
+from benchmarks.faults.oracle import log_likelihood_ratio, oracle_delay_min
+from benchmarks.faults.oracle_suspect import oracle_suspect
+from benchmarks.faults.report_method import METHODS, TRAINING_ROWS, WIDTH, alarms_of, alarms_raised
+from benchmarks.faults.runs import NOISE_SD, fault_free, measured_of, record_of, truth_of
+from benchmarks.faults.score import Outcome, Rate, judged, rows_to_false_alarm
+from benchmarks.faults.watch import Suspicion, incidents_of, intervals_of, suspicion, watch
+
+SOON_MIN = 10.0
+"""After the first alarm: when suspects are looked at for the first time."""
+
+ORACLE, MONITOR = "oracle", "monitor"
+EQUAL = "equal rate"
+THREE_SIGMA = "3 sigma"
+
+Widths = dict[str, dict[float, float]]
+"""Of the report's limits at equal rate: by the method's name and the promised false alarms in 30 days."""
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """What all detectors did in a case.
+
+    Attributes:
+        case: of the bank.
+        left_branch: whether the fault put the reactor out.
+        oracle_suspect: whom the oracle suspects at the end of the run.
+        outcomes: by the promised false alarms in 30 days, then by detector (see `detectors`).
+        soon: whom the monitor suspected `SOON_MIN` after its first alarm, by the promised false alarms.
+        late: the same at the end of the run.
+    """
+
+    case: Case
+    left_branch: bool
+    oracle_suspect: str
+    outcomes: dict[float, dict[str, Outcome]]
+    soon: dict[float, Suspicion]
+    late: dict[float, Suspicion]
+
+
+@dataclass(frozen=True)
+class FaultFreeResult:
+    """Alarms in a run without a fault.
+
+    Attributes:
+        phi: of its noise.
+        alarms: by the promised false alarms in 30 days, then by detector.
+        incidents: of the monitor, likewise.
+        names: of the alarms that the monitor raised, likewise.
+    """
+
+    phi: float
+    alarms: dict[float, dict[str, Rate]]
+    incidents: dict[float, Rate]
+    names: dict[float, list[str]]
+
+
+def detectors() -> list[str]:
+    """Names of all detectors, as in results."""
+    report = [f"{method.name} {kind}" for kind in (EQUAL, THREE_SIGMA) for method in METHODS]
+    return [ORACLE, MONITOR, *report]
+
+
+def fault_free_statistics(seed: int, rows: int) -> dict[str, NDArray[np.float32]]:
+    """The statistics of the report's methods on the watched rows of a run without a fault, by method."""
+    record = fault_free(seed, rows)
+    return {method.name: method.statistic(record)[TRAINING_ROWS:].astype(np.float32) for method in METHODS}
+
+
+def run_case(case: Case, budgets: tuple[float, ...], widths: Widths) -> CaseResult:
+    """Let all detectors watch a case.
+
+    Args:
+        case: of the bank.
+        budgets: false alarms in 30 days that are promised.
+        widths: of the report's limits.
+    """
+    record = record_of(case)
+    truth = truth_of(case, record)
+    increments = log_likelihood_ratio(measured_of(record), truth.nominal, truth.faulty, NOISE_SD)
+    watched_min = record.time_min[TRAINING_ROWS:]
+    statistics = {method.name: method.statistic(record)[TRAINING_ROWS:] for method in METHODS}
+    end_min = case.onset_min + AFTER_MIN
+    outcomes: dict[float, dict[str, Outcome]] = {}
+    soon, late = {}, {}
+    for budget in budgets:
+        watched = watch(record, budget)
+        delay_min = oracle_delay_min(record.time_min, increments, case.onset_min, rows_to_false_alarm(budget))
+        monitor = judged(intervals_of(watched.messages), watched.watching_since_min, case.onset_min, end_min)
+        outcomes[budget] = {ORACLE: Outcome(delay_min), MONITOR: monitor} | {
+            name: judged(alarms_of(watched_min, statistics[method], width), watched_min[0], case.onset_min, end_min)
+            for name, method, width in _charts(widths, budget)
+        }
+        detected_min = case.onset_min + monitor.delay_min
+        soon[budget] = suspicion(watched.messages, case.fault.cause, detected_min, detected_min + SOON_MIN)
+        late[budget] = suspicion(watched.messages, case.fault.cause, detected_min, end_min)
+    return CaseResult(case, truth.left_branch, oracle_suspect(case, record, truth), outcomes, soon, late)
+
+
+def run_fault_free(seed: int, phi: float, rows: int, budgets: tuple[float, ...], widths: Widths) -> FaultFreeResult:
+    """Count the alarms of a run without a fault.
+
+    Args:
+        seed: of the run.
+        phi: of its noise.
+        rows: how many.
+        budgets: false alarms in 30 days that are promised.
+        widths: of the report's limits.
+    """
+    record = fault_free(seed, rows, phi)
+    statistics = {method.name: method.statistic(record)[TRAINING_ROWS:] for method in METHODS}
+    report_min = (rows - TRAINING_ROWS) * PERIOD_MIN
+    alarms: dict[float, dict[str, Rate]] = {}
+    incidents, names = {}, {}
+    for budget in budgets:
+        watched = watch(record, budget)
+        watched_min = max(watched.last_min - watched.watching_since_min, 0.0)
+        names[budget] = [message.alarm for message in watched.messages if message.event == "raised"]
+        alarms[budget] = {MONITOR: Rate(len(names[budget]), watched_min)} | {
+            name: Rate(alarms_raised([statistics[method]], width), report_min)
+            for name, method, width in _charts(widths, budget)
+        }
+        incidents[budget] = Rate(incidents_of(watched.messages), watched_min)
+    return FaultFreeResult(phi, alarms, incidents, names)
+
+
+def _charts(widths: Widths, budget: float) -> Iterator[tuple[str, str, float]]:
+    """The report's charts: name, method and width."""
+    for method in METHODS:
+        yield f"{method.name} {EQUAL}", method.name, widths[method.name][budget]
+        yield f"{method.name} {THREE_SIGMA}", method.name, WIDTH

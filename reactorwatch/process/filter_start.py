@@ -1,0 +1,98 @@
+"""Where a filter begins: at the state that shows what is measured, very uncertain of it.
+
+If all states can be read off the measurements, they are: Newton's method on the outputs, which settles at once where
+these are the states themselves. If not, because a value is missing or a state has no sensor, the search begins at the
+steady state whose outputs are nearest to what is measured, so that the state that does not show is one that goes with
+the others: of the reactor's three steady states, that of the right branch.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.process.filter_step import output_function
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.steady_state import SteadyState, steady_states
+
+START_SD = 3.0
+"""Standard deviation at the start of a state that no sensor shows, in its scales."""
+
+START_SDS = 10.0
+"""Standard deviation at the start of a state that a sensor shows, in those of the sensor: it may be an outlier."""
+
+CORRECTIONS = 5
+
+
+class Beginning:
+    """Finds the state that a filter begins with.
+
+    Args:
+        model: of the plant.
+    """
+
+    def __init__(self, model: ProcessModel) -> None:
+        self._model = model
+        self._outputs = ArrayFunction(output_function(model))
+        self._lower = np.array([state.lower for state in model.states])
+        self._upper = np.array([state.upper for state in model.states])
+        self._where: tuple[float, ...] = ()
+        self._points: list[SteadyState] = []
+        self._wide = np.diag(np.square([START_SD * state.scale for state in model.states]))
+
+    def at(
+        self,
+        time_min: float,
+        inputs: Sequence[float],
+        measured: Sequence[float],
+        measurement_sd: Sequence[float],
+        changes: Mapping[str, float],
+    ) -> tuple[Array, Array] | None:
+        """The state and its covariance; None if nothing is measured.
+
+        Args:
+            time_min: of the row.
+            inputs: that hold from this row on.
+            measured: one an output; NaN: missing.
+            measurement_sd: of the sensors.
+            changes: parameters that differ from the model's values.
+        """
+        y, u = np.asarray(measured, dtype=float), np.asarray(inputs, dtype=float)
+        known = np.isfinite(y)
+        if not known.any() or not np.all(np.isfinite(u)):
+            return None
+        model = self._model.with_values(changes)
+        p, wide = model.values(), self._wide
+        R = np.diag(np.square(measurement_sd))[np.ix_(known, known)]
+        x = 0.5 * (self._lower + self._upper)
+        if np.linalg.matrix_rank(self._shown(x, u, p, time_min)[1][known]) < x.size:
+            points = self._steady_states(model, u, time_min)
+            distances = [float(np.nansum(((point.outputs - y) / measurement_sd) ** 2)) for point in points]
+            x = points[int(np.argmin(distances))].state if points else x
+        for _ in range(CORRECTIONS):
+            expected, H = self._shown(x, u, p, time_min)
+            K = _gain(wide, H[known], R)
+            x = np.clip(x + K @ (y - expected)[known], self._lower, self._upper)
+        H = self._shown(x, u, p, time_min)[1][known]
+        K = _gain(wide, H, START_SDS**2 * R)
+        rest = np.eye(x.size) - K @ H
+        return x, rest @ wide @ rest.T + START_SDS**2 * K @ R @ K.T
+
+    def _steady_states(self, model: ProcessModel, u: Array, time_min: float) -> list[SteadyState]:
+        """As they are now. Kept until they are asked for elsewhere: one record is often begun many times."""
+        where = (time_min, *u, *model.values())
+        if where != self._where:
+            self._where, self._points = where, steady_states(model, u, time_min)
+        return self._points
+
+    def _shown(self, x: Array, u: Array, p: Array, time_min: float) -> tuple[Array, Array]:
+        """The outputs of a state, and their derivatives with respect to it."""
+        outputs = self._outputs
+        for argument, value in zip(outputs.arguments, (x, u, p, np.array([time_min])), strict=True):
+            argument[0] = value
+        outputs()
+        return outputs.results[0][0].copy(), outputs.results[1].T.copy()
+
+
+def _gain(P: Array, H: Array, R: Array) -> Array:
+    return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P).T, dtype=np.float64)
