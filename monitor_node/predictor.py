@@ -22,6 +22,7 @@ from monitor_node.drift import learn
 from monitor_node.identification.regressor import RegressorBuffer, Rows, rows_of
 from monitor_node.identification.rls import RecursiveLeastSquares
 from monitor_node.identification.structure import Scaling, Structure
+from monitor_node.sampling import TOLERANCE
 from monitor_node.training_record import checks_of
 from reactorwatch.contract.messages_pb2 import Parameter
 from reactorwatch.errors import InputError
@@ -110,7 +111,8 @@ class ArxPredictor:
         if self._scaling is None:
             return residual
         input_centre, input_spread, centre, spread = self._scales
-        rows = rows_of(self._structure, (inputs - input_centre) / input_spread, (outputs - centre) / spread, time_min)
+        rows = rows_of(self._structure, (inputs - input_centre) / input_spread, (outputs - centre) / spread)
+        rows = _following(rows, time_min, self._structure.history)
         parameters = self._structure.parameters
         if len(rows.outputs) < ROWS_A_PARAMETER * parameters:
             return residual
@@ -146,7 +148,7 @@ class ArxPredictor:
         self._drift = learn(rows.regressors, residual, self._rls.forgetting, len(residual), arl0, names, lags)
 
     def drift(self) -> tuple[Judgement, dict[str, float]] | None:
-        """How far the two models are from each other, and each parameter's part of that; None: they are not compared."""
+        """How far the models are from each other, and each parameter's part of that; None: not compared."""
         self.catch_up()
         if self._drift is None or self._drifted is None or self._reference is None:
             return None
@@ -230,6 +232,17 @@ class ArxPredictor:
             "excitation": 1.0 / condition,
             "condition": condition,
         }
+
+
+def _following(rows: Rows, time_min: Array, history: int) -> Rows:
+    """Those rows that follow each other, with all their history, by one period, as is asked of the rows that come."""
+    steps = np.diff(time_min)
+    period = float(np.median(steps))
+    late = np.abs(steps - period) > TOLERANCE * period
+    number = np.arange(time_min.size)
+    last_late = np.maximum.accumulate(np.where(np.concatenate([[True], late]), number, 0))
+    kept = (number - last_late)[rows.position] >= history
+    return Rows(rows.regressors[kept], rows.outputs[kept], rows.position[kept])
 
 
 def _covariance(regressors: Array, outputs: Array, theta: Array) -> Array:

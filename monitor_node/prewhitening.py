@@ -31,6 +31,14 @@ ROWS_A_COEFFICIENT = 10
 BATCHES = 10
 """That the squares of a training are averaged over: longer than what they have in common lasts."""
 
+BLOCK, FEWEST_BLOCKS = 50, 8
+"""Rows that are compared with others, and how many such blocks there must be."""
+
+UNLIKE = 2.0
+"""Times the variance by chance, beyond which blocks are unlike."""
+
+WORST = 0.95
+
 LARGEST_SUM = 0.98
 """Of the coefficients. Nearer to 1 the residual is a random walk, and nothing would ever be a shift."""
 
@@ -103,7 +111,7 @@ def _fitted(rows: Array, order: int, smallest_sd: float) -> Prewhitening:
     error = target - target.mean() - centred @ a
     freedom = len(rows) - order - 1
     variance = float(error @ error) / freedom
-    sd = max(variance**0.5, smallest_sd)
+    sd = max(variance**0.5 * _worst(error), smallest_sd)
     passed = 1.0 - float(a.sum())
     of_sum = variance * float(np.sum(np.linalg.inv(gram)))
     return Prewhitening(
@@ -114,6 +122,24 @@ def _fitted(rows: Array, order: int, smallest_sd: float) -> Prewhitening:
         sd_variance=_sd_variance(error, freedom),
         passed_variance=of_sum / passed**2,
     )
+
+
+def _worst(error: Array) -> float:
+    """How much larger the residual is where it is large than on the whole; 1 if it is alike everywhere.
+
+    A linear model of a plant that is not linear fits better here than there, and what fits worst makes the false
+    alarms. So where blocks of rows differ by more than chance lets them, sigma is that of the worst of them.
+    """
+    blocks = error[: error.size // BLOCK * BLOCK].reshape(-1, BLOCK)
+    size = np.sqrt(np.mean(error**2)) if error.size else 0.0
+    if len(blocks) < FEWEST_BLOCKS or size <= 0.0:
+        return 1.0
+    sizes = np.sqrt(np.mean(blocks**2, axis=1)) / size
+    fourth = float(np.mean(error**4)) / size**4
+    by_chance = max(fourth - 1.0, 1.0) / (4.0 * BLOCK)
+    if float(np.var(sizes, ddof=1)) <= UNLIKE * by_chance:
+        return 1.0
+    return max(float(np.quantile(sizes, WORST)), 1.0)
 
 
 def _sd_variance(error: Array, freedom: int) -> float:

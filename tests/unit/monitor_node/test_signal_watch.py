@@ -1,0 +1,80 @@
+"""A stuck sensor, a spike and a dead plant are told as what they are, at once, and as nothing else."""
+
+import numpy as np
+import pytest
+
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from reactorwatch.contract.messages_pb2 import Alarm
+
+from .samples import samples
+from .watching import minute_ns, sound_run, watched
+
+AT_MIN, AT = 130.0, 1300
+CONFIG = MonitorConfig(isolation=False)
+
+
+@pytest.mark.parametrize(("signal", "row"), [("T", AT), ("C", AT)])
+def test_a_stuck_sensor_is_told_within_ten_readings(signal: str, row: int) -> None:
+    time_min, columns = sound_run(135.0, seed=1)
+    columns[signal][row:] = columns[signal][row]
+    run = watched(time_min, columns)
+    ((minute, alarm),) = [(at, alarm) for alarm, at in run.raised if alarm.startswith("stuck")]
+    assert alarm == f"stuck/{signal}"
+    assert AT_MIN < minute <= AT_MIN + 1.0
+    told = next(item for item in run.alarms if item.alarm == alarm)
+    assert [(item.cause, item.probability) for item in told.suspects] == [("stuck_sensor", 1.0)]
+    assert told.text.startswith(f"{signal} is stuck: it has read ")
+
+
+@pytest.mark.parametrize(("signal", "size"), [("T", 6.0), ("T", -40.0), ("C", 0.05)])
+def test_a_spike_is_told_one_row_later_and_raises_nothing_else(signal: str, size: float) -> None:
+    time_min, columns = sound_run(150.0, seed=2)
+    columns[signal][AT] += size
+    run = watched(time_min, columns)
+    assert run.raised == [(f"spike/{signal}", AT_MIN + 0.1)]
+    assert f"{size:+.1g}"[0] in run.alarms[0].text
+
+
+def test_a_real_jump_of_a_sensor_is_no_spike_and_no_row_more_than_one_is_lost() -> None:
+    time_min, columns = sound_run(150.0, seed=2)
+    columns["T"][AT:] += 6.0
+    run = watched(time_min, columns)
+    assert not [alarm for alarm, _ in run.raised if alarm.startswith("spike")]
+    assert run.raised[0][1] <= AT_MIN + 0.2
+
+
+def test_a_dead_sensor_is_told_while_the_others_go_on() -> None:
+    time_min, columns = sound_run(140.0, seed=3)
+    columns["T"][AT:] = np.nan
+    monitor = Monitor(CONFIG, 0)
+    said = [
+        item.message
+        for message in samples(time_min, columns)
+        if b"nan" not in message.payload
+        for item in monitor.on_message(message, 0)
+    ]
+    raised = [(item.alarm, item.time_ns) for item in said if isinstance(item, Alarm) and item.event == "raised"]
+    assert raised == [("silence/T", minute_ns(AT_MIN - 0.1 + 0.5))]
+
+
+def test_a_dead_plant_is_told_by_the_clock_of_receipt_while_nothing_comes() -> None:
+    """A row a second, then nothing: five seconds later the loop wakes the monitor, and it says so once."""
+    time_min, columns = sound_run(10.0, seed=4)
+    monitor = Monitor(CONFIG, 0)
+    now_ns = 0
+    for index, message in enumerate(samples(time_min, columns)):
+        now_ns = 10**9 * (index // 3)
+        monitor.on_message(message, now_ns)
+    monitor.on_tick(now_ns)
+    due_ns = now_ns
+    said: list[Alarm] = []
+    while not said:
+        due_ns = monitor.next_tick_ns()
+        assert due_ns < now_ns + 10**11
+        said = [item.message for item in monitor.on_tick(due_ns) if isinstance(item.message, Alarm)]
+    assert due_ns == now_ns + 5 * 10**9
+    assert [(alarm.alarm, alarm.event, alarm.time_ns) for alarm in said] == [
+        ("silence/plant", "raised", minute_ns(10.0 + 0.5))
+    ]
+    assert not [item for item in monitor.on_tick(due_ns + 10**12) if isinstance(item.message, Alarm)]
