@@ -72,7 +72,15 @@ class MonitorNode(Monitor):
         for publication in publications:
             alarm = publication.message
             if isinstance(alarm, Alarm):
-                log.info("alarm", alarm=alarm.alarm, change=alarm.event, by=alarm.by, text=alarm.text)
+                likely = [f"{item.cause} {item.probability:.2f}" for item in alarm.suspects]
+                log.info(
+                    "alarm",
+                    alarm=alarm.alarm,
+                    change=alarm.event,
+                    by=alarm.by,
+                    text=alarm.text,
+                    suspects=", ".join(likely),
+                )
         while self.notes:
             log.warning(self.notes.pop(0))
         if self._file is None:

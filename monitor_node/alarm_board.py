@@ -12,7 +12,7 @@ import msgspec
 
 from monitor_node.alarm_kpis import Counted, KpiCounter, KpiState
 from monitor_node.alarm_states import Event, State, fits
-from monitor_node.alarms import LAST_NS, AlarmMemory, ChartAlarm, Explanation, TimeNs
+from monitor_node.alarms import LAST_NS, AlarmMemory, ChartAlarm, Explanation, SuspectedCause, TimeNs
 from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig, PriorityName
 from monitor_node.incidents import Incident, Incidents
@@ -68,6 +68,7 @@ class AlarmBoard:
         self._kpis = KpiCounter()
         self._kpi_key = keys.key(config.plant, keys.ALARM_KPIS, KPIS)
         self._shelved: list[ChartAlarm] = []
+        self._suspects: list[SuspectedCause] = []  # of the latest incident
         self._kpi_minute: int | None = None
         self._kpis_changed = False
         self.time_ns: int | None = None
@@ -148,14 +149,15 @@ class AlarmBoard:
             publications.append(self._figures(time_ns))
         return publications
 
-    def suspect(self, time_ns: int, suspects: list[tuple[str, float]]) -> list[Publication]:
-        """Tell what the standing alarms of the latest incident may come from.
+    def suspect(self, time_ns: int, suspects: list[SuspectedCause]) -> list[Publication]:
+        """Tell what the alarms of the latest incident may come from: those that stand, and those that are yet to come.
 
         Args:
             time_ns: of the row that this was found at.
-            suspects: causes and their probabilities, the likeliest first.
+            suspects: the likeliest first.
         """
         publications: list[Publication] = []
+        self._suspects = list(suspects)
         for alarm in self._alarms.values():
             memory = alarm.memory
             if alarm.tells_cause:
@@ -165,6 +167,16 @@ class AlarmBoard:
                 self.changes += 1
                 publications.append(self._publication(alarm, SUSPECTED, time_ns))
         return publications
+
+    @property
+    def incident(self) -> int:
+        """Number of the latest incident; 0: there was none yet."""
+        return self._incidents.state.number
+
+    @property
+    def has_unexplained(self) -> bool:
+        """Whether an alarm stands that does not say itself what its cause is."""
+        return any(alarm.memory.rule.standing and not alarm.tells_cause for alarm in self._alarms.values())
 
     # --- what people do --------------------------------------------------------------------------------------
 
@@ -299,6 +311,10 @@ class AlarmBoard:
             if not memory.incident:
                 memory.incident = self._incidents.came_up(time_ns, alarm.name)
                 memory.first_in = self._incidents.state.first_in == alarm.name
+                if memory.first_in:
+                    self._suspects = []
+                if not alarm.tells_cause:
+                    memory.suspects = list(self._suspects)
         self._note_shelved()
         self.changes += 1
         self._kpis_changed = True

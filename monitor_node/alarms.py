@@ -33,6 +33,20 @@ TimeNs: TypeAlias = Annotated[int, msgspec.Meta(ge=-(2**63), le=LAST_NS)]
 """A time that messages can carry."""
 
 
+class SuspectedCause(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A cause that an alarm may come from; the fields of a `Suspect` message."""
+
+    cause: str
+    probability: float
+    profile: str = ""
+    size: float = 0.0
+    size_sd: float = 0.0
+    unit: str = ""
+    onset_ns: TimeNs = 0
+    onset_sd_min: float = 0.0
+    kind: str = ""
+
+
 class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
     """Everything that is remembered of an alarm.
 
@@ -47,7 +61,7 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
         unit: of both.
         text: what is wrong, in one sentence; empty before the first time.
         contributions: each signal's share of it.
-        suspects: causes and their probabilities, the likeliest first; empty while nobody has looked.
+        suspects: what it may come from, the likeliest first; empty while nobody has looked.
         incident: number of its incident; 0: it has not come up since it was raised.
         first_in: whether it began that incident.
         shelved_ns: when it was shelved; 0 if it is not.
@@ -66,7 +80,7 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
     unit: str = ""
     text: str = ""
     contributions: dict[str, float] = msgspec.field(default_factory=dict)
-    suspects: list[tuple[str, float]] = msgspec.field(default_factory=list)
+    suspects: list[SuspectedCause] = msgspec.field(default_factory=list)
     incident: Count = 0
     first_in: bool = False
     shelved_ns: TimeNs = 0
@@ -81,12 +95,12 @@ class Explanation(NamedTuple):
     Attributes:
         text: what is wrong, in one sentence.
         contributions: each signal's share of it.
-        suspects: causes and their probabilities, where the alarm itself says what it is.
+        suspects: where the alarm itself says what it comes from.
     """
 
     text: str
     contributions: dict[str, float]
-    suspects: Sequence[tuple[str, float]] = ()
+    suspects: Sequence[SuspectedCause] = ()
 
 
 class ChartAlarm:
@@ -205,7 +219,7 @@ class ChartAlarm:
             limit=memory.limit,
             unit=memory.unit,
             contributions=[Contribution(signal=name, share=share) for name, share in memory.contributions.items()],
-            suspects=[Suspect(cause=cause, probability=probability) for cause, probability in memory.suspects],
+            suspects=[Suspect(**msgspec.structs.asdict(item)) for item in memory.suspects],
             text=memory.text,
             event=event,
             incident=memory.incident,

@@ -23,7 +23,7 @@ from monitor_node.charts.base import Bank, Judgement, SignalChart
 from monitor_node.charts.ewma import Ewma
 from monitor_node.charts.mewma import Mewma
 from monitor_node.charts.shewhart import Shewhart
-from monitor_node.config import MonitorConfig, PriorityName
+from monitor_node.config import ChartName, MonitorConfig, PriorityName
 from monitor_node.prewhitening import Prewhitening
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
@@ -37,8 +37,8 @@ ALL = "all"
 SD = "sd"
 """The unit of what charts show: standard deviations of the residual."""
 
-OF_ONE = ("shewhart", "ewma", "cusum")
-OF_ALL = ("t2", "mewma", "pca_t2", "pca_spe")
+OF_EACH: tuple[ChartName, ...] = ("shewhart", "ewma", "cusum")
+OF_ALL: tuple[ChartName, ...] = ("t2", "mewma", "pca_t2", "pca_spe")
 WITHOUT_MEMORY = ("shewhart", "t2", "pca_t2", "pca_spe")
 """An alarm of theirs takes several points, so that a single outlier raises none."""
 
@@ -48,7 +48,7 @@ def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
     of_all = OF_ALL if len(config.outputs) > 1 else ()
     names: list[tuple[str, str]] = []
     for chart in config.charts:
-        if chart in OF_ONE:
+        if chart in OF_EACH:
             names += [(chart, signal) for signal in config.outputs]
         elif chart in of_all:
             names.append((chart, ALL))
@@ -181,7 +181,7 @@ class ChartWatch:
         for name in dict.fromkeys(chart for chart, _ in self._alarms):
             pairs = [pair for pair in self._alarms if pair[0] == name]
             charts: _OfEach | _OfAll
-            if name in OF_ONE:
+            if name in OF_EACH:
                 charts = _OfEach(name, design.of_each(name), config.outputs, passed)
             else:
                 charts = _OfAll(design.of_all(name), config.outputs)

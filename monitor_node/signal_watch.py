@@ -8,7 +8,7 @@ is overdue.
 from math import isfinite
 
 from monitor_node.alarm_board import AlarmBoard
-from monitor_node.alarms import ChartAlarm, Explanation
+from monitor_node.alarms import ChartAlarm, Explanation, SuspectedCause
 from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig
 from monitor_node.silence import NOTHING, Change, Silence
@@ -19,7 +19,9 @@ from reactorwatch.contract.codec import Publication
 PLANT = "plant"
 """What the silence of all signals together is of."""
 
-READINGS = "readings"
+STUCK_SENSOR = "stuck_sensor"
+
+READINGS, SENSOR = "readings", "sensor"
 
 FEWEST_FOR_SPIKES = 50
 
@@ -108,8 +110,13 @@ class SignalWatch:
             judgement = stuck.update(value)
             if judgement.out or not alarm.at_rest:
                 text = f"{name} is stuck: it has read {value:.6g} {unit} {judgement.statistic:.0f} times in a row"
-                publications += self._judge(alarm, time_ns, judgement, READINGS, text, name, cause="stuck_sensor")
+                publications += self._judge(alarm, time_ns, judgement, READINGS, text, name, cause=STUCK_SENSOR)
         return publications
+
+    @property
+    def stuck(self) -> list[bool]:
+        """Which outputs' sensors are stuck: what they show is no measurement."""
+        return [alarm.memory.rule.standing for alarm in self._stuck_alarms]
 
     def withheld(
         self, time_ns: int, e: list[float], scales: list[float], units: list[str]
@@ -183,6 +190,6 @@ class SignalWatch:
         self, alarm: ChartAlarm, time_ns: int, judgement: Judgement, unit: str, text: str, name: str, *, cause: str
     ) -> list[Publication]:
         def explain(_: Judgement) -> Explanation:
-            return Explanation(text, {} if name == PLANT else {name: 1.0}, [(cause, 1.0)])
+            return Explanation(text, {} if name == PLANT else {name: 1.0}, [SuspectedCause(cause, 1.0, kind=SENSOR)])
 
         return self._board.judge(alarm, time_ns, judgement, unit, explain)

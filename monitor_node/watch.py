@@ -16,9 +16,10 @@ from monitor_node.config import MonitorConfig
 from monitor_node.drift_watch import DriftWatch
 from monitor_node.predictor import ArxPredictor
 from monitor_node.prewhitening import Prewhitener
-from monitor_node.references import ArxReference, Reference
+from monitor_node.references import ArxReference, ProcessReference, Reference
 from monitor_node.sampling import SamplingPeriod
 from monitor_node.signal_watch import SignalWatch
+from monitor_node.suspicion import Suspicion
 from monitor_node.training import MOST_REFUSALS, Trained, Training
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
@@ -48,6 +49,7 @@ class PlantWatch:
 
     def __init__(self, config: MonitorConfig, board: AlarmBoard, *, points: bool = True) -> None:
         self._config = config
+        self._board = board
         self._points = points
         self._model = _model(config)
         self._sampling = SamplingPeriod()
@@ -61,6 +63,7 @@ class PlantWatch:
         self._checks: list[Check] = []
         self._reference: Reference | None = None
         self._whiteners: list[Prewhitener] = []
+        self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
         self._withheld = [False] * len(config.outputs)
         self._begin_training(None)
@@ -164,6 +167,8 @@ class PlantWatch:
         )
         self._reference, self._checks = trained.reference, trained.checks
         self._whiteners = [Prewhitener(item) for item in trained.learned]
+        if config.isolation and isinstance(trained.reference, ProcessReference):
+            self._suspicion = Suspicion(config, self._board, trained.reference)
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         self.notes += self._drift.start(self._predictors, self._arl0)
@@ -184,6 +189,10 @@ class PlantWatch:
     ) -> None:
         reference = self._reference
         assert reference is not None
+        publications.extend(self.signals.look(time_ns, values, units))
+        stuck = self.signals.stuck
+        if True in stuck:
+            values = [nan if still else value for value, still in zip(values, stuck, strict=True)]
         if isinstance(reference, ArxReference):
             reference.predictions = [
                 predictor.update(time_ns, input_value, value, follows=follows)
@@ -211,7 +220,6 @@ class PlantWatch:
             e.append(whitener.update(residual / sd))
         scales = [sd * whitener.learned.sd for sd, whitener in zip(expected.sd, self._whiteners, strict=True)]
         self.rows_watched += 1
-        publications.extend(self.signals.look(time_ns, values, units))
         self._withheld, told = self.signals.withheld(time_ns, e, scales, units)
         publications.extend(told)
         for whitener, withheld in zip(self._whiteners, self._withheld, strict=True):
@@ -219,6 +227,8 @@ class PlantWatch:
                 whitener.withhold()
         self._charts.update(time_ns, e, self._withheld, scales, units, publications, points=self._points)
         publications.extend(self._drift.update(time_ns, self._predictors))
+        if self._suspicion is not None:
+            publications.extend(self._suspicion.update(time_ns, input_value, values, units, stuck))
 
 
 def _model(config: MonitorConfig) -> ProcessModel | None:

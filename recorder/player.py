@@ -20,7 +20,18 @@ BATCH = 256
 """Messages that go out before the loop looks for a stop again."""
 
 SAMPLES = frozenset({keys.SAMPLE})
-EVERYTHING = frozenset({keys.SAMPLE, keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.FAULT})
+EVERYTHING = frozenset(
+    {
+        keys.SAMPLE,
+        keys.ESTIMATE,
+        keys.MODEL,
+        keys.CHART,
+        keys.ALARM,
+        keys.ALARM_KPIS,
+        keys.RECONSTRUCTION,
+        keys.FAULT,
+    }
+)
 """What a plant and a monitor publish. Health speaks of nodes that are not there, commands were heard once."""
 
 

@@ -164,13 +164,14 @@ def _object(alarm: "Alarm") -> dict[str, object]:
         "incident": alarm.incident or None,
         "first_in": alarm.first_in,
         "text": alarm.text,
+        "suspect": [{"cause": item.cause, "probability": item.probability} for item in alarm.suspects],
         "by": alarm.by,
         "comment": alarm.comment,
     }
 
 
 def _line(alarm: "Alarm") -> str:
-    from reactorwatch.cli.reports import priority_word
+    from reactorwatch.cli.reports import priority_word, suspects_text
 
     parts = [f"{alarm.alarm} ({priority_word(alarm)}): {_state(alarm)}"]
     if alarm.shelved_until_ns:
@@ -180,6 +181,9 @@ def _line(alarm: "Alarm") -> str:
         parts.append(f"raised {_moment(alarm.raised_ns)} (incident {alarm.incident}{first})")
     if alarm.text:
         parts.append(alarm.text)
+    suspects = suspects_text(alarm)
+    if suspects:
+        parts.append(f"suspect: {suspects}")
     if alarm.by:
         parts.append(f"{alarm.by}: {alarm.comment}" if alarm.comment else alarm.by)
     return "; ".join(parts)

@@ -16,10 +16,11 @@ from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from reactorwatch.cli.processes import Processes, write_settings
 from reactorwatch.cli.progress import bar, task
+from reactorwatch.cli.reports import suspects_text
 from reactorwatch.cli.sources import messages
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Estimate, Fault, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
@@ -190,7 +191,8 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     same = [alarm.SerializeToString() for alarm in alarms] == [
         alarm.SerializeToString() for alarm in again.alarm_messages
     ]
-    raised = [alarm for alarm in alarms if alarm.state == AlarmState.ALARM_STATE_UNACKNOWLEDGED]
+    raised = [alarm for alarm in alarms if alarm.event == "raised"]
+    suspected = [alarm for alarm in alarms if alarm.event == "suspected"]
     onset_ns = min((item.onset_ns for item in faults if item.active), default=None)
     before = [alarm for alarm in raised if onset_ns is None or alarm.time_ns < onset_ns]
     after = [alarm for alarm in raised if onset_ns is not None and alarm.time_ns >= onset_ns]
@@ -212,6 +214,10 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         )
     if not after:
         lines.append("- No alarm was raised after the fault.")
+    if suspected:
+        last = suspected[-1]
+        late = (last.time_ns - (onset_ns or 0)) / MINUTE_NS
+        lines.append(f"- Suspect, {late:.1f} min after the fault: {suspects_text(last, first_ns)}.")
     lines.append(
         "- False alarms before the fault: "
         + (", ".join(f"`{alarm.alarm}` at {at(alarm.time_ns)}" for alarm in before) or "none")

@@ -62,7 +62,9 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     for alarm, cleared_ns in result.raised:
         end = f"cleared at {to_minutes(cleared_ns, zero_ns):g} min" if cleared_ns else "still standing at the end"
         raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
-        lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}{_suspects(alarm)}")
+        lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}")
+    told = dict.fromkeys(filter(None, (suspects_text(alarm, zero_ns) for alarm, _ in result.raised)))
+    lines += [f"  suspect: {text}" for text in told]
     lines += [f"  note: {note}" for note in result.notes]
     if not result.raised and said["trained_until_min"] is not None:
         lines.append("no alarms")
@@ -71,12 +73,25 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     return "\n".join(lines)
 
 
-def _suspects(alarm: Alarm) -> str:
-    """The likeliest causes, as the end of a sentence."""
-    likely = [item for item in alarm.suspects if item.probability >= WORTH_TELLING]
-    if not likely:
-        return ""
-    return "; suspect: " + ", ".join(f"{item.cause} ({100 * item.probability:.0f} %)" for item in likely)
+def suspects_text(alarm: Alarm, zero_ns: int | None = None) -> str:
+    """The likeliest causes, for people; empty if nothing is known.
+
+    Args:
+        alarm: with its suspects.
+        zero_ns: where minutes start, if onsets are to be told.
+    """
+    told = []
+    for item in alarm.suspects:
+        if item.probability < WORTH_TELLING:
+            continue
+        text = f"{item.cause} ({100 * item.probability:.0f} %"
+        if item.profile:
+            unit = "" if item.unit == "1" else f" {item.unit}"
+            text += f"; {item.profile} of {item.size:.3g}{unit}"
+            if zero_ns is not None:
+                text += f" at {to_minutes(item.onset_ns, zero_ns):.1f} min"
+        told.append(text + ")")
+    return ", ".join(told)
 
 
 def priority_word(alarm: Alarm) -> str:

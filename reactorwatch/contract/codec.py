@@ -21,6 +21,7 @@ MESSAGES: tuple[type[Message], ...] = (
     messages.ChartPoint,
     messages.Alarm,
     messages.AlarmKpis,
+    messages.Reconstruction,
     messages.Health,
     messages.Fault,
     messages.SetInput,
@@ -39,6 +40,7 @@ Body: TypeAlias = (
     | messages.ChartPoint
     | messages.Alarm
     | messages.AlarmKpis
+    | messages.Reconstruction
     | messages.Health
     | messages.Fault
 )

@@ -229,12 +229,42 @@ class Contribution(_message.Message):
     def __init__(self, signal: _Optional[str] = ..., share: _Optional[float] = ...) -> None: ...
 
 class Suspect(_message.Message):
-    __slots__ = ("cause", "probability")
+    __slots__ = ("cause", "probability", "profile", "size", "size_sd", "unit", "onset_ns", "onset_sd_min", "kind")
     CAUSE_FIELD_NUMBER: _ClassVar[int]
     PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    PROFILE_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    SIZE_SD_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    ONSET_NS_FIELD_NUMBER: _ClassVar[int]
+    ONSET_SD_MIN_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
     cause: str
     probability: float
-    def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ...) -> None: ...
+    profile: str
+    size: float
+    size_sd: float
+    unit: str
+    onset_ns: int
+    onset_sd_min: float
+    kind: str
+    def __init__(self, cause: _Optional[str] = ..., probability: _Optional[float] = ..., profile: _Optional[str] = ..., size: _Optional[float] = ..., size_sd: _Optional[float] = ..., unit: _Optional[str] = ..., onset_ns: _Optional[int] = ..., onset_sd_min: _Optional[float] = ..., kind: _Optional[str] = ...) -> None: ...
+
+class Reconstruction(_message.Message):
+    __slots__ = ("time_ns", "value", "sd", "unit", "measured", "cause")
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    SD_FIELD_NUMBER: _ClassVar[int]
+    UNIT_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_FIELD_NUMBER: _ClassVar[int]
+    CAUSE_FIELD_NUMBER: _ClassVar[int]
+    time_ns: int
+    value: float
+    sd: float
+    unit: str
+    measured: float
+    cause: str
+    def __init__(self, time_ns: _Optional[int] = ..., value: _Optional[float] = ..., sd: _Optional[float] = ..., unit: _Optional[str] = ..., measured: _Optional[float] = ..., cause: _Optional[str] = ...) -> None: ...
 
 class Health(_message.Message):
     __slots__ = ("time_ns", "node", "version", "phase", "uptime_s", "received", "lost", "late", "refused", "refused_by_reason", "lag_ms", "duplicated", "out_of_order", "published", "rows", "incomplete_rows")

@@ -48,7 +48,7 @@ LONGEST_GAP_MIN = 30.0
 LEAST_PROCESS_SD = 1e-6
 """Of the scale of a state. Without any process noise its covariance would shrink below what a number can hold."""
 
-CHUNK, UNROLLED = 32, 8
+CHUNK, UNROLLED = 16, 8
 """Rows in one compiled chain, and how many of them are one expression."""
 
 _LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded

@@ -1,0 +1,181 @@
+"""Which cause, since when, how large: asked when an alarm has been raised.
+
+Every cause of the catalogue may have set in as a step or as a ramp. The linearised bank (see `isolation_bank`) tells
+which come into question and where to begin, and the filters of the models with these causes in them are fitted to the
+rows (see `isolation_fit`). What is said in the end is the posterior probability of each cause, by Laplace's method
+(Kass & Raftery 1995, Bayes factors, J. American Statistical Association 90), with
+
+    log evidence = gain in log likelihood - log(n) / 2 + log(sqrt(2 pi) sd of the onset / span of possible onsets),
+
+where n is how many values were measured since the onset: the prior of a size is as wide as one measurement would tell
+it (Kass & Wasserman 1995), so that no cause is preferred for its unit; the prior of an onset is even. All causes are
+equally likely beforehand, and so are that nothing is wrong and that the cause is none of these.
+
+*None of these* is judged by what the best cause leaves. If innovations are larger by a factor than they should be,
+row by row or in sums over some rows, that factor's evidence is weighed like that of a cause. Nothing and none of these
+together are one suspect, `UNKNOWN`.
+
+Causes that imitate each other share the probability, as they should: no more can be known from these rows.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import exp, inf, log, nan, pi, sqrt
+
+import numpy as np
+
+from monitor_node.isolation_bank import Bank
+from monitor_node.isolation_fit import Fit, Fitter
+from monitor_node.isolation_hypothesis import HUBER, Hypothesis
+from monitor_node.isolation_window import Row, Window, window_of
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import RAMP
+
+UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
+
+BURN_IN_ROWS = 20
+"""Rows at the start of the window in which the filter still finds its state: nothing is said to set in there."""
+
+SHARE_OF_RAMPS = 0.3
+"""How likely a cause is to grow, beforehand, rather than to set in at once."""
+
+SUMMED_ROWS = (1, 5, 20)
+"""Over which innovations are summed, to see whether something is left in them."""
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A cause, and what is known of it if it is the one.
+
+    Attributes:
+        cause: its name in the catalogue, or `UNKNOWN`.
+        profile: `step` or `ramp`; empty if unknown.
+        probability: that it is this cause; over all suspects they sum up to 1.
+        size: of a ramp the one that it has reached in the last row; in the effect's unit.
+        size_sd: its standard deviation.
+        onset_min: when it set in.
+        onset_sd_min: standard deviation of that.
+        kind: `sensor` or `process`; `UNKNOWN` if unknown.
+    """
+
+    cause: str
+    profile: str
+    probability: float
+    size: float
+    size_sd: float
+    onset_min: float
+    onset_sd_min: float
+    kind: str
+
+
+class Isolation:
+    """Keeps the newest rows of one plant and, asked, compares all causes on them.
+
+    Args:
+        model: of the plant.
+        noise: of the plant and its sensors.
+        window_rows: how many of the newest rows are kept.
+        effects: the causes.
+        excluded: names of causes that do not come into question.
+    """
+
+    def __init__(
+        self,
+        model: ProcessModel,
+        noise: NoiseLevels,
+        window_rows: int = 600,
+        effects: Sequence[Effect] = EFFECTS,
+        excluded: Sequence[str] = (),
+    ) -> None:
+        self._rows: deque[Row] = deque(maxlen=window_rows)
+        states = len(model.states)
+        self._effects = tuple(
+            effect for effect in effects if effect.name not in excluded and len(effect.extend(model).states) == states
+        )
+        self._nominal = Filter(model, noise)
+        self._bank = Bank(model, noise, self._effects)
+        self._fitter = Fitter(model, noise, self._effects)
+
+    def add(self, time_min: float, input_value: float, measured: Sequence[float]) -> None:
+        """Keep a row; NaN where something is missing."""
+        self._rows.append((time_min, input_value, measured))
+
+    def suspects(self, not_before_min: float = -inf) -> list[Suspect]:
+        """The causes that come into question, likeliest first, and `UNKNOWN` among them.
+
+        Args:
+            not_before_min: nothing was wrong before.
+        """
+        window = window_of(tuple(self._rows), self._nominal)
+        if window is None:
+            return [_unknown(1.0)]
+        first = max(BURN_IN_ROWS, int(np.searchsorted(window.time_min, not_before_min)))
+        if first >= window.time_min.size:
+            return [_unknown(1.0)]
+        fits = self._fitter.fit(window, *self._bank.scan(window, first))
+        span_min = float(window.time_min[-1] - window.time_min[first - 1])
+        evidence = [self._evidence(fit, window, span_min) for fit in fits]
+        none = evidence[0] + _left(fits[0], window)
+        top = max(*evidence, none, 0.0)
+        weights = [exp(value - top) for value in evidence]
+        unknown = exp(none - top) + exp(-top)
+        total = sum(weights) + unknown
+        found = [_unknown(unknown / total)]
+        for effect in self._effects:
+            of_cause = [
+                place for place, fit in enumerate(fits) if self._fitter.hypotheses[fit.hypothesis].effect is effect
+            ]
+            if of_cause:
+                likeliest = fits[max(of_cause, key=weights.__getitem__)]
+                share = sum(weights[place] for place in of_cause) / total
+                found.append(_suspect(self._fitter.hypotheses[likeliest.hypothesis], likeliest, share))
+        return sorted(found, key=lambda item: -item.probability)
+
+    def _evidence(self, fit: Fit, window: Window, span_min: float) -> float:
+        """Logarithm of how much likelier the rows are with a cause, over all its sizes and onsets."""
+        hypothesis = self._fitter.hypotheses[fit.hypothesis]
+        since = np.isfinite(window.measured[np.searchsorted(window.time_min, fit.onset_min) :])
+        of_size = -0.5 * log(max(int(since.sum()), 2))
+        of_onset = log(min(sqrt(2 * pi) * fit.onset_sd_min / span_min, 1.0))
+        of_profile = log(SHARE_OF_RAMPS if hypothesis.profile is RAMP else 1.0 - SHARE_OF_RAMPS)
+        return fit.gain + of_size + of_onset + of_profile
+
+
+def _left(fit: Fit, window: Window) -> float:
+    """Logarithm of the evidence that more than noise is left since the onset of the best cause, over that of noise."""
+    since = int(np.sum(window.time_min < fit.onset_min)) - (window.time_min.size - len(fit.w))
+    w = fit.w[max(since, 0) :]
+    found = []
+    for rows in SUMMED_ROWS:
+        whole = w[: len(w) // rows * rows].reshape(-1, rows, w.shape[1])
+        counts = np.sum(np.isfinite(whole), axis=1)
+        sums = np.sum(np.clip(np.nan_to_num(whole), -HUBER, HUBER), axis=1)
+        n = int(np.sum(counts > 0))
+        square = float(np.sum(sums[counts > 0] ** 2 / counts[counts > 0]))
+        if n:
+            larger = 0.5 * (square - n - n * log(square / n)) if square > n else 0.0
+            found.append(larger - 0.5 * log(n))
+    return max(found, default=0.0) - log(len(SUMMED_ROWS))
+
+
+def _suspect(hypothesis: Hypothesis, fit: Fit, probability: float) -> Suspect:
+    effect = hypothesis.effect
+    kind = SENSOR if effect.location.endswith("_sensor") else PROCESS
+    return Suspect(
+        effect.name,
+        hypothesis.profile.name,
+        probability,
+        fit.reached,
+        fit.reached_sd,
+        fit.onset_min,
+        fit.onset_sd_min,
+        kind,
+    )
+
+
+def _unknown(probability: float) -> Suspect:
+    return Suspect(UNKNOWN, "", probability, nan, nan, nan, nan, UNKNOWN)

@@ -1,0 +1,157 @@
+"""Every cause at every onset at once: the generalised likelihood ratio, linearised.
+
+If a deviation of size m sets in, the innovations of a filter that does not know of it are no longer white: whitened,
+they have the mean m g, where the signature g follows from the equations of the filter itself. With S the derivative
+of the filter's state with respect to m, between two rows and at a row
+
+    S <- F S + G,        g = L^-1 (H S + D),        S <- S - K (H S + D),
+
+with F, G the derivatives of the way between the rows with respect to state and m, H, D those of the outputs, K the
+filter's gain and L L' the covariance of its innovations. For a given cause and onset the likeliest size is a / b, with
+a = sum(g w) and b = sum(g g) over the whitened innovations w, its variance is 1 / b, and twice the logarithm of the
+likelihood ratio a^2 / b (Willsky & Jones 1976, A generalized likelihood ratio approach to the detection and
+estimation of jumps in linear systems, IEEE Trans. Automatic Control 21).
+
+All causes, profiles and candidate onsets are columns of one S, so a row costs a few small matrix products. A first
+scan has candidates that are ever more thinly spread the older they are. If it finds something, a second one looks at
+every row, or nearly so, at which that may have set in. The signature of an onset between two candidates is about what
+lies between theirs: with sum(g g) of neighbours, these cost next to nothing.
+
+The signature is that of an infinitesimal size. A large fault soon leads the plant where it no longer holds, so there
+are two scans: of the rows up to the first at which some cause stands out by `STANDS_OUT`, and of all.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monitor_node.isolation_ways import Linearisation, Ways
+from monitor_node.isolation_window import Window
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.filter import NoiseLevels
+from reactorwatch.process.model import Array, ProcessModel
+
+PROFILES = ("step", "ramp")
+"""How a deviation goes in time. The size of a ramp is its slope here, in a minute."""
+
+STANDS_OUT = 60.0
+"""Twice a logarithm of a likelihood ratio."""
+
+REACH = 30.0
+"""Likewise: an onset that is worse than the best one by more is out of question."""
+
+MOST_ONSETS = 60
+_ROW_BY_ROW, _SPREAD = 12, 12.0
+_BETWEEN = (0.25, 0.5, 0.75)
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """What the linearised bank finds.
+
+    Attributes:
+        rows: how many rows it rests on.
+        onset_min: when a deviation may set in, shape (n,), increasing.
+        size: the likeliest, shape (n, profiles, causes).
+        ratio: twice the logarithm of its likelihood ratio, likewise.
+        information: 1 / variance of the size, likewise.
+    """
+
+    rows: int
+    onset_min: Array
+    size: Array
+    ratio: Array
+    information: Array
+
+
+class Bank:
+    """The signatures of all causes.
+
+    Args:
+        model: of the plant.
+        noise: of the plant and its sensors.
+        effects: the causes; each has to act on the model's own states.
+    """
+
+    def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
+        self._count = len(effects)
+        self._lower = np.array([effect.lower for effect in effects])
+        self._upper = np.array([effect.upper for effect in effects])
+        self._linearisation = Linearisation(model, noise, effects)
+
+    def scan(self, window: Window, first_onset: int) -> tuple[Scan, Scan]:
+        """Compare all causes on the rows up to the first at which one stands out, and on all.
+
+        Args:
+            window: the rows, and the filter's run over them.
+            first_onset: the first row at which a deviation may set in; at least 1.
+        """
+        ways, rows = self._linearisation.ways(window), window.time_min.size
+        early, whole = self._scanned(window, ways, spread_onsets(first_onset, rows))
+        if early.rows == rows:
+            return early, whole
+        near = np.max(early.ratio, axis=(1, 2)) > np.max(early.ratio) - REACH
+        before = max(int(np.argmax(near)) - len(_BETWEEN) - 1, 0)
+        first = int(np.searchsorted(window.time_min, early.onset_min[before], side="right")) - 1
+        dense = np.unique(np.linspace(max(first, first_onset), early.rows - 1, MOST_ONSETS).astype(np.int64))
+        return self._scanned(window, ways, dense)
+
+    def _scanned(self, window: Window, ways: Ways, onsets: NDArray[np.int64]) -> tuple[Scan, Scan]:
+        times, start = window.time_min, window.time_min[onsets]
+        width = len(PROFILES) * self._count
+        S = np.zeros((ways.F.shape[1], onsets.size * width))
+        a, b, c = np.zeros((3, onsets.size * width))  # c: of neighbours, each with the next one
+        early: Scan | None = None
+        for row in range(int(onsets[0]), times.size):
+            way = row - 1  # that leads to this row
+            acting, shown = np.searchsorted(onsets, (row, row + 1)).tolist()  # set in before it, and in time for it
+            if acting:
+                part = S[:, : acting * width]
+                middle = 0.5 * (times[way] + times[row])
+                part[:] = ways.F[way] @ part + _columns(ways.G[way], middle - start[:acting])
+            part = S[:, : shown * width]
+            seen = ways.H[way] @ part + _columns(ways.D[way], times[row] - start[:shown])
+            part -= ways.K[way] @ seen
+            g = ways.L_inverse[way] @ seen
+            a[: shown * width] += ways.w[way] @ g
+            b[: shown * width] += np.einsum("ij,ij->j", g, g)
+            c[: (shown - 1) * width] += np.einsum("ij,ij->j", g[:, :-width], g[:, width:])
+            if early is None and np.max(a[: shown * width] ** 2 - STANDS_OUT * b[: shown * width]) > 0.0:
+                early = self._scan(row + 1, start, a, b, c)
+        whole = self._scan(times.size, start, a, b, c)
+        return early or whole, whole
+
+    def _scan(self, rows: int, onset_min: Array, a: Array, b: Array, c: Array) -> Scan:
+        a, b, c = (item.reshape(onset_min.size, len(PROFILES), self._count) for item in (a, b, c))
+        near, far = np.arange(onset_min.size - 1), np.arange(1, onset_min.size)
+        parts = [(onset_min, a, b)]
+        for share in _BETWEEN:
+            rest = 1.0 - share
+            squares = rest**2 * b[near] + 2.0 * rest * share * c[near] + share**2 * b[far]
+            parts.append((rest * onset_min[near] + share * onset_min[far], rest * a[near] + share * a[far], squares))
+        onset_min, a, b = (np.concatenate(items) for items in zip(*parts, strict=True))
+        order = np.argsort(onset_min, kind="stable")
+        onset_min, a, b = onset_min[order], a[order], b[order]
+        size = np.clip(a / np.maximum(b, 1e-300), self._lower, self._upper)
+        return Scan(rows, onset_min, size, size * (2.0 * a - size * b), b)
+
+
+def spread_onsets(first: int, rows: int) -> NDArray[np.int64]:
+    """Rows at which a deviation may set in: all of the newest, older ones ever more thinly spread."""
+    found, row = [], rows - 1
+    while row > first:
+        found.append(row)
+        age = rows - row
+        row -= 1 if age < _ROW_BY_ROW else int(np.ceil(age / _SPREAD))
+    return np.array([first, *reversed(found)], dtype=np.int64)
+
+
+def _columns(by_size: Array, age: Array) -> Array:
+    """Derivatives by the sizes now, as columns of S: for every onset a step of 1, then a ramp that is `age` now."""
+    n = by_size.shape[1]
+    columns = np.empty((by_size.shape[0], age.size, 2, n))
+    columns[:, :, 0] = by_size[:, None]
+    columns[:, :, 1] = by_size[:, None] * age[:, None]
+    return columns.reshape(by_size.shape[0], -1)

@@ -1,0 +1,175 @@
+"""How large each cause is and since when: the hypotheses, fitted to the rows.
+
+All hypotheses run over the same rows and from the same state, that of the filter before any of them sets in.
+
+The linearised bank is right about a small fault, so only the best few of its hypotheses are fitted then. A large fault
+is followed from where it is still small. The fit begins with what the bank found in the first rows, and the rows that
+it is fitted to are multiplied from round to round, so that it never has far to go; what falls behind on the way is left
+behind. Where even that beginning does not keep what the bank promises, smaller sizes are tried.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import inf
+
+import numpy as np
+
+from monitor_node.isolation_bank import Scan
+from monitor_node.isolation_hypothesis import SETTLED, Descent, Hypothesis, run
+from monitor_node.isolation_window import Window
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.profiles import RAMP, STEP
+
+BEHIND = 15.0
+"""In log likelihood: what is worse than the best by more is left behind."""
+
+SMALL = 50.0
+"""In log likelihood: what a fault gains for which the linearised bank is right."""
+
+MOST = 8
+"""Hypotheses about a small fault that are fitted."""
+
+PROFILES = (STEP, RAMP)
+"""In the order of the bank."""
+
+_MARGIN_ROWS, _FIRST_ROWS = 8, 6
+_STEPS, _LAST_STEPS = 4, 6
+_SHRINKS = (0.5, 0.2, 0.08)
+_HOLDS, _KEPT = 0.3, 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A hypothesis and what is known of it.
+
+    Attributes:
+        hypothesis: its number, see `Fitter`.
+        size: of a step; of a ramp its slope, in a minute.
+        onset_min: when it set in.
+        gain: in log likelihood, against nothing being wrong.
+        w: the whitened innovations of the newest rows, from before any hypothesis sets in; NaN: missing.
+        size_sd: standard deviation of the size.
+        onset_sd_min: of the onset.
+        reached: size in the last row, of a ramp too.
+        reached_sd: its standard deviation.
+    """
+
+    hypothesis: int
+    size: float
+    onset_min: float
+    gain: float
+    w: Array
+    size_sd: float
+    onset_sd_min: float
+    reached: float
+    reached_sd: float
+
+
+class Fitter:
+    """Fits all causes, each as a step and as a ramp.
+
+    Args:
+        model: of the plant.
+        noise: of the plant and its sensors.
+        effects: the causes, in the order of the bank.
+
+    Attributes:
+        hypotheses: of every cause the step, then of every cause the ramp.
+    """
+
+    def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
+        self._nominal = Filter(model, noise)
+        self.hypotheses = [Hypothesis(model, noise, effect, profile) for profile in PROFILES for effect in effects]
+
+    def fit(self, window: Window, early: Scan, whole: Scan) -> list[Fit]:
+        """The causes that come into question, likeliest first; of a small fault, then those that are not fitted.
+
+        Args:
+            window: the rows.
+            early: what the linearised bank found in the rows up to the first at which a cause stands out.
+            whole: what it found in all.
+        """
+        best, rows = _begun(whole, window, least=-BEHIND), window.time_min.size
+        begin = _begin(best[:MOST], window)
+        nothing = run(self._nominal, window, begin, rows)[0]
+        promised = best[0].gain
+        kept = (
+            nothing - self.hypotheses[best[0].hypothesis].run(window, begin, rows, best[0].size, best[0].onset_min)[0]
+        )
+        if promised > SMALL or not abs(kept - promised) < _HOLDS * promised + BEHIND:
+            return self._followed(window, early)
+        fits = [self._fitted(item, window, begin, rows, nothing, first=True, last=True) for item in best[:MOST]]
+        fits.sort(key=lambda item: -item.gain)
+        return [*fits, *(replace(item, onset_sd_min=fits[0].onset_sd_min) for item in best[MOST:])]
+
+    def _followed(self, window: Window, early: Scan) -> list[Fit]:
+        """The same from where a large fault was still small."""
+        rows, reached = window.time_min.size, early.rows
+        fits = _begun(early, window, least=-inf)
+        onset, first = int(np.searchsorted(window.time_min, fits[0].onset_min)), True
+        while True:
+            last, begin = reached >= rows, _begin(fits, window)
+            nothing = run(self._nominal, window, begin, reached)[0]
+            fits = [self._fitted(item, window, begin, reached, nothing, first=first, last=last) for item in fits]
+            fits.sort(key=lambda item: -item.gain)
+            if last:
+                return fits
+            # How far a fit can be from its best depends on how many rows it has seen; what it gains tells that best.
+            slack = 0.5 if first else 0.1
+            age = reached - onset
+            reached, first = min(onset + max((2 if age < 2 * _FIRST_ROWS else 4) * age, _FIRST_ROWS), rows), False
+            fits = [item for item in fits if item.gain > (1.0 - slack) * fits[0].gain - BEHIND]
+
+    def _fitted(
+        self, fit: Fit, window: Window, begin: int, rows: int, nothing: float, *, first: bool, last: bool
+    ) -> Fit:
+        """Fitted to the rows before `rows`, from where it is."""
+        descent = Descent(self.hypotheses[fit.hypothesis], window, begin, rows)
+        point = descent.at(fit.size, fit.onset_min)
+        if first and nothing - point.loss < _KEPT * fit.gain:
+            tried = [descent.at(share * fit.size, fit.onset_min) for share in _SHRINKS]
+            point = min((point, *tried), key=lambda item: item.loss)
+        slope, fresh = descent.slope(point, fit.size_sd), True
+        for _ in range(_LAST_STEPS if last else _STEPS):
+            nearer = descent.stepped(point, slope)
+            gained, point = point.loss - nearer.loss, nearer
+            if gained < SETTLED and fresh:
+                break
+            fresh = not (fresh and gained > SETTLED)
+            if fresh:
+                slope = descent.slope(point, slope.size_sd)
+        onset_sd_min, rise = inf, 0.0
+        if first or last:
+            point, rise = descent.jumped(point, slope)
+        if last:
+            point, onset_sd_min = descent.onset(point, slope, rise)
+        reached, reached_sd = descent.reached(point, slope)
+        gain = nothing - point.loss
+        return Fit(
+            fit.hypothesis, point.size, point.onset_min, gain, point.w, slope.size_sd, onset_sd_min, reached, reached_sd
+        )
+
+
+def _begun(scan: Scan, window: Window, least: float) -> list[Fit]:
+    """The hypotheses of a scan, best first, without those whose gain is less than the best plus `least`."""
+    ratio = scan.ratio.reshape(scan.onset_min.size, -1)
+    size, information = scan.size.reshape(ratio.shape), scan.information.reshape(ratio.shape)
+    found = []
+    for number, place in enumerate(np.argmax(ratio, axis=0).tolist()):
+        if information[place, number] > 0.0:
+            onset_min = float(scan.onset_min[place])
+            is_ramp = PROFILES[number // (ratio.shape[1] // len(PROFILES))] is RAMP
+            span = float(window.time_min[scan.rows - 1]) - onset_min if is_ramp else 1.0
+            value, sd = float(size[place, number]), float(information[place, number]) ** -0.5
+            gain = 0.5 * float(ratio[place, number])
+            found.append(Fit(number, value, onset_min, gain, np.empty((0, 0)), sd, inf, value * span, sd * span))
+    found.sort(key=lambda item: -item.gain)
+    return [item for item in found if item.gain > found[0].gain + least]
+
+
+def _begin(fits: Sequence[Fit], window: Window) -> int:
+    """The row that hypotheses begin with: some rows before any of them sets in."""
+    first = int(np.searchsorted(window.time_min, min(item.onset_min for item in fits)))
+    return max(first - _MARGIN_ROWS, 0)

@@ -1,0 +1,157 @@
+"""From an alarm to its cause: when the causes are compared, and what is told of it.
+
+Comparing all causes takes tenths of a second, so it is not done at every row but some rows after the first alarm of an
+incident, and again when three times as many have come, as long as an alarm stands that does not say itself what it
+is. What is then told follows from the samples alone. While the likeliest suspect is a sensor, it is also told what that
+sensor would read were it right.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+
+from monitor_node.alarm_board import AlarmBoard
+from monitor_node.alarms import SuspectedCause
+from monitor_node.config import MonitorConfig
+from monitor_node.isolation import UNKNOWN, Isolation, Suspect
+from monitor_node.isolation_window import Row
+from monitor_node.reconstruction import Reconstruction
+from monitor_node.references import ProcessReference, places
+from monitor_node.signal_watch import STUCK_SENSOR
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import SensorEffect
+from reactorwatch.records.record import MINUTE_NS
+
+LOOKS = (10, 30, 100, 300)
+"""Rows after the first alarm of an incident at which the causes are compared."""
+
+LEAST = 0.01
+"""Suspects that are less likely are not told."""
+
+CONVINCED = 0.5
+"""A sensor that is at least so likely the cause is reconstructed."""
+
+UNITS = {effect.name: effect.unit for effect in EFFECTS}
+OUTPUTS = {effect.name: effect.output for effect in EFFECTS if isinstance(effect, SensorEffect)}
+
+
+class Suspicion:
+    """Looks for the causes of one plant's alarms.
+
+    Args:
+        config: of the monitor.
+        board: the alarms of the plant.
+        reference: what its rows are expected by.
+    """
+
+    def __init__(self, config: MonitorConfig, board: AlarmBoard, reference: ProcessReference) -> None:
+        self._config, self._board, self._reference = config, board, reference
+        self._places = places(reference.model, config.outputs)
+        self._isolation: Isolation | None = None
+        self._rows: deque[tuple[float, float, list[float]]] = deque(maxlen=config.isolation_rows)
+        self._incident = 0
+        self._since: int | None = None
+        self._reconstruction: Reconstruction | None = None
+        self._output = self._cause = ""
+
+    def update(
+        self, time_ns: int, input_value: float, values: list[float], units: list[str], stuck: list[bool]
+    ) -> list[Publication]:
+        """Take a row in, after its alarms.
+
+        Args:
+            time_ns: of the row.
+            input_value: NaN if missing.
+            values: of the outputs; NaN where missing.
+            units: of the outputs.
+            stuck: outputs whose sensors are stuck; their values are missing.
+        """
+        time_min, measured = time_ns / MINUTE_NS, self._measured(values)
+        if self._rows and time_min <= self._rows[-1][0]:  # the plant's clock was set back
+            self._rows.clear()
+            self._isolation = None
+        self._rows.append((time_min, input_value, measured))
+        if self._isolation is not None:
+            self._isolation.add(time_min, input_value, measured)
+        board = self._board
+        if True in stuck:
+            self._reconstruct(self._config.outputs[stuck.index(True)], STUCK_SENSOR, time_min, list(self._rows)[:-1])
+        elif self._cause == STUCK_SENSOR or not board.has_unexplained:
+            self._reconstruction = None
+        publications = self._reconstructed(time_ns, input_value, measured, values, units)
+        if not board.has_unexplained:
+            self._since = None
+            return publications
+        if self._since is None or board.incident != self._incident:
+            self._since, self._incident = 0, board.incident
+        self._since += 1
+        if self._since in LOOKS:
+            suspects = self._compared().suspects()
+            told = [_told(item) for item in suspects if item.probability >= LEAST]
+            publications += board.suspect(time_ns, told)
+            self._follow(suspects[0])
+        return publications
+
+    def _compared(self) -> Isolation:
+        """With the newest rows in it. It is made at the first alarm: what it compiles takes a while."""
+        if self._isolation is None:
+            reference = self._reference
+            self._isolation = Isolation(reference.model, reference.noise, self._config.isolation_rows)
+            for row in self._rows:
+                self._isolation.add(*row)
+        return self._isolation
+
+    def _measured(self, values: list[float]) -> list[float]:
+        """The outputs of the model; NaN for those that are not watched."""
+        if self._places == list(range(len(self._reference.model.outputs))):
+            return values
+        measured = [float("nan")] * len(self._reference.model.outputs)
+        for place, value in zip(self._places, values, strict=True):
+            measured[place] = value
+        return measured
+
+    def _follow(self, suspect: Suspect) -> None:
+        """Begin, or cease, to reconstruct."""
+        output = OUTPUTS.get(suspect.cause, "")
+        if suspect.probability >= CONVINCED and output in self._config.outputs:
+            self._reconstruct(output, suspect.cause, suspect.onset_min, self._rows)
+        elif self._cause != STUCK_SENSOR:
+            self._reconstruction = None
+
+    def _reconstruct(self, output: str, cause: str, onset_min: float, rows: Iterable[Row]) -> None:
+        """Tell after these rows what the sensor of an output should read, as long as that is not done already."""
+        if self._reconstruction is None or (output, cause) != (self._output, self._cause):
+            model, noise = self._reference.model, self._reference.noise
+            place = model.output_names.index(output)
+            self._reconstruction = Reconstruction(model, noise, place, rows, onset_min)
+        self._output, self._cause = output, cause
+
+    def _reconstructed(
+        self, time_ns: int, input_value: float, measured: list[float], values: list[float], units: list[str]
+    ) -> list[Publication]:
+        if self._reconstruction is None:
+            return []
+        value, sd = self._reconstruction.update(time_ns / MINUTE_NS, input_value, measured)
+        place = self._config.outputs.index(self._output)
+        message = ReconstructionMessage(
+            time_ns=time_ns, value=value, sd=sd, unit=units[place], measured=values[place], cause=self._cause
+        )
+        return [Publication(keys.key(self._config.plant, keys.RECONSTRUCTION, self._output), message)]
+
+
+def _told(suspect: Suspect) -> SuspectedCause:
+    if suspect.cause == UNKNOWN:
+        return SuspectedCause(UNKNOWN, suspect.probability)
+    return SuspectedCause(
+        suspect.cause,
+        suspect.probability,
+        suspect.profile,
+        suspect.size,
+        suspect.size_sd,
+        UNITS[suspect.cause],
+        round(suspect.onset_min * MINUTE_NS),
+        suspect.onset_sd_min,
+        suspect.kind,
+    )
