@@ -35,7 +35,7 @@ PROFILES = (STEP, RAMP)
 """In the order of the bank."""
 
 _MARGIN_ROWS, _FIRST_ROWS = 8, 6
-_STEPS, _LAST_STEPS = 4, 6
+_STEPS, _LAST_STEPS = 3, 6
 _SHRINKS = (0.5, 0.2, 0.08)
 _HOLDS, _KEPT = 0.3, 0.5
 
@@ -140,11 +140,9 @@ class Fitter:
             fresh = not (fresh and gained > SETTLED)
             if fresh:
                 slope = descent.slope(point, slope.size_sd)
-        onset_sd_min, rise = inf, 0.0
-        if first or last:
-            point, rise = descent.jumped(point, slope)
+        onset_sd_min = inf
         if last:
-            point, onset_sd_min = descent.onset(point, slope, rise)
+            point, onset_sd_min = descent.onset(*descent.jumped(point, slope), slope)
         reached, reached_sd = descent.reached(point, slope)
         gain = nothing - point.loss
         return Fit(

@@ -24,7 +24,7 @@ HUBER = 4.0
 SETTLED = 0.05
 """In log likelihood."""
 
-_TRIES, _JUMPS, _DAMPING, _MORE_DAMPING = 2, 4, 1e-3, 100.0
+_TRIES, _JUMPS, _DAMPING, _MORE_DAMPING = 3, 4, 1e-3, 30.0
 
 
 class Hypothesis:
@@ -193,7 +193,7 @@ class Descent:
             point = best
         return point, rise
 
-    def onset(self, point: Point, slope: Slope, rise: float) -> tuple[Point, float]:
+    def onset(self, point: Point, rise: float, slope: Slope) -> tuple[Point, float]:
         """The point, in the middle of a plateau if it is on one, and the standard deviation of its onset."""
         spacing = self._spacing(point.onset_min)
         of_rows = max(spacing / sqrt(2.0 * rise) if rise > 0.0 else inf, spacing / sqrt(12.0))

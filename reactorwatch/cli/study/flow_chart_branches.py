@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from monitor_node import backtest
+from monitor_node.config import MonitorConfig
 from monitor_node.identification.flow_chart import Conclusion, follow
 from monitor_node.identification.structure import Structure
 from plant_node.config import PlantConfig
@@ -16,13 +18,15 @@ from reactorwatch.cli.study.canvas import GREEN, GREY, ORANGE, PURPLE, SKY, VERM
 from reactorwatch.cli.study.control_limits import ORDER, watched
 from reactorwatch.cli.study.figure import Finding, Verdict
 from reactorwatch.cli.study.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
-from reactorwatch.records.record import Record
+from reactorwatch.contract.codec import encode
+from reactorwatch.records.record import Record, to_minutes
+from recorder.player import samples_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
-_OUTPUT = "T"
+_OUTPUT, _PLANT = "T", "cstr"
 _QUESTIONS = ("is the sampling rate good?", "is there a mismatch?", "are the parameters accurate?")
 _COLOURS = {"fault free": GREEN, "fault": VERMILION, "sample again": ORANGE, "identify again": PURPLE}
 _PERIOD_MIN = 0.1
@@ -62,11 +66,28 @@ def draw(study: Study, drawing: Drawing) -> Finding:
             "deviations know nothing of that. So a model must be learned where the plant will be watched.\n\n"
         )
     text += (
-        "The report goes on to isolation, identification and reconstruction of the fault. These come with the charts "
-        "and the diagnosis, and are **not part of this software yet**: here it says that something is wrong, not "
-        "what."
+        "The report goes on to isolation, identification and reconstruction of the fault. The monitor does that, on "
+        "the innovations of a filter of the equations instead of the residuals of a linear model. On the same records "
+        "it says:\n\n| record | first alarm | likeliest cause at the end | since |\n|---|---|---|---|\n"
     )
+    text += "\n".join(_isolated(preset.name, study.fault_record(preset.name)) for preset in PRESETS)
+    text += "\n\nWhere the cause is a sensor, it also tells what that sensor should read (`docs/watching.md`)."
     return Finding(text, Verdict.IN_PART if right else Verdict.DISAGREES)
+
+
+def _isolated(name: str, record: Record) -> str:
+    """What the monitor says of a record, as a row of the table."""
+    result = backtest.run([encode(item) for item in samples_of(record, _PLANT)], MonitorConfig(plant=_PLANT))
+    if not result.raised:
+        return f"| {name} | none | | |"
+    first = min((alarm for alarm, _ in result.raised), key=lambda alarm: alarm.raised_ns)
+    raised = f"{to_minutes(first.raised_ns, result.first_ns):.1f} min"
+    if not first.suspects:
+        return f"| {name} | {raised} | none told | |"
+    likeliest = first.suspects[0]
+    size = "" if not likeliest.profile else f", {likeliest.profile} of {likeliest.size:.3g}"
+    since = f"{to_minutes(likeliest.onset_ns, result.first_ns):.1f} min" if likeliest.onset_ns else ""
+    return f"| {name} | {raised} | {likeliest.cause} ({100 * likeliest.probability:.0f} %{size}) | {since} |"
 
 
 def _follow(record: Record, trusted_rows: int) -> Conclusion:
