@@ -21,7 +21,7 @@ Causes that imitate each other share the probability, as they should: no more ca
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, inf, log, nan, pi, sqrt
+from math import exp, inf, isfinite, log, nan, pi, sqrt
 
 import numpy as np
 
@@ -116,7 +116,9 @@ class Isolation:
         first = max(BURN_IN_ROWS, int(np.searchsorted(window.time_min, not_before_min)))
         if first >= window.time_min.size:
             return [_unknown(1.0)]
-        fits = self._fitter.fit(window, *self._bank.scan(window, first))
+        fits = [fit for fit in self._fitter.fit(window, *self._bank.scan(window, first)) if isfinite(fit.gain)]
+        if not fits:  # no cause of any size can be followed through these rows
+            return [_unknown(1.0)]
         span_min = float(window.time_min[-1] - window.time_min[first - 1])
         evidence = [self._evidence(fit, window, span_min) for fit in fits]
         none = evidence[0] + _left(fits[0], window)

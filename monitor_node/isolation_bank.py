@@ -12,9 +12,9 @@ a = sum(g w) and b = sum(g g) over the whitened innovations w, its variance is 1
 likelihood ratio a^2 / b (Willsky & Jones 1976, A generalized likelihood ratio approach to the detection and
 estimation of jumps in linear systems, IEEE Trans. Automatic Control 21).
 
-All causes, profiles and candidate onsets are columns of one S, so a row costs a few small matrix products. A first
-scan has candidates that are ever more thinly spread the older they are. If it finds something, a second one looks at
-every row, or nearly so, at which that may have set in. The signature of an onset between two candidates is about what
+All causes, profiles and candidate onsets are columns of one S, so a row costs a few small matrix products. They
+are ever more thinly spread the older they are: seen from the last row first, and if something stood out before, a
+second time from there. The signature of an onset between two candidates is about what
 lies between theirs: with sum(g g) of neighbours, these cost next to nothing.
 
 The signature is that of an infinitesimal size. A large fault soon leads the plant where it no longer holds, so there
@@ -42,8 +42,7 @@ STANDS_OUT = 60.0
 REACH = 30.0
 """Likewise: an onset that is worse than the best one by more is out of question."""
 
-MOST_ONSETS = 60
-_ROW_BY_ROW, _SPREAD = 12, 12.0
+_SPREAD = 16.0
 _BETWEEN = (0.25, 0.5, 0.75)
 
 
@@ -95,8 +94,7 @@ class Bank:
         near = np.max(early.ratio, axis=(1, 2)) > np.max(early.ratio) - REACH
         before = max(int(np.argmax(near)) - len(_BETWEEN) - 1, 0)
         first = int(np.searchsorted(window.time_min, early.onset_min[before], side="right")) - 1
-        dense = np.unique(np.linspace(max(first, first_onset), early.rows - 1, MOST_ONSETS).astype(np.int64))
-        return self._scanned(window, ways, dense)
+        return self._scanned(window, ways, spread_onsets(max(first, first_onset), early.rows))
 
     def _scanned(self, window: Window, ways: Ways, onsets: NDArray[np.int64]) -> tuple[Scan, Scan]:
         times, start = window.time_min, window.time_min[onsets]
@@ -144,7 +142,7 @@ def spread_onsets(first: int, rows: int) -> NDArray[np.int64]:
     while row > first:
         found.append(row)
         age = rows - row
-        row -= 1 if age < _ROW_BY_ROW else int(np.ceil(age / _SPREAD))
+        row -= int(np.ceil(age / _SPREAD))
     return np.array([first, *reversed(found)], dtype=np.int64)
 
 

@@ -25,9 +25,6 @@ from reactorwatch.process.profiles import RAMP, STEP
 BEHIND = 15.0
 """In log likelihood: what is worse than the best by more is left behind."""
 
-SMALL = 50.0
-"""In log likelihood: what a fault gains for which the linearised bank is right."""
-
 MOST = 8
 """Hypotheses about a small fault that are fitted."""
 
@@ -37,7 +34,7 @@ PROFILES = (STEP, RAMP)
 _MARGIN_ROWS, _FIRST_ROWS = 8, 6
 _STEPS, _LAST_STEPS = 3, 6
 _SHRINKS = (0.5, 0.2, 0.08)
-_HOLDS, _KEPT = 0.3, 0.5
+_HOLDS, _NOISE, _KEPT = 0.05, 5.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +88,15 @@ class Fitter:
             early: what the linearised bank found in the rows up to the first at which a cause stands out.
             whole: what it found in all.
         """
-        best, rows = _begun(whole, window, least=-BEHIND), window.time_min.size
+        best, rows = _begun(whole, window), window.time_min.size
+        best = [item for item in best if item.gain > (1.0 - _HOLDS) * best[0].gain - BEHIND]
         begin = _begin(best[:MOST], window)
         nothing = run(self._nominal, window, begin, rows)[0]
         promised = best[0].gain
         kept = (
             nothing - self.hypotheses[best[0].hypothesis].run(window, begin, rows, best[0].size, best[0].onset_min)[0]
         )
-        if promised > SMALL or not abs(kept - promised) < _HOLDS * promised + BEHIND:
+        if not abs(kept - promised) < _HOLDS * promised + _NOISE:
             return self._followed(window, early)
         fits = [self._fitted(item, window, begin, rows, nothing, first=True, last=True) for item in best[:MOST]]
         fits.sort(key=lambda item: -item.gain)
@@ -107,7 +105,7 @@ class Fitter:
     def _followed(self, window: Window, early: Scan) -> list[Fit]:
         """The same from where a large fault was still small."""
         rows, reached = window.time_min.size, early.rows
-        fits = _begun(early, window, least=-inf)
+        fits = _begun(early, window)
         onset, first = int(np.searchsorted(window.time_min, fits[0].onset_min)), True
         while True:
             last, begin = reached >= rows, _begin(fits, window)
@@ -150,8 +148,8 @@ class Fitter:
         )
 
 
-def _begun(scan: Scan, window: Window, least: float) -> list[Fit]:
-    """The hypotheses of a scan, best first, without those whose gain is less than the best plus `least`."""
+def _begun(scan: Scan, window: Window) -> list[Fit]:
+    """The hypotheses of a scan, best first."""
     ratio = scan.ratio.reshape(scan.onset_min.size, -1)
     size, information = scan.size.reshape(ratio.shape), scan.information.reshape(ratio.shape)
     found = []
@@ -163,8 +161,7 @@ def _begun(scan: Scan, window: Window, least: float) -> list[Fit]:
             value, sd = float(size[place, number]), float(information[place, number]) ** -0.5
             gain = 0.5 * float(ratio[place, number])
             found.append(Fit(number, value, onset_min, gain, np.empty((0, 0)), sd, inf, value * span, sd * span))
-    found.sort(key=lambda item: -item.gain)
-    return [item for item in found if item.gain > found[0].gain + least]
+    return sorted(found, key=lambda item: -item.gain)
 
 
 def _begin(fits: Sequence[Fit], window: Window) -> int:

@@ -5,7 +5,7 @@ a number and not an object each.
 """
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -67,13 +67,15 @@ class Charted:
 
 
 class AlarmChange(NamedTuple):
-    """A change of an alarm's state, which is a `messages.AlarmState`."""
+    """A change of an alarm: its state is a `messages.AlarmState`, `event` says what made it."""
 
     time_ns: int
     alarm: str
     state: int
     priority: int
     text: str
+    event: str
+    suspects: Sequence[messages.Suspect]
 
 
 class FaultChange(NamedTuple):

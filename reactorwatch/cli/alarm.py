@@ -171,7 +171,8 @@ def _object(alarm: "Alarm") -> dict[str, object]:
 
 
 def _line(alarm: "Alarm") -> str:
-    from reactorwatch.cli.reports import priority_word, suspects_text
+    from reactorwatch.cli.reports import priority_word
+    from reactorwatch.contract.suspects import suspects_text
 
     parts = [f"{alarm.alarm} ({priority_word(alarm)}): {_state(alarm)}"]
     if alarm.shelved_until_ns:
@@ -181,7 +182,7 @@ def _line(alarm: "Alarm") -> str:
         parts.append(f"raised {_moment(alarm.raised_ns)} (incident {alarm.incident}{first})")
     if alarm.text:
         parts.append(alarm.text)
-    suspects = suspects_text(alarm)
+    suspects = suspects_text(alarm.suspects)
     if suspects:
         parts.append(f"suspect: {suspects}")
     if alarm.by:

@@ -16,11 +16,11 @@ from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from reactorwatch.cli.processes import Processes, write_settings
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.cli.reports import suspects_text
 from reactorwatch.cli.sources import messages
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample
+from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
@@ -217,7 +217,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     if suspected:
         last = suspected[-1]
         late = (last.time_ns - (onset_ns or 0)) / MINUTE_NS
-        lines.append(f"- Suspect, {late:.1f} min after the fault: {suspects_text(last, first_ns)}.")
+        lines.append(f"- Suspect, {late:.1f} min after the fault: {suspects_text(last.suspects, first_ns)}.")
     lines.append(
         "- False alarms before the fault: "
         + (", ".join(f"`{alarm.alarm}` at {at(alarm.time_ns)}" for alarm in before) or "none")

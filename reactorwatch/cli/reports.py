@@ -7,10 +7,8 @@ import msgspec
 
 from monitor_node.backtest import Backtest
 from reactorwatch.contract.messages_pb2 import Alarm, Priority
+from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.records.record import to_minutes
-
-WORTH_TELLING = 0.05
-"""Probability below which a suspect is not told to people."""
 
 
 def backtest_object(result: Backtest, zero_ns: int) -> dict[str, Any]:
@@ -63,7 +61,7 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
         end = f"cleared at {to_minutes(cleared_ns, zero_ns):g} min" if cleared_ns else "still standing at the end"
         raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
         lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}")
-    told = dict.fromkeys(filter(None, (suspects_text(alarm, zero_ns) for alarm, _ in result.raised)))
+    told = dict.fromkeys(filter(None, (suspects_text(alarm.suspects, zero_ns) for alarm, _ in result.raised)))
     lines += [f"  suspect: {text}" for text in told]
     lines += [f"  note: {note}" for note in result.notes]
     if not result.raised and said["trained_until_min"] is not None:
@@ -71,27 +69,6 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     if result.refused:
         lines.append("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items())))
     return "\n".join(lines)
-
-
-def suspects_text(alarm: Alarm, zero_ns: int | None = None) -> str:
-    """The likeliest causes, for people; empty if nothing is known.
-
-    Args:
-        alarm: with its suspects.
-        zero_ns: where minutes start, if onsets are to be told.
-    """
-    told = []
-    for item in alarm.suspects:
-        if item.probability < WORTH_TELLING:
-            continue
-        text = f"{item.cause} ({100 * item.probability:.0f} %"
-        if item.profile:
-            unit = "" if item.unit == "1" else f" {item.unit}"
-            text += f"; {item.profile} of {item.size:.3g}{unit}"
-            if zero_ns is not None:
-                text += f" at {to_minutes(item.onset_ns, zero_ns):.1f} min"
-        told.append(text + ")")
-    return ", ".join(told)
 
 
 def priority_word(alarm: Alarm) -> str:

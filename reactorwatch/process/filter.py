@@ -91,7 +91,6 @@ class Innovations(NamedTuple):
         sd: likewise.
         whitened: likewise.
         conditional_sd: likewise; the standard deviation of the residual if those of the outputs before it are known.
-        log_likelihood: of what was measured in each row under the model, shape (rows,).
         x: the state after each row, shape (rows, n_x).
         P: its covariance, shape (rows, n_x, n_x).
     """
@@ -101,9 +100,15 @@ class Innovations(NamedTuple):
     sd: Array
     whitened: Array
     conditional_sd: Array
-    log_likelihood: Array
     x: Array
     P: Array
+
+    @property
+    def log_likelihood(self) -> Array:
+        """Of what was measured in each row under the model, shape (rows,)."""
+        known = np.isfinite(self.whitened)
+        parts = np.where(known, 0.5 * self.whitened**2 + 0.5 * log(2 * pi) + np.log(self.conditional_sd), 0.0)
+        return np.asarray(-np.sum(parts, axis=1))
 
 
 class FilterState(msgspec.Struct, frozen=True):
@@ -269,8 +274,11 @@ class Filter:
             if row < rows and since[row] < point < time_min[row]:
                 plain[row] &= len(self._within(since[row], time_min[row])) == 1
                 first[row], second[row] = point - since[row], time_min[row] - point
-        before = np.vstack([self._inputs or inputs[0], inputs[:-1]])
-        new = np.column_stack([before, inputs, since, first, second, measured, limits])
+        new = np.empty((rows, self._new.nbytes // 8))
+        n_u = inputs.shape[1]
+        new[0, :n_u], new[1:, :n_u], new[:, n_u : 2 * n_u] = self._inputs or inputs[0], inputs[:-1], inputs
+        new[:, 2 * n_u], new[:, 2 * n_u + 1], new[:, 2 * n_u + 2] = since, first, second
+        new[:, -2 * n : -n], new[:, -n:] = measured, limits
         ends = np.append(np.flatnonzero(~plain), rows)
         row = 0
         while row < rows:
@@ -291,11 +299,11 @@ class Filter:
             else:
                 told[row], memory[row] = self._told, self._memory
             row += 1
-        prediction, residual, sd, whitened, conditional_sd = np.split(told[:, :-1], 5, axis=1)
-        known = np.isfinite(whitened)
-        parts = np.where(known, 0.5 * whitened**2 + 0.5 * log(2 * pi) + np.log(conditional_sd), 0.0)
+        prediction, residual, sd, whitened, conditional_sd = (
+            told[:, place * n : (place + 1) * n] for place in range(5)
+        )
         x, P = memory[:, : self._n_x], memory[:, self._n_x :].reshape(rows, self._n_x, self._n_x)
-        return Innovations(prediction, residual, sd, whitened, conditional_sd, -np.sum(parts, axis=1), x, P)
+        return Innovations(prediction, residual, sd, whitened, conditional_sd, x, P)
 
     def _run_chunk(self, new: Array, told: Array, memory: Array) -> int:
         """Take a chunk of rows in at once; returns how many of them, up to the first that did not go well."""

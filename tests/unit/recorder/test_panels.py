@@ -94,6 +94,17 @@ def test_the_log_tells_alarms_and_faults_in_order(run: Run) -> None:
     ]
 
 
+def test_the_log_tells_the_suspects_of_one_look_once(run: Run) -> None:
+    suspect = messages.Suspect(cause="coolant_flow", probability=0.9, profile="step", size=-0.05, unit="1")
+    suspect.onset_ns = run.span_ns[0] + 20 * 60_000_000_000
+    look = run.alarms[0]._replace(event="suspected", suspects=[suspect])
+    (log,) = alarms.draw(replace(run, alarms=(run.alarms[0], look, look._replace(alarm="ewma/T"))))
+    assert [(event.kind, event.text) for event in log.events][1:] == [
+        ("raised", "22.0 min  shewhart/T: T is lower than the model expects"),
+        ("suspect", "22.0 min  coolant_flow (90 %; step of -0.05 at 20.0 min)"),
+    ]
+
+
 def test_every_state_of_an_alarm_has_a_word(run: Run) -> None:
     changes = [run.alarms[0]._replace(state=state) for state in messages.AlarmState.values()]
     (log,) = alarms.draw(replace(run, alarms=tuple(changes)))
