@@ -59,6 +59,7 @@ class AlarmBoard:
     Attributes:
         time_ns: time of the newest row; None before the first.
         changes: counts up whenever there is something that a restart must not forget.
+        has_unexplained: whether an alarm stands that does not say itself what its cause is.
     """
 
     def __init__(self, config: MonitorConfig) -> None:
@@ -73,6 +74,7 @@ class AlarmBoard:
         self._kpis_changed = False
         self.time_ns: int | None = None
         self.changes = 0
+        self.has_unexplained = False
 
     def declare(
         self,
@@ -173,11 +175,6 @@ class AlarmBoard:
         """Number of the latest incident; 0: there was none yet."""
         return self._incidents.state.number
 
-    @property
-    def has_unexplained(self) -> bool:
-        """Whether an alarm stands that does not say itself what its cause is."""
-        return any(alarm.memory.rule.standing and not alarm.tells_cause for alarm in self._alarms.values())
-
     # --- what people do --------------------------------------------------------------------------------------
 
     def act(self, name: str, event: Event, by: str, comment: str) -> list[Publication]:
@@ -275,7 +272,7 @@ class AlarmBoard:
         for name, memory in state.alarms.items():
             if name in self._alarms:
                 self._alarms[name].memory = memory
-        self._note_shelved()
+        self._note()
         self.time_ns = state.time_ns
         self._incidents.state = state.incident
         self._kpis.state = state.kpis
@@ -315,12 +312,15 @@ class AlarmBoard:
                     self._suspects = []
                 if not alarm.tells_cause:
                     memory.suspects = list(self._suspects)
-        self._note_shelved()
+        self._note()
         self.changes += 1
         self._kpis_changed = True
 
-    def _note_shelved(self) -> None:
-        self._shelved = [alarm for alarm in self._alarms.values() if alarm.memory.state is State.SHELVED]
+    def _note(self) -> None:
+        """What is asked for at every row, and changes seldom."""
+        alarms = self._alarms.values()
+        self._shelved = [alarm for alarm in alarms if alarm.memory.state is State.SHELVED]
+        self.has_unexplained = any(alarm.memory.rule.standing and not alarm.tells_cause for alarm in alarms)
 
     def _publication(self, alarm: ChartAlarm, event: str, time_ns: int) -> Publication:
         return Publication(keys.key(self._config.plant, keys.ALARM, alarm.name), alarm.message(time_ns, event))

@@ -2,14 +2,16 @@
 
 Every cause of the catalogue may have set in as a step or as a ramp. The linearised bank (see `isolation_bank`) tells
 which come into question and where to begin, and the filters of the models with these causes in them are fitted to the
-rows (see `isolation_fit`). What is said in the end is the posterior probability of each cause, by Laplace's method
-(Kass & Raftery 1995, Bayes factors, J. American Statistical Association 90), with
+rows (see `isolation_fit`). What is said in the end is the posterior probability of each cause: of
 
-    log evidence = gain in log likelihood - log(n) / 2 + log(sqrt(2 pi) sd of the onset / span of possible onsets),
+    likelihood(size, onset) p(size) p(onset),
 
-where n is how many values were measured since the onset: the prior of a size is as wide as one measurement would tell
-it (Kass & Wasserman 1995), so that no cause is preferred for its unit; the prior of an onset is even. All causes are
-equally likely beforehand, and so are that nothing is wrong and that the cause is none of these.
+integrated over sizes and onsets, over that of all causes together. The prior of a size is normal and as wide as one
+measurement would tell it (the unit information prior of Kass & Wasserman 1995, J. American Statistical Association 90),
+so that no cause is preferred for its unit: with n values since the onset the integral over the size is the greatest
+likelihood over sqrt(1 + n). That of an onset is even. Of a small fault the integral over the onset is a sum over the
+bank's; of a large one its onset is about normal, and the integral is Laplace's. All causes are equally likely
+beforehand, and so are that nothing is wrong and that the cause is none of these.
 
 *None of these* is judged by what the best cause leaves. If innovations are larger by a factor than they should be,
 row by row or in sums over some rows, that factor's evidence is weighed like that of a cause. Nothing and none of these
@@ -21,13 +23,14 @@ Causes that imitate each other share the probability, as they should: no more ca
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import exp, inf, isfinite, log, nan, pi, sqrt
+from math import exp, inf, isfinite, log, nan
 
 import numpy as np
 
 from monitor_node.isolation_bank import Bank
 from monitor_node.isolation_fit import Fit, Fitter
 from monitor_node.isolation_hypothesis import HUBER, Hypothesis
+from monitor_node.isolation_ways import linearisable
 from monitor_node.isolation_window import Row, Window, window_of
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
@@ -36,9 +39,6 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP
 
 UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
-
-BURN_IN_ROWS = 20
-"""Rows at the start of the window in which the filter still finds its state: nothing is said to set in there."""
 
 SHARE_OF_RAMPS = 0.3
 """How likely a cause is to grow, beforehand, rather than to set in at once."""
@@ -79,7 +79,7 @@ class Isolation:
         model: of the plant.
         noise: of the plant and its sensors.
         window_rows: how many of the newest rows are kept.
-        effects: the causes.
+        effects: the causes; those that bring states of their own are left out.
         excluded: names of causes that do not come into question.
     """
 
@@ -92,10 +92,7 @@ class Isolation:
         excluded: Sequence[str] = (),
     ) -> None:
         self._rows: deque[Row] = deque(maxlen=window_rows)
-        states = len(model.states)
-        self._effects = tuple(
-            effect for effect in effects if effect.name not in excluded and len(effect.extend(model).states) == states
-        )
+        self._effects = linearisable(model, [effect for effect in effects if effect.name not in excluded])
         self._nominal = Filter(model, noise)
         self._bank = Bank(model, noise, self._effects)
         self._fitter = Fitter(model, noise, self._effects)
@@ -104,23 +101,21 @@ class Isolation:
         """Keep a row; NaN where something is missing."""
         self._rows.append((time_min, input_value, measured))
 
+    def clear(self) -> None:
+        """Forget all rows."""
+        self._rows.clear()
+
     def suspects(self, not_before_min: float = -inf) -> list[Suspect]:
         """The causes that come into question, likeliest first, and `UNKNOWN` among them.
 
         Args:
             not_before_min: nothing was wrong before.
         """
-        window = window_of(tuple(self._rows), self._nominal)
+        window = window_of(tuple(self._rows), self._nominal, not_before_min)
         if window is None:
             return [_unknown(1.0)]
-        first = max(BURN_IN_ROWS, int(np.searchsorted(window.time_min, not_before_min)))
-        if first >= window.time_min.size:
-            return [_unknown(1.0)]
-        fits = [fit for fit in self._fitter.fit(window, *self._bank.scan(window, first)) if isfinite(fit.gain)]
-        if not fits:  # no cause of any size can be followed through these rows
-            return [_unknown(1.0)]
-        span_min = float(window.time_min[-1] - window.time_min[first - 1])
-        evidence = [self._evidence(fit, window, span_min) for fit in fits]
+        fits = self._fitter.fit(window, *self._bank.scan(window))
+        evidence = [self._evidence(fit) for fit in fits]
         none = evidence[0] + _left(fits[0], window)
         top = max(*evidence, none, 0.0)
         weights = [exp(value - top) for value in evidence]
@@ -137,14 +132,10 @@ class Isolation:
                 found.append(_suspect(self._fitter.hypotheses[likeliest.hypothesis], likeliest, share))
         return sorted(found, key=lambda item: -item.probability)
 
-    def _evidence(self, fit: Fit, window: Window, span_min: float) -> float:
+    def _evidence(self, fit: Fit) -> float:
         """Logarithm of how much likelier the rows are with a cause, over all its sizes and onsets."""
-        hypothesis = self._fitter.hypotheses[fit.hypothesis]
-        since = np.isfinite(window.measured[np.searchsorted(window.time_min, fit.onset_min) :])
-        of_size = -0.5 * log(max(int(since.sum()), 2))
-        of_onset = log(min(sqrt(2 * pi) * fit.onset_sd_min / span_min, 1.0))
-        of_profile = log(SHARE_OF_RAMPS if hypothesis.profile is RAMP else 1.0 - SHARE_OF_RAMPS)
-        return fit.gain + of_size + of_onset + of_profile
+        is_ramp = self._fitter.hypotheses[fit.hypothesis].profile is RAMP
+        return fit.gain + fit.log_volume + log(SHARE_OF_RAMPS if is_ramp else 1.0 - SHARE_OF_RAMPS)
 
 
 def _left(fit: Fit, window: Window) -> float:

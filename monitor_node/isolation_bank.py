@@ -80,21 +80,20 @@ class Bank:
         self._upper = np.array([effect.upper for effect in effects])
         self._linearisation = Linearisation(model, noise, effects)
 
-    def scan(self, window: Window, first_onset: int) -> tuple[Scan, Scan]:
+    def scan(self, window: Window) -> tuple[Scan, Scan]:
         """Compare all causes on the rows up to the first at which one stands out, and on all.
 
         Args:
             window: the rows, and the filter's run over them.
-            first_onset: the first row at which a deviation may set in; at least 1.
         """
         ways, rows = self._linearisation.ways(window), window.time_min.size
-        early, whole = self._scanned(window, ways, spread_onsets(first_onset, rows))
+        early, whole = self._scanned(window, ways, spread_onsets(window.first_onset, rows))
         if early.rows == rows:
             return early, whole
         near = np.max(early.ratio, axis=(1, 2)) > np.max(early.ratio) - REACH
         before = max(int(np.argmax(near)) - len(_BETWEEN) - 1, 0)
         first = int(np.searchsorted(window.time_min, early.onset_min[before], side="right")) - 1
-        return self._scanned(window, ways, spread_onsets(max(first, first_onset), early.rows))
+        return self._scanned(window, ways, spread_onsets(max(first, window.first_onset), early.rows))
 
     def _scanned(self, window: Window, ways: Ways, onsets: NDArray[np.int64]) -> tuple[Scan, Scan]:
         times, start = window.time_min, window.time_min[onsets]

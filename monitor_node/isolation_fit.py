@@ -10,7 +10,7 @@ behind. Where even that beginning does not keep what the bank promises, smaller 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import inf
+from math import inf, log, pi, sqrt
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class Fit:
         onset_min: when it set in.
         gain: in log likelihood, against nothing being wrong.
         w: the whitened innovations of the newest rows, from before any hypothesis sets in; NaN: missing.
+        log_volume: how much of what was possible beforehand is still, of all onsets and sizes; see `isolation`.
         size_sd: standard deviation of the size.
         onset_sd_min: of the onset.
         reached: size in the last row, of a ramp too.
@@ -58,6 +59,7 @@ class Fit:
     onset_min: float
     gain: float
     w: Array
+    log_volume: float
     size_sd: float
     onset_sd_min: float
     reached: float
@@ -89,6 +91,8 @@ class Fitter:
             whole: what it found in all.
         """
         best, rows = _begun(whole, window), window.time_min.size
+        if not best:
+            return []
         best = [item for item in best if item.gain > (1.0 - _HOLDS) * best[0].gain - BEHIND]
         begin = _begin(best[:MOST], window)
         nothing = run(self._nominal, window, begin, rows)[0]
@@ -98,14 +102,19 @@ class Fitter:
         )
         if not abs(kept - promised) < _HOLDS * promised + _NOISE:
             return self._followed(window, early)
-        fits = [self._fitted(item, window, begin, rows, nothing, first=True, last=True) for item in best[:MOST]]
-        fits.sort(key=lambda item: -item.gain)
-        return [*fits, *(replace(item, onset_sd_min=fits[0].onset_sd_min) for item in best[MOST:])]
+        fits = []
+        for item in best[:MOST]:
+            fit = self._fitted(item, window, begin, rows, nothing, first=True, last=True)
+            onset_sd_min = max(fit.onset_sd_min, item.onset_sd_min)
+            fits.append(replace(fit, onset_sd_min=onset_sd_min, log_volume=item.log_volume))
+        return [*sorted(fits, key=lambda item: -item.gain), *best[MOST:]]
 
     def _followed(self, window: Window, early: Scan) -> list[Fit]:
         """The same from where a large fault was still small."""
         rows, reached = window.time_min.size, early.rows
         fits = _begun(early, window)
+        if not fits:
+            return []
         onset, first = int(np.searchsorted(window.time_min, fits[0].onset_min)), True
         while True:
             last, begin = reached >= rows, _begin(fits, window)
@@ -113,12 +122,13 @@ class Fitter:
             fits = [self._fitted(item, window, begin, reached, nothing, first=first, last=last) for item in fits]
             fits.sort(key=lambda item: -item.gain)
             if last:
-                return fits
+                return [replace(item, log_volume=_log_volume(item, window)) for item in fits]
             # How far a fit can be from its best depends on how many rows it has seen; what it gains tells that best.
             slack = 0.5 if first else 0.1
             age = reached - onset
             reached, first = min(onset + max((2 if age < 2 * _FIRST_ROWS else 4) * age, _FIRST_ROWS), rows), False
-            fits = [item for item in fits if item.gain > (1.0 - slack) * fits[0].gain - BEHIND]
+            least = fits[0].gain - slack * abs(fits[0].gain) - BEHIND
+            fits = [item for item in fits if item.gain >= least] or fits[:1]  # a gain may be no number
 
     def _fitted(
         self, fit: Fit, window: Window, begin: int, rows: int, nothing: float, *, first: bool, last: bool
@@ -143,25 +153,44 @@ class Fitter:
             point, onset_sd_min = descent.onset(*descent.jumped(point, slope), slope)
         reached, reached_sd = descent.reached(point, slope)
         gain = nothing - point.loss
-        return Fit(
-            fit.hypothesis, point.size, point.onset_min, gain, point.w, slope.size_sd, onset_sd_min, reached, reached_sd
-        )
+        found = (slope.size_sd, onset_sd_min, reached, reached_sd)
+        return Fit(fit.hypothesis, point.size, point.onset_min, gain, point.w, fit.log_volume, *found)
 
 
 def _begun(scan: Scan, window: Window) -> list[Fit]:
     """The hypotheses of a scan, best first."""
     ratio = scan.ratio.reshape(scan.onset_min.size, -1)
     size, information = scan.size.reshape(ratio.shape), scan.information.reshape(ratio.shape)
+    places = np.argmax(ratio, axis=0)
+    widths = np.gradient(scan.onset_min) if scan.onset_min.size > 1 else np.ones(1)
+    likely = np.exp(0.5 * (ratio - np.max(ratio, axis=0))) * widths[:, None]
+    off = scan.onset_min[:, None] - scan.onset_min[places]
+    onset_sd_min = np.sqrt(np.sum(likely * off**2, axis=0) / np.sum(likely, axis=0))
+    values = _values_since(window, scan.onset_min)
+    log_volume = np.log(np.sum(likely / np.sqrt(1.0 + values)[:, None], axis=0) / window.span_min)
     found = []
-    for number, place in enumerate(np.argmax(ratio, axis=0).tolist()):
+    for number, place in enumerate(places.tolist()):
         if information[place, number] > 0.0:
             onset_min = float(scan.onset_min[place])
             is_ramp = PROFILES[number // (ratio.shape[1] // len(PROFILES))] is RAMP
             span = float(window.time_min[scan.rows - 1]) - onset_min if is_ramp else 1.0
             value, sd = float(size[place, number]), float(information[place, number]) ** -0.5
-            gain = 0.5 * float(ratio[place, number])
-            found.append(Fit(number, value, onset_min, gain, np.empty((0, 0)), sd, inf, value * span, sd * span))
+            gain, onset_sd = 0.5 * float(ratio[place, number]), float(onset_sd_min[number])
+            known = (sd, onset_sd, value * span, sd * span)
+            found.append(Fit(number, value, onset_min, gain, np.empty((0, 0)), float(log_volume[number]), *known))
     return sorted(found, key=lambda item: -item.gain)
+
+
+def _values_since(window: Window, onset_min: Array) -> Array:
+    """How many values were measured since each onset."""
+    counts = np.append(np.cumsum(np.sum(np.isfinite(window.measured), axis=1)[::-1])[::-1], 0)
+    return np.asarray(counts[np.searchsorted(window.time_min, onset_min)])
+
+
+def _log_volume(fit: Fit, window: Window) -> float:
+    """That of a fit whose onset is about normal."""
+    values = float(_values_since(window, np.array([fit.onset_min]))[0])
+    return log(min(sqrt(2 * pi) * fit.onset_sd_min / window.span_min, 1.0)) - 0.5 * log(1.0 + values)
 
 
 def _begin(fits: Sequence[Fit], window: Window) -> int:

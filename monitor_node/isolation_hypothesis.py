@@ -21,6 +21,9 @@ from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.profiles import RAMP, STEP, Profile
 
 HUBER = 4.0
+LOST = 100.0
+"""Standard deviations that a value counts as off where a filter has lost the plant."""
+
 SETTLED = 0.05
 """In log likelihood."""
 
@@ -64,14 +67,12 @@ def run(kalman: Filter, window: Window, begin: int, rows: int) -> tuple[float, A
     """A filter's loss over the rows after `begin` and before `rows`, and its whitened innovations there."""
     part = slice(begin + 1, rows)
     found = kalman.run(window.time_min[part], window.inputs[part], window.measured[part], start=window.states[begin])
-    w = found.whitened
-    known = np.isfinite(w)
-    if np.any(np.isfinite(window.measured[part]) & ~known):  # it had to begin anew on the way
-        return inf, w
-    size = np.abs(np.where(known, w, 0.0))
+    # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
+    lost = np.isfinite(window.measured[part]) & ~np.isfinite(found.whitened)
+    w = np.where(lost, LOST, found.whitened)
+    size = np.abs(np.nan_to_num(w))
     losses = np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER))
-    loss = np.sum(losses) + np.sum(np.log(found.conditional_sd), where=known)
-    return (float(loss) if np.isfinite(loss) else inf), w
+    return float(np.sum(losses) + np.sum(np.log(found.conditional_sd), where=np.isfinite(found.conditional_sd))), w
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,11 +134,12 @@ class Descent:
         self._hypothesis, self._window, self._begin, self._rows = hypothesis, window, begin, rows
         self._times = window.time_min[begin:rows]
         self._end_min = float(self._times[-1])
+        self._earliest_min = max(window.earliest_min, float(self._times[0]))
         self._latest_min = float(self._times[-1 if hypothesis.profile is STEP else -2])
 
     def at(self, size: float, onset_min: float) -> Point:
         """The point, or the nearest one that is possible."""
-        onset_min = min(max(onset_min, float(self._times[0])), self._latest_min)
+        onset_min = min(max(onset_min, self._earliest_min), self._latest_min)
         size = self._hypothesis.limited(size, onset_min, self._end_min)
         loss, w = self._hypothesis.run(self._window, self._begin, self._rows, size, onset_min)
         return Point(size, onset_min, loss, w)
@@ -196,7 +198,7 @@ class Descent:
     def onset(self, point: Point, rise: float, slope: Slope) -> tuple[Point, float]:
         """The point, in the middle of a plateau if it is on one, and the standard deviation of its onset."""
         spacing = self._spacing(point.onset_min)
-        of_rows = max(spacing / sqrt(2.0 * rise) if rise > 0.0 else inf, spacing / sqrt(12.0))
+        of_rows = max(spacing / sqrt(2.0 * rise) if rise > 0.0 else slope.onset_sd_min, spacing / sqrt(12.0))
         row = min(int(np.searchsorted(self._times, point.onset_min)), self._times.size - 1)
         within = [self.at(point.size, float(self._times[row]) - share * spacing) for share in (0.1, 0.5, 0.9)]
         if max(abs(item.loss - point.loss) for item in within) < SETTLED:

@@ -47,6 +47,11 @@ class Ways:
     w: Array
 
 
+def linearisable(model: ProcessModel, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    """The effects that act on the model's own states: from no new state there is no infinitesimal deviation."""
+    return tuple(effect for effect in effects if effect.extend(model).state_names == model.state_names)
+
+
 class Linearisation:
     """Linearises the filter of a model.
 

@@ -1,13 +1,14 @@
 """The rows that a cause is looked for in, and what the filter makes of them if nothing is wrong.
 
-Every hypothesis is compared on the same rows, so what counts is settled here. A value far off that neither the row
-before nor the next one confirms is an outlier and counts as missing, whatever the cause. The filter follows a value far
-off from the second row on, as the monitor's own does.
+Every hypothesis is compared on the same rows, so what counts is settled here. The filter follows values that are far off
+from the second one on, as the monitor's own does. A value is an outlier, and counts as missing whatever the cause, if
+it stands out from the rows before and after it, which agree with each other; so is the newest one, if it is far off and
+the one before was not: nothing confirms it yet.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite, nan
+from math import inf, isfinite, nan
 from typing import TypeAlias
 
 import numpy as np
@@ -19,8 +20,16 @@ from reactorwatch.process.model import Array
 Row: TypeAlias = tuple[float, float, Sequence[float]]
 """Time in minutes, input, outputs; NaN where missing."""
 
+BURN_IN_ROWS = 20
+"""Rows at the start in which the filter still finds its state: nothing is said to set in there."""
+
 GATE = 6.0
 """A value so many standard deviations off has to be confirmed."""
+
+_OF_THREE = 1.5**0.5  # standard deviation of a value less the mean of its neighbours, for white noise
+
+GAP_PERIODS = 5.0
+"""Rows that are so many usual periods apart have a gap between them, in which nobody knows what the input was."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +43,7 @@ class Window:
         residual: what the filter was off by, shape (rows, n_y); NaN where missing or an outlier.
         used: whether a value corrected the filter, shape (rows, n_y).
         states: of the filter after each row.
+        first_onset: the first row at which something may set in; at least 1.
     """
 
     time_min: Array
@@ -42,6 +52,17 @@ class Window:
     residual: Array
     used: NDArray[np.bool_]
     states: list[FilterState]
+    first_onset: int
+
+    @property
+    def earliest_min(self) -> float:
+        """When something may set in at the earliest."""
+        return float(self.time_min[self.first_onset])
+
+    @property
+    def span_min(self) -> float:
+        """How long the time is in which something may set in."""
+        return float(self.time_min[-1] - self.time_min[self.first_onset - 1])
 
     @property
     def x(self) -> Array:
@@ -55,21 +76,25 @@ class Window:
         return np.array([state.P for state in self.states]).reshape(len(self.states), x, x)
 
 
-def window_of(rows: Sequence[Row], kalman: Filter) -> Window | None:
-    """The newest rows without a gap that a filter does not cross; None if there are fewer than two.
+def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf) -> Window | None:
+    """The newest rows without a gap; None if there are none in which something may set in.
 
     Args:
         rows: oldest first; where the input is missing it is taken to be as it was.
         kalman: of the plant without a fault; begins anew.
+        not_before_min: nothing was wrong before.
     """
-    kept = _without_gap(rows)
-    if len(kept) < 2:
+    kept = _since_gap(_running_on(rows))
+    times = np.array([row[0] for row in kept])
+    first_onset = max(BURN_IN_ROWS, int(np.searchsorted(times, not_before_min)))
+    if first_onset >= times.size:
         return None
     measured = np.array([row[2] for row in kept], dtype=float)
     n_y = measured.shape[1]
     residual, off = np.full(measured.shape, nan), np.zeros(measured.shape, dtype=bool)
     used = np.zeros(measured.shape, dtype=bool)
     states: list[FilterState] = []
+    sd: list[tuple[float, ...]] = []
     accept = [False] * n_y
     kalman.restart()
     for place, (time_min, value, outputs) in enumerate(kept):
@@ -81,28 +106,49 @@ def window_of(rows: Sequence[Row], kalman: Filter) -> Window | None:
             for size, follow, out in zip(found.residual, accept, far, strict=True)
         ]
         residual[place] = found.residual
+        sd.append(found.sd)
         accept = far
         states.append(kalman.state)
-    alone = off & ~np.vstack([off[1:], np.zeros((1, n_y), dtype=bool)])
-    alone &= ~np.vstack([np.zeros((1, n_y), dtype=bool), off[:-1]])
+    outlier = _outliers(residual, np.array(sd))
+    outlier[-1] = off[-1] & ~off[-2]
     return Window(
-        np.array([row[0] for row in kept]),
+        times,
         np.array([[row[1]] for row in kept]),
-        np.where(alone, np.nan, measured),
-        np.where(alone, np.nan, residual),
+        np.where(outlier, np.nan, measured),
+        np.where(outlier, np.nan, residual),
         used,
         states,
+        first_onset,
     )
 
 
-def _without_gap(rows: Sequence[Row]) -> list[Row]:
-    """The newest rows whose times increase without a long gap, every input known."""
+def _outliers(residual: Array, sd: Array) -> NDArray[np.bool_]:
+    """Which values stand out from the rows before and after them, shape (rows, n_y)."""
+    found = np.zeros(residual.shape, dtype=bool)
+    before, now, after = residual[:-2], residual[1:-1], residual[2:]
+    with np.errstate(invalid="ignore"):
+        out = np.abs(now - 0.5 * (before + after))
+        found[1:-1] = (out > GATE * _OF_THREE * sd[1:-1]) & (out > 2.0 * np.abs(after - before))
+    return found
+
+
+def _running_on(rows: Sequence[Row]) -> list[Row]:
+    """The newest rows whose times increase, every input known."""
     kept: list[Row] = []
     flow = nan
     for row in rows:
-        if kept and not 0.0 < row[0] - kept[-1][0] <= LONGEST_GAP_MIN:
+        if kept and not row[0] > kept[-1][0]:
             kept = []
         flow = row[1] if isfinite(row[1]) else flow
         if isfinite(flow):
             kept.append((row[0], flow, row[2]))
     return kept
+
+
+def _since_gap(rows: list[Row]) -> list[Row]:
+    """The rows since the last gap."""
+    if len(rows) < 2:
+        return rows
+    apart = np.diff([row[0] for row in rows])
+    gaps = np.flatnonzero(apart > min(GAP_PERIODS * float(np.median(apart)), LONGEST_GAP_MIN))
+    return rows[int(gaps[-1]) + 1 :] if gaps.size else rows
