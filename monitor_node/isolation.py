@@ -114,7 +114,9 @@ class Isolation:
         window = window_of(tuple(self._rows), self._nominal, not_before_min)
         if window is None:
             return [_unknown(1.0)]
-        fits = self._fitter.fit(window, *self._bank.scan(window))
+        fits = [fit for fit in self._fitter.fit(window, *self._bank.scan(window)) if isfinite(fit.gain)]
+        if not fits:  # no cause of any size can be followed through these rows
+            return [_unknown(1.0)]
         evidence = [self._evidence(fit) for fit in fits]
         none = evidence[0] + _left(fits[0], window)
         top = max(*evidence, none, 0.0)
