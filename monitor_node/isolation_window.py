@@ -1,9 +1,9 @@
 """The rows that a cause is looked for in, and what the filter makes of them if nothing is wrong.
 
 Every hypothesis is compared on the same rows, so what counts is settled here. The filter follows values that are far
-off from the second one on, as the monitor's own does. A value is an outlier, and counts as missing whatever the cause, if
-it stands out from the rows before and after it, which agree with each other; so is the newest one, if it is far off and
-the one before was not: nothing confirms it yet.
+off from the second one on, as the monitor's own does. A value is an outlier, and counts as missing whatever the cause,
+if it stands out from the rows before and after it, which agree with each other; so is the newest one, if it is far off
+and the one before was not: nothing confirms it yet.
 """
 
 from collections.abc import Sequence
