@@ -115,7 +115,7 @@ class Isolation:
         if window is None:
             return [_unknown(1.0)]
         fits = [fit for fit in self._fitter.fit(window, *self._bank.scan(window)) if isfinite(fit.gain)]
-        if not fits:  # no cause of any size can be followed through these rows
+        if not fits:  # nothing was measured in which a cause would show, or none can be followed through it
             return [_unknown(1.0)]
         evidence = [self._evidence(fit) for fit in fits]
         none = evidence[0] + _left(fits[0], window)

@@ -10,6 +10,7 @@ plateau, the onset is moved by whole rows as long as that helps, and in the end 
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf, sqrt
 
 import numpy as np
@@ -42,9 +43,13 @@ class Hypothesis:
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effect: Effect, profile: Profile) -> None:
         self.effect, self.profile = effect, profile
-        extended = effect.extend(model, profile)
-        self._prefix = extended.parameter_names[len(model.parameters)].removesuffix("size")
-        self._filter = Filter(extended, noise)
+        self._noise, self._extended = noise, effect.extend(model, profile)
+        self._prefix = self._extended.parameter_names[len(model.parameters)].removesuffix("size")
+
+    @cached_property
+    def _filter(self) -> Filter:
+        """Made when it is needed: it takes some milliseconds, and many causes never come into question."""
+        return Filter(self._extended, self._noise)
 
     def limited(self, size: float, onset_min: float, end_min: float) -> float:
         """The physically possible size that is nearest to it; a ramp's is so until the end."""

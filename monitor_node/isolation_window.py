@@ -2,8 +2,8 @@
 
 Every hypothesis is compared on the same rows, so what counts is settled here. The filter follows values that are far
 off from the second one on, as the monitor's own does. A value is an outlier, and counts as missing whatever the cause,
-if it stands out from the rows before and after it, which agree with each other; so is the newest one, if it is far off
-and the one before was not: nothing confirms it yet.
+if it stands out, alone or with its neighbour, from those before and after, which agree with each other. So is the
+newest one, if it is far off and the one before was not: nothing confirms it yet.
 """
 
 from collections.abc import Sequence
@@ -109,7 +109,8 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
         sd.append(found.sd)
         accept = far
         states.append(kalman.state)
-    outlier = _outliers(residual, np.array(sd))
+    # A filter that soon follows a step leaves its first rows standing alone; a plant that moves a lot, any row.
+    outlier = _standing_out(residual, np.array(sd)) & _standing_out(measured, np.array(sd))
     outlier[-1] = off[-1] & ~off[-2]
     return Window(
         times,
@@ -122,25 +123,31 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
     )
 
 
-def _outliers(residual: Array, sd: Array) -> NDArray[np.bool_]:
-    """Which values stand out from the rows before and after them, shape (rows, n_y)."""
-    found = np.zeros(residual.shape, dtype=bool)
-    before, now, after = residual[:-2], residual[1:-1], residual[2:]
-    with np.errstate(invalid="ignore"):
-        out = np.abs(now - 0.5 * (before + after))
-        found[1:-1] = (out > GATE * _OF_THREE * sd[1:-1]) & (out > 2.0 * np.abs(after - before))
+def _standing_out(values: Array, sd: Array) -> NDArray[np.bool_]:
+    """Which, alone or two in a row, stand out from those before and after them, shape (rows, n_y)."""
+    found = np.zeros(values.shape, dtype=bool)
+    for column, sizes, out in zip(values.T, sd.T, found.T, strict=True):
+        known = np.flatnonzero(np.isfinite(column))
+        for count in (1, 2):
+            before, after = column[known[: -count - 1]], column[known[count + 1 :]]
+            between = [known[place : known.size - count - 1 + place] for place in range(1, count + 1)]
+            usual, apart = 0.5 * (before + after), np.abs(after - before)
+            least = [np.maximum(GATE * _OF_THREE * sizes[now], apart) for now in between]
+            far = [np.abs(column[now] - usual) > size for now, size in zip(between, least, strict=True)]
+            for now in between:
+                out[now[np.logical_and.reduce(far)]] = True
     return found
 
 
 def _running_on(rows: Sequence[Row]) -> list[Row]:
-    """The newest rows whose times increase, every input known."""
+    """The newest rows whose times increase, every input known, from one on in which something is measured."""
     kept: list[Row] = []
     flow = nan
     for row in rows:
         if kept and not row[0] > kept[-1][0]:
             kept = []
         flow = row[1] if isfinite(row[1]) else flow
-        if isfinite(flow):
+        if isfinite(flow) and (kept or any(isfinite(value) for value in row[2])):
             kept.append((row[0], flow, row[2]))
     return kept
 

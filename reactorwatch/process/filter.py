@@ -224,11 +224,11 @@ class Filter:
         if before is None or not 0.0 < time_min - before <= LONGEST_GAP_MIN:
             return self._begin(time_min, inputs, measured)
         step = 0.5 * (time_min - before)
-        steps = (before, step, step)
+        steps = (step, step)
         if 2.0 * step > _LONGEST_ROW_MIN or self._breaks:
             steps = self._steps(before, time_min, step)
         limits = [inf if follow else gate for follow in accept] if accept else [gate] * n
-        self._pack(self._new, 0, *self._inputs, *inputs, *steps, *measured, *limits)
+        self._pack(self._new, 0, *self._inputs, *inputs, time_min, *steps, *measured, *limits)
         self._row()
         told = self._unpack(self._told)
         if not told[-1]:
@@ -277,7 +277,7 @@ class Filter:
         new = np.empty((rows, self._new.nbytes // 8))
         n_u = inputs.shape[1]
         new[0, :n_u], new[1:, :n_u], new[:, n_u : 2 * n_u] = self._inputs or inputs[0], inputs[:-1], inputs
-        new[:, 2 * n_u], new[:, 2 * n_u + 1], new[:, 2 * n_u + 2] = since, first, second
+        new[:, 2 * n_u], new[:, 2 * n_u + 1], new[:, 2 * n_u + 2] = time_min, first, second
         new[:, -2 * n : -n], new[:, -n:] = measured, limits
         ends = np.append(np.flatnonzero(~plain), rows)
         row = 0
@@ -331,15 +331,15 @@ class Filter:
         """The breakpoints between two rows."""
         return [point for point in self._breaks if before < point < time_min]
 
-    def _steps(self, before: float, time_min: float, half: float) -> tuple[float, float, float]:
-        """When the last two steps of a way begin, and their lengths; up to there it is walked."""
+    def _steps(self, before: float, time_min: float, half: float) -> tuple[float, float]:
+        """The lengths of the last two steps of a way; up to there it is walked."""
         within = self._within(before, time_min)
         if 2.0 * half > _LONGEST_ROW_MIN or len(within) > 1:
             return self._walk_to_last_steps(before, time_min)
-        return (before, within[0] - before, time_min - within[0]) if within else (before, half, half)
+        return (within[0] - before, time_min - within[0]) if within else (half, half)
 
-    def _walk_to_last_steps(self, before: float, time_min: float) -> tuple[float, float, float]:
-        """Predict up to the last two steps of the way; returns when the first of them begins, and their lengths."""
+    def _walk_to_last_steps(self, before: float, time_min: float) -> tuple[float, float]:
+        """Predict up to the last two steps of the way; returns their lengths."""
         edges = [before]
         for end in (*self._within(before, time_min), time_min):
             count, begin = ceil((end - edges[-1]) / (0.5 * _LONGEST_ROW_MIN)), edges[-1]
@@ -352,11 +352,11 @@ class Filter:
         for place in range(0, len(edges) - 3, 2):
             begin, middle, end = edges[place : place + 3]
             walk.arguments[0][0] = self._memory
-            walk.arguments[1][0] = [*self._inputs, begin, middle - begin, end - middle]
+            walk.arguments[1][0] = [*self._inputs, end, middle - begin, end - middle]
             walk()
             self._memory[:] = walk.results[0][0]
         begin, middle, end = edges[-3:]
-        return begin, middle - begin, end - middle
+        return middle - begin, end - middle
 
     @cached_property
     def _beginning(self) -> Beginning:

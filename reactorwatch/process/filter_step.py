@@ -20,8 +20,8 @@ from reactorwatch.process.model import ProcessModel
 def row_function(model: ProcessModel) -> ca.Function:
     """From one row to the next: (memory, new, constants) -> (memory, told).
 
-    new: [inputs of the row before, inputs, time of the row before, first step, second step, measured, limits], where
-    NaN is a value that is missing, and a limit is how many standard deviations off a value may be to correct the state.
+    new: [inputs of the row before, inputs, time of the row, first step, second step, measured, limits]; NaN is a value
+    that is missing, and a limit is how many standard deviations off a value may be to correct the state.
     told: [prediction, residual, its standard deviations, whitened residual, what that was divided by, 1 if all went
     well]; see `filter.Innovations`.
     """
@@ -29,10 +29,10 @@ def row_function(model: ProcessModel) -> ca.Function:
     memory, new, constants = _symbols(model, 2 * n_u + 3 + 2 * n_y)
     p, r, q = _constants(model, constants)
     parts = np.cumsum([0, n_u, n_u, 1, 1, 1, n_y, n_y]).tolist()
-    before, u, t, first, second, measured, limits = ca.vertsplit(new, parts)
-    x, P = _predicted(model, memory, before, t, first, second, p, q)
+    before, u, now, first, second, measured, limits = ca.vertsplit(new, parts)
+    x, P = _predicted(model, memory, before, now, first, second, p, q)
     inside = ca.logic_and(ca.mmin(x - _bounds(model)[0]) >= 0, ca.mmin(_bounds(model)[1] - x) >= 0)
-    expected, H = output_function(model)(x, u, p, t + first + second)
+    expected, H = output_function(model)(x, u, p, now)
     covariance = H @ P @ H.T + ca.diag(r)
     known = ca.fabs(measured) < inf  # false for NaN; CasADi takes x == x for true
     off = ca.if_else(known, measured - expected, 0.0)
@@ -90,9 +90,9 @@ def _bounds(model: ProcessModel) -> tuple[ca.DM, ca.DM]:
 
 
 def _predicted(
-    model: ProcessModel, memory: ca.SX, u: ca.SX, t: ca.SX, first: ca.SX, second: ca.SX, p: ca.SX, q: ca.SX
+    model: ProcessModel, memory: ca.SX, u: ca.SX, now: ca.SX, first: ca.SX, second: ca.SX, p: ca.SX, q: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """State and covariance after two steps.
+    """State and covariance after two steps, the second of which ends now.
 
     The Jacobian of a step is exp(h (A + A') / 2), with A and A' the Jacobians of the right-hand side at its ends and
     the exponential to fourth order. On the operating branch its entries are within 1 % of those of the step itself, for
@@ -102,7 +102,7 @@ def _predicted(
     step, slope = symbolic_step(model), _jacobian(model)
     start, P = memory[:n], ca.reshape(memory[n:], n, n)
     F, x = ca.SX.eye(n), start
-    for begin, h in ((t, first), (t + first, second)):
+    for begin, h in ((now - second - first, first), (now - second, second)):
         middle = begin + 0.5 * h
         after = step(x, u, p, begin, middle, h)[0]
         M = 0.5 * h * (slope(x, u, p, begin, middle) + slope(after, u, p, begin + h, middle))

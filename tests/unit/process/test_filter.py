@@ -183,8 +183,25 @@ def test_without_noise_it_predicts_what_the_simulator_runs(onset: str) -> None:
     assert np.all(np.abs(found.prediction - expected.outputs[1:]) < [1e-6, 2e-4])
 
 
+def test_a_sensor_s_step_at_the_time_of_a_row_shows_in_it() -> None:
+    """In every row, however its time is rounded."""
+    model = parse_fault("temperature_bias:step:3@0min").extend(cstr())
+    kalman = Filter(model, SENSORS)
+    for row in range(1, 400):
+        kalman.state = FilterState(0.1 * (row - 1), (OPERATING_COOLANT_FLOW,), OPERATING_STATE, (0.0,) * 4)
+        kalman.change({"temperature_bias.onset": 0.1 * row})
+        shown = kalman.update(0.1 * row, (OPERATING_COOLANT_FLOW,), (np.nan, np.nan)).prediction[1]
+        assert shown == pytest.approx(OPERATING_STATE[1] + 3.0, abs=0.05)
+
+
 def test_a_record_at_once_and_row_by_row_are_the_same_to_the_last_bit() -> None:
-    model = parse_fault("reaction_rate:step:-0.05@12.34min").extend(cstr())
+    model = cstr()
+    for fault in (
+        "reaction_rate:step:-0.05@12.34min",
+        "coolant_flow:step:-0.2@12.37min",
+        "feed_flow:step:0.01@15.06min",
+    ):
+        model = parse_fault(fault).extend(model)
     time_min, inputs, measured = record_of(PlantConfig(seed=7), 300)
     time_min = time_min + np.where(np.arange(300) > 200, 2.0, 0.0) + np.where(np.arange(300) > 250, 40.0, 0.0)
     measured[50, 0] = np.nan
@@ -231,6 +248,38 @@ def test_a_value_beyond_the_gate_is_treated_as_missing_until_it_is_accepted() ->
     ungated = Filter(cstr(), SENSORS).run(time_min, inputs, outlier)
     np.testing.assert_array_equal(followed.x, ungated.x)
     assert np.any(followed.x != without.x)
+
+
+@pytest.mark.parametrize(("far", "used"), [(5.99, True), (6.01, False)])
+def test_the_gate_is_in_standard_deviations_of_the_innovation(far: float, used: bool) -> None:
+    kalman = Filter(cstr(), SENSORS)
+    start = FilterState(0.0, (OPERATING_COOLANT_FLOW,), OPERATING_STATE, (1e-5, 0.0, 0.0, 0.4))
+    kalman.state = start
+    expected = kalman.update(0.1, (100.0,), (np.nan, np.nan))
+    without = kalman.state
+    kalman.state = start
+    kalman.update(0.1, (100.0,), (np.nan, expected.prediction[1] - far * expected.sd[1]), gate=6.0)
+    assert (kalman.state != without) is used
+
+
+def test_an_output_may_depend_on_the_input_of_its_own_row() -> None:
+    model = linear_model()
+    fed_through = replace(model.outputs[1], expression=model.states[0].symbol + 2.0 * model.inputs[0].symbol)
+    kalman = Filter(replace(model, outputs=(model.outputs[0], fed_through)), NOISE)
+    kalman.state = FilterState(0.0, (1.0,), (3.0, 1.0), (0.1, 0.0, 0.0, 0.1))
+    prediction = kalman.update(0.1, (5.0,), (np.nan, np.nan)).prediction
+    assert prediction[1] == pytest.approx(prediction[0] + 10.0)
+    assert prediction[0] == pytest.approx((sampled(0.1)[0] @ [3.0, 1.0] + sampled(0.1)[1])[0], abs=1e-9)
+
+
+def test_a_sensor_that_is_all_but_exact_leaves_the_covariance_positive() -> None:
+    """K H is 1 but for rounding then, and (1 - K H) P is nothing or less."""
+    kalman = Filter(linear_model(), NoiseLevels((1e-9, 1e-9), (0.0, 0.0)))
+    kalman.state = FilterState(0.0, (0.0,), (1.0, 1.0), (1e6, 3e5, 3e5, 1e6))
+    kalman.update(0.1, (0.0,), (1.0, 0.5))
+    P = np.array(kalman.state.P).reshape(2, 2)
+    assert np.all(np.diag(P) > 0.0)
+    assert np.all(np.diag(P) < 1e-17)
 
 
 def test_over_rows_without_any_measurement_it_predicts_alone() -> None:

@@ -1,0 +1,93 @@
+"""What counts of the rows: since the last gap, without what nothing confirms."""
+
+from math import nan
+
+import numpy as np
+import pytest
+
+from monitor_node.isolation_window import BURN_IN_ROWS, Row, Window, window_of
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.filter import Filter
+from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    return rows_of(seed=1, after_min=0.0, begin_min=40.0)
+
+
+def settled(rows: list[Row], not_before_min: float = 0.0) -> Window:
+    window = window_of(rows, Filter(cstr(), SENSORS), not_before_min)
+    assert window is not None
+    return window
+
+
+def shifted(rows: list[Row], places: list[int], column: int, size: float) -> list[Row]:
+    changed = list(rows)
+    for place in places:
+        time_min, flow, values = rows[place]
+        changed[place] = (time_min, flow, [v + size * (index == column) for index, v in enumerate(values)])
+    return changed
+
+
+def missing(window: Window) -> list[tuple[int, int]]:
+    return [(int(row), int(column)) for row, column in np.argwhere(np.isnan(window.measured))]
+
+
+def test_without_outliers_everything_counts(rows: list[Row]) -> None:
+    window = settled(rows)
+    assert missing(window) == []
+    np.testing.assert_array_equal(window.measured, [row[2] for row in rows])
+    np.testing.assert_array_equal(window.inputs[:, 0], [row[1] for row in rows])
+    assert window.first_onset == BURN_IN_ROWS
+    assert np.all(window.used[1:])
+
+
+@pytest.mark.parametrize(("column", "size"), [(0, 0.05), (1, -8.0)])
+@pytest.mark.parametrize("places", [[100], [100, 101]])
+def test_one_or_two_values_that_stand_out_do_not_count(
+    rows: list[Row], column: int, size: float, places: list[int]
+) -> None:
+    assert missing(settled(shifted(rows, places, column, size))) == [(place, column) for place in places]
+
+
+def test_the_same_in_the_middle_of_a_fault() -> None:
+    rows = rows_of("coolant_flow:step:-0.05", seed=2, after_min=5.0, begin_min=40.0)
+    place = next(place for place, row in enumerate(rows) if row[0] > ONSET_MIN + 2.0)
+    assert missing(settled(shifted(rows, [place], 1, 8.0))) == [(place, 1)]
+
+
+def test_a_step_counts_in_full(rows: list[Row]) -> None:
+    stepped = shifted(rows, list(range(100, len(rows))), 1, 5.0)
+    window = settled(stepped)
+    assert missing(window) == []
+    assert not window.used[100, 1]  # nothing confirmed it yet
+    assert window.used[101, 1]
+
+
+def test_the_newest_value_counts_only_if_the_one_before_confirms_it(rows: list[Row]) -> None:
+    last = len(rows) - 1
+    assert missing(settled(shifted(rows, [last], 1, 8.0))) == [(last, 1)]
+    assert missing(settled(shifted(rows, [last - 1, last], 1, 8.0))) == []
+
+
+def test_only_rows_since_the_last_gap_count(rows: list[Row]) -> None:
+    assert settled(rows[:50] + rows[60:]).time_min[0] == rows[60][0]
+    assert settled(rows[:50] + rows[53:]).time_min[0] == rows[0][0]
+    assert settled(rows[50:] + rows[40:]).time_min[0] == rows[40][0]
+
+
+def test_where_the_input_is_missing_it_is_as_it_was(rows: list[Row]) -> None:
+    holes = [(t, nan if place % 3 else flow, y) for place, (t, flow, y) in enumerate(rows[1:])]
+    window = settled(holes)
+    assert window.inputs[:6, 0].tolist() == [rows[1][1]] * 3 + [rows[4][1]] * 3
+
+
+def test_nothing_sets_in_before_it_may(rows: list[Row]) -> None:
+    window = settled(rows, not_before_min=rows[77][0])
+    assert window.first_onset == 77
+    assert window.earliest_min == rows[77][0]
+    assert window.span_min == pytest.approx(rows[-1][0] - rows[76][0])
+    assert window_of(rows, Filter(cstr(), SENSORS), rows[-1][0] + 1.0) is None
+    assert window_of(rows[:BURN_IN_ROWS], Filter(cstr(), SENSORS)) is None
+    assert window_of([], Filter(cstr(), SENSORS)) is None
