@@ -1,0 +1,59 @@
+"""Is what is left white? If the model is right, whitened innovations are, and nothing in the past tells the next one.
+
+Of each output, autocorrelations over `LAGS` rows are taken together by the test of Ljung & Box (1978, On a measure of
+lack of fit in time series models, Biometrika 65), and so are the correlations with the changes of the inputs in the
+last `LAGS` rows (Hosking 1980, The multivariate portmanteau statistic, J. American Statistical Association 75, has the
+sum of squares that this is part of). The smaller of the two p-values counts, twice, since there are two. Large values
+are cut off first, so that a few outliers do not decide.
+"""
+
+from math import log
+
+import numpy as np
+from scipy.stats import chi2
+
+from reactorwatch.process.model import Array
+
+LAGS = 20
+CUT = 4.0
+"""Standard deviations beyond which it does not matter how large a value is."""
+
+BURN_IN_ROWS = 20
+WHITE = 6.0
+"""Minus the decimal logarithm of the p-value, beyond which what is left is not white: a search looks at a lot."""
+
+LARGEST = 999.0
+
+
+def minus_log10_p(w: Array, inputs: Array) -> Array:
+    """Minus the decimal logarithm of the p-value that each output's innovations are white, shape (n_y,).
+
+    Args:
+        w: whitened innovations, shape (rows, n_y); NaN where nothing was measured.
+        inputs: shape (rows, n_u).
+    """
+    changes = np.diff(inputs, axis=0)[BURN_IN_ROWS - 1 :]
+    found = []
+    for column in w[BURN_IN_ROWS:].T:
+        known = np.isfinite(column)
+        z = np.where(known, np.clip(column, -CUT, CUT), 0.0)
+        z = np.where(known, z - z[known].mean() if known.any() else 0.0, 0.0)
+        logs = [_log_sf(_squares(z, z, first=1))]
+        logs += [_log_sf(_squares(z, change - change.mean(), first=0)) for change in changes.T if np.ptp(change) > 0.0]
+        found.append(min(max(-(min(logs) + log(len(logs))) / log(10.0), 0.0), LARGEST))
+    return np.array(found)
+
+
+def _squares(z: Array, past: Array, first: int) -> tuple[float, int]:
+    """Sum of squared correlations of z with the past, each over its variance by chance; and how many there are."""
+    n, total = z.size, 0.0
+    scale = float(np.sum(z * z) * np.sum(past * past))
+    if scale <= 0.0 or n <= 2 * LAGS:
+        return 0.0, LAGS
+    for lag in range(first, first + LAGS):
+        total += float(np.sum(z[lag:] * past[: n - lag])) ** 2 / scale * n * (n + 2) / (n - lag)
+    return total, LAGS
+
+
+def _log_sf(statistic: tuple[float, int]) -> float:
+    return float(chi2.logsf(*statistic))

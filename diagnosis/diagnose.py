@@ -1,0 +1,216 @@
+"""From a record and a model to what is wrong with the simulation."""
+
+from collections.abc import Mapping, Sequence
+from math import sqrt
+
+import numpy as np
+
+from diagnosis.adequacy import WHITE, minus_log10_p
+from diagnosis.courses import Signal
+from diagnosis.held_out import Errors, free_run, gained
+from diagnosis.record_checks import run_of
+from diagnosis.result import (
+    AMBIGUOUS,
+    NAMED,
+    NOMINAL,
+    UNKNOWN,
+    Alternative,
+    Cause,
+    Curves,
+    Diagnosis,
+    Estimate,
+    Gain,
+    HeldOut,
+)
+from diagnosis.run import Run
+from diagnosis.search import Explained, Found, Search
+from reactorwatch.errors import InputError
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.records.record import Record
+
+LEAST_GAIN = 10.0
+"""In BIC: less does not refute the nominal model (Kass & Raftery 1995, J. American Statistical Association 90)."""
+
+LISTED = 10.0
+"""In BIC: explanations that are worse by less are listed."""
+
+SURE = 6.0
+"""In BIC, odds of twenty to one: where a rival is worse by less, the record does not rank them."""
+
+PRACTICAL_SHARE = 0.02
+"""Of an output's range in the record: a difference in it that matters, where the user does not say."""
+
+SMALLEST_NOISE = 1e-3
+"""Of a state's scale: no sensor is taken for better, and files have so many digits."""
+
+
+def diagnose(
+    record: Record,
+    model: ProcessModel,
+    effects: Sequence[Effect] = EFFECTS,
+    tolerance: Mapping[str, float] | None = None,
+) -> Diagnosis:
+    """What a simulation by the model gets wrong of a record.
+
+    Args:
+        record: with the model's inputs and outputs as columns.
+        model: the simulation.
+        effects: the causes that may be named.
+        tolerance: by output, the root mean square difference that does not matter in practice, in its unit; where
+            nothing is said, a fiftieth of the output's range.
+
+    Raises:
+        InputError: the record cannot be diagnosed, or a tolerance is of no output or not positive.
+    """
+    run = run_of(record, model)
+    bands = _bands(run, model, tolerance or {})
+    found = Search(model, effects, run, _smallest_sd(model)).found()
+    best = found.best if found.nominal.bic - found.best.bic >= LEAST_GAIN else found.nominal
+    adequacy = minus_log10_p(best.fit.w, run.inputs)
+    verdict = _verdict(found, best, adequacy)
+    before, after = gained(run, found.nominal, best)
+    curves = _curves(run, model, found.nominal, best)
+    return Diagnosis(
+        samples=run.time_min.size,
+        span_min=run.span_min,
+        verdict=verdict,
+        causes=tuple(_causes(run, best)),
+        alternatives=tuple(_alternatives(found, best)),
+        location=best.hypothesis.sized.effects[0].location if best.key else "",
+        significant=verdict != NOMINAL,
+        practical=_matters(curves, bands),
+        gain=_gain(model, found, best, before, after),
+        adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
+        experiment=None,
+        extended_model={},
+        curves=curves,
+    )
+
+
+def _verdict(found: Found, best: Explained, adequacy: Array) -> str:
+    if best is found.nominal:
+        return NOMINAL if np.all(adequacy < WHITE) else UNKNOWN
+    rivals = [item.bic - best.bic for item in found.explained if item.hypothesis.causes != best.hypothesis.causes]
+    return AMBIGUOUS if rivals and min(rivals) < SURE else NAMED
+
+
+def _alternatives(found: Found, best: Explained) -> list[Alternative]:
+    """The best of every other set of causes."""
+    listed: list[Alternative] = []
+    seen = {frozenset(best.hypothesis.causes)}
+    if best is found.nominal:
+        return []
+    for item in found.explained:
+        causes = frozenset(item.hypothesis.causes)
+        if item.bic < best.bic + LISTED and causes not in seen:
+            seen.add(causes)
+            listed.append(Alternative(item.key, item.bic - best.bic))
+    return listed
+
+
+def _causes(run: Run, best: Explained) -> list[Cause]:
+    hypothesis, causes, begin = best.hypothesis, [], 0
+    covariance = hypothesis.covariance(run, best.fit) if best.key else np.empty((0, 0))
+    for effect, course, theta in zip(hypothesis.sized.effects, hypothesis.courses, best.fit.theta, strict=True):
+        part = covariance[begin : begin + theta.size, begin : begin + theta.size]
+        begin += theta.size
+        value = course.parameters(theta)
+        slope = {name: np.zeros(theta.size) for name in value}
+        for place in range(theta.size):
+            step = 0.01 * sqrt(max(float(part[place, place]), 1e-300))
+            near = theta.copy()
+            near[place] += step
+            for name, number in course.parameters(near).items():
+                slope[name][place] = (number - value[name]) / step
+        parameters = {
+            name: Estimate(
+                number, sqrt(max(float(slope[name] @ part @ slope[name]), 0.0)), course.unit(name, effect.unit)
+            )
+            for name, number in value.items()
+        }
+        causes.append(
+            Cause(effect.name, course.name, effect.labels.get(course.name, effect.label), effect.location, parameters)
+        )
+    return causes
+
+
+def _gain(model: ProcessModel, found: Found, best: Explained, before: Errors, after: Errors) -> Gain:
+    held_out = {
+        output.name: HeldOut(
+            float(before.free[place]),
+            float(after.free[place]),
+            float(before.one_step[place]),
+            float(after.one_step[place]),
+            found.noise.measurement_sd[place],
+            output.unit,
+        )
+        for place, output in enumerate(model.outputs)
+    }
+    return Gain(found.nominal.bic - best.bic, held_out)
+
+
+def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained) -> Curves:
+    outputs = model.output_names
+    hypothesis, signals = best.hypothesis, best.hypothesis.signals(best.fit)
+    deviation, deviation_sd = {}, {}
+    covariance = hypothesis.covariance(run, best.fit) if best.key else np.empty((0, 0))
+    begin = 0
+    for effect, course, theta, signal in zip(
+        hypothesis.sized.effects, hypothesis.courses, best.fit.theta, signals, strict=True
+    ):
+        part = covariance[begin : begin + theta.size, begin : begin + theta.size]
+        begin += theta.size
+        slope = course.derivatives(theta).at_row
+        deviation[effect.name] = signal.at_row
+        deviation_sd[effect.name] = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, part, slope), 0.0))
+    return Curves(
+        run.time_min,
+        dict(zip(model.input_names, run.inputs.T, strict=True)),
+        dict(zip(outputs, run.measured.T, strict=True)),
+        dict(zip(outputs, _free(run, nominal, ()).T, strict=True)),
+        dict(zip(outputs, _free(run, best, signals).T, strict=True)),
+        dict(zip(outputs, _standardised(nominal).T, strict=True)),
+        dict(zip(outputs, _standardised(best).T, strict=True)),
+        deviation,
+        deviation_sd,
+    )
+
+
+def _free(run: Run, item: Explained, signals: Sequence[Signal]) -> Array:
+    return free_run(run, item.hypothesis.sized, signals)
+
+
+def _standardised(item: Explained) -> Array:
+    return np.asarray(item.fit.found.residual / item.fit.found.sd)
+
+
+def _matters(curves: Curves, bands: Mapping[str, float]) -> bool:
+    """Whether the free runs of both models differ by more than the tolerance in an output."""
+    for output, band in bands.items():
+        difference = (curves.free_after[output] - curves.free_before[output])[
+            1:
+        ]  # the filter says nothing of the first
+        known = difference[np.isfinite(difference)]
+        if known.size < difference.size or float(np.sqrt(np.mean(known**2))) > band:
+            return True
+    return False
+
+
+def _bands(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> dict[str, float]:
+    for name, value in tolerance.items():
+        if name not in model.output_names:
+            raise InputError(f"tolerance must be of {', '.join(model.output_names)}, got {name}")
+        if not 0.0 < value < np.inf:
+            raise InputError(f"tolerance of {name} must be a positive number, got {value:g}")
+    ranges = np.nanquantile(run.measured, 0.99, axis=0) - np.nanquantile(run.measured, 0.01, axis=0)
+    return {
+        name: tolerance.get(name, PRACTICAL_SHARE * float(size))
+        for name, size in zip(model.output_names, ranges, strict=True)
+    }
+
+
+def _smallest_sd(model: ProcessModel) -> list[float]:
+    scales = {state.name: state.scale for state in model.states}
+    return [SMALLEST_NOISE * scales.get(output.name, 1.0) for output in model.outputs]

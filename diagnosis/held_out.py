@@ -1,0 +1,77 @@
+"""The gain, measured on rows that the fit did not see.
+
+Every `EVERY`-th block of `BLOCK_MIN` is held out: the numbers of the best hypothesis are fitted again without what was
+measured there, and then both models run freely through the whole record, from where the filter has found them after
+`OBSERVED_ROWS`, driven by the inputs alone. Blocks, and not the end of the record, because a deviation that sets in
+late would otherwise never be both learned and tested.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from diagnosis.courses import Signal
+from diagnosis.hypothesis import Sized
+from diagnosis.run import Run
+from diagnosis.search import Explained
+from reactorwatch.process.integrate import SimulationError
+from reactorwatch.process.model import Array
+from reactorwatch.process.simulate import Simulator
+
+EVERY, BLOCK_MIN = 4, 10.0
+OBSERVED_ROWS = 100
+
+
+class Errors(NamedTuple):
+    """Root mean square errors on the rows held out, each of shape (n_y,); NaN where the free run came to an end."""
+
+    free: Array
+    one_step: Array
+
+
+def held_out_rows(run: Run) -> Array:
+    """Which rows are held out, shape (rows,)."""
+    block = np.floor((run.time_min - run.time_min[0]) / BLOCK_MIN)
+    found = block % EVERY == EVERY - 1
+    found[:OBSERVED_ROWS] = False
+    return np.asarray(found)
+
+
+def gained(run: Run, nominal: Explained, best: Explained) -> tuple[Errors, Errors]:
+    """Errors of the nominal model and of the best hypothesis."""
+    hidden = held_out_rows(run)
+    seen = Run(run.time_min, run.inputs, np.where(hidden[:, None], np.nan, run.measured))
+    before = _errors(run, hidden, nominal.hypothesis.sized, ())
+    if best is nominal:
+        return before, before
+    fit = best.hypothesis.fit(seen, best.fit.theta)
+    return before, _errors(run, hidden, best.hypothesis.sized, best.hypothesis.signals(fit))
+
+
+def free_run(run: Run, sized: Sized, signals: Sequence[Signal]) -> Array:
+    """The outputs of a free run, shape (rows, n_y); the first rows are the filter's. NaN if it came to an end."""
+    _, _, found = sized.follow(run, signals)
+    outputs = np.array(found.prediction)
+    first = min(OBSERVED_ROWS, run.time_min.size - 2)
+    while first < run.time_min.size - 2 and not np.all(np.isfinite(found.x[first])):
+        first += 1
+    try:
+        inputs = sized.inputs(run, signals)[first:]
+        outputs[first:] = Simulator(sized.model).run(run.time_min[first:], inputs, found.x[first]).outputs
+    except SimulationError:
+        outputs[first:] = np.nan
+    return outputs
+
+
+def _errors(run: Run, hidden: Array, sized: Sized, signals: Sequence[Signal]) -> Errors:
+    _, _, found = sized.follow(run, signals)
+    free = free_run(run, sized, signals)
+    with np.errstate(invalid="ignore"):
+        return Errors(_rms((run.measured - free)[hidden]), _rms(found.residual[hidden]))
+
+
+def _rms(values: Array) -> Array:
+    known = np.isfinite(values)
+    count = np.maximum(known.sum(axis=0), 1)
+    return np.where(known.any(axis=0), np.sqrt(np.sum(np.where(known, values, 0.0) ** 2, axis=0) / count), np.nan)

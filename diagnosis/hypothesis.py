@@ -1,0 +1,210 @@
+"""One hypothesis: which effects are in the run, and with what kind of course; and its fit.
+
+The loss is minus the log likelihood of the innovations of the extended model's filter, in the sense of Huber (1964,
+Robust estimation of a location parameter, Annals of Mathematical Statistics 35): beyond `HUBER` standard deviations it
+grows no faster than the deviation. The filter follows what is measured as far as its process noise lets it, and with
+none it runs freely; so a start on the wrong branch or an extinguished plant leads no fit astray. The loss is lowered by
+Gauss and Newton's steps, damped as Levenberg and Marquardt do, whose derivatives come from the equations of the
+filter's own errors (`signatures`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from diagnosis import signatures
+from diagnosis.courses import Course, Signal
+from diagnosis.run import Run
+from diagnosis.size_inputs import with_size_inputs
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.filter import Filter, Innovations, NoiseLevels
+from reactorwatch.process.filter_errors import FilterErrors, Ways
+from reactorwatch.process.model import Array, ProcessModel
+
+HUBER = 4.0
+LOST = 100.0
+"""Standard deviations that a value counts as off where the filter has lost the plant."""
+
+SETTLED = 0.05
+"""In log likelihood: a step that gains less ends the search."""
+
+_RUNAWAY = 1e100
+"""A filter that lost an unstable plant has signatures without bound, and no step makes sense."""
+
+_MOST_STEPS, _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 12, 5, 1e-3, 10.0, 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A hypothesis at some numbers, and what is left of the run there.
+
+    Attributes:
+        theta: of each effect, the coefficients and numbers of its course.
+        loss: minus the log likelihood, up to a constant that all hypotheses share.
+        w: whitened innovations, shape (rows, n_y); NaN where nothing was measured.
+        found: the filter's run.
+    """
+
+    theta: tuple[Array, ...]
+    loss: float
+    w: Array
+    found: Innovations
+
+
+class Sized:
+    """The filter of a model in which the sizes of some effects are inputs.
+
+    Args:
+        model: of the plant.
+        effects: that are in it.
+        noise: of the plant and its sensors.
+    """
+
+    def __init__(self, model: ProcessModel, effects: Sequence[Effect], noise: NoiseLevels) -> None:
+        self.effects = tuple(effects)
+        self._sized = with_size_inputs(model, effects)
+        self.model = self._sized.model
+        self._filter = Filter(self.model, self._noise_of(noise))
+        self._errors = (
+            FilterErrors(self.model, self._filter.noise, self._sized.of_rates, self._sized.of_outputs)
+            if effects
+            else None
+        )
+
+    @property
+    def noise(self) -> NoiseLevels:
+        """Of the plant and its sensors."""
+        return self._filter.noise
+
+    @noise.setter
+    def noise(self, noise: NoiseLevels) -> None:
+        self._filter.noise = self._noise_of(noise)
+        if self._errors is not None:
+            self._errors.noise = self._filter.noise
+
+    def _noise_of(self, noise: NoiseLevels) -> NoiseLevels:
+        """States that an effect brings have none of their own."""
+        more = len(self.model.states) - len(noise.process_sd)
+        return NoiseLevels(noise.measurement_sd, (*noise.process_sd, *(0.0,) * more))
+
+    def inputs(self, run: Run, signals: Sequence[Signal]) -> Array:
+        """With the sizes beside them, shape (rows, n_u + 2 effects)."""
+        limited = [
+            Signal(*(np.clip(item, effect.lower, effect.upper) for item in signal))
+            for effect, signal in zip(self.effects, signals, strict=True)
+        ]
+        return self._sized.inputs(run.inputs, limited)
+
+    def follow(self, run: Run, signals: Sequence[Signal]) -> tuple[float, Array, Innovations]:
+        """Loss, whitened innovations and the filter's run."""
+        found = self._filter.run(run.time_min, self.inputs(run, signals), run.measured)
+        # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
+        lost = np.isfinite(run.measured) & ~np.isfinite(found.whitened)
+        lost[0] = False
+        w = np.where(lost, LOST, found.whitened)
+        return (
+            loss_of(w) + float(np.sum(np.log(found.conditional_sd), where=np.isfinite(found.conditional_sd))),
+            w,
+            found,
+        )
+
+    def ways(self, run: Run, signals: Sequence[Signal], found: Innovations) -> Ways:
+        """The equations of the filter's errors about its run; from the second row on, the first that it predicts."""
+        assert self._errors is not None
+        later = Innovations(*(item[1:] for item in found))
+        used = np.isfinite(run.measured[1:])
+        return self._errors.ways(run.time_min[1:], self.inputs(run, signals)[1:], later, used)
+
+
+class Hypothesis:
+    """Some effects, each with a kind of course.
+
+    Args:
+        sized: the model with them in it.
+        courses: one an effect.
+    """
+
+    def __init__(self, sized: Sized, courses: Sequence[Course]) -> None:
+        self.sized, self.courses = sized, tuple(courses)
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(effect.name for effect in self.sized.effects)
+
+    @property
+    def freedom(self) -> int:
+        """How many numbers are fitted."""
+        return sum(course.freedom for course in self.courses)
+
+    def at(self, run: Run, theta: Sequence[Array]) -> Fit:
+        """The nearest possible numbers, and what they make of the run."""
+        theta = tuple(
+            course.limited(numbers, effect.lower, effect.upper)
+            for course, numbers, effect in zip(self.courses, theta, self.sized.effects, strict=True)
+        )
+        loss, w, found = self.sized.follow(run, self._signals(theta))
+        return Fit(theta, loss, w, found)
+
+    def fit(self, run: Run, start: Sequence[Array], steps: int = _MOST_STEPS) -> Fit:
+        """The best numbers that are found from a start."""
+        best, damping = self.at(run, start), _DAMPING
+        for _ in range(steps):
+            g = self.slope(run, best)
+            w = np.nan_to_num(best.w[2:]).ravel()
+            weights = HUBER / np.maximum(np.abs(w), HUBER)
+            if not np.max(np.abs(g)) < _RUNAWAY:
+                break
+            information, gradient = (g * weights[:, None]).T @ g, g.T @ (weights * w)
+            scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+            information, gradient = information / np.outer(scale, scale), gradient / scale
+            before = best
+            for _ in range(_TRIES):
+                change = np.linalg.lstsq(information + damping * np.eye(scale.size), gradient, rcond=1e-12)[0] / scale
+                trial = self.at(run, self._moved(best.theta, change))
+                if trial.loss < best.loss:
+                    best, damping = trial, damping * _LESS_DAMPING
+                    break
+                damping *= _MORE_DAMPING
+            if best.loss > before.loss - SETTLED:
+                break
+        return best
+
+    def slope(self, run: Run, fit: Fit) -> Array:
+        """What the whitened innovations lose as the numbers grow, shape (values from the third row on, freedom)."""
+        signals = self._signals(fit.theta)
+        ways = self.sized.ways(run, signals, fit.found)
+        columns = []
+        for place, (course, numbers) in enumerate(zip(self.courses, fit.theta, strict=True)):
+            over_row, at_row = course.derivatives(numbers)
+            g = signatures.shown(ways, place, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
+            columns.append(g.reshape(-1, course.freedom))
+        return np.concatenate(columns, axis=1)
+
+    def covariance(self, run: Run, fit: Fit) -> Array:
+        """Of all numbers in a row, shape (freedom, freedom)."""
+        g = self.slope(run, fit)
+        scale = np.sqrt(np.maximum(np.sum(g * g, axis=0), 1e-300))
+        inner = np.linalg.pinv((g / scale).T @ (g / scale), rcond=1e-12, hermitian=True)
+        return np.asarray(inner / np.outer(scale, scale))
+
+    def signals(self, fit: Fit) -> list[Signal]:
+        """The deviations."""
+        return self._signals(fit.theta)
+
+    def _signals(self, theta: Sequence[Array]) -> list[Signal]:
+        return [course.signal(numbers) for course, numbers in zip(self.courses, theta, strict=True)]
+
+    def _moved(self, theta: Sequence[Array], change: Array) -> list[Array]:
+        moved, begin = [], 0
+        for numbers in theta:
+            moved.append(numbers + change[begin : begin + numbers.size])
+            begin += numbers.size
+        return moved
+
+
+def loss_of(w: Array) -> float:
+    """Of whitened innovations, without what they were divided by."""
+    size = np.abs(np.nan_to_num(w))
+    return float(np.sum(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER))))

@@ -1,0 +1,74 @@
+"""From a record to a run of a model, and what a record must have so that anything can be said of it."""
+
+import numpy as np
+
+from diagnosis.run import Run
+from reactorwatch.errors import InputError
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import Record
+
+FEWEST_ROWS = 200
+FEWEST_VALUES = 100
+"""Of an output: with less nothing can be told from noise."""
+
+
+def run_of(record: Record, model: ProcessModel) -> Run:
+    """What of the record the model speaks of.
+
+    Missing inputs are taken to be as they were.
+
+    Raises:
+        InputError: too few rows, a signal that is missing, constant or outside its bounds.
+    """
+    name = record.name
+    if record.rows < FEWEST_ROWS:
+        raise InputError(f"{name}: a diagnosis needs at least {FEWEST_ROWS} rows, got {record.rows}; record for longer")
+    missing = [item for item in (*model.input_names, *model.output_names) if item not in record.columns]
+    if missing:
+        raise InputError(
+            f"{name}: needs the columns {', '.join((*model.input_names, *model.output_names))}, "
+            f"{', '.join(missing)} is not there"
+        )
+    outputs = []
+    states = {state.name: state for state in model.states}
+    for output in model.outputs:
+        values = record.columns[output.name]
+        known = values[np.isfinite(values)]
+        if known.size < FEWEST_VALUES:
+            raise InputError(f"{name}: {output.name} needs at least {FEWEST_VALUES} values, got {known.size}")
+        if np.ptp(known) == 0.0:
+            raise InputError(
+                f"{name}: {output.name} must vary, it is {known[0]:g} {output.unit} in every row; "
+                "the sensor is stuck, or the column is not what it seems"
+            )
+        if output.name in states:
+            _check_bounds(name, output.name, output.unit, known, states[output.name].lower, states[output.name].upper)
+        outputs.append(values)
+    inputs = []
+    for item in model.inputs:
+        values = _held(record.columns[item.name])
+        if not np.all(np.isfinite(values)):
+            raise InputError(f"{name}: {item.name} must be there in the first row")
+        _check_bounds(name, item.name, item.unit, values, item.lower, item.upper)
+        inputs.append(values)
+    if all(np.ptp(values) == 0.0 for values in inputs):
+        raise InputError(
+            f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} in every row; "
+            "nothing can be told apart without excitation: record a stretch with steps in it"
+        )
+    return Run(record.time_min, np.column_stack(inputs), np.column_stack(outputs))
+
+
+def _check_bounds(name: str, signal: str, unit: str, values: np.ndarray, lower: float, upper: float) -> None:
+    typical = float(np.median(values))
+    if not lower <= typical <= upper:
+        hint = "; is it in degrees C? then add 273.15" if unit == "K" and lower <= typical + 273.15 <= upper else ""
+        rule = f"{signal} must be in [{lower:g}, {upper:g}] {unit}"
+        raise InputError(f"{name}: {rule}, its median is {typical:g}{hint or '; check its unit'}")
+
+
+def _held(values: np.ndarray) -> np.ndarray:
+    """With what is missing as it was before."""
+    places = np.where(np.isfinite(values), np.arange(values.size), -1)
+    places = np.maximum.accumulate(places)
+    return np.where(places >= 0, values[np.maximum(places, 0)], np.nan)

@@ -1,0 +1,164 @@
+"""What a diagnosis says."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from reactorwatch.process.model import Array
+
+NOMINAL, NAMED, AMBIGUOUS, UNKNOWN = "nominal", "named", "ambiguous", "unknown"
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A number with its standard deviation, in a unit."""
+
+    value: float
+    sd: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A cause that is part of an explanation.
+
+    Attributes:
+        cause: name in the catalogue.
+        profile: how it goes in time.
+        label: what a person calls it.
+        location: where it acts.
+        parameters: `size` first, then those of the profile.
+    """
+
+    cause: str
+    profile: str
+    label: str
+    location: str
+    parameters: dict[str, Estimate]
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another explanation.
+
+    Attributes:
+        causes: (cause, profile) of each of its causes.
+        delta_bic: by how much it is worse than the one that is named.
+    """
+
+    causes: tuple[tuple[str, str], ...]
+    delta_bic: float
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Errors of one output on rows that the fit did not see, in its unit.
+
+    Attributes:
+        rmse_before: of the free run of the nominal model.
+        rmse_after: of the extended one.
+        one_step_before: of the nominal model's prediction of the next row.
+        one_step_after: of the extended one's.
+        noise_sd: of the sensor: no model comes below.
+        unit: of all of them.
+    """
+
+    rmse_before: float
+    rmse_after: float
+    one_step_before: float
+    one_step_after: float
+    noise_sd: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What the extended model is better by.
+
+    Attributes:
+        delta_bic: of the nominal model over that of the extended one.
+        held_out: by output.
+    """
+
+    delta_bic: float
+    held_out: dict[str, HeldOut]
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """An input that would tell rivals apart.
+
+    Attributes:
+        why: in a sentence.
+        input: (minute, value) of each change.
+        separates: the causes.
+        expected_delta_bic: what it is expected to bring between the two nearest of them.
+    """
+
+    why: str
+    input: tuple[tuple[float, float], ...]
+    separates: tuple[str, ...]
+    expected_delta_bic: float
+
+
+@dataclass(frozen=True, eq=False)
+class Curves:
+    """What the pictures of a diagnosis are drawn from; all over the rows of the record.
+
+    Attributes:
+        time_min: shape (rows,).
+        inputs: by name.
+        measured: by output; NaN where missing.
+        free_before: free run of the nominal model, by output.
+        free_after: that of the extended model.
+        residual_before: innovations of the nominal model's filter in standard deviations, by output.
+        residual_after: those of the extended one's.
+        deviation: m(t) of each cause, by its name.
+        deviation_sd: its standard deviation.
+    """
+
+    time_min: Array
+    inputs: dict[str, Array]
+    measured: dict[str, Array]
+    free_before: dict[str, Array]
+    free_after: dict[str, Array]
+    residual_before: dict[str, Array]
+    residual_after: dict[str, Array]
+    deviation: dict[str, Array]
+    deviation_sd: dict[str, Array]
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What is wrong with a simulation, as far as a record tells.
+
+    Attributes:
+        samples: rows of the record.
+        span_min: from its first row to its last.
+        verdict: `nominal`, `named`, `ambiguous` or `unknown`.
+        causes: that explain the record together; empty if nominal or unknown.
+        alternatives: every other explanation within 10 BIC, the best first.
+        location: where the deviation acts; empty if nominal.
+        significant: whether the nominal model is refuted statistically.
+        practical: whether the difference is larger than the user's tolerance.
+        gain: what the extended model is better by.
+        adequacy: minus the decimal logarithm of the p-value that what is left is white, by output.
+        experiment: that would tell the alternatives apart; None where there is nothing to tell.
+        extended_model: as in its file (`diagnosis.extended_model`).
+        remarks: what else people should know, in sentences.
+        curves: for pictures.
+    """
+
+    samples: int
+    span_min: float
+    verdict: str
+    causes: tuple[Cause, ...]
+    alternatives: tuple[Alternative, ...]
+    location: str
+    significant: bool
+    practical: bool
+    gain: Gain
+    adequacy: dict[str, float]
+    experiment: Experiment | None
+    extended_model: dict[str, Any]
+    remarks: tuple[str, ...] = ()
+    curves: Curves | None = field(default=None, repr=False, compare=False)

@@ -1,0 +1,191 @@
+"""Which causes, with which courses, come into question: all of them at once, linearised about a run of the filter.
+
+Where a hypothesis has been fitted already, the run is that of its filter, and its own signature is added to what is
+left: so rivals are asked to explain the same as it does, instead of it. About a good fit the linearisation holds, and
+little noise of the process hides what tells rivals apart; about the nominal model that noise has taken up the
+deviation, and the causes that stand out are all that can be asked for.
+
+An effect that brings states of its own, such as a lag, has no infinitesimal deviation. Its signature is what a size of
+the usual magnitude does, by a run of its own; and since lags are short beside the courses, that signature times the
+course is taken for that of the course.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import log
+
+import numpy as np
+
+from diagnosis import signatures
+from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Signal, Sine, Step
+from diagnosis.hypothesis import HUBER, Fit, Hypothesis, Sized
+from diagnosis.run import Run
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.filter_errors import FilterErrors, Ways
+from reactorwatch.process.model import Array, ProcessModel
+
+KNOTS = 13
+DECAYS = (0.02, 0.1, 0.4)
+"""Time constants of decays that are looked for, in spans of the record."""
+
+SHORTEST_PERIOD_ROWS = 12
+KNOWN_PERIODS = 10
+"""For so many periods the size of a sine's signature is computed; between them it is interpolated."""
+
+EDGE_ROWS = 5
+"""Nearer to the ends of the record no onset is looked for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lead:
+    """A cause with a course that may explain what is left.
+
+    Attributes:
+        effect: the cause.
+        course: of its deviation.
+        theta: where a fit may begin.
+        gain: twice the logarithm of the likelihood ratio that the linear model promises.
+    """
+
+    effect: Effect
+    course: Course
+    theta: Array
+    gain: float
+
+    def score(self, values: int) -> float:
+        """The gain in BIC."""
+        return self.gain - self.course.freedom * log(values)
+
+
+class Screen:
+    """Looks for leads in a run.
+
+    Args:
+        model: of the plant.
+        effects: the catalogue.
+        run: the record.
+    """
+
+    def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run) -> None:
+        self._model, self._run = model, run
+        names = model.state_names
+        self._direct = tuple(effect for effect in effects if effect.extend(model).state_names == names)
+        self._other = tuple(effect for effect in effects if effect not in self._direct)
+        self._period_min = float(np.median(np.diff(run.time_min)))
+        self._beta = np.diff(run.time_min[1:])
+        t = run.time_min
+        self._constant, self._step, self._ramp, self._decay = Constant(t), Step(t), Ramp(t), Decay(t)
+        self._sine, self._free = Sine(t), Free(t, KNOTS)
+
+    def leads(self, hypothesis: Hypothesis | Sized, fit: Fit) -> list[Lead]:
+        """The best of each cause and course, the most promising first.
+
+        Args:
+            hypothesis: about whose run all is linearised.
+            fit: of it.
+        """
+        sized = hypothesis.sized if isinstance(hypothesis, Hypothesis) else hypothesis
+        signals = hypothesis.signals(fit) if isinstance(hypothesis, Hypothesis) else []
+        w = np.clip(np.nan_to_num(fit.w[2:]), -HUBER, HUBER)
+        if isinstance(hypothesis, Hypothesis):
+            w = w + self._explained(hypothesis, fit)
+        ways = self._ways(sized, signals, fit)
+        ways = Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, w)
+        found = self._set_in(ways) + self._swinging(ways) + self._freely(ways)
+        return sorted(found, key=lambda item: -item.score(self._run.values))
+
+    def _explained(self, hypothesis: Hypothesis, fit: Fit) -> Array:
+        """What the fitted deviations do to the innovations of a filter that does not know them, shape (rows, n_y)."""
+        ways = hypothesis.sized.ways(self._run, hypothesis.signals(fit), fit.found)
+        total = np.zeros((ways.w.shape[0], ways.w.shape[1]))
+        for place, (over_row, at_row) in enumerate(hypothesis.signals(fit)):
+            total += signatures.shown(ways, place, over_row[1:-1, None], at_row[2:, None])[:, :, 0]
+        return total
+
+    def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit) -> Ways:
+        """Of all effects about the run of a filter."""
+        extended, symbols = sized.model, []
+        for effect in self._direct:
+            extended = effect.extend(extended)
+            symbols.append(extended.parameters[-1].symbol)
+        errors = FilterErrors(extended, sized.noise, symbols, symbols)
+        later = type(fit.found)(*(item[1:] for item in fit.found))
+        inputs = sized.inputs(self._run, signals)[1:]
+        return errors.ways(self._run.time_min[1:], inputs, later, np.isfinite(self._run.measured[1:]))
+
+    def _set_in(self, ways: Ways) -> list[Lead]:
+        """Constants, steps, ramps and decays."""
+        times, leads = self._run.time_min[1:-1], []
+        beta = self._beta
+        left_of_span = self._step.end_min - times
+        found = signatures.onsets(ways, beta, np.ones_like(beta), 0.5 * beta)
+        inner = slice(EDGE_ROWS, -EDGE_ROWS)
+        for cause, effect in enumerate(self._direct):
+            size, gain = _best(found.step_a[:, cause], found.step_b[:, cause], effect)
+            leads.append(Lead(effect, self._constant, size[:1], float(gain[0])))
+            place = EDGE_ROWS + int(np.argmax(gain[inner]))
+            leads.append(Lead(effect, self._step, np.array([size[place], times[place]]), float(gain[place])))
+            # From the slope of a ramp to the size that it has in the end.
+            ends, b = found.other_a[:, cause] / left_of_span, found.other_b[:, cause] / left_of_span**2
+            size, gain = _best(ends, b, effect)
+            place = EDGE_ROWS + int(np.argmax(gain[inner]))
+            leads.append(Lead(effect, self._ramp, np.array([size[place], times[place]]), float(gain[place])))
+        for share in DECAYS:
+            constant = share * self._run.span_min
+            gamma = np.exp(-beta / constant)
+            found = signatures.onsets(ways, 1.0 - gamma, gamma, 1.0 - (1.0 - gamma) * constant / beta)
+            for cause, effect in enumerate(self._direct):
+                size, gain = _best(found.other_a[:, cause], found.other_b[:, cause], effect)
+                place = int(np.argmax(gain[:-EDGE_ROWS]))
+                theta = np.array([size[place], times[place], constant])
+                leads.append(Lead(effect, self._decay, self._decay.limited(theta, -np.inf, np.inf), float(gain[place])))
+        return leads
+
+    def _swinging(self, ways: Ways) -> list[Lead]:
+        """Sines."""
+        over_row, at_row = signatures.sought(ways)
+        rows = round(self._run.span_min / self._period_min) + 1
+        place = np.round((self._run.time_min[1:] - self._sine.begin_min) / self._period_min).astype(int)
+        count = 2 * rows
+        frequency = np.fft.rfftfreq(count, self._period_min)
+        inner = (frequency > 0.75 / self._run.span_min) & (frequency < 1.0 / (SHORTEST_PERIOD_ROWS * self._period_min))
+        angle = 2.0 * np.pi * frequency[inner]
+        leads = []
+        known = np.geomspace(1.0 / frequency[inner][-1], 1.0 / frequency[inner][0], KNOWN_PERIODS)
+        courses = [self._sine.basis(np.array([period])) for period in known]
+        both = [np.concatenate([getattr(item, name) for item in courses], axis=1) for name in Signal._fields]
+        for cause, effect in enumerate(self._direct):
+            sums = np.zeros((2, count))
+            np.add.at(sums[0], place[:-1], over_row[:, cause])
+            np.add.at(sums[1], place[1:], at_row[:, cause])
+            felt, seen = np.fft.rfft(sums, axis=1)[:, inner]
+            # A row feels the mean of the sine from its time to the next one.
+            turn = np.exp(-0.5j * angle * self._period_min) * np.sinc(frequency[inner] * self._period_min)
+            total = felt * turn + seen
+            g = signatures.shown(ways, cause, np.ascontiguousarray(both[0][1:-1]), np.ascontiguousarray(both[1][2:]))
+            b = 0.5 * np.sum(g**2, axis=(0, 1)).reshape(KNOWN_PERIODS, 2).sum(axis=1)
+            b_of = np.exp(np.interp(np.log(1.0 / frequency[inner]), np.log(known), np.log(np.maximum(b, 1e-300))))
+            gain = np.abs(total) ** 2 / b_of
+            best = int(np.argmax(gain))
+            theta = np.array([-total.imag[best], total.real[best], 0.0]) / b_of[best]
+            theta[2] = 1.0 / frequency[inner][best]
+            leads.append(Lead(effect, self._sine, theta, float(gain[best])))
+        return leads
+
+    def _freely(self, ways: Ways) -> list[Lead]:
+        """Free curves."""
+        over_row, at_row = self._free.basis(np.empty(0))
+        leads = []
+        for cause, effect in enumerate(self._direct):
+            g = signatures.shown(ways, cause, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
+            g = g.reshape(-1, KNOTS)
+            a = g.T @ ways.w.ravel()
+            theta = np.asarray(np.linalg.lstsq(g.T @ g, a, rcond=1e-12)[0], dtype=np.float64)
+            leads.append(Lead(effect, self._free, theta, float(a @ theta)))
+        return leads
+
+
+def _best(a: Array, b: Array, effect: Effect) -> tuple[Array, Array]:
+    """The likeliest possible sizes and their gains."""
+    size = np.clip(a / np.maximum(b, 1e-300), effect.lower, effect.upper)
+    return size, size * (2.0 * a - size * b)

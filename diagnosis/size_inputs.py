@@ -1,0 +1,59 @@
+"""A model in which the sizes of some effects are inputs, so that a deviation may have any course in time."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import casadi as ca
+import numpy as np
+
+from diagnosis.courses import Signal
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.model import Array, ProcessModel, variable
+
+
+@dataclass(frozen=True, eq=False)
+class SizedModel:
+    """A model with two inputs an effect: the size that the balances feel, and the one that the outputs show.
+
+    Attributes:
+        model: the process.
+        of_rates: the symbols of the first, one an effect.
+        of_outputs: those of the second.
+    """
+
+    model: ProcessModel
+    of_rates: tuple[ca.SX, ...]
+    of_outputs: tuple[ca.SX, ...]
+
+    def inputs(self, inputs: Array, signals: Sequence[Signal]) -> Array:
+        """The inputs of a record with the sizes beside them, shape (rows, n_u + 2 effects)."""
+        columns = [item for signal in signals for item in (signal.over_row, signal.at_row)]
+        return np.column_stack([inputs, *columns])
+
+
+def with_size_inputs(model: ProcessModel, effects: Sequence[Effect]) -> SizedModel:
+    """The model with the effects in it, their sizes as inputs.
+
+    Args:
+        model: any that has what the effects act on.
+        effects: in the order of the inputs to be.
+
+    Raises:
+        ValueError: the model lacks what an effect acts on.
+    """
+    of_rates, of_outputs = [], []
+    for number, effect in enumerate(effects, start=1):
+        size = ca.SX.sym("size")
+        extended = effect.apply(model, size)
+        felt, seen = (
+            variable(f"{effect.name}.{number}.{where}", effect.unit, (effect.lower, effect.upper), 1.0, effect.label)
+            for where in ("felt", "seen")
+        )
+        rhs = ca.substitute(list(extended.rhs), [size], [felt.symbol])
+        outputs = tuple(
+            replace(item, expression=ca.substitute(item.expression, size, seen.symbol)) for item in extended.outputs
+        )
+        model = replace(extended, rhs=tuple(rhs), outputs=outputs, inputs=(*model.inputs, felt, seen))
+        of_rates.append(felt.symbol)
+        of_outputs.append(seen.symbol)
+    return SizedModel(model, tuple(of_rates), tuple(of_outputs))
