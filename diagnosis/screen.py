@@ -91,7 +91,10 @@ class Screen:
             w = w + self._explained(hypothesis, fit)
         ways = self._ways(sized, signals, fit)
         ways = Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, w)
-        found = self._set_in(ways) + self._swinging(ways) + self._freely(ways)
+        found = self._set_in(ways) + self._swinging(ways) + self._in_course(ways, self._free, np.empty(0))
+        if isinstance(hypothesis, Hypothesis):
+            for course, theta in zip(hypothesis.courses, fit.theta, strict=True):
+                found += self._in_course(ways, course, theta[course.coefficients :])
         return sorted(found, key=lambda item: -item.score(self._run.values))
 
     def _explained(self, hypothesis: Hypothesis, fit: Fit) -> Array:
@@ -172,16 +175,17 @@ class Screen:
             leads.append(Lead(effect, self._sine, theta, float(gain[best])))
         return leads
 
-    def _freely(self, ways: Ways) -> list[Lead]:
-        """Free curves."""
-        over_row, at_row = self._free.basis(np.empty(0))
+    def _in_course(self, ways: Ways, course: Course, shape: Array) -> list[Lead]:
+        """All causes in one course with given numbers."""
+        over_row, at_row = (np.ascontiguousarray(item) for item in course.basis(shape))
         leads = []
         for cause, effect in enumerate(self._direct):
-            g = signatures.shown(ways, cause, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
-            g = g.reshape(-1, KNOTS)
-            a = g.T @ ways.w.ravel()
-            theta = np.asarray(np.linalg.lstsq(g.T @ g, a, rcond=1e-12)[0], dtype=np.float64)
-            leads.append(Lead(effect, self._free, theta, float(a @ theta)))
+            g = signatures.shown(ways, cause, over_row[1:-1], at_row[2:]).reshape(-1, course.coefficients)
+            a, b = g.T @ ways.w.ravel(), g.T @ g
+            by = np.asarray(np.linalg.lstsq(b, a, rcond=1e-12)[0], dtype=np.float64)
+            if course.coefficients == 1:
+                by = np.clip(by, effect.lower, effect.upper)
+            leads.append(Lead(effect, course, np.append(by, shape), float(by @ (2.0 * a - b @ by))))
         return leads
 
 

@@ -19,15 +19,16 @@ from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.noise import tune
 
-FIRST_LEADS, SECOND_LEADS, A_CAUSE = 6, 10, 2
-"""How many leads are fitted of the first and of the second screen, and how many of a cause."""
+FIRST_LEADS, LEADS, A_CAUSE = 3, 10, 2
+"""How many leads are fitted of the first screen and of each later one, and how many of a cause."""
 
 LEAST_SCORE = -20.0
 """A lead that promises less in BIC is not fitted."""
 
-FIRST_STEPS = 4
 IN_QUESTION = 60.0
-"""In BIC: what is worse than the best by more is not fitted on."""
+"""In BIC: a rival that is worse by more is out of question."""
+
+ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,22 +92,24 @@ class Search:
         """The best explanations by one effect."""
         nominal = self.nominal()
         leads = self.screen.leads(nominal.hypothesis.sized, nominal.fit)
-        fitted = [self.fitted(item, FIRST_STEPS) for item in self.chosen(leads, FIRST_LEADS)]
-        best = min([nominal, *fitted], key=lambda item: item.bic)
-        if best is nominal:
-            return Found(self.noise, nominal, _sorted(fitted))
-        known = {item.key: item for item in fitted}
-        for _ in range(3):
-            self.settle(best)
-            leads = self.screen.leads(best.hypothesis, best.fit)
-            for item in self.chosen(leads, SECOND_LEADS):
-                known.setdefault(_key(item), self.fitted(item, 0))
-            refitted = self.refitted(list(known.values()))
-            known = {item.key: item for item in refitted}
-            again, best = best, min(refitted, key=lambda item: item.bic)
-            if best.key == again.key:
+        known = {item.key: item for item in map(self.fitted, self.chosen(leads, FIRST_LEADS, LEAST_SCORE))}
+        best = min([nominal, *known.values()], key=lambda item: item.bic)
+        for _ in range(ROUNDS):
+            if best is nominal:
                 break
-        return Found(self.noise, self.nominal(), _sorted(list(known.values())))
+            self.settle(best)
+            known = {best.key: self.refitted(best)}
+            best = known[best.key]
+            leads = self.screen.leads(best.hypothesis, best.fit)
+            least = max(leads[0].score(self.run.values) - IN_QUESTION, LEAST_SCORE)
+            for lead in self.chosen(leads, LEADS, least):
+                if _key(lead) not in known:
+                    item = self.fitted(lead)
+                    known[item.key] = item
+            again, best = best, min(known.values(), key=lambda item: item.bic)
+            if best is again:
+                break
+        return Found(self.noise, self.nominal(), sorted(known.values(), key=lambda item: item.bic))
 
     def nominal(self) -> Explained:
         """Without any effect."""
@@ -119,37 +122,27 @@ class Search:
         found = tune(sized.model, run.time_min, inputs, run.measured, self._smallest_sd)
         self.noise = NoiseLevels(found.measurement_sd, found.process_sd[: len(self._model.states)])
 
-    def chosen(self, leads: Sequence[Lead], count: int) -> list[Lead]:
-        """The best leads, not too many of one cause."""
+    def chosen(self, leads: Sequence[Lead], count: int, least: float) -> list[Lead]:
+        """The best leads that promise enough, not too many of one cause."""
         found: list[Lead] = []
         for lead in leads:
             same = [item for item in found if item.effect is lead.effect]
             new = all(item.course.name != lead.course.name for item in same)
-            if new and len(same) < A_CAUSE and lead.score(self.run.values) > LEAST_SCORE:
+            if new and len(same) < A_CAUSE and lead.score(self.run.values) > least:
                 found.append(lead)
             if len(found) == count:
                 break
         return found
 
-    def fitted(self, lead: Lead, steps: int) -> Explained:
-        """A lead as a hypothesis, fitted by so many steps."""
+    def fitted(self, lead: Lead) -> Explained:
+        """A lead as a hypothesis."""
         hypothesis = Hypothesis(self.sized((lead.effect,)), (lead.course,))
-        fit = hypothesis.fit(self.run, (lead.theta,), steps)
-        return self._with_bic(hypothesis, fit)
+        return self._with_bic(hypothesis, hypothesis.fit(self.run, (lead.theta,)))
 
-    def refitted(self, explained: Sequence[Explained]) -> list[Explained]:
-        """With the noise that holds now, those in question to the end."""
-        found = []
-        for item in explained:
-            self._use_noise(item.hypothesis.sized)
-            found.append(self._with_bic(item.hypothesis, item.hypothesis.fit(self.run, item.fit.theta, FIRST_STEPS)))
-        best = min(item.bic for item in found)
-        return [
-            self._with_bic(item.hypothesis, item.hypothesis.fit(self.run, item.fit.theta))
-            if item.bic < best + IN_QUESTION
-            else item
-            for item in found
-        ]
+    def refitted(self, explained: Explained) -> Explained:
+        """With the noise that holds now."""
+        self._use_noise(explained.hypothesis.sized)
+        return self._with_bic(explained.hypothesis, explained.hypothesis.fit(self.run, explained.fit.theta))
 
     def explained(self, hypothesis: Hypothesis, theta: Sequence[Array]) -> Explained:
         """A hypothesis at some numbers."""
@@ -172,7 +165,3 @@ class Search:
 
 def _key(lead: Lead) -> tuple[tuple[str, str], ...]:
     return ((lead.effect.name, lead.course.name),)
-
-
-def _sorted(explained: list[Explained]) -> list[Explained]:
-    return sorted(explained, key=lambda item: item.bic)

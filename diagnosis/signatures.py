@@ -162,17 +162,19 @@ def _onsets(
     step_a, step_b = np.zeros((rows, causes)), np.zeros((rows, causes))
     other_a, other_b = np.zeros((rows, causes)), np.zeros((rows, causes))
     M, V = np.zeros((size, size)), np.zeros((n_y, size))  # z <- M z, g = V z
+    NM, n_before = np.zeros((size, size)), np.zeros(size)
+    before, off = np.zeros((n_x, size)), np.zeros((n_y, size))
     for c in range(causes):
         N, n = np.zeros((size, size)), np.zeros(size)  # sum(g g) = z'N z, sum(w g) = n'z
         for k in range(rows - 1, -1, -1):
-            before = np.zeros((n_x, size))
             for i in range(n_x):
                 for j in range(n_x):
                     before[i, j] = F[k, i, j]
                 before[i, n_x] = G[k, i, c]
                 before[i, n_x + 1] = G[k, i, c] * mean[k]
-            off = np.zeros((n_y, size))
             for i in range(n_y):
+                for j in range(n_x):
+                    off[i, j] = 0.0
                 off[i, n_x] = D[k, i, c]
                 off[i, n_x + 1] = D[k, i, c] * beta[k]
                 for j in range(size):
@@ -191,7 +193,29 @@ def _onsets(
                     for place in range(i + 1):
                         value += L_inverse[k, i, place] * off[place, j]
                     V[i, j] = value
-            N, n = M.T @ N @ M + V.T @ V, M.T @ n + V.T @ w[k]
+            for i in range(size):
+                for j in range(size):
+                    value = 0.0
+                    for place in range(size):
+                        value += N[i, place] * M[place, j]
+                    NM[i, j] = value
+            for i in range(size):
+                value = 0.0
+                for place in range(size):
+                    value += M[place, i] * n[place]
+                for place in range(n_y):
+                    value += V[place, i] * w[k, place]
+                n_before[i] = value
+                for j in range(i + 1):
+                    value = 0.0
+                    for place in range(size):
+                        value += M[place, i] * NM[place, j]
+                    for place in range(n_y):
+                        value += V[place, i] * V[place, j]
+                    N[i, j] = value
+                    N[j, i] = value
+            for i in range(size):
+                n[i] = n_before[i]
             step_a[k, c], step_b[k, c] = n[n_x], N[n_x, n_x]
             other_a[k, c], other_b[k, c] = n[n_x + 1], N[n_x + 1, n_x + 1]
     return step_a, step_b, other_a, other_b
