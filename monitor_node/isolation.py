@@ -1,8 +1,8 @@
 """Which cause, since when, how large: asked when an alarm has been raised.
 
-Every cause of the catalogue may have set in as a step or as a ramp. The linearised bank (see `isolation_bank`) tells
-which come into question and where to begin, and the filters of the models with these causes in them are fitted to the
-rows (see `isolation_fit`). What is said in the end is the posterior probability of each cause: of
+Every cause of `isolation_causes` may have set in as a step or as a ramp. The linearised bank (see `isolation_bank`)
+tells which come into question and where to begin, and the filters of the models with these causes in them are fitted to
+the rows (see `isolation_fit`). What is said in the end is the posterior probability of each cause: of
 
     likelihood(size, onset) p(size) p(onset),
 
@@ -28,11 +28,11 @@ from math import exp, inf, isfinite, log, nan
 import numpy as np
 
 from monitor_node.isolation_bank import Bank
+from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_fit import Fit, Fitter
 from monitor_node.isolation_hypothesis import HUBER, Hypothesis
 from monitor_node.isolation_ways import linearisable
 from monitor_node.isolation_window import Row, Window, window_of
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.model import ProcessModel
@@ -88,7 +88,7 @@ class Isolation:
         model: ProcessModel,
         noise: NoiseLevels,
         window_rows: int = 600,
-        effects: Sequence[Effect] = EFFECTS,
+        effects: Sequence[Effect] = CAUSES,
         excluded: Sequence[str] = (),
     ) -> None:
         self._rows: deque[Row] = deque(maxlen=window_rows)

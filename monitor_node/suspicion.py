@@ -13,6 +13,7 @@ from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import SuspectedCause
 from monitor_node.config import MonitorConfig
 from monitor_node.isolation import UNKNOWN, Isolation, Suspect
+from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_window import Row
 from monitor_node.reconstruction import Reconstruction
 from monitor_node.references import ProcessReference, places
@@ -20,7 +21,6 @@ from monitor_node.signal_watch import STUCK_SENSOR
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import SensorEffect
 from reactorwatch.records.record import MINUTE_NS
 
@@ -33,8 +33,8 @@ LEAST = 0.01
 CONVINCED = 0.5
 """A sensor that is at least so likely the cause is reconstructed."""
 
-UNITS = {effect.name: effect.unit for effect in EFFECTS}
-OUTPUTS = {effect.name: effect.output for effect in EFFECTS if isinstance(effect, SensorEffect)}
+UNITS = {effect.name: effect.unit for effect in CAUSES}
+OUTPUTS = {effect.name: effect.output for effect in CAUSES if isinstance(effect, SensorEffect)}
 
 
 class Suspicion:

@@ -26,6 +26,7 @@ from plant_node.scenario import SIGNAL, Scenario
 from plant_node.sensors import Sensor
 from reactorwatch.errors import InputError
 from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.process.effects.base import TIMING
 from reactorwatch.process.fault import FaultSpecification
 from reactorwatch.process.integrate import SimulationError, Stepper
 from reactorwatch.process.level_control import with_level_control
@@ -241,7 +242,7 @@ class Plant:
         command = self._by_hand_l_min
         if command is None and self._control is not None:
             # A sensor sees the state, which no input moves at once: that of this row is not needed to read it.
-            there = self._true_outputs(np.array([self._control.base_flow_l_min]))
+            there = self._true_outputs(np.array([self._control.base_flow_l_min]), self._seen_by_controller)
             index = self._model.output_names.index(CONTROLLED)
             sensor = self._sensors[len(self._model.inputs) + index]
             temperature_K = sensor.reading(float(there[index]), self._number)
@@ -259,13 +260,16 @@ class Plant:
         if self._control is None:
             return start_state(self._model, self._input(), self._config.start)
         base = np.array([self._control.base_flow_l_min + self._dither()])
-        return start_state(self._control.closed(self._model, self._valve), base, self._config.start)
+        model = self._extended(self._physical(self._installed))
+        return start_state(self._control.closed(model, self._valve), base, self._config.start)
 
-    def _true_outputs(self, inputs: Array) -> Array:
-        x, u, p, now, middle = self._outputs.arguments
-        x[0], u[0], p[0], now[0], middle[0] = self._x, inputs, self._p, self.time_min, self.time_min
-        self._outputs()
-        outputs: Array = self._outputs.results[1][0]
+    def _true_outputs(self, inputs: Array, function: ArrayFunction | None = None) -> Array:
+        function = function or self._outputs
+        x, u, p, now, middle = function.arguments
+        x[0], u[0], now[0], middle[0] = self._x, inputs, self.time_min, self.time_min
+        p[0] = self._p[: p.size]  # those of faults of timing come last
+        function()
+        outputs: Array = function.results[1][0]
         return outputs
 
     def _changes(self, time_min: float) -> tuple[FaultChange, ...]:
@@ -284,9 +288,15 @@ class Plant:
         self._installed = faults
         self._use(model)
 
+    def _physical(self, faults: list[_Installed]) -> list[_Installed]:
+        """Those that are in the plant, not in how its rows are stamped, which no controller sees."""
+        return [fault for fault in faults if fault.specification.effect.location != TIMING]
+
     def _extended(self, faults: list[_Installed]) -> ProcessModel:
+        """The model with these faults in it; first those that are physical, because the others shift what they do."""
         model = self._base
-        for fault in faults:
+        physical = self._physical(faults)
+        for fault in (*physical, *(fault for fault in faults if fault not in physical)):
             try:
                 model = fault.specification.extend(model)
             except ValueError as error:
@@ -296,6 +306,8 @@ class Plant:
     def _use(self, model: ProcessModel) -> None:
         self._model, self._p = model, model.values()
         self._stepper, self._outputs = Stepper(model), ArrayFunction(model.function("outputs"))
+        seen = self._extended(self._physical(self._installed))
+        self._seen_by_controller = ArrayFunction(seen.function("outputs"))
 
 
 def _with_level(model: ProcessModel, gain_per_min: float) -> ProcessModel:

@@ -1,8 +1,9 @@
 """Which faults, how large, when: the cases of the bank.
 
-Every effect of the plant's catalogue sets in as a step, and three of them as a ramp too, each in three sizes: small is
-about the smallest that the oracle (see `oracle`) finds within an hour, medium eight times as much, and large ten times
-that: as gross as the report's method needs. Large faults that cool the reactor put it out: that is noted, not avoided.
+Every cause that the monitor compares (see `monitor_node.isolation_causes`) sets in as a step, and three of them as a
+ramp too, each in three sizes: small is about the smallest that the oracle (see `oracle`) finds within an hour, medium
+eight times as much, and large ten times that: as gross as the report's method needs. Large faults that cool the reactor
+put it out: that is noted, not avoided.
 
 Every case has a seed of its own, so the fault-free rows before its onset are like no other case's.
 """

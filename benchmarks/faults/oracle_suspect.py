@@ -2,7 +2,7 @@
 
 Some causes imitate each other so well (see `bank.TWINS`) that nobody tells them apart in the noise of a run. This
 oracle knows the onset, the profile, the equations, the state before the onset, the spread of the noise, and the run to
-its end. For every effect of the catalogue it fits the size, by least squares over the noise of the measurements
+its end. For every cause that the monitor compares it fits the size, by least squares over the noise of the measurements
 (Gauss and Newton's steps, halved until they gain), and it suspects the one that fits best: for independent normal noise
 the likeliest, if all were equally likely before. Where a fault puts the reactor out those steps may end in a local
 minimum; so that the true cause is not missed for that, its true size is tried as well.
@@ -14,8 +14,8 @@ import numpy as np
 
 from benchmarks.faults.bank import BANK, Case
 from benchmarks.faults.runs import NOISE_SD, Truth, measured_of, profile_changes, simulator_of
+from monitor_node.isolation_causes import CAUSES
 from plant_node.scenario import SIGNAL
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.model import Array
@@ -36,7 +36,7 @@ def oracle_suspect(case: Case, record: Record, truth: Truth) -> str:
         truth: of that case.
     """
     since = int(np.argmax(record.time_min >= case.onset_min)) - 1
-    misfits = {effect.name: _misfit(effect, case, record, truth, since) for effect in EFFECTS}
+    misfits = {effect.name: _misfit(effect, case, record, truth, since) for effect in CAUSES}
     at_true_size = float(np.sum(((measured_of(record) - truth.faulty)[since:] / NOISE_SD) ** 2))
     misfits[case.fault.cause] = min(misfits[case.fault.cause], at_true_size)
     return min(misfits, key=misfits.__getitem__)

@@ -26,6 +26,12 @@ OPERATING_COOLANT_FLOW = 103.41
 OPERATING_STATE = (0.1, 438.54)
 """(C in mol/l, T in K) at `OPERATING_COOLANT_FLOW`, as the literature rounds it."""
 
+COOLING = "cooling"
+"""Name of the term that the coolant adds to the energy balance, in K/min."""
+
+FEED = "feed"
+"""`feed C` and `feed T` are the terms that say what the feed brings, in the units of the outputs."""
+
 
 def cstr() -> ProcessModel:
     """The reactor with its nominal constants."""
@@ -47,6 +53,7 @@ def cstr() -> ProcessModel:
     flow = ca.fmax(qc.symbol, SMALLEST_COOLANT_FLOW)
     cooling = K2.symbol * flow * (1 - ca.exp(-K3.symbol / flow))
     dilution = q.symbol / V.symbol
+    to_coolant = cooling * (Tcf.symbol - T.symbol)
     return ProcessModel(
         name="cstr",
         states=(C, T),
@@ -54,8 +61,9 @@ def cstr() -> ProcessModel:
         parameters=(q, V, Cf, Tf, Tcf, E_R, k0, K1, K2, K3),
         rhs=(
             dilution * (Cf.symbol - C.symbol) - k0.symbol * C.symbol * arrhenius,
-            dilution * (Tf.symbol - T.symbol) + K1.symbol * C.symbol * arrhenius + cooling * (Tcf.symbol - T.symbol),
+            dilution * (Tf.symbol - T.symbol) + K1.symbol * C.symbol * arrhenius + to_coolant,
         ),
         outputs=(Output("C", C.unit, C.symbol), Output("T", T.unit, T.symbol)),
         clock=new_clock(),
+        terms={COOLING: to_coolant, f"{FEED} C": Cf.symbol, f"{FEED} T": Tf.symbol},
     )

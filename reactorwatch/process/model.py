@@ -9,8 +9,8 @@ expression compares its onset with `Clock.middle`, the middle of the integration
 which within one step takes both sides; and the onset is listed in `breakpoints`, where the integrator ends its step.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 
 import casadi as ca
 import numpy as np
@@ -105,6 +105,7 @@ class ProcessModel:
         outputs: y.
         clock: the symbols that stand for time.
         breakpoints: names of the parameters, in minutes, that are times at which `rhs` jumps or has a kink.
+        terms: parts of the balances that effects act on or need, by name, as they stand in `rhs`.
     """
 
     name: str
@@ -115,6 +116,7 @@ class ProcessModel:
     outputs: tuple[Output, ...]
     clock: Clock
     breakpoints: tuple[str, ...] = ()
+    terms: Mapping[str, ca.SX] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):
@@ -181,13 +183,49 @@ class ProcessModel:
             ),
         )
 
-    def substitute(self, symbol: ca.SX, expression: ca.SX) -> "ProcessModel":
-        """The same model with the symbol of a parameter or input replaced in every balance by an expression.
+    def term(self, name: str) -> ca.SX:
+        """The part of the balances of that name.
 
-        Outputs stay as they are: a sensor sees what is, not what the balances are told.
+        Raises:
+            ValueError: there is none.
         """
-        new = ca.substitute(list(self.rhs), [symbol], [expression])
-        return replace(self, rhs=tuple(new))
+        if name not in self.terms:
+            raise ValueError(f"{self.name} has no term {name!r} (it has {', '.join(self.terms) or 'none'})")
+        return self.terms[name]
+
+    def substitute(self, symbol: ca.SX, expression: ca.SX) -> "ProcessModel":
+        """The same model with the symbol of a parameter or input replaced wherever it stands by an expression."""
+        return self._mapped(lambda items: ca.substitute(items, [symbol], [expression]))
+
+    def added_to(self, state: str, rate: ca.SX) -> "ProcessModel":
+        """The same model with a further rate in the balance of a state.
+
+        Raises:
+            ValueError: there is no such state.
+        """
+        index = self.state_index(state)
+        return replace(self, rhs=tuple(item + rate if place == index else item for place, item in enumerate(self.rhs)))
+
+    def state_index(self, name: str) -> int:
+        """The place of the state of that name.
+
+        Raises:
+            ValueError: there is none.
+        """
+        if name not in self.state_names:
+            raise ValueError(f"{self.name} has no state {name!r} (it has {', '.join(self.state_names)})")
+        return self.state_names.index(name)
+
+    def _mapped(self, change: Callable[[list[ca.SX]], list[ca.SX]]) -> "ProcessModel":
+        """The same model with all its expressions changed."""
+        shown = [output.expression for output in self.outputs]
+        changed = iter(change([*self.rhs, *shown, *self.terms.values()]))
+        return replace(
+            self,
+            rhs=tuple(next(changed) for _ in self.rhs),
+            outputs=tuple(replace(output, expression=next(changed)) for output in self.outputs),
+            terms={name: next(changed) for name in self.terms},
+        )
 
     def function(self, name: str = "model") -> ca.Function:
         """The model as a CasADi function (x, u, p, t, t_middle) -> (dx/dt, y)."""

@@ -2,6 +2,7 @@
 
 from reactorwatch.process.effects.activation_energy import ActivationEnergy
 from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effects.bypass import Bypass
 from reactorwatch.process.effects.concentration_bias import ConcentrationBias
 from reactorwatch.process.effects.concentration_gain import ConcentrationGain
 from reactorwatch.process.effects.coolant_flow import CoolantFlow
@@ -12,8 +13,12 @@ from reactorwatch.process.effects.feed_temperature import FeedTemperature
 from reactorwatch.process.effects.heat_loss import HeatLoss
 from reactorwatch.process.effects.heat_transfer import HeatTransfer
 from reactorwatch.process.effects.reaction_heat import ReactionHeat
+from reactorwatch.process.effects.reaction_order import ReactionOrder
 from reactorwatch.process.effects.reaction_rate import ReactionRate
+from reactorwatch.process.effects.sample_timing import SampleTiming
+from reactorwatch.process.effects.side_reaction import SideReaction
 from reactorwatch.process.effects.temperature_bias import TemperatureBias
+from reactorwatch.process.effects.volume import Volume
 
 EFFECTS: tuple[Effect, ...] = (
     FeedTemperature(),
@@ -22,6 +27,8 @@ EFFECTS: tuple[Effect, ...] = (
     ReactionRate(),
     ActivationEnergy(),
     ReactionHeat(),
+    SideReaction(),
+    ReactionOrder(),
     HeatTransfer(),
     HeatLoss(),
     CoolantTemperature(),
@@ -29,5 +36,8 @@ EFFECTS: tuple[Effect, ...] = (
     TemperatureBias(),
     ConcentrationBias(),
     ConcentrationGain(),
+    Bypass(),
+    Volume(),
+    SampleTiming(),
 )
-"""From the feed over the reaction and the cooling to the sensors."""
+"""From the feed over the reaction and the cooling to the sensors, then what concerns several of them."""

@@ -12,4 +12,5 @@ class ActivationEnergy(ParameterEffect):
     unit = "1"
     lower = -0.5
     upper = 0.5
+    typical = 0.002
     parameter = "E_R"

@@ -14,6 +14,21 @@ import casadi as ca
 from reactorwatch.process.model import Parameter, ProcessModel
 from reactorwatch.process.profiles import CONSTANT, Profile
 
+TIMING = "timing"
+"""Location of what is wrong with the times of a record, not with the plant."""
+
+LOCATIONS = (
+    "mass_balance",
+    "energy_balance",
+    "reaction",
+    "feed",
+    "coolant",
+    "temperature_sensor",
+    "concentration_sensor",
+    TIMING,
+)
+"""Where an effect can act."""
+
 
 class Effect(ABC):
     """A physical deviation.
@@ -21,11 +36,14 @@ class Effect(ABC):
     Attributes:
         name: as in the catalogue of causes.
         label: what a person calls it.
-        location: where in the plant it acts.
+        location: where in the plant it acts, one of `LOCATIONS`.
         unit: of its size.
         lower: smallest size that makes physical sense.
         upper: largest size that makes physical sense.
         neutral: the size at which it does nothing.
+        typical: a size that matters in practice: fits are scaled by it.
+        starts: sizes that a fit begins at, where the effect is so far from linear that it may not get there from its
+            neutral size; empty: it begins at neutral.
         labels: what a person calls it with a given profile, where that has a name of its own.
     """
 
@@ -36,6 +54,8 @@ class Effect(ABC):
     lower: ClassVar[float]
     upper: ClassVar[float]
     neutral: ClassVar[float] = 0.0
+    typical: ClassVar[float]
+    starts: ClassVar[tuple[float, ...]] = ()
     labels: ClassVar[dict[str, str]] = {}
 
     @abstractmethod
@@ -50,13 +70,13 @@ class Effect(ABC):
             profile: how the size goes in time.
 
         Returns:
-            A model with the parameters `<name>.size` (neutral) and those of the profile; when the model holds this
-            effect already, `<name>_2.size` and so on.
+            A model with the parameters `<name>.size` (neutral) and those of the profile, behind constants and states
+            of the effect's own; when the model holds this effect already, `<name>_2.size` and so on.
 
         Raises:
             ValueError: the model lacks what the effect acts on.
         """
-        prefix = self._free_prefix(model)
+        prefix = self.prefix(model)
         size = Parameter(
             f"{prefix}.size", self.neutral, self.unit, self.lower, self.upper, f"size of: {self.label}", ca.SX.sym("m")
         )
@@ -88,7 +108,8 @@ class Effect(ABC):
         """What a person calls this effect with that profile."""
         return self.labels.get(profile.name, self.label)
 
-    def _free_prefix(self, model: ProcessModel) -> str:
+    def prefix(self, model: ProcessModel) -> str:
+        """What the names of the parameters and states begin with that this effect would bring into a model."""
         taken = set(model.parameter_names)
         prefix, number = self.name, 1
         while f"{prefix}.size" in taken:

@@ -16,6 +16,7 @@ class ConcentrationBias(SensorEffect):
     unit = "mol/l"
     lower = -1.0
     upper = 1.0
+    typical = 0.01
     output = "C"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the analyser"}
 

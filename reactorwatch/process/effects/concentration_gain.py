@@ -16,6 +16,7 @@ class ConcentrationGain(SensorEffect):
     unit = "1"
     lower = -0.99
     upper = 4.0
+    typical = 0.1
     output = "C"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the gain of the analyser"}
 

@@ -17,6 +17,7 @@ class CoolantFlow(Effect):
     unit = "1"
     lower = -0.99
     upper = 4.0
+    typical = 0.02
     labels: ClassVar[dict[str, str]] = {"step": "coolant leak", "constant": "wrong gain of the coolant valve"}
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:

@@ -12,4 +12,5 @@ class CoolantTemperature(ParameterShift):
     unit = "K"
     lower = -50.0
     upper = 50.0
+    typical = 2.0
     parameter = "Tcf"

@@ -12,4 +12,5 @@ class FeedConcentration(ParameterShift):
     unit = "mol/l"
     lower = -1.0
     upper = 1.0
+    typical = 0.01
     parameter = "Cf"

@@ -12,4 +12,5 @@ class FeedFlow(ParameterEffect):
     unit = "1"
     lower = -0.99
     upper = 4.0
+    typical = 0.03
     parameter = "q"

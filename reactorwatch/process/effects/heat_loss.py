@@ -1,7 +1,5 @@
 """Heat is lost to the surroundings."""
 
-from dataclasses import replace
-
 import casadi as ca
 
 from reactorwatch.process.effects.base import Effect
@@ -19,6 +17,7 @@ class HeatLoss(Effect):
     unit = "1/min"
     lower = 0.0
     upper = 1.0
+    typical = 0.01
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.
@@ -26,9 +25,5 @@ class HeatLoss(Effect):
         Raises:
             ValueError: the model has no state T.
         """
-        if "T" not in model.state_names:
-            raise ValueError(f"heat_loss needs a model with the state 'T', {model.name} has {model.state_names}")
-        index = model.state_names.index("T")
-        lost = size * (model.states[index].symbol - SURROUNDINGS_K)
-        rhs = tuple(item - lost if place == index else item for place, item in enumerate(model.rhs))
-        return replace(model, rhs=rhs)
+        T = model.states[model.state_index("T")].symbol
+        return model.added_to("T", -size * (T - SURROUNDINGS_K))

@@ -14,5 +14,6 @@ class HeatTransfer(ParameterEffect):
     unit = "1"
     lower = -0.99
     upper = 4.0
+    typical = -0.3
     parameter = "K3"
     labels: ClassVar[dict[str, str]] = {"ramp": "fouling of the jacket", "decay": "fouling of the jacket"}

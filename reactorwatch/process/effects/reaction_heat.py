@@ -12,4 +12,5 @@ class ReactionHeat(ParameterEffect):
     unit = "1"
     lower = -0.99
     upper = 4.0
+    typical = 0.01
     parameter = "K1"

@@ -17,6 +17,7 @@ class ReactionRate(Effect):
     unit = "1"
     lower = -0.99
     upper = 4.0
+    typical = 0.05
     labels: ClassVar[dict[str, str]] = {"decay": "deactivation of the catalyst"}
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:

@@ -16,6 +16,7 @@ class TemperatureBias(SensorEffect):
     unit = "K"
     lower = -100.0
     upper = 100.0
+    typical = 2.0
     output = "T"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the temperature sensor"}
 

@@ -1,4 +1,4 @@
-"""The bank holds every effect, in sizes that can be, and its records are what the plant's equations give."""
+"""The bank holds every cause that the monitor compares, in sizes that can be; its records follow the equations."""
 
 from collections import Counter
 
@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks.faults.bank import AFTER_MIN, BANK, GRADES, ONSET_MIN, TWINS, Case, Fault, cases
 from benchmarks.faults.runs import NOISE_SD, fault_free, record_of, truth_of
+from monitor_node.isolation_causes import CAUSES
 from plant_node.initial_state import start_state
 from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import Array
 from reactorwatch.process.profiles import STEP
@@ -19,8 +19,8 @@ from reactorwatch.records.record import Record
 RAMP = Fault("temperature_bias", "ramp", (0.2, 1.0, 8.0))
 
 
-def test_every_effect_of_the_catalogue_is_in_the_bank_as_a_step() -> None:
-    assert {fault.cause for fault in BANK if fault.profile == "step"} == {effect.name for effect in EFFECTS}
+def test_every_cause_of_the_monitor_is_in_the_bank_as_a_step() -> None:
+    assert {fault.cause for fault in BANK if fault.profile == "step"} == {effect.name for effect in CAUSES}
 
 
 def test_every_case_is_one_that_the_plant_takes() -> None:
@@ -86,7 +86,7 @@ def test_noise_is_as_autocorrelated_as_asked_for_and_always_of_the_same_spread(p
 
 
 def test_twins_are_the_causes_that_imitate_each_other_but_for_a_hundredth() -> None:
-    signatures = {effect.name: _signature(effect.name) for effect in EFFECTS}
+    signatures = {effect.name: _signature(effect.name) for effect in CAUSES}
     found = {
         cause: {
             other
@@ -101,7 +101,7 @@ def test_twins_are_the_causes_that_imitate_each_other_but_for_a_hundredth() -> N
 def _signature(cause: str) -> Array:
     """What a tenth of the small step does to both measurements, over their noise, in two runs."""
     fault = next(item for item in BANK if item.cause == cause and item.profile == "step")
-    effect = next(item for item in EFFECTS if item.name == cause)
+    effect = next(item for item in CAUSES if item.name == cause)
     simulator = Simulator(effect.extend(cstr(), STEP))
     changes = {f"{cause}.size": fault.signs[0] * fault.sizes[0] / 10, f"{cause}.onset": 20.0}
     time_min = np.arange(round((20 + AFTER_MIN) * 10)) / 10

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from monitor_node.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, Suspect
+from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_window import Row
 from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.model import ProcessModel, variable
@@ -49,8 +49,8 @@ def of_cause(suspects: list[Suspect], cause: str) -> Suspect:
     return next(item for item in suspects if item.cause == cause)
 
 
-def test_the_list_of_gross_faults_has_every_effect_in_it() -> None:
-    assert [cause for cause, _ in GROSS] == [effect.name for effect in EFFECTS]
+def test_the_list_of_gross_faults_has_every_cause_in_it() -> None:
+    assert [cause for cause, _ in GROSS] == [effect.name for effect in CAUSES]
 
 
 def test_gross_faults_are_named_after_twenty_minutes(isolation: Isolation) -> None:
@@ -262,7 +262,7 @@ class NewState(Effect):
 
 
 def test_excluded_causes_and_those_with_states_of_their_own_are_not_suspected() -> None:
-    chosen = [*(effect for effect in EFFECTS if effect.location.endswith("sensor")), NewState()]
+    chosen = [*(effect for effect in CAUSES if effect.location.endswith("sensor")), NewState()]
     isolation = Isolation(cstr(), SENSORS, effects=chosen, excluded=("concentration_bias",))
     suspects = suspects_of(isolation, rows_of("concentration_bias:step:0.02", seed=14, after_min=5.0))
     assert {item.cause for item in suspects} <= {"temperature_bias", "concentration_gain", UNKNOWN}

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from monitor_node.isolation_bank import Bank, Scan, spread_onsets
+from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_hypothesis import Hypothesis
 from monitor_node.isolation_window import Window, window_of
 from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.profiles import RAMP, STEP, Profile
@@ -21,7 +21,7 @@ def scanned(noise: NoiseLevels, period_min: float = 0.1) -> tuple[Window, Scan]:
     rows = rows_of(seed=1, after_min=0.0, begin_min=30.0, process_noise_sd=process_sd, period_min=period_min)
     window = window_of(rows, Filter(cstr(), noise))
     assert window is not None
-    return window, Bank(cstr(), noise, EFFECTS).scan(window)[1]
+    return window, Bank(cstr(), noise, CAUSES).scan(window)[1]
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +40,7 @@ def check_promise(effect: Effect, profile: Profile, window: Window, scan: Scan, 
     while not np.any(np.isclose(window.time_min, scan.onset_min[onset])):  # of one that lies on a row
         onset += 1
     onset_min = float(scan.onset_min[onset])
-    cause, shape = EFFECTS.index(effect), (STEP, RAMP).index(profile)
+    cause, shape = CAUSES.index(effect), (STEP, RAMP).index(profile)
     b, size = scan.information[onset, shape, cause], scan.size[onset, shape, cause]
     hypothesis = Hypothesis(cstr(), noise, effect, profile)
     begin, rows = int(np.searchsorted(window.time_min, onset_min)) - 5, window.time_min.size
@@ -54,7 +54,7 @@ def check_promise(effect: Effect, profile: Profile, window: Window, scan: Scan, 
 
 
 @pytest.mark.parametrize("profile", [STEP, RAMP], ids=["step", "ramp"])
-@pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for effect in EFFECTS])
+@pytest.mark.parametrize("effect", CAUSES, ids=[effect.name for effect in CAUSES])
 def test_the_bank_promises_what_a_small_size_does(
     effect: Effect, profile: Profile, quiet: tuple[Window, Scan], noisy: tuple[Window, Scan]
 ) -> None:
@@ -68,10 +68,10 @@ def test_it_does_so_for_an_onset_between_two_rows(quiet: tuple[Window, Scan]) ->
     place = int(np.searchsorted(scan.onset_min, ONSET_MIN - 1.0))
     while abs(scan.onset_min[place] % 0.1 - 0.05) > 1e-6:
         place += 1
-    for effect in EFFECTS:
+    for effect in CAUSES:
         if effect.location.endswith("sensor"):
             continue  # to them it is the same as an onset at the next row
-        b = scan.information[place, 0, EFFECTS.index(effect)]
+        b = scan.information[place, 0, CAUSES.index(effect)]
         hypothesis, little = Hypothesis(cstr(), SENSORS, effect, STEP), 0.02 / np.sqrt(b)
         rows, onset_min = window.time_min.size, float(scan.onset_min[place])
         none, up = (hypothesis.run(window, rows - 30, rows, by, onset_min)[1] for by in (0.0, little))
@@ -80,7 +80,7 @@ def test_it_does_so_for_an_onset_between_two_rows(quiet: tuple[Window, Scan]) ->
 
 def test_it_does_so_for_rows_that_are_far_apart() -> None:
     window, scan = scanned(SENSORS, period_min=0.5)
-    for effect in EFFECTS:
+    for effect in CAUSES:
         check_promise(effect, STEP, window, scan, SENSORS)
 
 
@@ -88,7 +88,7 @@ def test_a_fault_ends_the_early_scan_where_it_stands_out() -> None:
     rows = rows_of("temperature_bias:step:3", seed=2, after_min=5.0)
     window = window_of(rows, Filter(cstr(), SENSORS))
     assert window is not None
-    early, whole = Bank(cstr(), SENSORS, EFFECTS).scan(window)
+    early, whole = Bank(cstr(), SENSORS, CAUSES).scan(window)
     assert ONSET_MIN < window.time_min[early.rows - 1] < ONSET_MIN + 0.3
     assert whole.rows == window.time_min.size
     assert np.max(whole.ratio) > np.max(early.ratio) > 60.0

@@ -5,10 +5,10 @@ from math import inf, sqrt
 import numpy as np
 import pytest
 
+from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_hypothesis import HUBER, LOST, Descent, Hypothesis
 from monitor_node.isolation_window import Window, window_of
 from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter
 from reactorwatch.process.profiles import RAMP, STEP
@@ -18,7 +18,7 @@ BEGIN, SIZE = 150, 2.0
 
 
 def effect_of(name: str) -> Effect:
-    return next(effect for effect in EFFECTS if effect.name == name)
+    return next(effect for effect in CAUSES if effect.name == name)
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 import reactorwatch.process.effects as catalogue
 from reactorwatch.process.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effects.base import LOCATIONS, Effect
 from reactorwatch.process.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.effects.heat_transfer import HeatTransfer
 from reactorwatch.process.model import ProcessModel
@@ -79,7 +79,10 @@ def test_before_its_onset_nothing_is_different_and_after_it_something_is(effect:
 def test_its_facts_make_sense(effect: Effect) -> None:
     assert effect.lower <= effect.neutral <= effect.upper
     assert effect.label
-    assert effect.location
+    assert effect.location in LOCATIONS
+    assert effect.lower <= effect.typical <= effect.upper
+    assert effect.typical != effect.neutral
+    assert all(effect.lower <= size <= effect.upper for size in effect.starts)
     assert set(effect.labels) <= {profile.name for profile in PROFILES}
     for profile in PROFILES:
         assert effect.label_with(profile) == effect.labels.get(profile.name, effect.label)
@@ -90,7 +93,10 @@ def test_twice_in_a_model_it_gets_a_number(effect: Effect) -> None:
     model = effect.extend(effect.extend(cstr(), STEP), RAMP)
     new = model.parameter_names[len(cstr().parameters) :]
     name = effect.name
-    assert new == (f"{name}.size", f"{name}.onset", f"{name}_2.size", f"{name}_2.onset", f"{name}_2.end")
+    shape = [item for item in new if item.rpartition(".")[2] in ("size", "onset", "end")]
+    assert shape == [f"{name}.size", f"{name}.onset", f"{name}_2.size", f"{name}_2.onset", f"{name}_2.end"]
+    own = {item.removeprefix(f"{name}.") for item in new if item.startswith(f"{name}.")} - {"size", "onset"}
+    assert {item for item in new if item not in shape} == {f"{name}{x}.{item}" for x in ("", "_2") for item in own}
 
 
 def test_all_effects_together_at_neutral_are_the_base_model() -> None:

@@ -5,6 +5,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import OPERATING_STATE, cstr
+from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.profiles import STEP
@@ -42,10 +43,7 @@ def test_specification_means_what_it_says(text: str, values: dict[str, float], c
     assert parse_fault(str(found)) == found
 
 
-CAUSES = (
-    "feed_temperature, feed_concentration, feed_flow, reaction_rate, activation_energy, reaction_heat, heat_transfer, "
-    "heat_loss, coolant_temperature, coolant_flow, temperature_bias, concentration_bias, concentration_gain"
-)
+CAUSES = ", ".join(effect.name for effect in EFFECTS)
 
 
 @pytest.mark.parametrize(

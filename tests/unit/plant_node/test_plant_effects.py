@@ -1,0 +1,49 @@
+"""The faults of the catalogue in the plant: its rows are what the physics makes of them."""
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from plant_node.config import NoiseSd, PlantConfig
+from plant_node.controllers import TemperatureControl
+from plant_node.core import Plant
+from plant_node.record import simulate_record
+from plant_node.scenario import Constant
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.model import Array
+
+QUIET = NoiseSd(C=0, T=0)
+
+
+def nominal(t: float, x: Array, qc: float) -> list[float]:
+    speed = x[0] * np.exp(-1e4 / x[1])
+    cooling = 0.01 * qc * (1 - np.exp(-700 / qc)) * (350 - x[1])
+    return [1 - x[0] - 7.2e10 * speed, 350 - x[1] + 1.44e13 * speed + cooling]
+
+
+def test_a_flow_that_is_stamped_late_has_acted_when_its_row_is_measured() -> None:
+    config = PlantConfig(noise_sd=QUIET, faults=("sample_timing:constant:0.04",), seed=3)
+    record = simulate_record(config, 200)
+    C, T, qc = (record.columns[name] for name in ("C", "T", "qc"))
+    for row in np.flatnonzero(np.diff(qc)):
+        x = np.array([C[row], T[row]])
+        for span, flow in ((0.06, qc[row]), (0.04, qc[row + 1])):
+            x = solve_ivp(nominal, (0, span), x, args=(flow,), rtol=1e-10, atol=1e-12).y[:, -1]
+        np.testing.assert_allclose([C[row + 1], T[row + 1]], x, atol=1e-3, rtol=0)
+
+
+def test_a_controller_does_not_see_how_its_commands_are_stamped() -> None:
+    control = TemperatureControl(set_point_K=((0.0, 438.54), (2.0, 441.0)))
+    late, in_time = (
+        Plant(PlantConfig(noise_sd=QUIET, temperature_control=control, faults=faults), cstr(), Constant())
+        for faults in (("sample_timing:constant:0.05", "temperature_bias:constant:1"), ("temperature_bias:constant:1",))
+    )
+    rows = [(late.next_row().readings, in_time.next_row().readings) for _ in range(60)]
+    assert [a["qc"] for a, _ in rows] == [b["qc"] for _, b in rows]
+    assert max(abs(a["T"] - b["T"]) for a, b in rows) > 0.1
+
+
+def test_timing_is_wrong_of_whatever_else_is_wrong_in_whichever_order_it_was_put_in() -> None:
+    faults = ("sample_timing:constant:0.05", "heat_loss:constant:0.01", "coolant_flow:constant:0.02")
+    runs = [simulate_record(PlantConfig(noise_sd=QUIET, faults=order, seed=4), 50) for order in (faults, faults[::-1])]
+    first, last = runs
+    np.testing.assert_allclose(first.columns["T"], last.columns["T"], rtol=0, atol=1e-9)

@@ -1,0 +1,119 @@
+"""Effects against the physics written out by hand and integrated by scipy, to a tolerance far below ours."""
+
+from collections.abc import Callable
+from math import exp
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from reactorwatch.process.cstr import OPERATING_STATE, cstr
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.level_control import with_level_control
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.simulate import Simulator
+
+TIMES: Array = np.cumsum(np.append(0.0, np.random.default_rng(8).choice([0.05, 0.1, 0.2], 150)))
+FLOWS = np.repeat(np.random.default_rng(9).uniform(92, 108, 31), 5)[: TIMES.size]
+START = np.array(OPERATING_STATE)
+ERROR = np.array([2e-6, 2e-3])
+"""mol/l and K: a hundredth of what the sensors' noise is, or less."""
+
+Rates = Callable[[float, Array, float], list[float]]
+
+
+def reactor(x: Array, qc: float, q: float = 100, V: float = 100, rate: float = 1.0) -> list[float]:
+    """The balances as the literature has them, by volume, and the rate times a factor."""
+    C, T = x[:2].tolist()
+    speed = rate * C * exp(-1e4 / T)
+    return [
+        q / V * (1.0 - C) - 7.2e10 * speed,
+        q / V * (350 - T) + 1.44e13 * speed + 0.01 * (100 / V) * qc * (1 - exp(-700 / qc)) * (350 - T),
+    ]
+
+
+def run(rates: Rates, start: Array, time_min: Array, flows: Array) -> Array:
+    """States at the given times, the flow of each holding until the next."""
+    states = [start]
+    for begin, end, qc in zip(time_min[:-1], time_min[1:], flows[:-1], strict=True):
+        found = solve_ivp(rates, (begin, end), states[-1], args=(qc,), method="DOP853", rtol=1e-11, atol=1e-12)
+        states.append(found.y[:, -1])
+    return np.array(states)
+
+
+def extended(cause: str, size: float, model: ProcessModel | None = None) -> ProcessModel:
+    effect = next(item for item in EFFECTS if item.name == cause)
+    return effect.extend(model or cstr()).with_values({f"{cause}.size": size})
+
+
+def simulated(cause: str, size: float) -> Array:
+    return Simulator(extended(cause, size)).run(TIMES, FLOWS, START).outputs
+
+
+@pytest.mark.parametrize("size", [-0.3, 0.2])
+def test_reaction_order(size: float) -> None:
+    truth = run(lambda t, x, qc: reactor(x, qc, rate=(x[0] / 0.1) ** size), START, TIMES, FLOWS)
+    assert np.all(np.abs(simulated("reaction_order", size) - truth) < ERROR)
+
+
+def test_side_reaction() -> None:
+    def rates(t: float, x: Array, qc: float) -> list[float]:
+        dC, dT = reactor(x, qc)
+        side = 0.5 * exp(-15e3 * (1 / x[1] - 1 / 438.54)) * x[0]
+        return [dC - side, dT + 100 * side]
+
+    assert np.all(np.abs(simulated("side_reaction", 0.5) - run(rates, START, TIMES, FLOWS)) < ERROR)
+
+
+@pytest.mark.parametrize("size", [-0.1, 0.2])
+def test_volume(size: float) -> None:
+    truth = run(lambda t, x, qc: reactor(x, qc, V=100 * (1 + size)), START, TIMES, FLOWS)
+    assert np.all(np.abs(simulated("volume", size) - truth) < ERROR)
+
+
+def test_volume_with_a_level_of_its_own_is_where_the_level_comes_to_rest() -> None:
+    model = extended("volume", 0.1, with_level_control(cstr()))
+    states = Simulator(model).run(TIMES, FLOWS, np.array([*START, 110.0])).states
+    truth = run(lambda t, x, qc: reactor(x, qc, V=110), START, TIMES, FLOWS)
+    assert np.all(np.abs(states[:, :2] - truth) < ERROR)
+    assert states[:, 2] == pytest.approx(110.0)
+
+
+def test_bypass() -> None:
+    inside = run(lambda t, x, qc: reactor(x, qc, q=95), START, TIMES, FLOWS)
+    assert np.all(np.abs(simulated("bypass", 0.05) - (0.95 * inside + 0.05 * np.array([1.0, 350.0]))) < ERROR)
+
+
+@pytest.mark.parametrize("first", ["bypass", "feed_temperature"])
+def test_what_passes_by_is_the_feed_as_it_is(first: str) -> None:
+    second = "feed_temperature" if first == "bypass" else "bypass"
+    sizes = {"bypass": 0.05, "feed_temperature": 8.0}
+    model = extended(second, sizes[second], extended(first, sizes[first]))
+    run_ = Simulator(model).run(TIMES, FLOWS, START)
+    np.testing.assert_allclose(run_.outputs, 0.95 * run_.states + 0.05 * np.array([1.0, 358.0]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("late", [0.02, 0.05])
+def test_an_input_that_is_stamped_late_has_acted_before(late: float) -> None:
+    """The plant is switched early, and read at the times of the rows; the shortest of them is 0.05 min."""
+    found = simulated("sample_timing", late)
+    switched = TIMES - late
+    between = np.ravel(np.column_stack([switched, TIMES]))
+    truth = run(lambda t, x, qc: reactor(x, qc), START, between, np.repeat(FLOWS, 2))
+    assert np.all(np.abs(found - truth[1::2]) < ERROR)
+
+
+def test_an_input_that_is_interpolated_is_held_and_stamped_half_a_period_late_to_first_order() -> None:
+    """Nine tenths of the difference to a held input that is stamped in time goes away."""
+    time_min: Array = 0.1 * np.arange(151.0)
+    flows: Array = 100 + 6 * np.sin(time_min)
+
+    def rates(t: float, x: Array, qc: float) -> list[float]:
+        return reactor(x, float(np.interp(t, time_min, flows)))
+
+    truth = run(rates, START, time_min, flows)
+    late, in_time = (
+        Simulator(extended("sample_timing", size)).run(time_min, flows, START).outputs[30:] - truth[30:]
+        for size in (0.05, 0.0)
+    )
+    assert np.all(np.std(late, axis=0) < 0.1 * np.std(in_time, axis=0))
