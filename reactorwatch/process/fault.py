@@ -4,26 +4,30 @@
     heat_transfer:ramp:-0.3@30min,end=90min
     reaction_rate:decay:-0.2@30min,time_constant=1h
     activation_energy:constant:0.002
+    coolant_flow:free:-0.05,0min=0,50min=0.2,100min=1
 
 So: cause, profile and size with colons between; where the profile has an onset, `@` and that; then `name=value` for
 whatever else the profile knows, each after a comma. The size is in the effect's unit. A time carries its unit: s,
-min or h.
+min or h. The free profile is a curve, linear between knots: after the size come two or more `time=share of the size`.
 """
 
 import difflib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import isfinite
+from math import inf, isfinite
 from typing import TypeVar
 
 from reactorwatch.errors import InputError
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import PROFILES, Profile
+from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_profile
 
 EXAMPLE = "coolant_flow:step:-0.05@30min"
+
+MOST_KNOTS = 100
+"""Of a curve. Every step of the plant looks for its knots."""
 
 _MINUTES = {"s": 1 / 60, "min": 1.0, "h": 60.0}
 _NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)")
@@ -88,6 +92,8 @@ class FaultSpecification:
     def __str__(self) -> str:
         """The canonical text; `parse_fault` makes the same specification of it."""
         text = f"{self.effect.name}:{self.profile.name}:{_written(self.values['size'])}"
+        if self.profile.name == FREE_NAME:
+            return text + "".join(f",{_written(time)}min={_written(share)}" for time, share in _curve(self.values))
         if "onset" in self.values:
             text += f"@{_written(self.values['onset'])}min"
         for item in self.profile.parameters:
@@ -116,6 +122,8 @@ def parse_fault(text: str) -> FaultSpecification:
     if at and "onset" not in known:
         raise InputError(f"fault {text!r}: the profile {profile.name} has no onset, got '@{onset}'; leave it out")
     values = {"size": _number(text, "size", size, effect.unit, (effect.lower, effect.upper))}
+    if profile.name == FREE_NAME:
+        return _parsed_curve(text, effect, values["size"], assignments)
     said = [("onset", onset)] if at else []
     for assignment in assignments:
         name, equals, value = (part.strip() for part in assignment.partition("="))
@@ -129,6 +137,37 @@ def parse_fault(text: str) -> FaultSpecification:
         values[name] = _number(text, name, value, item.unit, (item.lower, item.upper))
     _check_order(text, values)
     return FaultSpecification(effect, profile, values)
+
+
+def _parsed_curve(text: str, effect: Effect, size: float, assignments: list[str]) -> FaultSpecification:
+    """A fault with the free profile."""
+    knots: list[tuple[float, float]] = []
+    for assignment in assignments:
+        time, _, share = (part.strip() for part in assignment.partition("="))
+        knot = (_number(text, "time", time, "min", (-inf, inf)), _number(text, "share", share, "1", (-inf, inf)))
+        if knots and not knots[-1][0] < knot[0]:
+            raise InputError(f"fault {text!r}: times must rise, got {knot[0]:g} min after {knots[-1][0]:g} min")
+        if not effect.lower <= size * knot[1] <= effect.upper:
+            raise InputError(
+                f"fault {text!r}: size times share must be in [{effect.lower:g}, {effect.upper:g}], "
+                f"got {size * knot[1]:g} at {knot[0]:g} min"
+            )
+        knots.append(knot)
+    if not 2 <= len(knots) <= MOST_KNOTS:
+        raise InputError(
+            f"fault {text!r}: a curve must have 2 to {MOST_KNOTS} times with their shares, like ,0min=0,90min=1, "
+            f"got {len(knots)}"
+        )
+    values = {"size": size}
+    values |= {f"time_{number}": time for number, (time, _) in enumerate(knots, 1)}
+    values |= {f"value_{number}": share for number, (_, share) in enumerate(knots, 1)}
+    return FaultSpecification(effect, free_profile(len(knots)), values)
+
+
+def _curve(values: Mapping[str, float]) -> list[tuple[float, float]]:
+    """The knots of a free profile: times in minutes and shares of the size."""
+    count = sum(name.startswith("time_") for name in values)
+    return [(values[f"time_{number}"], values[f"value_{number}"]) for number in range(1, count + 1)]
 
 
 def _chosen(text: str, what: str, name: str, valid: Mapping[str, _Item]) -> _Item:

@@ -1,10 +1,12 @@
 """How a deviation goes in time: the size m(t) of an effect, as an expression of the clock.
 
-All times are minutes of the plant. Before its onset a profile is zero.
+All times are minutes of the plant. Before its onset a profile is zero. The free one has no onset: it is a curve through
+knots, which can look like any of the others, or like none.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from math import inf, pi
 
 import casadi as ca
@@ -114,4 +116,40 @@ SINE = Profile(
     "swings about zero",
 )
 
-PROFILES: tuple[Profile, ...] = (CONSTANT, STEP, RAMP, DECAY, SINE)
+FREE_NAME = "free"
+
+
+@cache
+def free_profile(knots: int) -> Profile:
+    """A curve: the size times what is linear between knots at `time_1`, `time_2`, ..., and constant beyond them.
+
+    The size carries the unit and says how large the curve is; the knots' values `value_1`, ... are shares of it. In a
+    fit of the values the size is held, at one that matters in practice, and the knots stay where they are.
+
+    Args:
+        knots: how many, at least 2; their times must rise.
+
+    Raises:
+        ValueError: fewer than 2 knots.
+    """
+    if knots < 2:
+        raise ValueError(f"a free profile must have at least 2 knots, got {knots}")
+    numbers = range(1, knots + 1)
+    times = (ProfileParameter(f"time_{i}", "min", None, -inf, inf, f"of knot {i}", breakpoint=True) for i in numbers)
+    values = (ProfileParameter(f"value_{i}", "1", None, -inf, inf, f"share of the size at knot {i}") for i in numbers)
+
+    def curve(clock: Clock, p: dict[str, ca.SX]) -> ca.SX:
+        share = p["value_1"]
+        for i in range(1, knots):
+            begin, span = p[f"time_{i}"], ca.fmax(p[f"time_{i + 1}"] - p[f"time_{i}"], 1e-9)
+            rising = p[f"value_{i}"] + (p[f"value_{i + 1}"] - p[f"value_{i}"]) * (clock.now - begin) / span
+            share = ca.if_else(clock.middle >= begin, rising, share)
+        return p["size"] * ca.if_else(clock.middle >= p[f"time_{knots}"], p[f"value_{knots}"], share)
+
+    return Profile(FREE_NAME, (*times, *values), curve, "any curve, linear between knots")
+
+
+FREE = free_profile(12)
+"""With as many knots as make a step, a ramp, a decay and a sine look like themselves."""
+
+PROFILES: tuple[Profile, ...] = (CONSTANT, STEP, RAMP, DECAY, SINE, FREE)

@@ -8,13 +8,18 @@ from hypothesis import strategies as st
 from reactorwatch.errors import InputError
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.fault import FaultSpecification, parse_fault
-from reactorwatch.process.profiles import PROFILES
+from reactorwatch.process.profiles import FREE, PROFILES, free_profile
 
 
 @st.composite
 def faults(draw: st.DrawFn) -> FaultSpecification:
     effect, profile = draw(st.sampled_from(EFFECTS)), draw(st.sampled_from(PROFILES))
     values = {"size": draw(st.floats(effect.lower, effect.upper))}
+    if profile is FREE:
+        times = sorted(draw(st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=5, unique=True)))
+        values |= {f"time_{number}": time for number, time in enumerate(times, 1)}
+        values |= {f"value_{number}": draw(st.floats(0.0, 1.0)) for number in range(1, len(times) + 1)}
+        return FaultSpecification(effect, free_profile(len(times)), values)
     for item in profile.parameters:
         if draw(st.booleans()):
             low, high = max(item.lower, -1e6), min(item.upper, 1e6)
@@ -42,7 +47,13 @@ def test_units_of_time_are_the_same_time(minutes: float, unit: tuple[str, float]
 @settings(derandomize=True, max_examples=500, deadline=None)
 @given(st.text(alphabet="coolant_flow:step=-0.5@3min,eE+ \n\t'\"\u0664\u00b2", max_size=40) | st.text(max_size=20))
 def test_any_text_is_a_fault_or_one_line_that_says_why_not(text: str) -> None:
-    for candidate in (text, f"coolant_flow:step:{text}", f"coolant_flow:sine:0.1@{text}", f"coolant_flow:{text}:1"):
+    for candidate in (
+        text,
+        f"coolant_flow:step:{text}",
+        f"coolant_flow:sine:0.1@{text}",
+        f"coolant_flow:{text}:1",
+        f"coolant_flow:free:1,{text}",
+    ):
         said = ""
         try:
             parse_fault(candidate)

@@ -13,16 +13,18 @@ from reactorwatch.process.effects.base import LOCATIONS, Effect
 from reactorwatch.process.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.effects.heat_transfer import HeatTransfer
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import CONSTANT, PROFILES, RAMP, STEP, Profile
+from reactorwatch.process.profiles import CONSTANT, FREE, PROFILES, RAMP, STEP, Profile, free_profile
 from reactorwatch.process.simulate import Simulator
 
 SHAPE = {"onset": 1.2, "end": 3.4, "time_constant": 0.5, "period": 2.5, "phase": 0.4}  # on samples, where min
+SHAPE |= {"time_1": 1.2, "value_1": 0.0, "time_2": 2.5, "value_2": 1.0, "time_3": 4.1, "value_3": -0.4}
+SHAPES = (*(profile for profile in PROFILES if profile is not FREE), free_profile(3))
 TIMES = np.round(np.arange(60, dtype=np.float64) * 0.1, 9)
 FLOWS = np.repeat(np.random.default_rng(5).uniform(95, 108, 12), 5)
 START = np.array(OPERATING_STATE)
 
 of_every_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
-with_every_profile = pytest.mark.parametrize("profile", PROFILES, ids=lambda profile: profile.name)
+with_every_profile = pytest.mark.parametrize("profile", SHAPES, ids=lambda profile: profile.name)
 
 
 def shaped(effect: Effect, profile: Profile) -> ProcessModel:
@@ -166,11 +168,12 @@ def test_profiles_go_in_time_as_they_say() -> None:
         "step": 3.0 * on,
         "ramp": 3.0 * np.minimum(since / 2.2, 1),
         "decay": 3.0 * on * (1 - np.exp(-since / 0.5)),
+        "free": 3.0 * np.interp(TIMES, [1.2, 2.5, 4.1], [0.0, 1.0, -0.4]),
         "sine": 3.0 * on * np.sin(2 * np.pi * since / 2.5 + 0.4),
     }
     nominal = Simulator(cstr()).run(TIMES, FLOWS, START).outputs
     assert {profile.name for profile in PROFILES} == set(expected)
-    for profile in PROFILES:
+    for profile in SHAPES:
         run = Simulator(shaped(bias, profile)).run(TIMES, FLOWS, START, {"temperature_bias.size": 3.0})
         np.testing.assert_allclose(run.outputs[:, 1] - nominal[:, 1], expected[profile.name], atol=1e-9)
         np.testing.assert_array_equal(run.outputs[:, 0], nominal[:, 0])

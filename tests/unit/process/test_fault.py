@@ -33,6 +33,19 @@ from reactorwatch.process.simulate import Simulator
         ),
         ("activation_energy:constant:0.002", {"size": 0.002}, None),
         ("temperature_bias:step:2K", {"size": 2.0}, "temperature_bias:step:2"),
+        (
+            "coolant_flow:free:-0.05,0min=0,0.5h=.2,90min=1",
+            {
+                "size": -0.05,
+                "time_1": 0.0,
+                "time_2": 30.0,
+                "time_3": 90.0,
+                "value_1": 0.0,
+                "value_2": 0.2,
+                "value_3": 1.0,
+            },
+            "coolant_flow:free:-0.05,0min=0,30min=0.2,90min=1",
+        ),
         ("coolant_flow:ramp:0.1,onset=5min", {"size": 0.1, "onset": 5.0}, "coolant_flow:ramp:0.1@5min"),
     ],
 )
@@ -54,7 +67,7 @@ CAUSES = ", ".join(effect.name for effect in EFFECTS)
         ("colant_flow:step:1", f"unknown cause 'colant_flow'; did you mean 'coolant_flow'? (valid: {CAUSES})"),
         (
             "coolant_flow:stop:1",
-            "unknown profile 'stop'; did you mean 'step'? (valid: constant, step, ramp, decay, sine)",
+            "unknown profile 'stop'; did you mean 'step'? (valid: constant, step, ramp, decay, sine, free)",
         ),
         ("coolant_flow:step:", "size must be a number, got ''"),
         ("coolant_flow:step:five", "size must be a number, got 'five'"),
@@ -75,6 +88,18 @@ CAUSES = ", ".join(effect.name for effect in EFFECTS)
         ("coolant_flow:step:0.1@3min,onset=4min", "onset must be said once, got it again as '4min'"),
         ("coolant_flow:step:0.1,3min", "after the size must come name=value, got '3min'"),
         ("coolant_flow:sine:0.1,period=0min", "period must be in [0.001, inf] min, got 0"),
+        (
+            "coolant_flow:free:0.1@3min",
+            "the profile free has no onset, got '@3min'; leave it out",
+        ),
+        (
+            "coolant_flow:free:0.1,0min=1",
+            "a curve must have 2 to 100 times with their shares, like ,0min=0,90min=1, got 1",
+        ),
+        ("coolant_flow:free:0.1,0=1,9min=1", "time must be a time with its unit (s, min, h), like 30min, got '0'"),
+        ("coolant_flow:free:0.1,0min,9min=1", "share must be a number, got ''"),
+        ("coolant_flow:free:0.1,9min=1,9min=0", "times must rise, got 9 min after 9 min"),
+        ("coolant_flow:free:-0.5,0min=1,9min=2", "size times share must be in [-0.99, 4], got -1 at 9 min"),
         ("coolant_flow:ramp:0.1@9min,end=9min", "end must come after the onset, got end 9 min and onset 9 min"),
     ],
 )

@@ -8,7 +8,7 @@ from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.process.profiles import PROFILES, STEP, Profile
+from reactorwatch.process.profiles import FREE, PROFILES, STEP, Profile, free_profile
 from reactorwatch.process.simulate import Simulator
 
 START = np.array(OPERATING_STATE)
@@ -17,6 +17,8 @@ FLOWS = np.repeat(np.random.default_rng(4).uniform(95, 108, 12), 5)
 
 NO_EFFECT = np.array([1e-5, 1e-3])  # derivatives below a ten-thousandth of these are the noise of differences
 SHAPE = {"onset": 1.2345, "end": 3.4567, "time_constant": 2.0, "period": 2.5, "phase": 0.4}
+SHAPE |= {"time_1": 1.2345, "value_1": 0.3, "time_2": 2.4567, "value_2": 1.0, "time_3": 4.1234, "value_3": 0.4}
+SHAPES = (*(profile for profile in PROFILES if profile is not FREE), free_profile(3))
 
 
 def differences(simulator: Simulator, values: dict[str, float], name: str, step: float) -> tuple[Array, Array]:
@@ -37,7 +39,7 @@ def check(model: ProcessModel, values: dict[str, float], steps: dict[str, float]
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
-@pytest.mark.parametrize("profile", PROFILES, ids=lambda profile: profile.name)
+@pytest.mark.parametrize("profile", SHAPES, ids=lambda profile: profile.name)
 def test_of_every_effect_with_every_profile(effect: Effect, profile: Profile) -> None:
     size = effect.neutral + 0.005 * (effect.upper - effect.neutral)
     values = {f"{effect.name}.size": size}
