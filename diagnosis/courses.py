@@ -40,7 +40,7 @@ class Number:
         unit: of its value.
         lower: smallest value.
         upper: largest value.
-        difference: for its derivative.
+        difference: the least one for its derivative.
     """
 
     name: str
@@ -90,9 +90,9 @@ class Course(ABC):
 
     def unit(self, name: str, unit_of_size: str) -> str:
         """Of a parameter."""
-        if name == "size" or name.startswith("knot"):
-            return unit_of_size
-        return "rad" if name == "phase" else "min"
+        if name.startswith("value"):
+            return "1"
+        return {"size": unit_of_size, "phase": "rad"}.get(name, "min")
 
     def basis(self, shape: Array) -> Signal:
         """The functions as signals, shape (rows, coefficients)."""
@@ -106,29 +106,40 @@ class Course(ABC):
         by = theta[: self.coefficients]
         return Signal(over_row @ by, at_row @ by)
 
-    def derivatives(self, theta: Array) -> Signal:
-        """Of the deviation by theta, shape (rows, freedom); by differences for the numbers."""
+    def derivatives(self, theta: Array, differences: Array) -> Signal:
+        """Of the deviation by theta, shape (rows, freedom).
+
+        Args:
+            theta: coefficients, then numbers.
+            differences: of the numbers, from which theirs come; at least those of `numbers`.
+        """
         basis = self.basis(theta[self.coefficients :])
         columns = [basis]
-        for place, number in enumerate(self.numbers, start=self.coefficients):
-            near = []
-            for way in (-1.0, 1.0):
-                moved = theta.copy()
-                moved[place] += way * number.difference
-                near.append(self.signal(moved))
-            columns.append(
-                Signal(*((high - low)[:, None] / (2.0 * number.difference) for low, high in zip(*near, strict=True)))
-            )
+        for place, (number, difference) in enumerate(
+            zip(self.numbers, differences, strict=True), start=self.coefficients
+        ):
+            low, high = theta.copy(), theta.copy()
+            low[place] = max(theta[place] - difference, min(number.lower, theta[place] - number.difference))
+            high[place] = min(theta[place] + difference, max(number.upper, theta[place] + number.difference))
+            near = zip(self.signal(low), self.signal(high), strict=True)
+            columns.append(Signal(*((after - before)[:, None] / (high[place] - low[place]) for before, after in near)))
         return Signal(*(np.concatenate(items, axis=1) for items in zip(*columns, strict=True)))
 
+    @property
+    def least_differences(self) -> Array:
+        """Of the numbers, for their derivatives; shape (numbers,)."""
+        return np.array([number.difference for number in self.numbers])
+
     def limited(self, theta: Array, lower: float, upper: float) -> Array:
-        """The nearest possible numbers, and coefficients where there is but one."""
+        """The nearest possible numbers."""
         found = theta.copy()
-        if self.coefficients == 1:
-            found[0] = min(max(found[0], lower), upper)
+        found[: self.coefficients] = self._coefficients_limited(theta[: self.coefficients], lower, upper)
         for place, number in enumerate(self.numbers, start=self.coefficients):
             found[place] = min(max(found[place], number.lower), number.upper)
         return found
+
+    def _coefficients_limited(self, by: Array, lower: float, upper: float) -> Array:
+        return np.clip(by, lower, upper)
 
     def _onset(self) -> Number:
         return Number("onset", "min", self.begin_min, self.end_min - self.period_min, self.period_min / 2)
@@ -220,7 +231,7 @@ class Sine(Course):
     def numbers(self) -> tuple[Number, ...]:
         """See `Course`."""
         span = self.end_min - self.begin_min
-        return (Number("period", "min", 4.0 * self.period_min, 2.0 * span, 1e-5 * span),)
+        return (Number("period", "min", 4.0 * self.period_min, span, 1e-5 * span),)
 
     def functions(self, shape: Array) -> tuple[Array, Array]:
         """See `Course`."""
@@ -233,6 +244,10 @@ class Sine(Course):
         """See `Course`."""
         size, phase = hypot(theta[0], theta[1]), atan2(theta[1], theta[0])
         return {"size": size, "onset": self.begin_min, "period": float(theta[2]), "phase": phase}
+
+    def _coefficients_limited(self, by: Array, lower: float, upper: float) -> Array:
+        """A swing goes to both sides, whatever the effect; how far is limited."""
+        return np.asarray(by * min(1.0, max(abs(lower), abs(upper)) / max(hypot(*by), 1e-300)))
 
 
 class Free(Course):
@@ -258,7 +273,9 @@ class Free(Course):
         return self._value, self._area
 
     def parameters(self, theta: Array) -> dict[str, float]:
-        """See `Course`. The size is the largest deviation."""
+        """See `Course`. The size is the largest deviation, and the values are shares of it."""
         values = theta[: self.coefficients]
-        found = {"size": float(values[np.argmax(np.abs(values))])}
-        return found | {f"knot_{place}": float(value) for place, value in enumerate(values, start=1)}
+        size = float(values[np.argmax(np.abs(values))])
+        found = {"size": size}
+        found |= {f"time_{place}": float(time_min) for place, time_min in enumerate(self.knots_min, start=1)}
+        return found | {f"value_{place}": float(value) / (size or 1.0) for place, value in enumerate(values, start=1)}

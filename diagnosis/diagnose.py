@@ -162,7 +162,7 @@ def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained) 
     ):
         part = covariance[begin : begin + theta.size, begin : begin + theta.size]
         begin += theta.size
-        slope = course.derivatives(theta).at_row
+        slope = course.derivatives(theta, course.least_differences).at_row
         deviation[effect.name] = signal.at_row
         deviation_sd[effect.name] = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, part, slope), 0.0))
     return Curves(

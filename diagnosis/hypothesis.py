@@ -11,6 +11,7 @@ filter's own errors (`signatures`).
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import casadi as ca
 import numpy as np
 
 from diagnosis import signatures
@@ -32,6 +33,7 @@ SETTLED = 0.05
 _RUNAWAY = 1e100
 """A filter that lost an unstable plant has signatures without bound, and no step makes sense."""
 
+_WIDENINGS = 4
 _MOST_STEPS, _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 12, 5, 1e-3, 10.0, 0.1
 
 
@@ -88,13 +90,16 @@ class Sized:
         more = len(self.model.states) - len(noise.process_sd)
         return NoiseLevels(noise.measurement_sd, (*noise.process_sd, *(0.0,) * more))
 
+    def size_symbols(self, effect: Effect) -> tuple[ca.SX, ca.SX] | None:
+        """The inputs that are the size of an effect, as balances and outputs have it; None if it has none."""
+        if effect not in self.effects:
+            return None
+        place = self.effects.index(effect)
+        return self._sized.of_rates[place], self._sized.of_outputs[place]
+
     def inputs(self, run: Run, signals: Sequence[Signal]) -> Array:
         """With the sizes beside them, shape (rows, n_u + 2 effects)."""
-        limited = [
-            Signal(*(np.clip(item, effect.lower, effect.upper) for item in signal))
-            for effect, signal in zip(self.effects, signals, strict=True)
-        ]
-        return self._sized.inputs(run.inputs, limited)
+        return self._sized.inputs(run.inputs, signals)
 
     def follow(self, run: Run, signals: Sequence[Signal]) -> tuple[float, Array, Innovations]:
         """Loss, whitened innovations and the filter's run."""
@@ -150,12 +155,13 @@ class Hypothesis:
     def fit(self, run: Run, start: Sequence[Array], steps: int = _MOST_STEPS) -> Fit:
         """The best numbers that are found from a start."""
         best, damping = self.at(run, start), _DAMPING
+        differences = self._least_differences()
         for _ in range(steps):
-            g = self.slope(run, best)
+            g = self._slope(run, best, differences)
             w = np.nan_to_num(best.w[2:]).ravel()
-            weights = HUBER / np.maximum(np.abs(w), HUBER)
             if not np.max(np.abs(g)) < _RUNAWAY:
                 break
+            weights = HUBER / np.maximum(np.abs(w), HUBER)
             information, gradient = (g * weights[:, None]).T @ g, g.T @ (weights * w)
             scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
             information, gradient = information / np.outer(scale, scale), gradient / scale
@@ -169,25 +175,42 @@ class Hypothesis:
                 damping *= _MORE_DAMPING
             if best.loss > before.loss - SETTLED:
                 break
+            differences = self._widened(_inverse(g))
         return best
 
-    def slope(self, run: Run, fit: Fit) -> Array:
+    def covariance(self, run: Run, fit: Fit) -> Array:
+        """Of all numbers in a row, shape (freedom, freedom).
+
+        An onset matters only where something happens, so how the innovations change with it depends on how far it is
+        moved. It is moved by about one standard deviation.
+        """
+        differences = self._least_differences()
+        for _ in range(_WIDENINGS):
+            found = _inverse(self._slope(run, fit, differences))
+            differences = self._widened(found)
+        return found
+
+    def _slope(self, run: Run, fit: Fit, differences: Sequence[Array]) -> Array:
         """What the whitened innovations lose as the numbers grow, shape (values from the third row on, freedom)."""
-        signals = self._signals(fit.theta)
-        ways = self.sized.ways(run, signals, fit.found)
+        ways = self.sized.ways(run, self._signals(fit.theta), fit.found)
         columns = []
-        for place, (course, numbers) in enumerate(zip(self.courses, fit.theta, strict=True)):
-            over_row, at_row = course.derivatives(numbers)
+        for place, (course, numbers, moved) in enumerate(zip(self.courses, fit.theta, differences, strict=True)):
+            over_row, at_row = course.derivatives(numbers, moved)
             g = signatures.shown(ways, place, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
             columns.append(g.reshape(-1, course.freedom))
         return np.concatenate(columns, axis=1)
 
-    def covariance(self, run: Run, fit: Fit) -> Array:
-        """Of all numbers in a row, shape (freedom, freedom)."""
-        g = self.slope(run, fit)
-        scale = np.sqrt(np.maximum(np.sum(g * g, axis=0), 1e-300))
-        inner = np.linalg.pinv((g / scale).T @ (g / scale), rcond=1e-12, hermitian=True)
-        return np.asarray(inner / np.outer(scale, scale))
+    def _least_differences(self) -> list[Array]:
+        return [course.least_differences for course in self.courses]
+
+    def _widened(self, covariance: Array) -> list[Array]:
+        """Differences of one standard deviation, or the least ones if these are larger."""
+        sds, found, begin = np.sqrt(np.maximum(np.diag(covariance), 0.0)), [], 0
+        for course in self.courses:
+            numbers = sds[begin + course.coefficients : begin + course.freedom]
+            found.append(np.maximum(course.least_differences, numbers))
+            begin += course.freedom
+        return found
 
     def signals(self, fit: Fit) -> list[Signal]:
         """The deviations."""
@@ -202,6 +225,13 @@ class Hypothesis:
             moved.append(numbers + change[begin : begin + numbers.size])
             begin += numbers.size
         return moved
+
+
+def _inverse(g: Array) -> Array:
+    """Covariance of numbers whose derivatives these are."""
+    scale = np.sqrt(np.maximum(np.sum(g * g, axis=0), 1e-300))
+    inner = np.linalg.pinv((g / scale).T @ (g / scale), rcond=1e-12, hermitian=True)
+    return np.asarray(inner / np.outer(scale, scale))
 
 
 def loss_of(w: Array) -> float:

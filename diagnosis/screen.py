@@ -24,7 +24,7 @@ from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter_errors import FilterErrors, Ways
 from reactorwatch.process.model import Array, ProcessModel
 
-KNOTS = 13
+KNOTS = 12
 DECAYS = (0.02, 0.1, 0.4)
 """Time constants of decays that are looked for, in spans of the record."""
 
@@ -107,11 +107,16 @@ class Screen:
 
     def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit) -> Ways:
         """Of all effects about the run of a filter."""
-        extended, symbols = sized.model, []
+        extended = sized.model
+        of_rates, of_outputs = [], []
         for effect in self._direct:
-            extended = effect.extend(extended)
-            symbols.append(extended.parameters[-1].symbol)
-        errors = FilterErrors(extended, sized.noise, symbols, symbols)
+            own = sized.size_symbols(effect)
+            if own is None:
+                extended = effect.extend(extended)
+                own = (extended.parameters[-1].symbol,) * 2
+            of_rates.append(own[0])
+            of_outputs.append(own[1])
+        errors = FilterErrors(extended, sized.noise, of_rates, of_outputs)
         later = type(fit.found)(*(item[1:] for item in fit.found))
         inputs = sized.inputs(self._run, signals)[1:]
         return errors.ways(self._run.time_min[1:], inputs, later, np.isfinite(self._run.measured[1:]))

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log
 
+import numpy as np
+
 from diagnosis.hypothesis import Fit, Hypothesis, Sized
 from diagnosis.run import Run
 from diagnosis.screen import Lead, Screen
@@ -29,6 +31,7 @@ IN_QUESTION = 60.0
 """In BIC: a rival that is worse by more is out of question."""
 
 ROUNDS = 5
+_NEAR = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +105,9 @@ class Search:
             best = known[best.key]
             leads = self.screen.leads(best.hypothesis, best.fit)
             least = max(leads[0].score(self.run.values) - IN_QUESTION, LEAST_SCORE)
-            for lead in self.chosen(leads, LEADS, least):
-                if _key(lead) not in known:
-                    item = self.fitted(lead)
+            for lead in [*self.chosen(leads, LEADS, least), *self._simpler(leads, best)]:
+                item = self.fitted(lead) if _key(lead) not in known or self._elsewhere(lead, best) else best
+                if item.key not in known or item.bic < known[item.key].bic:
                     known[item.key] = item
             again, best = best, min(known.values(), key=lambda item: item.bic)
             if best is again:
@@ -134,10 +137,23 @@ class Search:
                 break
         return found
 
+    def _simpler(self, leads: Sequence[Lead], best: Explained) -> list[Lead]:
+        """The best's own cause in every simpler course: with the right one, it needs fewer numbers."""
+        (effect,), (course,) = best.hypothesis.sized.effects, best.hypothesis.courses
+        of_cause = [item for item in leads if item.effect is effect and item.course.freedom < course.freedom]
+        names = dict.fromkeys(item.course.name for item in of_cause)
+        return [next(item for item in of_cause if item.course.name == name) for name in names]
+
     def fitted(self, lead: Lead) -> Explained:
         """A lead as a hypothesis."""
         hypothesis = Hypothesis(self.sized((lead.effect,)), (lead.course,))
         return self._with_bic(hypothesis, hypothesis.fit(self.run, (lead.theta,)))
+
+    def _elsewhere(self, lead: Lead, best: Explained) -> bool:
+        """Whether a lead of the best's own cause and course begins where its fit is not."""
+        theta = best.fit.theta[0]
+        apart = np.abs(lead.theta - theta)[lead.course.coefficients :]
+        return bool(np.any(apart > _NEAR * lead.course.least_differences))
 
     def refitted(self, explained: Explained) -> Explained:
         """With the noise that holds now."""

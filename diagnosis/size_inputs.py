@@ -45,8 +45,9 @@ def with_size_inputs(model: ProcessModel, effects: Sequence[Effect]) -> SizedMod
     for number, effect in enumerate(effects, start=1):
         size = ca.SX.sym("size")
         extended = effect.apply(model, size)
+        largest = max(abs(effect.lower), abs(effect.upper))  # bounds are those of a size; a sine swings about zero
         felt, seen = (
-            variable(f"{effect.name}.{number}.{where}", effect.unit, (effect.lower, effect.upper), 1.0, effect.label)
+            variable(f"{effect.name}.{number}.{where}", effect.unit, (-largest, largest), effect.typical, effect.label)
             for where in ("felt", "seen")
         )
         rhs = ca.substitute(list(extended.rhs), [size], [felt.symbol])
