@@ -39,7 +39,7 @@ bench: $(READY) ## speed, as ratios measured in one run
 		echo "== $$file"; $(BIN)/python $$file || exit 1; done
 
 faults: $(READY) ## the watch on a bank of faults, against an oracle and the report's method: most of an hour
-	@$(BIN)/python benchmarks/fault_bank.py
+	@$(BIN)/python benchmarks/fault_bank.py --write docs/fault_bank.md
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py

@@ -246,8 +246,9 @@ class Sine(Course):
         return {"size": size, "onset": self.begin_min, "period": float(theta[2]), "phase": phase}
 
     def _coefficients_limited(self, by: Array, lower: float, upper: float) -> Array:
-        """A swing goes to both sides, whatever the effect; how far is limited."""
-        return np.asarray(by * min(1.0, max(abs(lower), abs(upper)) / max(hypot(*by), 1e-300)))
+        """A swing goes to both sides; of an effect that has but one, too, as far as that goes."""
+        reach = min(-lower, upper) if lower < 0.0 else upper
+        return np.asarray(by * min(1.0, reach / max(hypot(*by), 1e-300)))
 
 
 class Free(Course):

@@ -105,14 +105,12 @@ class Sized:
         """Loss, whitened innovations and the filter's run."""
         found = self._filter.run(run.time_min, self.inputs(run, signals), run.measured)
         # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
-        lost = np.isfinite(run.measured) & ~np.isfinite(found.whitened)
-        lost[0] = False
-        w = np.where(lost, LOST, found.whitened)
-        return (
-            loss_of(w) + float(np.sum(np.log(found.conditional_sd), where=np.isfinite(found.conditional_sd))),
-            w,
-            found,
-        )
+        known = np.isfinite(run.measured)
+        good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0)
+        known[0] = False
+        w = np.where(known & ~good, LOST, np.where(known, found.whitened, np.nan))
+        spread = np.log(np.where(known & good, found.conditional_sd, 1.0))
+        return loss_of(w) + float(np.sum(spread)), w, found
 
     def ways(self, run: Run, signals: Sequence[Signal], found: Innovations) -> Ways:
         """The equations of the filter's errors about its run; from the second row on, the first that it predicts."""
