@@ -30,6 +30,9 @@ LOST = 100.0
 SETTLED = 0.05
 """In log likelihood: a step that gains less ends the search."""
 
+_CLUELESS = 1e6
+"""Standard deviations of a sensor: a filter that is less sure of its prediction has lost the plant."""
+
 _RUNAWAY = 1e100
 """A filter that lost an unstable plant has signatures without bound, and no step makes sense."""
 
@@ -68,11 +71,7 @@ class Sized:
         self._sized = with_size_inputs(model, effects)
         self.model = self._sized.model
         self._filter = Filter(self.model, self._noise_of(noise))
-        self._errors = (
-            FilterErrors(self.model, self._filter.noise, self._sized.of_rates, self._sized.of_outputs)
-            if effects
-            else None
-        )
+        self._errors = FilterErrors(self.model, self._filter.noise, self._sized.of_rates, self._sized.of_outputs)
 
     @property
     def noise(self) -> NoiseLevels:
@@ -82,8 +81,7 @@ class Sized:
     @noise.setter
     def noise(self, noise: NoiseLevels) -> None:
         self._filter.noise = self._noise_of(noise)
-        if self._errors is not None:
-            self._errors.noise = self._filter.noise
+        self._errors.noise = self._filter.noise
 
     def _noise_of(self, noise: NoiseLevels) -> NoiseLevels:
         """States that an effect brings have none of their own."""
@@ -106,7 +104,8 @@ class Sized:
         found = self._filter.run(run.time_min, self.inputs(run, signals), run.measured)
         # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
         known = np.isfinite(run.measured)
-        good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0)
+        least = np.array(self.noise.measurement_sd)
+        good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0) & (found.conditional_sd < _CLUELESS * least)
         known[0] = False
         w = np.where(known & ~good, LOST, np.where(known, found.whitened, np.nan))
         spread = np.log(np.where(known & good, found.conditional_sd, 1.0))
@@ -114,7 +113,6 @@ class Sized:
 
     def ways(self, run: Run, signals: Sequence[Signal], found: Innovations) -> Ways:
         """The equations of the filter's errors about its run; from the second row on, the first that it predicts."""
-        assert self._errors is not None
         later = Innovations(*(item[1:] for item in found))
         used = np.isfinite(run.measured[1:])
         return self._errors.ways(run.time_min[1:], self.inputs(run, signals)[1:], later, used)
@@ -155,7 +153,8 @@ class Hypothesis:
         best, damping = self.at(run, start), _DAMPING
         differences = self._least_differences()
         for _ in range(steps):
-            g = self._slope(run, best, differences)
+            with np.errstate(over="ignore", invalid="ignore"):
+                g = self._slope(run, best, differences)
             w = np.nan_to_num(best.w[2:]).ravel()
             if not np.max(np.abs(g)) < _RUNAWAY:
                 break

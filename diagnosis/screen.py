@@ -77,33 +77,34 @@ class Screen:
         self._constant, self._step, self._ramp, self._decay = Constant(t), Step(t), Ramp(t), Decay(t)
         self._sine, self._free = Sine(t), Free(t, KNOTS)
 
-    def leads(self, hypothesis: Hypothesis | Sized, fit: Fit) -> list[Lead]:
+    def leads(self, hypothesis: Hypothesis, fit: Fit, replaced: Sequence[int] = ()) -> list[Lead]:
         """The best of each cause and course, the most promising first.
 
         Args:
             hypothesis: about whose run all is linearised.
             fit: of it.
+            replaced: places of those of its effects that rivals are looked for, to take their place; the others stay.
         """
-        sized = hypothesis.sized if isinstance(hypothesis, Hypothesis) else hypothesis
-        signals = hypothesis.signals(fit) if isinstance(hypothesis, Hypothesis) else []
         w = np.clip(np.nan_to_num(fit.w[2:]), -HUBER, HUBER)
-        if isinstance(hypothesis, Hypothesis):
-            w = w + self._explained(hypothesis, fit)
-        ways = self._ways(sized, signals, fit)
+        for place in replaced:
+            w = w + self._explained(hypothesis, fit, place)
+        ways = self._ways(hypothesis.sized, hypothesis.signals(fit), fit)
+        if not (np.all(np.isfinite(w)) and np.all(np.isfinite(ways.F))):
+            return []
         ways = Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, w)
         found = self._set_in(ways) + self._swinging(ways) + self._in_course(ways, self._free, np.empty(0))
-        if isinstance(hypothesis, Hypothesis):
-            for course, theta in zip(hypothesis.courses, fit.theta, strict=True):
+        for place in replaced:
+            course, theta = hypothesis.courses[place], fit.theta[place]
+            if course.name != self._free.name:
                 found += self._in_course(ways, course, theta[course.coefficients :])
         return sorted(found, key=lambda item: -item.score(self._run.values))
 
-    def _explained(self, hypothesis: Hypothesis, fit: Fit) -> Array:
-        """What the fitted deviations do to the innovations of a filter that does not know them, shape (rows, n_y)."""
-        ways = hypothesis.sized.ways(self._run, hypothesis.signals(fit), fit.found)
-        total = np.zeros((ways.w.shape[0], ways.w.shape[1]))
-        for place, (over_row, at_row) in enumerate(hypothesis.signals(fit)):
-            total += signatures.shown(ways, place, over_row[1:-1, None], at_row[2:, None])[:, :, 0]
-        return total
+    def _explained(self, hypothesis: Hypothesis, fit: Fit, place: int) -> Array:
+        """What a fitted deviation does to the innovations of a filter that does not know it, shape (rows, n_y)."""
+        signals = hypothesis.signals(fit)
+        ways = hypothesis.sized.ways(self._run, signals, fit.found)
+        over_row, at_row = signals[place]
+        return signatures.shown(ways, place, over_row[1:-1, None], at_row[2:, None])[:, :, 0]
 
     def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit) -> Ways:
         """Of all effects about the run of a filter."""

@@ -61,7 +61,7 @@ class Found:
 
     Attributes:
         noise: of the plant and its sensors, under the best hypothesis.
-        nominal: the one without any effect, with that noise; its key is empty.
+        nominal: the one without any effect, with the noise that it needs itself; its key is empty.
         explained: all that were fitted, the best first.
     """
 
@@ -94,7 +94,7 @@ class Search:
     def found(self) -> Found:
         """The best explanations by one effect."""
         nominal = self.nominal()
-        leads = self.screen.leads(nominal.hypothesis.sized, nominal.fit)
+        leads = self.screen.leads(nominal.hypothesis, nominal.fit)
         known = {item.key: item for item in map(self.fitted, self.chosen(leads, FIRST_LEADS, LEAST_SCORE))}
         best = min([nominal, *known.values()], key=lambda item: item.bic)
         for _ in range(ROUNDS):
@@ -103,7 +103,9 @@ class Search:
             self.settle(best)
             known = {best.key: self.refitted(best)}
             best = known[best.key]
-            leads = self.screen.leads(best.hypothesis, best.fit)
+            leads = self.screen.leads(best.hypothesis, best.fit, replaced=(0,))
+            if not leads:
+                break
             least = max(leads[0].score(self.run.values) - IN_QUESTION, LEAST_SCORE)
             for lead in [*self.chosen(leads, LEADS, least), *self._simpler(leads, best)]:
                 item = self.fitted(lead) if _key(lead) not in known or self._elsewhere(lead, best) else best
@@ -112,7 +114,7 @@ class Search:
             again, best = best, min(known.values(), key=lambda item: item.bic)
             if best is again:
                 break
-        return Found(self.noise, self.nominal(), sorted(known.values(), key=lambda item: item.bic))
+        return Found(self.noise, nominal, sorted(known.values(), key=lambda item: item.bic))
 
     def nominal(self) -> Explained:
         """Without any effect."""
@@ -146,8 +148,11 @@ class Search:
 
     def fitted(self, lead: Lead) -> Explained:
         """A lead as a hypothesis."""
-        hypothesis = Hypothesis(self.sized((lead.effect,)), (lead.course,))
-        return self._with_bic(hypothesis, hypothesis.fit(self.run, (lead.theta,)))
+        return self.fit(Hypothesis(self.sized((lead.effect,)), (lead.course,)), (lead.theta,))
+
+    def fit(self, hypothesis: Hypothesis, start: Sequence[Array]) -> Explained:
+        """A hypothesis, fitted from a start."""
+        return self._with_bic(hypothesis, hypothesis.fit(self.run, start))
 
     def _elsewhere(self, lead: Lead, best: Explained) -> bool:
         """Whether a lead of the best's own cause and course begins where its fit is not."""
@@ -158,7 +163,7 @@ class Search:
     def refitted(self, explained: Explained) -> Explained:
         """With the noise that holds now."""
         self._use_noise(explained.hypothesis.sized)
-        return self._with_bic(explained.hypothesis, explained.hypothesis.fit(self.run, explained.fit.theta))
+        return self.fit(explained.hypothesis, explained.fit.theta)
 
     def explained(self, hypothesis: Hypothesis, theta: Sequence[Array]) -> Explained:
         """A hypothesis at some numbers."""

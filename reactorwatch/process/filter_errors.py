@@ -77,14 +77,18 @@ class FilterErrors:
             found: the filter's run over them.
             used: whether a value corrected the filter, shape (rows, n_y).
         """
+        with np.errstate(over="ignore", invalid="ignore"):  # about a run that has lost an unstable plant
+            return self._ways(time_min, inputs, found, used)
+
+    def _ways(self, time_min: Array, inputs: Array, found: Innovations, used: Array) -> Ways:
         R, q = np.square(self.noise.measurement_sd), np.square(self.noise.process_sd)
         p, step = self.model.values(), np.diff(time_min)
         there, F, G = self._walked(found.x[:-1], inputs[:-1], time_min[:-1], step, p)
         H, D = self._over(self._shown, p, there, inputs[1:], time_min[1:, None])
         prior = F @ found.P[:-1] @ F.transpose(0, 2, 1) + np.eye(there.shape[1]) * q * step[:, None, None]
-        known = np.isfinite(found.residual[1:])
-        both = known[:, :, None] & known[:, None, :]
         covariance = H @ prior @ H.transpose(0, 2, 1) + np.diag(R)
+        known = np.isfinite(found.residual[1:]) & np.all(np.isfinite(covariance), axis=2)
+        both = known[:, :, None] & known[:, None, :]
         L = np.linalg.cholesky(np.where(both, covariance, np.eye(R.size)))
         L_inverse = np.asarray(np.linalg.inv(L) * both)
         w = np.einsum("kij,kj->ki", L_inverse, np.where(known, found.residual[1:], 0.0))
