@@ -113,6 +113,7 @@ class Plant:
         ]
         self._process_noise = process_noise(config.process_noise_sd, model, config.period_min, config.seed)
         self._number = 0
+        self._held: Array | None = None
         self._control = config.temperature_control
         if self._control is not None:
             self._control.check(model, self._valve)
@@ -152,6 +153,7 @@ class Plant:
     def next_row(self) -> Row:
         """Measure, and let the plant run on to the row after."""
         time_min, inputs = self.time_min, self._input()
+        self._x, self._held = self._stepper.begin_row(self._x, inputs, self._p, time_min), inputs
         row = Row(
             number=self._number,
             time_min=time_min,
@@ -284,7 +286,8 @@ class Plant:
     def _install(self, faults: list[_Installed]) -> None:
         """Go on from where the plant is, with these faults in it; nothing has changed if they cannot be."""
         model = self._extended(faults)
-        self._x = carried_over(model, self.state, self._input(), self.time_min)
+        held = self._input() if self._held is None else self._held
+        self._x = carried_over(model, self.state, held, self.time_min)
         self._installed = faults
         self._use(model)
 

@@ -79,7 +79,7 @@ def carried_over(model: ProcessModel, known: Mapping[str, float], inputs: Array,
     if not missing:
         return state
     free = ca.vertcat(*(model.states[index].symbol for index in missing))
-    balance = ca.vertcat(*(model.rhs[index] for index in missing))
+    balance = ca.vertcat(*(_at_rest(model, index) for index in missing))
     step = ca.Function(
         "step",
         [*model.arguments(), model.clock.now, model.clock.middle],
@@ -93,3 +93,9 @@ def carried_over(model: ProcessModel, known: Mapping[str, float], inputs: Array,
             return state
     names = ", ".join(model.states[index].name for index in missing)
     raise InputError(f"{model.name}: {names} cannot be at rest while {dict(known)}; give a start for them")
+
+
+def _at_rest(model: ProcessModel, index: int) -> ca.SX:
+    """What is zero where a state is at rest."""
+    state = model.states[index]
+    return state.symbol - model.at_rest[state.name] if state.name in model.at_rest else model.rhs[index]

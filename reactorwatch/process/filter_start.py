@@ -4,14 +4,18 @@ If all states can be read off the measurements, they are: Newton's method on the
 these are the states themselves. If not, because a value is missing or a state has no sensor, the search begins at the
 steady state whose outputs are nearest to what is measured, so that the state that does not show is one that goes with
 the others: of the reactor's three steady states, that of the right branch.
+
+The memory that effects bring along (`ProcessModel.at_rest`) is at rest to begin with, give or take its scale.
 """
 
 from collections.abc import Mapping, Sequence
 
+import casadi as ca
 import numpy as np
 
 from reactorwatch.process.array_function import ArrayFunction
 from reactorwatch.process.filter_step import output_function
+from reactorwatch.process.memory import reset_function, rest_function
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
 
@@ -32,13 +36,17 @@ class Beginning:
     """
 
     def __init__(self, model: ProcessModel) -> None:
-        self._model = model
-        self._outputs = ArrayFunction(output_function(model))
-        self._lower = np.array([state.lower for state in model.states])
-        self._upper = np.array([state.upper for state in model.states])
+        own = model.without_memory()
+        self._model = own
+        self._outputs = ArrayFunction(output_function(own))
+        self._lower = np.array([state.lower for state in own.states])
+        self._upper = np.array([state.upper for state in own.states])
         self._where: tuple[float, ...] = ()
         self._points: list[SteadyState] = []
-        self._wide = np.diag(np.square([START_SD * state.scale for state in model.states]))
+        self._wide = np.diag(np.square([START_SD * state.scale for state in own.states]))
+        self._memory = np.array([state.scale * (state.name in model.at_rest) for state in model.states])
+        self._completed = ArrayFunction(_with_derivative(rest_function(model)))
+        self._begun = ArrayFunction(_with_derivative(reset_function(model)))
 
     def at(
         self,
@@ -76,7 +84,17 @@ class Beginning:
         H = self._shown(x, u, p, time_min)[1][known]
         K = _gain(wide, H, START_SDS**2 * R)
         rest = np.eye(x.size) - K @ H
-        return x, rest @ wide @ rest.T + START_SDS**2 * K @ R @ K.T
+        return self._with_memory(x, u, p, time_min, rest @ wide @ rest.T + START_SDS**2 * K @ R @ K.T)
+
+    def _with_memory(self, x: Array, u: Array, p: Array, time_min: float, P: Array) -> tuple[Array, Array]:
+        """The same with the states that nobody measures at rest, give or take their scales."""
+        for function, further in ((self._completed, np.diag(np.square(self._memory))), (self._begun, 0.0)):
+            for argument, value in zip(function.arguments, (x, u, p, np.array([time_min])), strict=True):
+                argument[0] = value
+            function()
+            J = function.results[1].T
+            x, P = function.results[0][0].copy(), J @ P @ J.T + further
+        return x, P
 
     def _steady_states(self, model: ProcessModel, u: Array, time_min: float) -> list[SteadyState]:
         """As they are now. Kept until they are asked for elsewhere: one record is often begun many times."""
@@ -92,6 +110,13 @@ class Beginning:
             argument[0] = value
         outputs()
         return outputs.results[0][0].copy(), outputs.results[1].T.copy()
+
+
+def _with_derivative(function: ca.Function) -> ca.Function:
+    """Of one vector of results, with the derivative by the first argument."""
+    symbols = function.sx_in()
+    result = function(*symbols)
+    return ca.Function(function.name(), symbols, [result, ca.densify(ca.jacobian(result, symbols[0]))])
 
 
 def _gain(P: Array, H: Array, R: Array) -> Array:

@@ -1,7 +1,8 @@
 """One row of the extended Kalman filter as one compiled function (the equations are in `filter`).
 
 From one row to the next the state takes two steps of the integrator. They meet in the middle of the row, or at the
-breakpoint that lies in it: there the right-hand side jumps, and a step across a jump would lose its order.
+breakpoint that lies in it: there the right-hand side jumps, and a step across a jump would lose its order. States that
+jump when a row begins do so before its measurements correct them.
 
 What a filter remembers is one vector: the state x, then its covariance P, column by column. The constants are one
 vector as well: the parameters, the variances of the sensors, the variances of the process in a minute.
@@ -14,6 +15,7 @@ import numpy as np
 
 from reactorwatch.process.array_function import ArrayFunction
 from reactorwatch.process.integrate import symbolic_step
+from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import ProcessModel
 
 
@@ -31,6 +33,8 @@ def row_function(model: ProcessModel) -> ca.Function:
     parts = np.cumsum([0, n_u, n_u, 1, 1, 1, n_y, n_y]).tolist()
     before, u, now, first, second, measured, limits = ca.vertsplit(new, parts)
     x, P = _predicted(model, memory, before, now, first, second, p, q)
+    if model.resets:
+        x, P = _jumped(model, x, P, u, p, now)
     inside = ca.logic_and(ca.mmin(x - _bounds(model)[0]) >= 0, ca.mmin(_bounds(model)[1] - x) >= 0)
     expected, H = output_function(model)(x, u, p, now)
     covariance = H @ P @ H.T + ca.diag(r)
@@ -108,6 +112,14 @@ def _predicted(
         M = 0.5 * h * (slope(x, u, p, begin, middle) + slope(after, u, p, begin + h, middle))
         F, x = exponential(M) @ F, after
     return x, F @ P @ F.T + ca.diag(q * (first + second))
+
+
+def _jumped(model: ProcessModel, x: ca.SX, P: ca.SX, u: ca.SX, p: ca.SX, now: ca.SX) -> tuple[ca.SX, ca.SX]:
+    """State and covariance when a row has begun."""
+    reset, before = reset_function(model), ca.SX.sym("before", x.numel())
+    after = reset(before, u, p, now)
+    after, U = ca.substitute([after, ca.jacobian(after, before)], [before], [x])
+    return after, U @ P @ U.T
 
 
 def _jacobian(model: ProcessModel) -> ca.Function:

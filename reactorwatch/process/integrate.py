@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import Array, ProcessModel
 
 LONGEST_STEP_MIN = 0.05
@@ -30,6 +31,10 @@ MOST_STEPS = 100_000
 
 TOLERANCE = 1e-6
 """Allowed local error of a step, relative to `Variable.scale` of each state."""
+
+MEMORY_SLACK = 100
+"""The tolerance of the memory that effects bring along (`ProcessModel.at_rest`) over that of the process's own states.
+It is linear and stable, so its errors don't grow, and where an input jumps, it follows as fast as a step is long."""
 
 _TIMES = (0.0, 1 / 5, 3 / 10, 3 / 5, 1.0, 7 / 8)
 _STAGES: tuple[tuple[float, ...], ...] = (
@@ -62,7 +67,7 @@ def symbolic_step(model: ProcessModel) -> ca.Function:
         slopes.append(rhs(x + h * _weighted(weights, slopes), u, p, t + time * h, middle)[0])
     after = x + h * _weighted(_FIFTH_ORDER, slopes)
     error = h * _weighted(_ERROR, slopes)
-    scales = ca.DM([state.scale for state in model.states])
+    scales = ca.DM([state.scale * (MEMORY_SLACK if state.name in model.at_rest else 1) for state in model.states])
     return ca.Function(
         "step",
         [x, u, p, t, middle, h],
@@ -182,6 +187,24 @@ class Stepper:
         self._model = model
         self._step = ArrayFunction(symbolic_step(model))
         self._breakpoints = [model.parameter_names.index(name) for name in model.breakpoints]
+        self._reset = ArrayFunction(reset_function(model)) if model.resets else None
+
+    def begin_row(self, x: Array, u: Array, p: Array, time_min: float) -> Array:
+        """The state when a row has begun: what jumps then has jumped.
+
+        Args:
+            x: state before, shape (n_x,).
+            u: input from then on, shape (n_u,).
+            p: parameters, shape (n_p,).
+            time_min: of the row.
+        """
+        if self._reset is None:
+            return x
+        for argument, value in zip(self._reset.arguments, (x, u, p, np.array([time_min])), strict=True):
+            argument[0] = value
+        self._reset()
+        after: Array = self._reset.results[0][0].copy()
+        return after
 
     def advance(self, x: Array, u: Array, p: Array, start_min: float, end_min: float) -> Array:
         """The state at the end of a stretch over which the input is constant.

@@ -7,6 +7,11 @@ Time is in minutes. The right-hand side may depend on it through effects that co
 at once, the right-hand side jumps, and an integrator that steps across the jump loses its order. So such an
 expression compares its onset with `Clock.middle`, the middle of the integration step, and never with `Clock.now`,
 which within one step takes both sides; and the onset is listed in `breakpoints`, where the integrator ends its step.
+
+Some states are not the process's own but memory that an effect brings along: a valve that lags, the wall of the vessel.
+Nobody measures them and nobody says where they begin, so the model does: in `at_rest`, by the other states and the
+inputs. And some do not flow but jump, at the moment at which a row of a record begins and the input may have changed: a
+valve that sticks. Those are in `resets`.
 """
 
 from collections.abc import Callable, Mapping
@@ -106,6 +111,8 @@ class ProcessModel:
         clock: the symbols that stand for time.
         breakpoints: names of the parameters, in minutes, that are times at which `rhs` jumps or has a kink.
         terms: parts of the balances that effects act on or need, by name, as they stand in `rhs`.
+        at_rest: by name of a state, where it rests while the other states, inputs and parameters are what they are.
+        resets: by name of a state, what it becomes when a row begins: of the states before and the inputs from then on.
     """
 
     name: str
@@ -117,6 +124,8 @@ class ProcessModel:
     clock: Clock
     breakpoints: tuple[str, ...] = ()
     terms: Mapping[str, ca.SX] = field(default_factory=dict)
+    at_rest: Mapping[str, ca.SX] = field(default_factory=dict)
+    resets: Mapping[str, ca.SX] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):
@@ -219,12 +228,56 @@ class ProcessModel:
     def _mapped(self, change: Callable[[list[ca.SX]], list[ca.SX]]) -> "ProcessModel":
         """The same model with all its expressions changed."""
         shown = [output.expression for output in self.outputs]
-        changed = iter(change([*self.rhs, *shown, *self.terms.values()]))
+        named = (self.terms, self.at_rest, self.resets)
+        changed = iter(change([*self.rhs, *shown, *(item for items in named for item in items.values())]))
         return replace(
             self,
             rhs=tuple(next(changed) for _ in self.rhs),
             outputs=tuple(replace(output, expression=next(changed)) for output in self.outputs),
             terms={name: next(changed) for name in self.terms},
+            at_rest={name: next(changed) for name in self.at_rest},
+            resets={name: next(changed) for name in self.resets},
+        )
+
+    def with_state(self, state: Variable, rate: ca.SX, at_rest: ca.SX, reset: ca.SX | None = None) -> "ProcessModel":
+        """The same model with a further state.
+
+        Args:
+            state: behind the others.
+            rate: its balance.
+            at_rest: see `ProcessModel`.
+            reset: likewise; None: it does not jump.
+        """
+        return replace(
+            self,
+            states=(*self.states, state),
+            rhs=(*self.rhs, rate),
+            at_rest={**self.at_rest, state.name: at_rest},
+            resets=self.resets if reset is None else {**self.resets, state.name: reset},
+        )
+
+    def at_rest_states(self) -> tuple[ca.SX, ...]:
+        """All states as expressions of those that are not in `at_rest`."""
+        resting = [state for state in self.states if state.name in self.at_rest]
+        symbols, where = [state.symbol for state in resting], [self.at_rest[state.name] for state in resting]
+        found = [self.at_rest.get(state.name, state.symbol) for state in self.states]
+        while resting and ca.depends_on(ca.vertcat(*found), ca.vertcat(*symbols)):  # one may rest where another does
+            found = ca.substitute(found, symbols, where)
+        return tuple(found)
+
+    def without_memory(self) -> "ProcessModel":
+        """The model of the states that are not in `at_rest`, while all others are at rest."""
+        if not self.at_rest:
+            return self
+        symbols, rest = [state.symbol for state in self.states], list(self.at_rest_states())
+        resting = self._mapped(lambda items: ca.substitute(items, symbols, rest))
+        own = [place for place, state in enumerate(self.states) if state.name not in self.at_rest]
+        return replace(
+            resting,
+            states=tuple(self.states[place] for place in own),
+            rhs=tuple(resting.rhs[place] for place in own),
+            at_rest={},
+            resets={},
         )
 
     def function(self, name: str = "model") -> ca.Function:

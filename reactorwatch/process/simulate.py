@@ -6,6 +6,9 @@ that `simulate` returns, not of an approximation of the continuous system.
 
 An onset is a parameter like any other here: it moves the edge between two steps, so it enters through their
 lengths. Before it, dh/d(onset) = +1 for the stretch that ends there; after it, -1, and that stretch starts later.
+
+States that jump when a row begins (`ProcessModel.resets`) do so at the end of the step that leads there, so what a run
+shows of a row is the state after it has begun.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,6 +20,7 @@ import numpy as np
 
 from reactorwatch.process.array_function import ArrayFunction, mapped
 from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
+from reactorwatch.process.memory import reset_function, rest_function
 from reactorwatch.process.model import Array, ProcessModel
 
 CHUNK = 256
@@ -65,6 +69,7 @@ class Simulator:
 
     def __init__(self, model: ProcessModel) -> None:
         self.model = model
+        self._own = sum(state.name not in model.at_rest for state in model.states)
         self._stepper = Stepper(model)
         self._sensitivity_chains: dict[tuple[int, ...], ArrayFunction] = {}
 
@@ -80,7 +85,8 @@ class Simulator:
         Args:
             time_min: shape (rows,), increasing.
             inputs: shape (rows, n_u) or (rows,) for one input; row k holds over [t_k, t_k+1).
-            start: state at the first time, shape (n_x,).
+            start: state at the first time, shape (n_x,); or without the states of `ProcessModel.at_rest`, if these are
+                behind the others: then they are at rest.
             changes: parameters that differ from the model's values.
 
         Raises:
@@ -88,6 +94,7 @@ class Simulator:
             SimulationError: the equations cannot be integrated further.
         """
         inputs, start, p = self._checked(time_min, inputs, start, changes)
+        start, _, _ = self._begun(start, inputs, p, time_min)
         grid = self._grid(time_min, p)
         states, _ = self._run_steps(grid, inputs, start, p)
         return self._trajectory(time_min, inputs, p, np.vstack([start, states[grid.end_of_row]]))
@@ -106,10 +113,10 @@ class Simulator:
         Args:
             time_min: shape (rows,).
             inputs: shape (rows, n_u) or (rows,).
-            start: shape (n_x,).
+            start: shape (n_x,), or shorter, as for `run`.
             names: the parameters to differentiate by.
             changes: parameters that differ from the model's values.
-            start_sensitivity: d start / d parameters, shape (n_x, len(names)); zero if not given.
+            start_sensitivity: d start / d parameters, shape (start.size, len(names)); zero if not given.
 
         Raises:
             ValueError: as `run`, or an unknown parameter.
@@ -117,10 +124,12 @@ class Simulator:
         """
         inputs, start, p = self._checked(time_min, inputs, start, changes)
         wanted = [self.model.parameter_names.index(self.model.parameter(name).name) for name in names]
-        shape = (len(self.model.states), len(wanted))
+        shape = (start.size, len(wanted))
         initial = np.zeros(shape) if start_sensitivity is None else np.array(start_sensitivity, dtype=float)
         if initial.shape != shape:
             raise ValueError(f"start_sensitivity must have shape {shape}, got {initial.shape}")
+        start, by_start, by_p = self._begun(start, inputs, p, time_min)
+        initial = by_start @ initial + by_p[:, wanted]
         grid = self._grid(time_min, p)
         states, cuts = self._run_steps(grid, inputs, start, p)
         trajectory = self._trajectory(time_min, inputs, p, np.vstack([start, states[grid.end_of_row]]))
@@ -136,7 +145,7 @@ class Simulator:
     @cached_property
     def _chain(self) -> ArrayFunction:
         """(x, U, p, t, t_middle, h) -> (states after each step, error of each)."""
-        step = symbolic_step(self.model)
+        step = _row_step(self.model)
         few = step.mapaccum("few", UNROLLED).expand()
         symbols = self._chain_symbols()
         x, u, p, t, middle, h = symbols
@@ -150,7 +159,7 @@ class Simulator:
         return self._sensitivity_chains[wanted]
 
     def _new_sensitivity_chain(self, wanted: tuple[int, ...]) -> ArrayFunction:
-        step = symbolic_step(self.model)
+        step = _row_step(self.model)
         n_x, n = len(self.model.states), len(wanted)
         x, u, p, t, middle, h = step.sx_in()
         S, of_t, of_h = ca.SX.sym("S", n_x, n), ca.SX.sym("of_t", 1, n), ca.SX.sym("of_h", 1, n)
@@ -176,7 +185,7 @@ class Simulator:
         model = self.model
         sizes = (
             ("x", len(model.states), 1),
-            ("u", len(model.inputs), CHUNK),
+            ("u", len(model.inputs) * (2 if model.resets else 1) + bool(model.resets), CHUNK),
             ("p", len(model.parameters), 1),
             ("t", 1, CHUNK),
             ("t_middle", 1, CHUNK),
@@ -204,7 +213,29 @@ class Simulator:
         y = ca.vertcat(*(output.expression for output in model.outputs))
         return x, u, p, t, ca.substitute(ca.substitute(y, model.clock.now, t), model.clock.middle, t)
 
+    @cached_property
+    def _complete(self) -> ArrayFunction:
+        """(x without the states of `at_rest`, u, p, t) -> (x, its derivatives by x without them and by p)."""
+        return ArrayFunction(_with_derivatives(rest_function(self.model)))
+
+    @cached_property
+    def _reset(self) -> ArrayFunction:
+        """(x, u, p, t) -> (x when a row has begun, its derivatives by x and by p)."""
+        return ArrayFunction(_with_derivatives(reset_function(self.model)))
+
     # --- running ---------------------------------------------------------------------------------------------
+
+    def _begun(self, start: Array, inputs: Array, p: Array, time_min: Array) -> tuple[Array, Array, Array]:
+        """The whole state when the first row has begun, and its derivatives by the start that is given and by p."""
+        x, by_start, by_p = start, np.eye(start.size), np.zeros((start.size, p.size))
+        missing, model = start.size < len(self.model.states), self.model
+        for function in (*((self._complete,) if missing else ()), *((self._reset,) if model.resets else ())):
+            for argument, value in zip(function.arguments, (x, inputs[0], p, time_min[:1]), strict=True):
+                argument[0] = value
+            function()
+            after, by_x, further = function.results
+            x, by_start, by_p = after[0].copy(), by_x.T @ by_start, by_x.T @ by_p + further.T
+        return x, by_start, by_p
 
     def _grid(self, time_min: Array, p: Array) -> StepGrid:
         indices = [self.model.parameter_names.index(name) for name in self.model.breakpoints]
@@ -219,7 +250,7 @@ class Simulator:
         steps = grid.length_min.size
         states = np.empty((steps, start.size))
         cuts: dict[int, Array] = {}
-        x, first = start, 0
+        x, first, ends = start, 0, set(grid.end_of_row.tolist())
         while first < steps:
             part = slice(first, min(first + CHUNK, steps))
             count = self._fill(self._chain, grid, inputs, p, x, part)
@@ -237,6 +268,9 @@ class Simulator:
                 walking = lengths.size > 1
                 if walking:
                     cuts[first] = lengths
+                if self.model.resets and first in ends:
+                    row = grid.row[first] + 1
+                    x = self._stepper.begin_row(x, inputs[row], p, float(t + h))
                 states[first] = x
                 first += 1
         return states, cuts
@@ -270,7 +304,11 @@ class Simulator:
         count = int(part.stop - part.start)
         state, u, parameters, time, middle, length = chain.arguments[:6]
         state[0], parameters[0] = x, p
-        u[:count] = inputs[grid.row[part]]
+        n_u = inputs.shape[1]
+        u[:count, :n_u] = inputs[grid.row[part]]
+        if self.model.resets:
+            last = np.isin(np.arange(part.start, part.stop), grid.end_of_row)
+            u[:count, n_u:-1], u[:count, -1] = inputs[grid.row[part] + last], last
         time[:count, 0] = grid.start_min[part]
         middle[:count, 0] = grid.middle_min[part]
         length[:count, 0] = grid.length_min[part]
@@ -327,7 +365,7 @@ class Simulator:
             raise ValueError(f"times must increase, got {time_min[row]:g} after {time_min[row - 1]:g} min (row {row})")
         if inputs.shape != (time_min.size, len(model.inputs)):
             raise ValueError(f"inputs must have shape {(time_min.size, len(model.inputs))}, got {inputs.shape}")
-        if start.shape != (len(model.states),) or not np.all(np.isfinite(start)):
+        if start.shape not in ((len(model.states),), (self._own,)) or not np.all(np.isfinite(start)):
             raise ValueError(f"start must be {len(model.states)} finite numbers ({model.state_names}), got {start}")
         for column, item in enumerate(model.inputs):
             outside = ~((inputs[:, column] >= item.lower) & (inputs[:, column] <= item.upper))
@@ -338,3 +376,23 @@ class Simulator:
                     f"got {inputs[row, column]:g} at {time_min[row]:g} min"
                 )
         return inputs, start, model.values(changes)
+
+
+def _row_step(model: ProcessModel) -> ca.Function:
+    """One step; if the model has resets, u is the input, that of the row after, and 1 where the step ends a row."""
+    step = symbolic_step(model)
+    if not model.resets:
+        return step
+    x, u, p, t, middle, h = step.sx_in()
+    following, last = ca.SX.sym("u_next", u.numel()), ca.SX.sym("last")
+    after, error = step(x, u, p, t, middle, h)
+    after = ca.if_else(last, reset_function(model)(after, following, p, t + h), after)
+    return ca.Function("row_step", [x, ca.vertcat(u, following, last), p, t, middle, h], [after, error])
+
+
+def _with_derivatives(function: ca.Function) -> ca.Function:
+    """Of one vector of results: it, and its derivatives by the first and the third argument."""
+    symbols = function.sx_in()
+    result = function(*symbols)
+    derivatives = (ca.densify(ca.jacobian(result, symbols[place])) for place in (0, 2))
+    return ca.Function(function.name(), symbols, [result, *derivatives])

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.linearise import linearise
+from reactorwatch.process.memory import rest_function
 from reactorwatch.process.model import Array, ProcessModel
 
 STARTS = 1024
@@ -57,7 +58,7 @@ def steady_states(model: ProcessModel, inputs: Array, time_min: float = 0.0) -> 
         time_min: when, for models with an effect that depends on time.
 
     Returns:
-        By rising value of the last state (for the reactor: from extinguished to operating).
+        By rising value of the last state that is not in `at_rest` (for the reactor: from extinguished to operating).
 
     Raises:
         ValueError: inputs that do not fit the model.
@@ -65,11 +66,12 @@ def steady_states(model: ProcessModel, inputs: Array, time_min: float = 0.0) -> 
     inputs = np.atleast_1d(np.asarray(inputs, dtype=float))
     if inputs.shape != (len(model.inputs),) or not np.all(np.isfinite(inputs)):
         raise ValueError(f"inputs must be {len(model.inputs)} finite numbers ({model.input_names}), got {inputs}")
-    scales = np.array([state.scale for state in model.states])
-    lower = np.array([state.lower for state in model.states])
-    upper = np.array([state.upper for state in model.states])
-    x = lower[:, None] + _lattice(len(model.states)) * (upper - lower)[:, None]
-    rhs, newton = _newton(model)
+    own = model.without_memory()
+    scales = np.array([state.scale for state in own.states])
+    lower = np.array([state.lower for state in own.states])
+    upper = np.array([state.upper for state in own.states])
+    x = lower[:, None] + _lattice(len(own.states)) * (upper - lower)[:, None]
+    rhs, newton = _newton(own)
     fixed = (inputs, model.values(), time_min)
     for _ in range(ITERATIONS):
         step = np.nan_to_num(np.array(newton(x, *fixed)))
@@ -81,8 +83,9 @@ def steady_states(model: ProcessModel, inputs: Array, time_min: float = 0.0) -> 
     for point in x[:, residual < RESIDUAL].T:
         if all(np.max(np.abs(point - other) / scales) > SAME for other in found):
             found.append(point)
-    function = model.function()
-    states = [
+    function, completed = model.function(), rest_function(model)
+    found = [np.array(completed(point, *fixed)).ravel() for point in sorted(found, key=lambda point: float(point[-1]))]
+    return [
         SteadyState(
             point,
             np.array(function(point, *fixed, time_min)[1]).ravel(),
@@ -90,7 +93,6 @@ def steady_states(model: ProcessModel, inputs: Array, time_min: float = 0.0) -> 
         )
         for point in found
     ]
-    return sorted(states, key=lambda item: float(item.state[-1]))
 
 
 def _newton(model: ProcessModel) -> tuple[ca.Function, ca.Function]:

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from reactorwatch.process.model import Parameter, ProcessModel
+from reactorwatch.process.model import Parameter, ProcessModel, Variable
 from reactorwatch.process.profiles import CONSTANT, Profile
 
 TIMING = "timing"
@@ -146,8 +146,8 @@ class SensorEffect(Effect):
     output: ClassVar[str]
 
     @abstractmethod
-    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """What the sensor makes of the value that is there."""
+    def sensed(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
+        """What the sensor makes of the value that is there, and the model with what it remembers for that."""
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.
@@ -159,10 +159,31 @@ class SensorEffect(Effect):
             raise ValueError(
                 f"{self.name} needs a model with the output {self.output!r}, {model.name} has {model.output_names}"
             )
-        return replace(
-            model,
-            outputs=tuple(
-                replace(item, expression=self.measured(item.expression, size)) if item.name == self.output else item
-                for item in model.outputs
-            ),
-        )
+        value = model.outputs[model.output_names.index(self.output)].expression
+        extended, shown = self.sensed(model, value, size)
+        outputs = (replace(item, expression=shown) if item.name == self.output else item for item in model.outputs)
+        return replace(extended, outputs=tuple(outputs))
+
+
+class ReadingEffect(SensorEffect):
+    """An effect of a sensor that remembers nothing: what it shows is a function of what is there."""
+
+    @abstractmethod
+    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """What the sensor makes of the value that is there."""
+
+    def sensed(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
+        """See `SensorEffect`."""
+        return model, self.measured(value, size)
+
+
+def coolant_flow_of(effect: Effect, model: ProcessModel) -> Variable:
+    """The input that the coolant valve is told.
+
+    Raises:
+        ValueError: the model has no input qc.
+    """
+    for item in model.inputs:
+        if item.name == "qc":
+            return item
+    raise ValueError(f"{effect.name} needs a model with the input 'qc', {model.name} has {model.input_names}")

@@ -4,10 +4,10 @@ from typing import ClassVar
 
 import casadi as ca
 
-from reactorwatch.process.effects.base import SensorEffect
+from reactorwatch.process.effects.base import ReadingEffect
 
 
-class ConcentrationBias(SensorEffect):
+class ConcentrationBias(ReadingEffect):
     """The measured concentration is C + m."""
 
     name = "concentration_bias"
@@ -21,5 +21,5 @@ class ConcentrationBias(SensorEffect):
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the analyser"}
 
     def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """See `SensorEffect`."""
+        """See `ReadingEffect`."""
         return value + size

@@ -4,10 +4,10 @@ from typing import ClassVar
 
 import casadi as ca
 
-from reactorwatch.process.effects.base import SensorEffect
+from reactorwatch.process.effects.base import ReadingEffect
 
 
-class ConcentrationGain(SensorEffect):
+class ConcentrationGain(ReadingEffect):
     """The measured concentration is C (1 + m)."""
 
     name = "concentration_gain"
@@ -21,5 +21,5 @@ class ConcentrationGain(SensorEffect):
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the gain of the analyser"}
 
     def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """See `SensorEffect`."""
+        """See `ReadingEffect`."""
         return value * (1 + size)

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effects.base import Effect, coolant_flow_of
 from reactorwatch.process.model import ProcessModel
 
 
@@ -26,7 +26,5 @@ class CoolantFlow(Effect):
         Raises:
             ValueError: the model has no input qc.
         """
-        for item in model.inputs:
-            if item.name == "qc":
-                return model.substitute(item.symbol, item.symbol * (1 + size))
-        raise ValueError(f"coolant_flow needs a model with the input 'qc', {model.name} has {model.input_names}")
+        qc = coolant_flow_of(self, model).symbol
+        return model.substitute(qc, qc * (1 + size))

@@ -6,6 +6,7 @@ import casadi as ca
 
 from reactorwatch.process.effects.base import TIMING, Effect
 from reactorwatch.process.integrate import symbolic_step
+from reactorwatch.process.memory import positive
 from reactorwatch.process.model import ProcessModel
 
 STEPS = 2
@@ -39,7 +40,7 @@ class SampleTiming(Effect):
         symbols, clock = model.arguments(), model.clock
         x, u, p = symbols
         step, shown = symbolic_step(model), model.function("shown")
-        late = ca.if_else(size >= 0, size, 0)
+        late = positive(size)
         h = late / STEPS
         for number in range(STEPS):
             x = step(x, u, p, clock.now + number * h, clock.middle, h)[0]

@@ -4,10 +4,10 @@ from typing import ClassVar
 
 import casadi as ca
 
-from reactorwatch.process.effects.base import SensorEffect
+from reactorwatch.process.effects.base import ReadingEffect
 
 
-class TemperatureBias(SensorEffect):
+class TemperatureBias(ReadingEffect):
     """The measured temperature is T + m."""
 
     name = "temperature_bias"
@@ -21,5 +21,5 @@ class TemperatureBias(SensorEffect):
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the temperature sensor"}
 
     def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """See `SensorEffect`."""
+        """See `ReadingEffect`."""
         return value + size

@@ -1,14 +1,19 @@
 """The faults of the catalogue in the plant: its rows are what the physics makes of them."""
 
 import numpy as np
+import pytest
+from msgspec.structs import replace as with_changes
 from scipy.integrate import solve_ivp
 
 from plant_node.config import NoiseSd, PlantConfig
-from plant_node.controllers import TemperatureControl
+from plant_node.controllers import LevelControl, TemperatureControl
 from plant_node.core import Plant
 from plant_node.record import simulate_record
 from plant_node.scenario import Constant
 from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import Array
 
 QUIET = NoiseSd(C=0, T=0)
@@ -47,3 +52,35 @@ def test_timing_is_wrong_of_whatever_else_is_wrong_in_whichever_order_it_was_put
     runs = [simulate_record(PlantConfig(noise_sd=QUIET, faults=order, seed=4), 50) for order in (faults, faults[::-1])]
     first, last = runs
     np.testing.assert_allclose(first.columns["T"], last.columns["T"], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: effect.name)
+@pytest.mark.parametrize("controlled", [False, True])
+def test_every_effect_sets_in_on_a_plant_at_rest_and_moves_what_is_measured(effect: Effect, controlled: bool) -> None:
+    """Under both controllers too; the flow is stepped after the onset, so that lags show."""
+    control = TemperatureControl(set_point_K=((0.0, 438.54), (3.0, 437.0))) if controlled else None
+    scenario = {"kind": "square", "low": 101.0, "high": 103.0, "period_min": 6.0}
+    level = LevelControl() if controlled else None
+    sound = PlantConfig(noise_sd=QUIET, temperature_control=control, level_control=level, scenario=scenario)
+    fault = f"{effect.name}:step:{2 * effect.typical!r}@1min"
+    runs = [simulate_record(config, 80).columns for config in (with_changes(sound, faults=(fault,)), sound)]
+    off = np.abs(np.column_stack([runs[0][name] - runs[1][name] for name in ("C", "T")]))
+    assert np.all(off[:10] < [1e-7, 1e-5])
+    assert np.any(off[10:] > [1e-4, 1e-2])
+
+
+def test_a_valve_that_begins_to_stick_stands_where_it_was() -> None:
+    """It is made to stick before the flow is stepped by less than it sticks, and let go after."""
+    plant, twin = (Plant(PlantConfig(noise_sd=QUIET, scenario="constant"), cstr(), Constant()) for _ in range(2))
+    shown, expected = [], []
+    for number in range(60):
+        if number == 10:
+            plant.inject(parse_fault("valve_stiction:constant:3"))
+            plant.set_input("qc", 102.0)
+        if number == 30:
+            plant.clear("valve_stiction")
+            twin.set_input("qc", 102.0)
+        shown.append(plant.next_row().readings)
+        expected.append(twin.next_row().readings)
+    assert [row["qc"] for row in shown[10:30]] == [102.0] * 20
+    np.testing.assert_allclose([row["T"] for row in shown], [row["T"] for row in expected], rtol=0, atol=1e-6)

@@ -161,6 +161,7 @@ def test_on_the_plant_its_innovations_are_white(process_sd: dict[str, float]) ->
         "coolant_flow:step:-0.05@60.037min",
         "temperature_bias:step:3@60min",
         "heat_transfer:ramp:-0.5@60.04min,end=120min",
+        "coolant_flow:free:-0.05,60.03min=0,90min=1,150.06min=0.3",
     ],
 )
 def test_with_the_true_fault_in_the_model_the_innovations_of_a_faulty_plant_are_white(fault: str) -> None:
