@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from diagnosis.courses import Signal
-from diagnosis.hypothesis import Sized
 from diagnosis.run import Run
 from diagnosis.search import Explained
+from diagnosis.sized import Sized
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
@@ -57,8 +57,10 @@ def free_run(run: Run, sized: Sized, signals: Sequence[Signal]) -> Array:
     while first < run.time_min.size - 2 and not np.all(np.isfinite(found.x[first])):
         first += 1
     try:
-        inputs = sized.inputs(run, signals)[first:]
-        outputs[first:] = Simulator(sized.model).run(run.time_min[first:], inputs, found.x[first]).outputs
+        whole = sized.whole
+        inputs = whole.inputs(run.inputs, signals)[first:]
+        start = found.x[first][: sized.own_states]  # memory is short: it begins at rest
+        outputs[first:] = Simulator(whole.model).run(run.time_min[first:], inputs, start).outputs
     except SimulationError:
         outputs[first:] = np.nan
     return outputs

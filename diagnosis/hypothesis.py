@@ -11,31 +11,23 @@ filter's own errors (`signatures`).
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import casadi as ca
 import numpy as np
 
 from diagnosis import signatures
 from diagnosis.courses import Course, Signal
 from diagnosis.run import Run
-from diagnosis.size_inputs import with_size_inputs
-from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.filter import Filter, Innovations, NoiseLevels
-from reactorwatch.process.filter_errors import FilterErrors, Ways
-from reactorwatch.process.model import Array, ProcessModel
-
-HUBER = 4.0
-LOST = 100.0
-"""Standard deviations that a value counts as off where the filter has lost the plant."""
+from diagnosis.sized import HUBER, Sized, clipped
+from reactorwatch.process.filter import Innovations
+from reactorwatch.process.model import Array
 
 SETTLED = 0.05
 """In log likelihood: a step that gains less ends the search."""
 
-_CLUELESS = 1e6
-"""Standard deviations of a sensor: a filter that is less sure of its prediction has lost the plant."""
-
 _RUNAWAY = 1e100
 """A filter that lost an unstable plant has signatures without bound, and no step makes sense."""
 
+_SHARE = 0.02
+_FIRST_SHARE, _LAST_SHARE = 0.4, 0.003
 _WIDENINGS = 4
 _MOST_STEPS, _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 12, 5, 1e-3, 10.0, 0.1
 
@@ -55,67 +47,6 @@ class Fit:
     loss: float
     w: Array
     found: Innovations
-
-
-class Sized:
-    """The filter of a model in which the sizes of some effects are inputs.
-
-    Args:
-        model: of the plant.
-        effects: that are in it.
-        noise: of the plant and its sensors.
-    """
-
-    def __init__(self, model: ProcessModel, effects: Sequence[Effect], noise: NoiseLevels) -> None:
-        self.effects = tuple(effects)
-        self._sized = with_size_inputs(model, effects)
-        self.model = self._sized.model
-        self._filter = Filter(self.model, self._noise_of(noise))
-        self._errors = FilterErrors(self.model, self._filter.noise, self._sized.of_rates, self._sized.of_outputs)
-
-    @property
-    def noise(self) -> NoiseLevels:
-        """Of the plant and its sensors."""
-        return self._filter.noise
-
-    @noise.setter
-    def noise(self, noise: NoiseLevels) -> None:
-        self._filter.noise = self._noise_of(noise)
-        self._errors.noise = self._filter.noise
-
-    def _noise_of(self, noise: NoiseLevels) -> NoiseLevels:
-        """States that an effect brings have none of their own."""
-        more = len(self.model.states) - len(noise.process_sd)
-        return NoiseLevels(noise.measurement_sd, (*noise.process_sd, *(0.0,) * more))
-
-    def size_symbols(self, effect: Effect) -> tuple[ca.SX, ca.SX] | None:
-        """The inputs that are the size of an effect, as balances and outputs have it; None if it has none."""
-        if effect not in self.effects:
-            return None
-        place = self.effects.index(effect)
-        return self._sized.of_rates[place], self._sized.of_outputs[place]
-
-    def inputs(self, run: Run, signals: Sequence[Signal]) -> Array:
-        """With the sizes beside them, shape (rows, n_u + 2 effects)."""
-        return self._sized.inputs(run.inputs, signals)
-
-    def follow(self, run: Run, signals: Sequence[Signal]) -> tuple[float, Array, Innovations]:
-        """Loss, whitened innovations and the filter's run."""
-        found = self._filter.run(run.time_min, self.inputs(run, signals), run.measured)
-        # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
-        known = np.isfinite(run.measured)
-        least = np.array(self.noise.measurement_sd)
-        good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0) & (found.conditional_sd < _CLUELESS * least)
-        known[0] = False
-        w = np.where(known & ~good, LOST, np.where(known, found.whitened, np.nan))
-        spread = np.log(np.where(known & good, found.conditional_sd, 1.0))
-        return loss_of(w) + float(np.sum(spread)), w, found
-
-    def ways(self, run: Run, signals: Sequence[Signal], found: Innovations) -> Ways:
-        """The equations of the filter's errors about its run; from the second row on, the first that it predicts."""
-        later = Innovations(*(item[1:] for item in found))
-        used = np.isfinite(run.measured[1:])
-        return self._errors.ways(run.time_min[1:], self.inputs(run, signals)[1:], later, used)
 
 
 class Hypothesis:
@@ -160,6 +91,8 @@ class Hypothesis:
                 break
             weights = HUBER / np.maximum(np.abs(w), HUBER)
             information, gradient = (g * weights[:, None]).T @ g, g.T @ (weights * w)
+            if not np.any(information):
+                return self._scanned(run, best)
             scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
             information, gradient = information / np.outer(scale, scale), gradient / scale
             before = best
@@ -173,6 +106,17 @@ class Hypothesis:
             if best.loss > before.loss - SETTLED:
                 break
             differences = self._widened(_inverse(g))
+        return best
+
+    def _scanned(self, run: Run, best: Fit) -> Fit:
+        """Of a single coefficient that the innovations depend on in jumps: the best of ever nearer ones."""
+        step = _FIRST_SHARE
+        while step > _LAST_SHARE:
+            (numbers,) = best.theta
+            for way in (1.0 / (1.0 + step), 1.0 + step):
+                trial = self.at(run, [numbers * way])
+                best = min(best, trial, key=lambda item: item.loss)
+            step *= 0.7
         return best
 
     def covariance(self, run: Run, fit: Fit) -> Array:
@@ -189,6 +133,8 @@ class Hypothesis:
 
     def _slope(self, run: Run, fit: Fit, differences: Sequence[Array]) -> Array:
         """What the whitened innovations lose as the numbers grow, shape (values from the third row on, freedom)."""
+        if self.sized.late is not None:
+            return self._slope_by_differences(run, fit, differences)
         ways = self.sized.ways(run, self._signals(fit.theta), fit.found)
         columns = []
         for place, (course, numbers, moved) in enumerate(zip(self.courses, fit.theta, differences, strict=True)):
@@ -196,6 +142,23 @@ class Hypothesis:
             g = signatures.shown(ways, place, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
             columns.append(g.reshape(-1, course.freedom))
         return np.concatenate(columns, axis=1)
+
+    def _slope_by_differences(self, run: Run, fit: Fit, differences: Sequence[Array]) -> Array:
+        columns = []
+        for place, (course, moved) in enumerate(zip(self.courses, differences, strict=True)):
+            size = _SHARE * self.sized.effects[place].typical
+            for number, step in enumerate([*(size,) * course.coefficients, *moved.tolist()]):
+                theta = [item.copy() for item in fit.theta]
+                theta[place][number] += step
+                _, w, _ = self.sized.follow(run, self._signals(theta))
+                columns.append((clipped(fit.w[2:]) - clipped(w[2:])).ravel() / step)
+        return np.stack(columns, axis=1)
+
+    def without(self, run: Run, fit: Fit, place: int) -> Array:
+        """The whitened innovations of a filter that does not know one of the deviations, shape (rows, n_y)."""
+        signals = self._signals(fit.theta)
+        signals[place] = Signal(*(np.zeros_like(item) for item in signals[place]))
+        return self.sized.follow(run, signals)[1]
 
     def _least_differences(self) -> list[Array]:
         return [course.least_differences for course in self.courses]
@@ -229,9 +192,3 @@ def _inverse(g: Array) -> Array:
     scale = np.sqrt(np.maximum(np.sum(g * g, axis=0), 1e-300))
     inner = np.linalg.pinv((g / scale).T @ (g / scale), rcond=1e-12, hermitian=True)
     return np.asarray(inner / np.outer(scale, scale))
-
-
-def loss_of(w: Array) -> float:
-    """Of whitened innovations, without what they were divided by."""
-    size = np.abs(np.nan_to_num(w))
-    return float(np.sum(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER))))

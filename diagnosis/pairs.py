@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from diagnosis.courses import Course
 from diagnosis.hypothesis import Hypothesis
 from diagnosis.screen import Lead
-from diagnosis.search import IN_QUESTION, Explained, Found, Search
+from diagnosis.search import IN_QUESTION, Explained, Found, Key, Search
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array
 
@@ -37,7 +37,7 @@ def with_pairs(search: Search, found: Found) -> Found:
     left = _promising(search, search.screen.leads(single.hypothesis, single.fit), LEAST_PAIR_GAIN)
     if not left:
         return found
-    pairs: dict[tuple[tuple[str, str], ...], Explained] = {}
+    pairs: dict[Key, Explained] = {}
     for begin in _beginnings(found.explained):
         left = _promising(search, search.screen.leads(begin.hypothesis, begin.fit), LEAST_PAIR_GAIN)
         for lead in _others(left, begin)[:SECONDS]:
@@ -95,6 +95,6 @@ def _fitted(search: Search, parts: Sequence[tuple[Effect, Course, Array]]) -> Ex
     return search.fit(Hypothesis(search.sized(effects), courses), theta)
 
 
-def _keep(pairs: dict[tuple[tuple[str, str], ...], Explained], item: Explained) -> None:
+def _keep(pairs: dict[Key, Explained], item: Explained) -> None:
     if item.key not in pairs or item.bic < pairs[item.key].bic:
         pairs[item.key] = item

@@ -5,9 +5,7 @@ left: so rivals are asked to explain the same as it does, instead of it. About a
 little noise of the process hides what tells rivals apart; about the nominal model that noise has taken up the
 deviation, and the causes that stand out are all that can be asked for.
 
-An effect that brings states of its own, such as a lag, has no infinitesimal deviation. Its signature is what a size of
-the usual magnitude does, by a run of its own; and since lags are short beside the courses, that signature times the
-course is taken for that of the course.
+Effects that bring states of their own, such as a lag, have no infinitesimal deviation; for them see `memory_screen`.
 """
 
 from collections.abc import Sequence
@@ -18,8 +16,9 @@ import numpy as np
 
 from diagnosis import signatures
 from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Signal, Sine, Step
-from diagnosis.hypothesis import HUBER, Fit, Hypothesis, Sized
+from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
+from diagnosis.sized import Sized, clipped
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter_errors import FilterErrors, Ways
 from reactorwatch.process.model import Array, ProcessModel
@@ -70,7 +69,7 @@ class Screen:
         self._model, self._run = model, run
         names = model.state_names
         self._direct = tuple(effect for effect in effects if effect.extend(model).state_names == names)
-        self._other = tuple(effect for effect in effects if effect not in self._direct)
+        self.with_memory = tuple(effect for effect in effects if effect not in self._direct)
         self._period_min = float(np.median(np.diff(run.time_min)))
         self._beta = np.diff(run.time_min[1:])
         t = run.time_min
@@ -85,26 +84,31 @@ class Screen:
             fit: of it.
             replaced: places of those of its effects that rivals are looked for, to take their place; the others stay.
         """
-        w = np.clip(np.nan_to_num(fit.w[2:]), -HUBER, HUBER)
-        for place in replaced:
-            w = w + self._explained(hypothesis, fit, place)
-        ways = self._ways(hypothesis.sized, hypothesis.signals(fit), fit)
-        if not (np.all(np.isfinite(w)) and np.all(np.isfinite(ways.F))):
-            return []
-        ways = Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, w)
-        found = self._set_in(ways) + self._swinging(ways) + self._in_course(ways, self._free, np.empty(0))
-        for place in replaced:
-            course, theta = hypothesis.courses[place], fit.theta[place]
-            if course.name != self._free.name:
-                found += self._in_course(ways, course, theta[course.coefficients :])
+        with np.errstate(over="ignore", invalid="ignore"):  # about a run that has lost an unstable plant
+            w = clipped(fit.w[2:])
+            for place in replaced:
+                w = w + self._explained(hypothesis, fit, place)
+            ways = self._ways(hypothesis.sized, hypothesis.signals(fit), fit)
+            if not all(np.all(np.isfinite(item)) for item in (w, ways.F, ways.G, ways.K)):
+                return []
+            ways = Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, w)
+            found = self._set_in(ways) + self._swinging(ways) + self._in_course(ways, self._free, np.empty(0))
+            for place in replaced:
+                course, theta = hypothesis.courses[place], fit.theta[place]
+                if course.name != self._free.name:
+                    found += self._in_course(ways, course, theta[course.coefficients :])
+        found = [item for item in found if np.isfinite(item.gain) and np.all(np.isfinite(item.theta))]
         return sorted(found, key=lambda item: -item.score(self._run.values))
 
     def _explained(self, hypothesis: Hypothesis, fit: Fit, place: int) -> Array:
         """What a fitted deviation does to the innovations of a filter that does not know it, shape (rows, n_y)."""
+        if place == hypothesis.sized.late:
+            return clipped(hypothesis.without(self._run, fit, place)[2:]) - clipped(fit.w[2:])
         signals = hypothesis.signals(fit)
         ways = hypothesis.sized.ways(self._run, signals, fit.found)
         over_row, at_row = signals[place]
-        return signatures.shown(ways, place, over_row[1:-1, None], at_row[2:, None])[:, :, 0]
+        column = place - (hypothesis.sized.late is not None and hypothesis.sized.late < place)
+        return signatures.shown(ways, column, over_row[1:-1, None], at_row[2:, None])[:, :, 0]
 
     def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit) -> Ways:
         """Of all effects about the run of a filter."""
@@ -120,7 +124,7 @@ class Screen:
         errors = FilterErrors(extended, sized.noise, of_rates, of_outputs)
         later = type(fit.found)(*(item[1:] for item in fit.found))
         inputs = sized.inputs(self._run, signals)[1:]
-        return errors.ways(self._run.time_min[1:], inputs, later, np.isfinite(self._run.measured[1:]))
+        return errors.ways(self._run.time_min[1:], inputs, later, sized.used(self._run)[1:])
 
     def _set_in(self, ways: Ways) -> list[Lead]:
         """Constants, steps, ramps and decays."""
@@ -188,6 +192,8 @@ class Screen:
         for cause, effect in enumerate(self._direct):
             g = signatures.shown(ways, cause, over_row[1:-1], at_row[2:]).reshape(-1, course.coefficients)
             a, b = g.T @ ways.w.ravel(), g.T @ g
+            if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
+                continue
             by = np.asarray(np.linalg.lstsq(b, a, rcond=1e-12)[0], dtype=np.float64)
             if course.coefficients == 1:
                 by = np.clip(by, effect.lower, effect.upper)
@@ -198,4 +204,6 @@ class Screen:
 def _best(a: Array, b: Array, effect: Effect) -> tuple[Array, Array]:
     """The likeliest possible sizes and their gains."""
     size = np.clip(a / np.maximum(b, 1e-300), effect.lower, effect.upper)
-    return size, size * (2.0 * a - size * b)
+    gain = size * (2.0 * a - size * b)
+    good = np.isfinite(gain)
+    return np.where(good, size, 0.0), np.where(good, gain, 0.0)

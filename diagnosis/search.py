@@ -10,19 +10,22 @@ a model, Annals of Statistics 6) with the noise of the best.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log
+from typing import TypeAlias
 
 import numpy as np
 
-from diagnosis.hypothesis import Fit, Hypothesis, Sized
+from diagnosis.hypothesis import Fit, Hypothesis
+from diagnosis.memory_screen import MemoryScreen
 from diagnosis.run import Run
 from diagnosis.screen import Lead, Screen
+from diagnosis.sized import Sized
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.noise import tune
 
-FIRST_LEADS, LEADS, A_CAUSE = 3, 10, 2
-"""How many leads are fitted of the first screen and of each later one, and how many of a cause."""
+FIRST_LEADS, MOST_LEADS, LEADS, A_CAUSE = 3, 8, 10, 2
+"""How many leads of the first screen are fitted, and if none of them gains anything; of each later one; of a cause."""
 
 LEAST_SCORE = -20.0
 """A lead that promises less in BIC is not fitted."""
@@ -32,6 +35,11 @@ IN_QUESTION = 60.0
 
 ROUNDS = 5
 _NEAR = 4.0
+_SHARE = 0.3  # of what the best lead promises: linear promises of memory are rough
+
+
+Key: TypeAlias = tuple[tuple[str, str], ...]
+"""(cause, profile) of each effect."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +57,7 @@ class Explained:
     bic: float
 
     @property
-    def key(self) -> tuple[tuple[str, str], ...]:
+    def key(self) -> Key:
         """(cause, profile) of its effects, in the order of their names."""
         courses = (course.name for course in self.hypothesis.courses)
         return tuple(sorted(zip(self.hypothesis.causes, courses, strict=True)))
@@ -94,9 +102,18 @@ class Search:
     def found(self) -> Found:
         """The best explanations by one effect."""
         nominal = self.nominal()
-        leads = self.screen.leads(nominal.hypothesis, nominal.fit)
-        known = {item.key: item for item in map(self.fitted, self.chosen(leads, FIRST_LEADS, LEAST_SCORE))}
-        best = min([nominal, *known.values()], key=lambda item: item.bic)
+        memory = MemoryScreen(self.screen.with_memory, self.run)
+        remembering = self._sorted(memory.leads(nominal.fit, lambda effect: self.sized((effect,))))
+        leads = self._sorted(self.screen.leads(nominal.hypothesis, nominal.fit) + remembering)
+        best, known = nominal, dict[Key, Explained]()
+        for number, lead in enumerate(_of_different_causes(leads)):
+            if lead.score(self.run.values) < 0.0 or number >= (MOST_LEADS if best is nominal else FIRST_LEADS):
+                break
+            item = self.fitted(lead)
+            known[item.key] = item
+            best = min(best, item, key=lambda item: item.bic)
+        least = max([LEAST_SCORE, *(_SHARE * item.score(self.run.values) for item in leads[:1])])
+        remembering = self.chosen(remembering, LEADS, least, of_a_cause=1)
         for _ in range(ROUNDS):
             if best is nominal:
                 break
@@ -104,11 +121,10 @@ class Search:
             known = {best.key: self.refitted(best)}
             best = known[best.key]
             leads = self.screen.leads(best.hypothesis, best.fit, replaced=(0,))
-            if not leads:
-                break
-            least = max(leads[0].score(self.run.values) - IN_QUESTION, LEAST_SCORE)
-            for lead in [*self.chosen(leads, LEADS, least), *self._simpler(leads, best)]:
-                item = self.fitted(lead) if _key(lead) not in known or self._elsewhere(lead, best) else best
+            least = max([LEAST_SCORE, *(item.score(self.run.values) - IN_QUESTION for item in leads[:1])])
+            for lead in [*self.chosen(leads, LEADS, least), *self._simpler(leads, best), *remembering]:
+                fresh = _key(lead) not in known or (_key(lead) == best.key and self._elsewhere(lead, best))
+                item = self.fitted(lead) if fresh else known[_key(lead)]
                 if item.key not in known or item.bic < known[item.key].bic:
                     known[item.key] = item
             again, best = best, min(known.values(), key=lambda item: item.bic)
@@ -122,22 +138,23 @@ class Search:
 
     def settle(self, best: Explained) -> None:
         """Take the noise that a hypothesis needs for that of all."""
-        sized, run = best.hypothesis.sized, self.run
-        inputs = sized.inputs(run, best.hypothesis.signals(best.fit))
-        found = tune(sized.model, run.time_min, inputs, run.measured, self._smallest_sd)
-        self.noise = NoiseLevels(found.measurement_sd, found.process_sd[: len(self._model.states)])
+        signals = best.hypothesis.signals(best.fit)
+        self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd)
 
-    def chosen(self, leads: Sequence[Lead], count: int, least: float) -> list[Lead]:
+    def chosen(self, leads: Sequence[Lead], count: int, least: float, of_a_cause: int = A_CAUSE) -> list[Lead]:
         """The best leads that promise enough, not too many of one cause."""
         found: list[Lead] = []
         for lead in leads:
             same = [item for item in found if item.effect is lead.effect]
             new = all(item.course.name != lead.course.name for item in same)
-            if new and len(same) < A_CAUSE and lead.score(self.run.values) > least:
+            if new and len(same) < of_a_cause and lead.score(self.run.values) > least:
                 found.append(lead)
             if len(found) == count:
                 break
         return found
+
+    def _sorted(self, leads: Sequence[Lead]) -> list[Lead]:
+        return sorted(leads, key=lambda item: -item.score(self.run.values))
 
     def _simpler(self, leads: Sequence[Lead], best: Explained) -> list[Lead]:
         """The best's own cause in every simpler course: with the right one, it needs fewer numbers."""
@@ -184,5 +201,13 @@ class Search:
         return Explained(hypothesis, fit, 2.0 * fit.loss + hypothesis.freedom * log(self.run.values))
 
 
-def _key(lead: Lead) -> tuple[tuple[str, str], ...]:
+def _of_different_causes(leads: Sequence[Lead]) -> list[Lead]:
+    """The first of each cause."""
+    found: dict[str, Lead] = {}
+    for lead in leads:
+        found.setdefault(lead.effect.name, lead)
+    return list(found.values())
+
+
+def _key(lead: Lead) -> Key:
     return ((lead.effect.name, lead.course.name),)

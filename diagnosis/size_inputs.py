@@ -50,11 +50,12 @@ def with_size_inputs(model: ProcessModel, effects: Sequence[Effect]) -> SizedMod
             variable(f"{effect.name}.{number}.{where}", effect.unit, (-largest, largest), effect.typical, effect.label)
             for where in ("felt", "seen")
         )
-        rhs = ca.substitute(list(extended.rhs), [size], [felt.symbol])
+        model = extended.substitute(size, felt.symbol)
         outputs = tuple(
-            replace(item, expression=ca.substitute(item.expression, size, seen.symbol)) for item in extended.outputs
+            replace(item, expression=ca.substitute(was.expression, size, seen.symbol))
+            for item, was in zip(model.outputs, extended.outputs, strict=True)
         )
-        model = replace(extended, rhs=tuple(rhs), outputs=outputs, inputs=(*model.inputs, felt, seen))
+        model = replace(model, outputs=outputs, inputs=(*model.inputs, felt, seen))
         of_rates.append(felt.symbol)
         of_outputs.append(seen.symbol)
     return SizedModel(model, tuple(of_rates), tuple(of_outputs))

@@ -16,6 +16,7 @@ from math import ceil
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from reactorwatch.process.array_function import ArrayFunction, mapped
 from reactorwatch.process.filter import Innovations, NoiseLevels
@@ -68,7 +69,7 @@ class FilterErrors:
         self._shown = mapped(_shown(model, ca.vertcat(*of_outputs)), CHUNK, parameters=2)
         self.noise = noise
 
-    def ways(self, time_min: Array, inputs: Array, found: Innovations, used: Array) -> Ways:
+    def ways(self, time_min: Array, inputs: Array, found: Innovations, used: NDArray[np.bool_]) -> Ways:
         """Those between the rows of a record.
 
         Args:
@@ -80,7 +81,7 @@ class FilterErrors:
         with np.errstate(over="ignore", invalid="ignore"):  # about a run that has lost an unstable plant
             return self._ways(time_min, inputs, found, used)
 
-    def _ways(self, time_min: Array, inputs: Array, found: Innovations, used: Array) -> Ways:
+    def _ways(self, time_min: Array, inputs: Array, found: Innovations, used: NDArray[np.bool_]) -> Ways:
         R, q = np.square(self.noise.measurement_sd), np.square(self.noise.process_sd)
         p, step = self.model.values(), np.diff(time_min)
         there, F, G = self._walked(found.x[:-1], inputs[:-1], time_min[:-1], step, p)

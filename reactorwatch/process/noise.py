@@ -195,6 +195,8 @@ class _Tuning:
 
 def _rough(measured: Array) -> Array:
     """A first guess of the sensors' noise: third differences leave little of what the process does."""
-    third = np.abs(np.diff(measured, n=3, axis=0))
-    known = [column[np.isfinite(column)] for column in third.T]
-    return np.array([np.median(column) if column.size else 0.0 for column in known]) / _OF_THIRD_DIFFERENCES
+    found = []
+    for column in measured.T:
+        third = np.abs(np.diff(column[np.isfinite(column)], n=3))
+        found.append(float(np.median(third)) if third.size else 0.0)
+    return np.array(found) / _OF_THIRD_DIFFERENCES

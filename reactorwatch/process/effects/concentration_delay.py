@@ -38,7 +38,7 @@ class ConcentrationDelay(SensorEffect):
     upper = 3.0
     typical = 0.2
     starts = (0.1, 0.5, 1.5)
-    output = "C"
+    output = late_output = "C"
 
     def sensed(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
         """See `SensorEffect`."""

@@ -5,8 +5,9 @@ import pytest
 
 from diagnosis import signatures
 from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Sine, Step
-from diagnosis.hypothesis import Fit, Hypothesis, Sized
+from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
+from diagnosis.sized import Sized
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect

@@ -1,0 +1,85 @@
+"""Leads among the effects that bring memory of their own: lags, a valve that sticks, a delay.
+
+They have no infinitesimal deviation, so each is tried at a few sizes of the usual magnitude. What the innovations lose
+by a size is its signature; since such memory is short beside the courses, that signature times a course is taken for
+that of the course.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from diagnosis.courses import Constant, Free, Ramp, Step
+from diagnosis.hypothesis import Fit
+from diagnosis.run import Run
+from diagnosis.screen import EDGE_ROWS, KNOTS, Lead
+from diagnosis.sized import Sized, clipped
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.model import Array
+
+
+class MemoryScreen:
+    """Tries the effects with memory on one run.
+
+    Args:
+        effects: those that bring states of their own.
+        run: the record.
+    """
+
+    def __init__(self, effects: Sequence[Effect], run: Run) -> None:
+        self._effects, self._run = tuple(effects), run
+        t = run.time_min
+        self._constant, self._step, self._ramp, self._free = Constant(t), Step(t), Ramp(t), Free(t, KNOTS)
+
+    def leads(self, nominal: Fit, sized: Callable[[Effect], Sized]) -> list[Lead]:
+        """The best size of each effect as a constant, and from there a step, a ramp and a free curve.
+
+        Args:
+            nominal: the fit without any effect.
+            sized: makes the model with an effect.
+        """
+        found = []
+        for effect in self._effects:
+            model = sized(effect)
+            tried = []
+            for start in effect.starts or (effect.typical,):
+                loss, w, _ = model.follow(self._run, [self._constant.signal(np.array([start]))])
+                tried.append((2.0 * (nominal.loss - loss), start, w))
+            gain, start, w = max(tried, key=lambda item: item[0])
+            if gain > 0.0:
+                found.append(Lead(effect, self._constant, np.array([start]), gain))
+            before = clipped(nominal.w)
+            for _, start, w in tried:
+                found += self._scaled(effect, before, (before - clipped(w)) / start)
+        return found
+
+    def _scaled(self, effect: Effect, w: Array, g: Array) -> list[Lead]:
+        """From the signature of a size of 1 in every row."""
+        a, b = np.sum(w * g, axis=1), np.sum(g * g, axis=1)
+        t = self._run.time_min
+        leads = [_lead(effect, self._constant, a.sum(), b.sum(), ())]
+        later_a, later_b = (np.cumsum(item[::-1])[::-1] for item in (a, b))
+        place = _best(later_a, later_b, effect)
+        leads.append(_lead(effect, self._step, later_a[place], later_b[place], (t[place],)))
+        moments = [np.cumsum((item * t**power)[::-1])[::-1] for item in (a, b) for power in (0, 1, 2)]
+        span = np.maximum(t[-1] - t, self._ramp.period_min)
+        grown_a = (moments[1] - t * moments[0]) / span
+        grown_b = np.maximum(moments[5] - 2 * t * moments[4] + t**2 * moments[3], 0.0) / span**2
+        place = _best(grown_a, grown_b, effect)
+        leads.append(_lead(effect, self._ramp, grown_a[place], grown_b[place], (t[place],)))
+        hats = self._free.functions(np.empty(0))[0]
+        A, B = hats.T @ a, hats.T @ (hats * b[:, None])
+        by = np.clip(np.asarray(np.linalg.lstsq(B, A, rcond=1e-9)[0]), effect.lower, effect.upper)
+        leads.append(Lead(effect, self._free, by, float(by @ (2.0 * A - B @ by))))
+        return leads
+
+
+def _lead(effect: Effect, course: Constant | Step | Ramp, a: float, b: float, shape: tuple[float, ...]) -> Lead:
+    size = float(np.clip(a / max(b, 1e-300), effect.lower, effect.upper))
+    return Lead(effect, course, np.array([size, *shape]), size * (2.0 * float(a) - size * float(b)))
+
+
+def _best(a: Array, b: Array, effect: Effect) -> int:
+    size = np.clip(a / np.maximum(b, 1e-300), effect.lower, effect.upper)
+    gain = size * (2.0 * a - size * b)
+    return EDGE_ROWS + int(np.argmax(gain[EDGE_ROWS:-EDGE_ROWS]))

@@ -1,0 +1,153 @@
+"""The filter of a model with some effects in it, whose sizes are signals."""
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnosis.courses import Signal
+from diagnosis.late_output import Moved, gathered, moved
+from diagnosis.run import Run
+from diagnosis.size_inputs import SizedModel, with_size_inputs
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.filter import Filter, Innovations, NoiseLevels
+from reactorwatch.process.filter_errors import FilterErrors, Ways
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.noise import tune
+
+HUBER = 4.0
+"""Standard deviations beyond which an innovation counts no more than in proportion."""
+
+LOST = 100.0
+"""Standard deviations that a value counts as off where the filter has lost the plant."""
+
+_CLUELESS = 1e6
+"""Standard deviations of a sensor: a filter that is less sure of its prediction has lost the plant."""
+
+
+class Sized:
+    """The filter of a model in which the sizes of some effects are inputs.
+
+    A sensor that is late is left out of the filter's model: its values are moved (see `late_output`).
+
+    Args:
+        model: of the plant.
+        effects: that are in it; at most one makes an output late.
+        noise: of the plant and its sensors.
+
+    Attributes:
+        effects: as given.
+        late: place of the effect that makes an output late; None: no such.
+    """
+
+    def __init__(self, model: ProcessModel, effects: Sequence[Effect], noise: NoiseLevels) -> None:
+        self.effects = tuple(effects)
+        places = [place for place, effect in enumerate(self.effects) if effect.late_output is not None]
+        self.late = places[0] if places else None
+        self._plant = model
+        self._filtered = with_size_inputs(model, [item for item in self.effects if item.late_output is None])
+        self._filter = Filter(self.model, self._noise_of(noise))
+        self._errors = FilterErrors(self.model, self._filter.noise, self._filtered.of_rates, self._filtered.of_outputs)
+
+    @property
+    def model(self) -> ProcessModel:
+        """That the filter has."""
+        return self._filtered.model
+
+    @property
+    def own_states(self) -> int:
+        """How many states the plant has without these effects; they are the first."""
+        return len(self._plant.states)
+
+    @cached_property
+    def whole(self) -> SizedModel:
+        """With all effects in it, for free runs."""
+        return with_size_inputs(self._plant, self.effects)
+
+    @property
+    def noise(self) -> NoiseLevels:
+        """Of the plant and its sensors."""
+        return self._filter.noise
+
+    @noise.setter
+    def noise(self, noise: NoiseLevels) -> None:
+        self._filter.noise = self._noise_of(noise)
+        self._errors.noise = self._filter.noise
+
+    def size_symbols(self, effect: Effect) -> tuple[ca.SX, ca.SX] | None:
+        """The inputs that are the size of an effect, as balances and outputs have it; None if it has none."""
+        names = [item for item in self.effects if item.late_output is None]
+        if effect not in names:
+            return None
+        place = names.index(effect)
+        return self._filtered.of_rates[place], self._filtered.of_outputs[place]
+
+    def inputs(self, run: Run, signals: Sequence[Signal]) -> Array:
+        """Those of the filter: with the sizes beside them, shape (rows, n_u + 2 effects)."""
+        return self._filtered.inputs(run.inputs, [item for place, item in enumerate(signals) if place != self.late])
+
+    def follow(self, run: Run, signals: Sequence[Signal]) -> tuple[float, Array, Innovations]:
+        """Loss, whitened innovations and the filter's run."""
+        if self.late is None:
+            found = self._filter.run(run.time_min, self.inputs(run, signals), run.measured)
+        else:
+            by = self._moved(run, signals, self.late)
+            found = self._filter.run(by.run.time_min, by.run.inputs, by.run.measured)
+            found = gathered(found, by, self._output(self.late))
+        # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
+        known = np.isfinite(run.measured)
+        least = np.array(self.noise.measurement_sd)
+        good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0) & (found.conditional_sd < _CLUELESS * least)
+        known[0] = False
+        w = np.where(known & ~good, LOST, np.where(known, found.whitened, np.nan))
+        spread = np.log(np.where(known & good, found.conditional_sd, 1.0))
+        return loss_of(w) + float(np.sum(spread)), w, found
+
+    def tuned(self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float]) -> NoiseLevels:
+        """The noise under which the run is likeliest with these deviations."""
+        inputs = self.inputs(run, signals)
+        if self.late is not None:
+            run = self._moved(run, signals, self.late).run
+            inputs = run.inputs
+        found = tune(self.model, run.time_min, inputs, run.measured, smallest_sd)
+        return NoiseLevels(found.measurement_sd, found.process_sd[: len(self._plant.states)])
+
+    def ways(self, run: Run, signals: Sequence[Signal], found: Innovations) -> Ways:
+        """The equations of the filter's errors about its run; from the second row on, the first that it predicts."""
+        later = Innovations(*(item[1:] for item in found))
+        used = self.used(run)[1:]
+        return self._errors.ways(run.time_min[1:], self.inputs(run, signals)[1:], later, used)
+
+    def used(self, run: Run) -> NDArray[np.bool_]:
+        """Which values correct the filter in their own row, shape (rows, n_y); those of a late sensor do it before."""
+        found = np.isfinite(run.measured)
+        if self.late is not None:
+            found[:, self._output(self.late)] = False
+        return found
+
+    def _moved(self, run: Run, signals: Sequence[Signal], late: int) -> Moved:
+        inputs = self.inputs(run, signals)
+        held: NDArray[np.bool_] = np.ones(inputs.shape[1], dtype=bool)
+        held[run.inputs.shape[1] + 1 :: 2] = False  # what the outputs show
+        return moved(run, inputs, held, self._output(late), signals[late].at_row)
+
+    def _output(self, late: int) -> int:
+        return self._plant.output_names.index(str(self.effects[late].late_output))
+
+    def _noise_of(self, noise: NoiseLevels) -> NoiseLevels:
+        """States that an effect brings have none of their own."""
+        more = len(self.model.states) - len(noise.process_sd)
+        return NoiseLevels(noise.measurement_sd, (*noise.process_sd, *(0.0,) * more))
+
+
+def clipped(w: Array) -> Array:
+    """Whitened innovations without what is missing and what is far off."""
+    return np.asarray(np.clip(np.nan_to_num(w), -HUBER, HUBER))
+
+
+def loss_of(w: Array) -> float:
+    """Of whitened innovations, without what they were divided by."""
+    size = np.abs(np.nan_to_num(w))
+    return float(np.sum(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER))))
