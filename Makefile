@@ -1,6 +1,6 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults pictures protobuf clean
+.PHONY: help setup demo test lint bench faults study pictures protobuf clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -35,11 +35,14 @@ lint: $(READY) ## style, types, and who may import whom
 	@$(BIN)/lint-imports
 
 bench: $(READY) ## speed, as ratios measured in one run
-	@for file in $(filter-out benchmarks/fault_bank.py,$(wildcard benchmarks/[a-z]*.py)); do \
+	@for file in $(filter-out benchmarks/fault_bank.py benchmarks/diagnosis_study.py,$(wildcard benchmarks/[a-z]*.py)); do \
 		echo "== $$file"; $(BIN)/python $$file || exit 1; done
 
 faults: $(READY) ## the watch on a bank of faults, against an oracle and the report's method: most of an hour
 	@$(BIN)/python benchmarks/fault_bank.py --write docs/fault_bank.md
+
+study: $(READY) ## the diagnosis on records with something hidden in them; writes docs/diagnosis_study.md: hours
+	@$(BIN)/python benchmarks/diagnosis_study.py --write
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py

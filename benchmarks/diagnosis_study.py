@@ -1,0 +1,149 @@
+"""Does the diagnosis find what is hidden in a record, how large it is, and nothing where nothing is?
+
+Records of every class (`benchmarks/hidden/classes.py`) are drawn from fresh seeds, with a solver and equations that the
+diagnosis does not use (`tests/hidden_effect/`), diagnosed in parallel, and held against the truth.
+
+    python benchmarks/diagnosis_study.py [--quick] [--records N] [--jobs N] [--classes NAME ...] [--seed N]
+                                         [--json FILE] [--write]
+
+`--write` puts the tables into docs/diagnosis_study.md.
+"""
+
+import argparse
+import json
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks.hidden.classes import CLASSES, StudyClass, class_named, drawn
+from benchmarks.hidden.tables import confusion_table, failures, main_table
+from diagnosis.diagnose import diagnose
+from reactorwatch.process.cstr import cstr
+from tests.hidden_effect.draw import draw
+from tests.hidden_effect.judge import Judged, failed, judge
+
+RECORDS, NOMINAL_RECORDS, QUICK_RECORDS = 96, 330, 13
+FIRST_SEED = 10_000_000
+PAGE = Path(__file__).parents[1] / "docs" / "diagnosis_study.md"
+
+TEMPLATE = """# How well the diagnosis finds what is hidden
+
+Made by `make study`, from seeds of {seed} on. Every record is drawn from a seed, made by equations and a solver that
+the diagnosis does not use, and held against the truth. The classes are in `benchmarks/hidden/classes.py`; how large
+what is hidden is, in `tests/hidden_effect/catalogue.py`.
+
+{main}
+
+*first*: exactly what is hidden is named. *listed*: it is named, or among the alternatives. *list*: how many
+explanations are on it. *wrong*: something is claimed that is not there. *place*: the location is right. *curve*: of the
+whole course, whatever its profile is called.
+
+## What each cause was called
+
+Over all classes in which one cause is hidden, or none.
+
+{confusion}
+"""
+
+_warm = False
+
+
+def main() -> None:
+    """Run the study and print it."""
+    chosen = arguments()
+    # The matrices are small: threads of the linear algebra would only wait for each other.
+    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    classes = [class_named(name) for name in chosen.classes] if chosen.classes else list(CLASSES)
+    tasks = [(study, number) for study in classes for number in range(_records(study, chosen))]
+    began = time.perf_counter()
+    found: dict[str, list[Judged]] = {study.name: [] for study in classes}
+    with Progress(console=Console(stderr=True)) as progress:
+        bar = progress.add_task("diagnoses", total=len(tasks))
+        if chosen.jobs == 1:
+            for study, number in tasks:
+                found[study.name].append(judged(study.name, number, chosen.seed))
+                progress.advance(bar)
+        else:
+            with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as executor:
+                futures = {executor.submit(judged, study.name, n, chosen.seed): study for study, n in tasks}
+                for future in as_completed(futures):
+                    found[futures[future].name].append(future.result())
+                    progress.advance(bar)
+    for items in found.values():
+        items.sort(key=lambda item: item.seed)
+    report(found, chosen, time.perf_counter() - began)
+
+
+def report(found: dict[str, list[Judged]], chosen: argparse.Namespace, seconds: float) -> None:
+    """Print what was found and write it where it was asked for."""
+    print(main_table(found))
+    print()
+    print(confusion_table(found))
+    print()
+    print("\n".join(failures(found)))
+    print(f"\n{sum(map(len, found.values()))} records, {seconds:.0f} s, seeds from {chosen.seed}")
+    if chosen.json is not None:
+        numbers = {name: [asdict(item) for item in items] for name, items in found.items()}
+        chosen.json.write_text(json.dumps(numbers, indent=1) + "\n")
+    if chosen.write:
+        PAGE.write_text(page(found, chosen.seed))
+
+
+def judged(name: str, number: int, first_seed: int) -> Judged:
+    """Draw, diagnose and judge one record."""
+    warm_up()
+    hidden = drawn(class_named(name), number, first_seed)
+    began = time.perf_counter()
+    try:
+        said = diagnose(hidden.record, cstr())
+    except Exception as error:  # noqa: BLE001 # whatever it is, it is a result of the study
+        return failed(hidden, f"{type(error).__name__}: {error}", time.perf_counter() - began)
+    return judge(hidden, said, time.perf_counter() - began)
+
+
+def warm_up() -> None:
+    """Let the first diagnosis of a process, which loads compiled code, not count."""
+    global _warm
+    if not _warm:
+        diagnose(draw(1).record, cstr())
+        _warm = True
+
+
+def page(found: dict[str, list[Judged]], seed: int) -> str:
+    """The page of the study."""
+    text = TEMPLATE.format(seed=seed, main=main_table(found), confusion=confusion_table(found))
+    missed = failures(found)
+    return text + (
+        "\n## Where it was not named\n\n" + "\n".join(f"- {line}" for line in missed) + "\n" if missed else ""
+    )
+
+
+def _records(study: StudyClass, chosen: argparse.Namespace) -> int:
+    if chosen.records is not None:
+        return int(chosen.records)
+    if chosen.quick:
+        return QUICK_RECORDS
+    return NOMINAL_RECORDS if study.kind == "nominal" else RECORDS
+
+
+def arguments() -> argparse.Namespace:
+    """What was asked for on the command line."""
+    parser = argparse.ArgumentParser(description="The diagnosis on records with something hidden in them.")
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK_RECORDS} records a class, for a try")
+    parser.add_argument("--records", type=int, help=f"a class (default {RECORDS}, {NOMINAL_RECORDS} nominal ones)")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
+    parser.add_argument("--classes", nargs="+", metavar="NAME", help=", ".join(item.name for item in CLASSES))
+    parser.add_argument("--seed", type=int, default=FIRST_SEED, help="the first")
+    parser.add_argument("--json", type=Path, help="where the numbers are written, record by record")
+    parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    main()

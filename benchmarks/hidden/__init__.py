@@ -1,0 +1,1 @@
+"""The study of the diagnosis: records with something hidden in them, class by class."""

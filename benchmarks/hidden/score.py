@@ -1,0 +1,109 @@
+"""Numbers of a class of records, from what was judged record by record."""
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from math import nan
+
+import numpy as np
+
+from tests.hidden_effect.judge import NOMINAL, UNKNOWN, Judged
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of some records; shares from 0 to 1, NaN where there is nothing to take a share of.
+
+    Attributes:
+        records: how many.
+        first: share in which exactly what is hidden is named.
+        listed: share in which it is named or listed.
+        count: explanations on the list, on average.
+        wrong: share in which something is claimed that is not there.
+        unknown: share called unknown.
+        unknown_in_place: share called unknown, with the right place.
+        right_place: share with the right place, whatever it is called.
+        same_profile: share of the right causes whose profile is right too.
+        size: median and 90 % of the relative error of the size.
+        curve: median and 90 % of the relative error of the curve.
+        size_inside: share of the 95 % intervals that hold the size.
+        onset: median and 90 % of the error of a step's onset, in min.
+        onset_inside: share of the 95 % intervals that hold it.
+        held_out: median and 90 % of the error of T on rows not seen over its noise.
+        before: the same of the nominal model.
+        seconds: median and largest.
+        errors: diagnoses that came to no end.
+    """
+
+    records: int
+    first: float
+    listed: float
+    count: float
+    wrong: float
+    unknown: float
+    unknown_in_place: float
+    right_place: float
+    same_profile: float
+    size: tuple[float, float]
+    curve: tuple[float, float]
+    size_inside: float
+    onset: tuple[float, float]
+    onset_inside: float
+    held_out: tuple[float, float]
+    before: tuple[float, float]
+    seconds: tuple[float, float]
+    errors: int
+
+    @classmethod
+    def of(cls, judged: Sequence[Judged]) -> "Score":
+        """The score of some records."""
+        right = [(course, profile) for item in judged if item.first for course, profile in _courses(item)]
+        return cls(
+            records=len(judged),
+            first=_share(item.first for item in judged),
+            listed=_share(item.listed for item in judged),
+            count=_mean([item.count for item in judged if not item.remark]),
+            wrong=_share(item.wrong for item in judged),
+            unknown=_share(item.verdict == UNKNOWN for item in judged),
+            unknown_in_place=_share(item.verdict == UNKNOWN and item.right_place for item in judged),
+            right_place=_share(item.right_place for item in judged),
+            same_profile=_share(course == profile for course, profile in right),
+            size=_two([error for item in judged for error in item.size_errors], 0.9),
+            curve=_two([error for item in judged for error in item.curve_errors], 0.9),
+            size_inside=_share(inside for item in judged for inside in item.size_inside),
+            onset=_two([error for item in judged for error in item.onset_errors], 0.9),
+            onset_inside=_share(inside for item in judged for inside in item.onset_inside),
+            held_out=_two([item.held_out for item in judged if not item.remark], 0.9),
+            before=_two([item.before for item in judged if not item.remark], 0.9),
+            seconds=_two([item.seconds for item in judged], 1.0),
+            errors=sum(bool(item.remark) for item in judged),
+        )
+
+
+def confusion(judged: Sequence[Judged]) -> list[tuple[str, list[tuple[str, int]]]]:
+    """What each truth was called, the most frequent first."""
+    called: dict[str, Counter[str]] = {}
+    for item in judged:
+        called.setdefault("+".join(item.truth) or NOMINAL, Counter())[item.called] += 1
+    return [(truth, counts.most_common()) for truth, counts in called.items()]
+
+
+def _courses(item: Judged) -> Iterable[tuple[str, str]]:
+    return zip(item.courses, item.profiles, strict=True)
+
+
+def _share(found: Iterable[bool]) -> float:
+    return _mean([float(item) for item in found])
+
+
+def _mean(values: Sequence[float]) -> float:
+    return float(np.mean(values)) if values else nan
+
+
+def _two(values: Sequence[float], share: float) -> tuple[float, float]:
+    """The median and another quantile; what is not a number counts as infinite."""
+    if not values:
+        return nan, nan
+    sorted_up = np.sort(np.where(np.isfinite(values), values, np.inf))
+    places = [max(int(np.ceil(item * sorted_up.size)) - 1, 0) for item in (0.5, share)]
+    return float(sorted_up[places[0]]), float(sorted_up[places[1]])

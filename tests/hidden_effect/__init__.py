@@ -1,0 +1,1 @@
+"""Hide an effect in data, and require that it be found."""
