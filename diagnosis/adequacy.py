@@ -3,8 +3,9 @@
 Of each output, autocorrelations over `LAGS` rows are taken together by the test of Ljung & Box (1978, On a measure of
 lack of fit in time series models, Biometrika 65), and so are the correlations with the changes of the inputs in the
 last `LAGS` rows (Hosking 1980, The multivariate portmanteau statistic, J. American Statistical Association 75, has the
-sum of squares that this is part of). The smaller of the two p-values counts, twice, since there are two. Large values
-are cut off first, so that a few outliers do not decide.
+sum of squares that this is part of); not with one in the same row, for a controller may have answered. The smaller of
+the two p-values counts, twice, since there are two. Large values are cut off first, so that a few outliers do not
+decide.
 """
 
 from math import log
@@ -39,7 +40,7 @@ def minus_log10_p(w: Array, inputs: Array) -> Array:
         z = np.where(known, np.clip(column, -CUT, CUT), 0.0)
         z = np.where(known, z - z[known].mean() if known.any() else 0.0, 0.0)
         logs = [_log_sf(_squares(z, z, first=1))]
-        logs += [_log_sf(_squares(z, change - change.mean(), first=0)) for change in changes.T if np.ptp(change) > 0.0]
+        logs += [_log_sf(_squares(z, change - change.mean(), first=1)) for change in changes.T if np.ptp(change) > 0.0]
         found.append(min(max(-(min(logs) + log(len(logs))) / log(10.0), 0.0), LARGEST))
     return np.array(found)
 

@@ -8,6 +8,7 @@ import numpy as np
 from diagnosis.adequacy import WHITE, minus_log10_p
 from diagnosis.courses import Signal
 from diagnosis.held_out import Errors, free_run, gained
+from diagnosis.pairs import with_pairs
 from diagnosis.record_checks import run_of
 from diagnosis.result import (
     AMBIGUOUS,
@@ -66,7 +67,8 @@ def diagnose(
     """
     run = run_of(record, model)
     bands = _bands(run, model, tolerance or {})
-    found = Search(model, effects, run, _smallest_sd(model)).found()
+    search = Search(model, effects, run, _smallest_sd(model))
+    found = with_pairs(search, search.found())
     best = found.best if found.nominal.bic - found.best.bic >= LEAST_GAIN else found.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict = _verdict(found, best, adequacy)

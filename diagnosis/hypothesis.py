@@ -18,6 +18,7 @@ from diagnosis.courses import Course, Signal
 from diagnosis.run import Run
 from diagnosis.sized import HUBER, Sized, clipped
 from reactorwatch.process.filter import Innovations
+from reactorwatch.process.filter_errors import Ways
 from reactorwatch.process.model import Array
 
 SETTLED = 0.05
@@ -28,7 +29,7 @@ _RUNAWAY = 1e100
 
 _SHARE = 0.02
 _FIRST_SHARE, _LAST_SHARE = 0.4, 0.003
-_WIDENINGS = 4
+_WIDENINGS, _WIDER = 10, 2.0
 _MOST_STEPS, _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 12, 5, 1e-3, 10.0, 0.1
 
 
@@ -90,8 +91,8 @@ class Hypothesis:
             if not np.max(np.abs(g)) < _RUNAWAY:
                 break
             weights = HUBER / np.maximum(np.abs(w), HUBER)
-            information, gradient = (g * weights[:, None]).T @ g, g.T @ (weights * w)
-            if not np.any(information):
+            information, gradient = (g * weights[:, None]).T @ g + self._least_information(), g.T @ (weights * w)
+            if not np.any(g):
                 return self._scanned(run, best)
             scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
             information, gradient = information / np.outer(scale, scale), gradient / scale
@@ -105,7 +106,7 @@ class Hypothesis:
                 damping *= _MORE_DAMPING
             if best.loss > before.loss - SETTLED:
                 break
-            differences = self._widened(_inverse(g))
+            differences = self._widened(self._inverse(g), differences)
         return best
 
     def _scanned(self, run: Run, best: Fit) -> Fit:
@@ -125,17 +126,36 @@ class Hypothesis:
         An onset matters only where something happens, so how the innovations change with it depends on how far it is
         moved. It is moved by about one standard deviation.
         """
+        ways = None if self.sized.late is not None else self.sized.ways(run, self._signals(fit.theta), fit.found)
         differences = self._least_differences()
         for _ in range(_WIDENINGS):
-            found = _inverse(self._slope(run, fit, differences))
-            differences = self._widened(found)
+            found = self._inverse(self._slope(run, fit, differences, ways))
+            before, differences = differences, self._widened(found, differences)
+            if all(np.array_equal(*pair) for pair in zip(before, differences, strict=True)):
+                break
         return found
 
-    def _slope(self, run: Run, fit: Fit, differences: Sequence[Array]) -> Array:
+    def _inverse(self, g: Array) -> Array:
+        """Covariance of the numbers whose derivatives these are."""
+        information = g.T @ g + self._least_information()
+        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        inner = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+        return np.asarray(inner / np.outer(scale, scale))
+
+    def _least_information(self) -> Array:
+        """What is known of the numbers beforehand: where they can be. Some records do not tell an onset at all."""
+        widths: list[float] = []
+        for effect, course in zip(self.sized.effects, self.courses, strict=True):
+            widths += [effect.upper - effect.lower] * course.coefficients
+            widths += [number.upper - number.lower for number in course.numbers]
+        return np.diag(np.square(1.0 / np.array(widths)))
+
+    def _slope(self, run: Run, fit: Fit, differences: Sequence[Array], ways: Ways | None = None) -> Array:
         """What the whitened innovations lose as the numbers grow, shape (values from the third row on, freedom)."""
         if self.sized.late is not None:
             return self._slope_by_differences(run, fit, differences)
-        ways = self.sized.ways(run, self._signals(fit.theta), fit.found)
+        if ways is None:
+            ways = self.sized.ways(run, self._signals(fit.theta), fit.found)
         columns = []
         for place, (course, numbers, moved) in enumerate(zip(self.courses, fit.theta, differences, strict=True)):
             over_row, at_row = course.derivatives(numbers, moved)
@@ -163,12 +183,12 @@ class Hypothesis:
     def _least_differences(self) -> list[Array]:
         return [course.least_differences for course in self.courses]
 
-    def _widened(self, covariance: Array) -> list[Array]:
-        """Differences of one standard deviation, or the least ones if these are larger."""
+    def _widened(self, covariance: Array, differences: Sequence[Array]) -> list[Array]:
+        """Wider differences where a standard deviation is, by not too much at once."""
         sds, found, begin = np.sqrt(np.maximum(np.diag(covariance), 0.0)), [], 0
-        for course in self.courses:
+        for course, before in zip(self.courses, differences, strict=True):
             numbers = sds[begin + course.coefficients : begin + course.freedom]
-            found.append(np.maximum(course.least_differences, numbers))
+            found.append(np.maximum(before, np.minimum(numbers, _WIDER * before)))
             begin += course.freedom
         return found
 
@@ -185,10 +205,3 @@ class Hypothesis:
             moved.append(numbers + change[begin : begin + numbers.size])
             begin += numbers.size
         return moved
-
-
-def _inverse(g: Array) -> Array:
-    """Covariance of numbers whose derivatives these are."""
-    scale = np.sqrt(np.maximum(np.sum(g * g, axis=0), 1e-300))
-    inner = np.linalg.pinv((g / scale).T @ (g / scale), rcond=1e-12, hermitian=True)
-    return np.asarray(inner / np.outer(scale, scale))

@@ -12,6 +12,10 @@ FEWEST_VALUES = 100
 """Of an output: with less nothing can be told from noise."""
 
 
+_OFF_GRID, _REGULAR = 0.05, 0.95
+"""Rows are on a grid if steps are whole periods, give or take so much of one, in so many of them."""
+
+
 def run_of(record: Record, model: ProcessModel) -> Run:
     """What of the record the model speaks of.
 
@@ -56,7 +60,9 @@ def run_of(record: Record, model: ProcessModel) -> Run:
             f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} in every row; "
             "nothing can be told apart without excitation: record a stretch with steps in it"
         )
-    return Run(record.time_min, np.column_stack(inputs), np.column_stack(outputs))
+    known = np.column_stack([np.isfinite(record.columns[item.name]) for item in model.inputs])
+    u = np.column_stack(inputs)
+    return Run(record.time_min, u, np.column_stack(outputs), _breaks(record.time_min, u, known))
 
 
 def _check_bounds(name: str, signal: str, unit: str, values: np.ndarray, lower: float, upper: float) -> None:
@@ -65,6 +71,20 @@ def _check_bounds(name: str, signal: str, unit: str, values: np.ndarray, lower: 
         hint = "; is it in degrees C? then add 273.15" if unit == "K" and lower <= typical + 273.15 <= upper else ""
         rule = f"{signal} must be in [{lower:g}, {upper:g}] {unit}"
         raise InputError(f"{name}: {rule}, its median is {typical:g}{hint or '; check its unit'}")
+
+
+def _breaks(time_min: np.ndarray, inputs: np.ndarray, known: np.ndarray) -> tuple[int, ...]:
+    """Rows whose inputs differ from those of the row before, with rows missing between them or the inputs in it.
+
+    Nobody knows when they changed. Where rows are irregular by nature none is taken to be missing.
+    """
+    step = np.diff(time_min)
+    period = float(np.median(step))
+    counts = step / period
+    regular = np.mean(np.abs(counts - np.round(counts)) < _OFF_GRID) > _REGULAR
+    gap = (counts > 1.5) & regular | ~np.all(known[:-1], axis=1)
+    changed = np.any(np.diff(inputs, axis=0) != 0.0, axis=1)
+    return tuple((np.flatnonzero(gap & changed) + 1).tolist())
 
 
 def _held(values: np.ndarray) -> np.ndarray:

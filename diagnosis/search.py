@@ -97,7 +97,7 @@ class Search:
         self._model, self.run, self._smallest_sd = model, run, list(smallest_sd)
         self.screen = Screen(model, effects, run)
         self._sized: dict[tuple[str, ...], Sized] = {}
-        self.noise = tune(model, run.time_min, run.inputs, run.measured, self._smallest_sd)
+        self.noise = tune(model, run.time_min, run.known_inputs, run.measured, self._smallest_sd)
 
     def found(self) -> Found:
         """The best explanations by one effect."""

@@ -86,7 +86,9 @@ class Sized:
 
     def inputs(self, run: Run, signals: Sequence[Signal]) -> Array:
         """Those of the filter: with the sizes beside them, shape (rows, n_u + 2 effects)."""
-        return self._filtered.inputs(run.inputs, [item for place, item in enumerate(signals) if place != self.late])
+        return self._filtered.inputs(
+            run.known_inputs, [item for place, item in enumerate(signals) if place != self.late]
+        )
 
     def follow(self, run: Run, signals: Sequence[Signal]) -> tuple[float, Array, Innovations]:
         """Loss, whitened innovations and the filter's run."""
@@ -100,7 +102,7 @@ class Sized:
         known = np.isfinite(run.measured)
         least = np.array(self.noise.measurement_sd)
         good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0) & (found.conditional_sd < _CLUELESS * least)
-        known[0] = False
+        known[[0, *run.breaks]] = False
         w = np.where(known & ~good, LOST, np.where(known, found.whitened, np.nan))
         spread = np.log(np.where(known & good, found.conditional_sd, 1.0))
         return loss_of(w) + float(np.sum(spread)), w, found

@@ -94,6 +94,8 @@ class FilterErrors:
         L_inverse = np.asarray(np.linalg.inv(L) * both)
         w = np.einsum("kij,kj->ki", L_inverse, np.where(known, found.residual[1:], 0.0))
         K = found.P[1:] @ H.transpose(0, 2, 1) * (used[1:] / R)[:, None, :]
+        began = np.all(np.isnan(found.prediction[1:]), axis=1)  # what was before is forgotten there
+        F, G, H, D, K = (np.where(began[:, None, None], 0.0, item) for item in (F, G, H, D, K))
         return Ways(F, G, H, D, K, L_inverse, w)
 
     def _walked(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
