@@ -46,7 +46,7 @@ class Counts:
     restarts: int = 0
 
 
-@dataclass
+@dataclass(slots=True)
 class Sequence:
     """Where one signal's numbering is.
 
@@ -61,12 +61,19 @@ class Sequence:
     newest_ns: int = 0
 
 
-@dataclass
+@dataclass(slots=True)
 class Waiting:
-    """A row that waits: a value and a sequence number a signal, None where the signal has not come."""
+    """A row that waits.
 
-    values: list[float | None]
+    Attributes:
+        values: one a signal; NaN where the signal has not come.
+        numbers: of their samples; None where the signal has not come.
+        missing: how many signals have not come.
+    """
+
+    values: list[float]
     numbers: list[int | None]
+    missing: int
 
 
 @dataclass
@@ -105,6 +112,7 @@ class Aligner:
         if reorder_rows < 1:
             raise ValueError(f"reorder_rows must be at least 1, got {reorder_rows}")
         self._index = {signal: index for index, signal in enumerate(signals)}
+        self._all = (True,) * len(signals)
         self._reorder_rows = reorder_rows
         self.state = AlignmentState(sequences=[Sequence() for _ in signals])
 
@@ -117,37 +125,47 @@ class Aligner:
             sequence: the publisher's number of it.
             value: finite.
         """
-        index = self._index[signal]
-        rows = self._restart(index, time_ns, sequence)
-        state, counts = self.state, self.state.counts
+        index, state = self._index[signal], self.state
+        position, rows = state.sequences[index], list[Row]()
+        if sequence == position.expected and time_ns > position.newest_ns:  # as nearly always
+            position.expected, position.newest_ns = sequence + 1, time_ns
+        else:
+            rows = self._restart(index, time_ns, sequence)
+            if self._has_come(index, time_ns):
+                state.counts.duplicated += 1
+                return rows
+            self._count_sequence(state.sequences[index], time_ns, sequence)
         waiting = state.pending.get(time_ns)
-        gone = waiting is None and state.newest_left_ns is not None and time_ns <= state.newest_left_ns
-        if (waiting is not None and waiting.values[index] is not None) or (
-            gone and state.left.get(time_ns, ())[index : index + 1] == (True,)
-        ):
-            counts.duplicated += 1
-            return rows
-        self._count_sequence(state.sequences[index], time_ns, sequence)
-        if gone:
-            counts.late += 1
-            return rows
         if waiting is None:
-            empty = len(self._index)
-            waiting = state.pending[time_ns] = Waiting([None] * empty, [None] * empty)
+            if state.newest_left_ns is not None and time_ns <= state.newest_left_ns:
+                state.counts.late += 1
+                return rows
+            count = len(self._index)
+            waiting = state.pending[time_ns] = Waiting([nan] * count, [None] * count, count)
         waiting.values[index] = value
         waiting.numbers[index] = sequence
-        if None in waiting.values and len(state.pending) == 1:  # as mostly: the next sample of the row is on its way
-            return rows
-        return rows + self._release()
+        waiting.missing -= 1
+        if len(state.pending) > 1:
+            return rows + self._release()
+        if self._may_leave(waiting):
+            rows.append(self._leave(time_ns))
+        return rows
 
     def flush(self) -> list[Row]:
         """Let everything leave that still waits, as at the end of a record."""
         return [self._leave(time_ns) for time_ns in sorted(self.state.pending)]
 
+    def _has_come(self, index: int, time_ns: int) -> bool:
+        """Whether a sample of that signal and that time came before."""
+        waiting = self.state.pending.get(time_ns)
+        if waiting is not None:
+            return waiting.numbers[index] is not None
+        return self.state.left.get(time_ns, ())[index : index + 1] == (True,)
+
     def _release(self) -> list[Row]:
         pending = self.state.pending
         rows: list[Row] = []
-        times = sorted(pending) if len(pending) > 1 else list(pending)
+        times = sorted(pending)
         for position, time_ns in enumerate(times):
             newer = len(times) - 1 - position
             if newer < self._reorder_rows and not self._may_leave(pending[time_ns]):
@@ -157,30 +175,31 @@ class Aligner:
 
     def _may_leave(self, waiting: Waiting) -> bool:
         """Whether a row is complete, and follows by any of its numbers the row that left last."""
-        if None in waiting.values:
+        if waiting.missing:
             return False
-        return any(
-            position.next_to_leave in (None, number)
-            for position, number in zip(self.state.sequences, waiting.numbers, strict=True)
-        )
+        for position, number in zip(self.state.sequences, waiting.numbers, strict=True):
+            if position.next_to_leave is None or position.next_to_leave == number:
+                return True
+        return False
 
     def _leave(self, time_ns: int) -> Row:
         state = self.state
         waiting = state.pending.pop(time_ns)
-        values = waiting.values
         for position, number in zip(state.sequences, waiting.numbers, strict=True):
             if number is not None:
                 position.next_to_leave = number + 1
             elif position.next_to_leave is not None:
                 position.next_to_leave += 1
-        state.left[time_ns] = tuple(value is not None for value in values)
+        if waiting.missing:
+            state.counts.incomplete_rows += 1
+            state.left[time_ns] = tuple(number is not None for number in waiting.numbers)
+        else:
+            state.left[time_ns] = self._all
         if len(state.left) > REMEMBERED * self._reorder_rows:
             del state.left[next(iter(state.left))]
         state.newest_left_ns = time_ns
         state.counts.rows += 1
-        if None in values:
-            state.counts.incomplete_rows += 1
-        row = Row(time_ns, tuple(nan if value is None else value for value in values), state.restarted)
+        row = Row(time_ns, tuple(waiting.values), state.restarted)
         state.restarted = False
         return row
 

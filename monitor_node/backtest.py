@@ -72,8 +72,8 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
         alarms.extend(item.message for item in publications if isinstance(item.message, Alarm))
 
     for message in messages:
-        if message.key.startswith(prefix):
-            keep(monitor.on_message(message, message.received_ns))
+        if message.key.startswith(prefix) and (publications := monitor.on_message(message, message.received_ns)):
+            keep(publications)
     keep(monitor.finish())
     return Backtest(
         rows=monitor.rows,

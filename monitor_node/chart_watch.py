@@ -63,12 +63,12 @@ class _OfEach:
         self._bank = Bank(charts)
         self._shows_outliers = name in WITHOUT_MEMORY
 
-    def update(self, e: list[float], known: list[bool], withheld: list[bool]) -> bool:
+    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
         """Take a row in; whether any chart is out."""
         if True in withheld and not self._shows_outliers:
             known = [here and not outlier for here, outlier in zip(known, withheld, strict=True)]
         self._known = known
-        return True in self._bank.judge(e, known)
+        return self._bank.judge(e, known)
 
     def judgement(self, place: int) -> Judgement | None:
         """Of one of the charts; None if it had nothing to judge."""
@@ -102,7 +102,7 @@ class _OfAll:
         self._last: list[float] = []
         self._judgement: Judgement | None = None
 
-    def update(self, e: list[float], known: list[bool], withheld: list[bool]) -> bool:
+    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
         """Take a row in; whether the chart is out. A row in which an output is missing is left out."""
         if False in known or True in withheld:
             self._judgement = None
@@ -192,7 +192,7 @@ class ChartWatch:
         self,
         time_ns: int,
         e: list[float],
-        withheld: list[bool],
+        withheld: tuple[bool, ...],
         scales: list[float],
         units: list[str],
         publications: list[Publication],

@@ -173,12 +173,13 @@ class Prewhitener:
         self.past: deque[float] = deque(maxlen=max(len(learned.coefficients), 1))
         """The last values, newest first: all that it remembers."""
         self._expected = 0.0
+        self._order, self._mean = len(learned.coefficients), learned.constant / learned.passed
 
     def expected(self) -> float:
         """What z is going to be as far as its past can tell; without a past that is long enough: its mean."""
         learned = self.learned
-        if len(self.past) < len(learned.coefficients):
-            return learned.constant / learned.passed
+        if len(self.past) < self._order:
+            return self._mean
         value = learned.constant
         for coefficient, z in zip(learned.coefficients, self.past, strict=False):
             value += coefficient * z
@@ -195,11 +196,10 @@ class Prewhitener:
         if not isfinite(z):
             self.past.clear()
             return nan
-        known = len(self.past) >= len(self.learned.coefficients)
-        self._expected = self.expected()
-        e = (z - self._expected) / self.learned.sd if known else nan
+        known = len(self.past) >= self._order
+        self._expected = expected = self.expected()
         self.past.appendleft(z)
-        return e
+        return (z - expected) / self.learned.sd if known else nan
 
     def withhold(self) -> None:
         """Take the last value for an outlier: what was expected instead is remembered."""

@@ -6,6 +6,7 @@ identified model: it holds for any plant, but only where it was trained, so rows
 are not judged.
 """
 
+from collections.abc import Sequence
 from math import isfinite, nan
 from typing import NamedTuple, Protocol
 
@@ -35,8 +36,8 @@ class Expected(NamedTuple):
         sd: of the residual, in the output's unit: as far as the reference knows it, 1 if it does not.
     """
 
-    prediction: list[float]
-    sd: list[float]
+    prediction: Sequence[float]
+    sd: Sequence[float]
 
 
 class Reference(Protocol):
@@ -103,7 +104,7 @@ class ProcessReference:
             return Expected(nothing, nothing)
         if self._accept_all:
             found = self._filter.update(time_ns / MINUTE_NS, (self._last_input,), values, gate=GATE, accept=accept)
-            return Expected(list(found.prediction), list(found.sd))
+            return Expected(found.prediction, found.sd)
         measured, followed = [nan] * self._count, [False] * self._count
         for place, value, follow in zip(self._places, values, accept, strict=True):
             measured[place], followed[place] = value, follow

@@ -32,6 +32,9 @@ class SignalWatch:
     Args:
         config: of the monitor.
         board: the alarms of the plant; those of the signals are declared here.
+
+    Attributes:
+        stuck: which outputs' sensors are stuck: what they show is no measurement.
     """
 
     def __init__(self, config: MonitorConfig, board: AlarmBoard) -> None:
@@ -50,6 +53,8 @@ class SignalWatch:
         ]
         self._stuck: list[Stuck] = []
         self._spikes: list[Spike | None] = []
+        self._none = (False,) * len(outputs)
+        self._note_stuck()
 
     @staticmethod
     def chance_alarms(config: MonitorConfig) -> int:
@@ -65,6 +70,7 @@ class SignalWatch:
             arl0: run length of each alarm without a fault, in rows.
         """
         self._stuck, self._spikes = [], []
+        self._note_stuck()
         for readings, residuals in zip(values, e, strict=True):
             stuck = Stuck(arl0)
             for reading in readings:
@@ -77,50 +83,43 @@ class SignalWatch:
 
     # --- rows ------------------------------------------------------------------------------------------------
 
-    def hear(self, time_ns: int, input_value: float, values: list[float]) -> list[Publication]:
+    def hear(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
         """Look for silence in a row.
 
         Args:
             time_ns: of the row.
-            input_value: NaN if missing.
-            values: of the outputs; NaN where missing.
+            values: of the input, then of the outputs; NaN where missing.
         """
         silences = self._silences
+        publications: list[Publication] = []
         change = silences[0].update(time_ns, present=True)
-        publications = self._tell(0, change) if change is not NOTHING else []
-        index = 1
-        for value in (input_value, *values):
-            silence = silences[index]
-            if change is not NOTHING:
+        if change is not NOTHING:
+            publications += self._tell(0, change)
+            for silence in silences[1:]:
                 silence.excuse(time_ns)
-            own = silence.update(time_ns, present=value == value)  # NaN is not equal to itself
-            if own is not NOTHING:
-                publications += self._tell(index, own)
-            index += 1
+        for index, value in enumerate(values, start=1):
+            change = silences[index].update(time_ns, present=value == value)  # NaN is not equal to itself
+            if change is not NOTHING:
+                publications += self._tell(index, change)
         return publications
 
     def look(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
         """Look for stuck sensors in a row."""
         publications: list[Publication] = []
-        for stuck, alarm, name, value, unit in zip(
-            self._stuck, self._stuck_alarms, self._outputs, values, units, strict=True
-        ):
+        for index, value in enumerate(values):
             if not isfinite(value):
                 continue
-            judgement = stuck.update(value)
+            alarm, judgement = self._stuck_alarms[index], self._stuck[index].update(value)
             if judgement.out or not alarm.at_rest:
-                text = f"{name} is stuck: it has read {value:.6g} {unit} {judgement.statistic:.0f} times in a row"
+                name, times = self._outputs[index], judgement.statistic
+                text = f"{name} is stuck: it has read {value:.6g} {units[index]} {times:.0f} times in a row"
                 publications += self._judge(alarm, time_ns, judgement, READINGS, text, name, cause=STUCK_SENSOR)
+                self._note_stuck()
         return publications
-
-    @property
-    def stuck(self) -> list[bool]:
-        """Which outputs' sensors are stuck: what they show is no measurement."""
-        return [alarm.memory.rule.standing for alarm in self._stuck_alarms]
 
     def withheld(
         self, time_ns: int, e: list[float], scales: list[float], units: list[str]
-    ) -> tuple[list[bool], list[Publication]]:
+    ) -> tuple[tuple[bool, ...], list[Publication]]:
         """Look for spikes in a row; tells which of its values must not enter a memory yet.
 
         Args:
@@ -129,14 +128,15 @@ class SignalWatch:
             scales: what one standard deviation is, in the outputs' units.
             units: of the outputs.
         """
-        flags, publications = [], list[Publication]()
-        for index, (spike, alarm, name) in enumerate(zip(self._spikes, self._spike_alarms, self._outputs, strict=True)):
+        flags, publications = self._none, list[Publication]()
+        for index, spike in enumerate(self._spikes):
             if spike is None or not isfinite(e[index]):
-                flags.append(False)
                 continue
-            verdict = spike.update(e[index])
-            flags.append(verdict.withhold)
+            alarm, verdict = self._spike_alarms[index], spike.update(e[index])
+            if verdict.withhold:
+                flags = (*flags[:index], True, *flags[index + 1 :])
             if verdict.spike or not alarm.at_rest:
+                name = self._outputs[index]
                 size = verdict.size if verdict.spike else 0.0
                 judgement = Judgement(size, 0.0, -spike.limit, spike.limit, verdict.spike)
                 text = (
@@ -173,6 +173,10 @@ class SignalWatch:
         return self._tell(0, change) if change is not NOTHING else []
 
     # --- within ----------------------------------------------------------------------------------------------
+
+    def _note_stuck(self) -> None:
+        """What is asked for at every row, and changes seldom."""
+        self.stuck = [alarm.memory.rule.standing for alarm in self._stuck_alarms]
 
     def _tell(self, index: int, change: Change) -> list[Publication]:
         name, alarm = self._names[index], self._silent[index]

@@ -92,11 +92,6 @@ class Spacing(msgspec.Struct, forbid_unknown_fields=True):
             return None
         return int(limit * (self.mean_ns + DEVIATIONS * self.deviation_ns))
 
-    @property
-    def steady(self) -> bool:
-        """Whether all spacings were the same."""
-        return self.count == MEMORY and self.deviation_ns == 0.0
-
     def learn(self, spacing_ns: float) -> None:
         """Take the next spacing in."""
         self.count = min(self.count + 1, MEMORY)
@@ -179,12 +174,13 @@ class Silence:
             time_ns: of the row.
             present: whether what is watched has a value in it.
         """
-        last_ns = self._last_ns
+        last_ns, rows = self._last_ns, self._rows
         if last_ns is None or time_ns <= last_ns:
             self._last_ns = time_ns
             return self._change(None, time_ns) if present else NOTHING
-        rows, spacing_ns = self._rows, time_ns - last_ns
-        if present and spacing_ns == rows.mean_ns and rows.steady and not self.standing:
+        spacing_ns = time_ns - last_ns
+        as_always = spacing_ns == rows.mean_ns and not rows.deviation_ns and rows.count == MEMORY
+        if as_always and present and not self.standing:
             self._last_ns = time_ns  # there is nothing to learn
             return NOTHING
         allowed_ns = rows.allowed_ns(self._limit)

@@ -33,7 +33,7 @@ from math import ceil, inf, log
 
 from scipy.special import betaincinv
 
-from monitor_node.charts.base import Judgement, finite
+from monitor_node.charts.base import LARGEST_VALUE, Judgement, finite
 from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
 
@@ -156,6 +156,11 @@ class Stuck:
         Raises:
             ValueError: it is not finite; leave a missing sample out.
         """
+        last = self._last
+        if self._single and not self._repeats and last is not None and last != value and abs(value) < LARGEST_VALUE:
+            self._last = value  # as nearly always
+            self._steps.append(abs(value - last))
+            return self._single
         finite(value)
         if self._learning:
             self._end_run()

@@ -65,7 +65,7 @@ class PlantWatch:
         self._whiteners: list[Prewhitener] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
-        self._withheld = [False] * len(config.outputs)
+        self._withheld = (False,) * len(config.outputs)
         self._begin_training(None)
         self.notes: list[str] = []
         self.rows_watched = 0
@@ -88,9 +88,9 @@ class PlantWatch:
             units: of the outputs.
             publications: what is to be published is added here.
         """
-        time_ns, input_value, values = row.time_ns, row.values[0], list(row.values[1:])
+        time_ns, (input_value, *values) = row.time_ns, row.values
         follows = self._sampling.follows(time_ns) and not row.restarted
-        publications.extend(self.signals.hear(time_ns, input_value, values))
+        publications.extend(self.signals.hear(time_ns, row.values))
         if self._reference is None:
             self._train(time_ns, input_value, values, units, publications, follows=follows)
         else:
@@ -206,26 +206,29 @@ class PlantWatch:
             self.signals.restart()
             for whitener in self._whiteners:
                 whitener.restart()
-        expected = reference.update(time_ns, input_value, values, tuple(self._withheld))
+        predictions, sds = reference.update(time_ns, input_value, values, self._withheld)
         e: list[float] = []
+        scales: list[float] = []
         for index, whitener in enumerate(self._whiteners):
-            residual, sd = values[index] - expected.prediction[index], expected.sd[index]
+            residual, sd = values[index] - predictions[index], sds[index]
+            scale = sd * whitener.learned.sd
             if self._points and isfinite(residual):
-                usual = expected.prediction[index] + sd * whitener.expected()
-                reach = sd * whitener.learned.sd * self._charts.widths[index]
-                estimate = _estimate(time_ns, expected.prediction[index], residual, units[index])
-                estimate.residual_sd = sd * whitener.learned.sd
+                usual, reach = predictions[index] + sd * whitener.expected(), scale * self._charts.widths[index]
+                estimate = _estimate(time_ns, predictions[index], residual, units[index])
+                estimate.residual_sd = scale
                 estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach
                 publications.append(Publication(self._estimate_keys[index], estimate))
             e.append(whitener.update(residual / sd))
-        scales = [sd * whitener.learned.sd for sd, whitener in zip(expected.sd, self._whiteners, strict=True)]
+            scales.append(scale)
         self.rows_watched += 1
-        self._withheld, told = self.signals.withheld(time_ns, e, scales, units)
+        withheld, told = self.signals.withheld(time_ns, e, scales, units)
+        self._withheld = withheld
         publications.extend(told)
-        for whitener, withheld in zip(self._whiteners, self._withheld, strict=True):
-            if withheld:
-                whitener.withhold()
-        self._charts.update(time_ns, e, self._withheld, scales, units, publications, points=self._points)
+        if True in withheld:
+            for whitener, outlier in zip(self._whiteners, withheld, strict=True):
+                if outlier:
+                    whitener.withhold()
+        self._charts.update(time_ns, e, withheld, scales, units, publications, points=self._points)
         publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._suspicion.update(time_ns, input_value, values, units, stuck))

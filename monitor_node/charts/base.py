@@ -13,6 +13,7 @@ as selections, so that the compiler can turn the loop into vector instructions.)
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from math import isfinite
+from struct import Struct
 from typing import Any, ClassVar, Generic, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
@@ -223,7 +224,8 @@ class Bank(Generic[Kind]):
         if len(kinds) != 1:
             raise InputError(f"charts must be one or more of one kind, got {sorted(kind.__name__ for kind in kinds)}")
         (self._kind,) = kinds
-        self._columns: Array = np.concatenate([chart._columns for chart in charts], axis=1)
+        self._columns: Array = np.ascontiguousarray(np.concatenate([chart._columns for chart in charts], axis=1))
+        self._row = Struct(f"{len(charts)}d")
 
     @classmethod
     def from_state(cls, kind: type[Kind], state: SignalState) -> Self:
@@ -234,6 +236,7 @@ class Bank(Generic[Kind]):
         """
         bank = cls.__new__(cls)
         bank._kind, bank._columns = kind, _columns(kind, state)
+        bank._row = Struct(f"{state.plants}d")
         return bank
 
     @property
@@ -271,18 +274,21 @@ class Bank(Generic[Kind]):
         said[:, ~present] = np.nan
         return Judgements(said[0], said[1], said[2], said[3], present & (columns[OUT] > 0.0))
 
-    def judge(self, values: list[float], present: list[bool]) -> list[bool]:
-        """As `update`, for the few charts of one plant at every row: which are out; `judgement` says the rest.
+    def judge(self, values: list[float], present: list[bool]) -> bool:
+        """As `update`, for the few charts of one plant at every row: whether any is out; `judgement` says the rest.
 
         Args:
             values: one a chart, finite where present.
             present: False leaves a chart as it is.
         """
-        columns = self._columns
-        columns[X] = values
-        columns[PRESENT] = present
+        columns, row = self._columns, self._row
+        row.pack_into(columns, X * row.size, *values)
+        row.pack_into(columns, PRESENT * row.size, *present)
         self._kind.kernel(columns)
-        return [here and out > 0.0 for here, out in zip(present, columns[OUT].tolist(), strict=True)]
+        for here, out in zip(present, row.unpack_from(columns, OUT * row.size), strict=True):
+            if out > 0.0 and here:
+                return True
+        return False
 
     def judgement(self, plant: int) -> Judgement:
         """What a chart said of its last value."""
