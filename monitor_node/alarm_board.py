@@ -19,7 +19,7 @@ from monitor_node.incidents import Incident, Incidents
 from monitor_node.persistence import Persistence
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS
 
@@ -72,6 +72,7 @@ class AlarmBoard:
         self._suspects: list[SuspectedCause] = []  # of the latest incident
         self._kpi_minute: int | None = None
         self._kpis_changed = False
+        self._told: AlarmKpis | None = None
         self.time_ns: int | None = None
         self.changes = 0
         self.has_unexplained = False
@@ -275,7 +276,7 @@ class AlarmBoard:
         self._note()
         self.time_ns = state.time_ns
         self._incidents.state = state.incident
-        self._kpis.state = state.kpis
+        self._kpis.state, self._told = state.kpis, None
 
     # --- within ----------------------------------------------------------------------------------------------
 
@@ -326,9 +327,16 @@ class AlarmBoard:
         return Publication(keys.key(self._config.plant, keys.ALARM, alarm.name), alarm.message(time_ns, event))
 
     def _figures(self, time_ns: int) -> Publication:
-        self._kpi_minute, self._kpis_changed = time_ns // MINUTE_NS, False
-        counted = (
-            Counted(alarm.name, alarm.priority, alarm.memory.state, alarm.memory.raised_ns)
-            for alarm in self._alarms.values()
-        )
-        return Publication(self._kpi_key, self._kpis.figures(time_ns, counted, self._incidents.state.number))
+        before = self._told
+        if self._kpis_changed or before is None or before.standing or before.alarms_10min:
+            counted = [
+                Counted(alarm.name, alarm.priority, alarm.memory.state, alarm.memory.raised_ns)
+                for alarm in self._alarms.values()
+            ]
+            told = self._kpis.figures(time_ns, counted, self._incidents.state.number)
+        else:  # nothing that time alone would change
+            told = AlarmKpis()
+            told.CopyFrom(before)
+            told.time_ns = time_ns
+        self._kpi_minute, self._kpis_changed, self._told = time_ns // MINUTE_NS, False, told
+        return Publication(self._kpi_key, told)

@@ -52,12 +52,10 @@ class Sequence:
 
     Attributes:
         expected: the number after the highest that has come; None before the first.
-        next_to_leave: the number after that of the row which left last; None before the first.
         newest_ns: the latest time that has come.
     """
 
     expected: int | None = None
-    next_to_leave: int | None = None
     newest_ns: int = 0
 
 
@@ -82,16 +80,19 @@ class AlignmentState:
 
     Attributes:
         pending: rows that wait, by time.
-        left: rows that left last, oldest first: by time, whether each signal had come.
+        left: rows that left last, oldest first: by time, the numbers of their samples, None where one had not come.
         newest_left_ns: time of the row that left last; None before the first.
+        newest_numbers: its number of each signal, and if that had not come, what it would have been; None before the
+            first.
         sequences: by signal.
         restarted: whether the next row is the first of a new run.
         counts: of what happened so far.
     """
 
     pending: dict[int, Waiting] = field(default_factory=dict)
-    left: dict[int, tuple[bool, ...]] = field(default_factory=dict)
+    left: dict[int, list[int | None]] = field(default_factory=dict)
     newest_left_ns: int | None = None
+    newest_numbers: list[int | None] = field(default_factory=list)
     sequences: list[Sequence] = field(default_factory=list)
     restarted: bool = True
     counts: Counts = field(default_factory=Counts)
@@ -112,9 +113,10 @@ class Aligner:
         if reorder_rows < 1:
             raise ValueError(f"reorder_rows must be at least 1, got {reorder_rows}")
         self._index = {signal: index for index, signal in enumerate(signals)}
-        self._all = (True,) * len(signals)
+        self._count = len(signals)
         self._reorder_rows = reorder_rows
-        self.state = AlignmentState(sequences=[Sequence() for _ in signals])
+        self.state = AlignmentState()
+        self._begin()
 
     def update(self, signal: str, time_ns: int, sequence: int, value: float) -> list[Row]:
         """Take a sample in; returns the rows that leave because of it, oldest first.
@@ -125,8 +127,9 @@ class Aligner:
             sequence: the publisher's number of it.
             value: finite.
         """
+        rows: list[Row] = []
         index, state = self._index[signal], self.state
-        position, rows = state.sequences[index], list[Row]()
+        position = state.sequences[index]
         if sequence == position.expected and time_ns > position.newest_ns:  # as nearly always
             position.expected, position.newest_ns = sequence + 1, time_ns
         else:
@@ -135,19 +138,20 @@ class Aligner:
                 state.counts.duplicated += 1
                 return rows
             self._count_sequence(state.sequences[index], time_ns, sequence)
-        waiting = state.pending.get(time_ns)
+        pending = state.pending
+        waiting = pending.get(time_ns)
         if waiting is None:
             if state.newest_left_ns is not None and time_ns <= state.newest_left_ns:
                 state.counts.late += 1
                 return rows
-            count = len(self._index)
-            waiting = state.pending[time_ns] = Waiting([nan] * count, [None] * count, count)
+            count = self._count
+            waiting = pending[time_ns] = Waiting([nan] * count, [None] * count, count)
         waiting.values[index] = value
         waiting.numbers[index] = sequence
         waiting.missing -= 1
-        if len(state.pending) > 1:
+        if len(pending) > 1:
             return rows + self._release()
-        if self._may_leave(waiting):
+        if not waiting.missing and self._may_leave(waiting):
             rows.append(self._leave(time_ns))
         return rows
 
@@ -158,9 +162,8 @@ class Aligner:
     def _has_come(self, index: int, time_ns: int) -> bool:
         """Whether a sample of that signal and that time came before."""
         waiting = self.state.pending.get(time_ns)
-        if waiting is not None:
-            return waiting.numbers[index] is not None
-        return self.state.left.get(time_ns, ())[index : index + 1] == (True,)
+        numbers = waiting.numbers if waiting is not None else self.state.left.get(time_ns)
+        return numbers is not None and numbers[index] is not None
 
     def _release(self) -> list[Row]:
         pending = self.state.pending
@@ -177,27 +180,23 @@ class Aligner:
         """Whether a row is complete, and follows by any of its numbers the row that left last."""
         if waiting.missing:
             return False
-        for position, number in zip(self.state.sequences, waiting.numbers, strict=True):
-            if position.next_to_leave is None or position.next_to_leave == number:
+        for before, number in zip(self.state.newest_numbers, waiting.numbers, strict=True):
+            if before is None or number == before + 1:
                 return True
         return False
 
     def _leave(self, time_ns: int) -> Row:
         state = self.state
         waiting = state.pending.pop(time_ns)
-        for position, number in zip(state.sequences, waiting.numbers, strict=True):
-            if number is not None:
-                position.next_to_leave = number + 1
-            elif position.next_to_leave is not None:
-                position.next_to_leave += 1
+        numbers, left = waiting.numbers, state.left
+        left[time_ns] = numbers
+        if len(left) > REMEMBERED * self._reorder_rows:
+            del left[next(iter(left))]
         if waiting.missing:
             state.counts.incomplete_rows += 1
-            state.left[time_ns] = tuple(number is not None for number in waiting.numbers)
-        else:
-            state.left[time_ns] = self._all
-        if len(state.left) > REMEMBERED * self._reorder_rows:
-            del state.left[next(iter(state.left))]
-        state.newest_left_ns = time_ns
+            pairs = zip(state.newest_numbers, numbers, strict=True)
+            numbers = [before + 1 if number is None and before is not None else number for before, number in pairs]
+        state.newest_left_ns, state.newest_numbers = time_ns, numbers
         state.counts.rows += 1
         row = Row(time_ns, tuple(waiting.values), state.restarted)
         state.restarted = False
@@ -216,11 +215,14 @@ class Aligner:
             return []
         rows = self.flush()
         self.state.counts.restarts += 1
-        self.state.left = {}
-        self.state.newest_left_ns = None
-        self.state.restarted = True
-        self.state.sequences = [Sequence() for _ in self._index]
+        self._begin()
         return rows
+
+    def _begin(self) -> None:
+        """Begin a new run of the publisher."""
+        state = self.state
+        state.left, state.newest_left_ns, state.newest_numbers = {}, None, [None] * self._count
+        state.sequences, state.restarted = [Sequence() for _ in range(self._count)], True
 
     def _count_sequence(self, position: Sequence, time_ns: int, sequence: int) -> None:
         counts = self.state.counts

@@ -58,6 +58,7 @@ class Monitor:
         self.alarms = AlarmBoard(config)
         self._watch = PlantWatch(config, self.alarms, points=points)
         self._units = dict.fromkeys(self._signals, "")
+        self._output_units = [""] * len(config.outputs)
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self._watching_since_ns: int | None = None
@@ -68,6 +69,7 @@ class Monitor:
         self._start_ns = start_ns
         self._health_due_ns = start_ns
         self._snapshot_due_ns: int | None = None
+        self._snapshot_ns = int(config.snapshot_min * MINUTE_NS)
 
     # --- what the loop calls ---------------------------------------------------------------------------------
 
@@ -106,7 +108,9 @@ class Monitor:
         if quality == BAD:
             self.refusals.add("bad_quality", f"{signal} is marked bad at {sample.time_ns} ns")
             return []
-        self._units[signal] = sample.unit
+        if sample.unit != self._units[signal]:
+            self._units[signal] = sample.unit
+            self._output_units = [self._units[output] for output in self.config.outputs]
         publications: list[Publication] = []
         if now_ns >= self._heard_ns + HEARD_AGAIN_NS:
             self._heard_ns = now_ns
@@ -190,21 +194,18 @@ class Monitor:
         return publications
 
     def _on_row(self, row: Row, publications: list[Publication]) -> None:
-        config = self.config
-        if self.first_ns is None or row.time_ns < self.first_ns:
-            self.first_ns = row.time_ns
-        self.last_ns = row.time_ns
-        self._watch.update(row, [self._units[signal] for signal in config.outputs], publications)
-        publications.extend(self.alarms.end_row(row.time_ns))
+        time_ns, due_ns = row.time_ns, self._snapshot_due_ns
+        if self.first_ns is None or time_ns < self.first_ns:
+            self.first_ns = time_ns
+        self.last_ns = time_ns
+        self._watch.update(row, self._output_units, publications)
+        publications.extend(self.alarms.end_row(time_ns))
         if self._watching_since_ns is None and self._watch.watching:
-            self._watching_since_ns = row.time_ns
-        if (
-            self._snapshot_due_ns is None
-            or not 0 <= self._snapshot_due_ns - row.time_ns <= config.snapshot_min * MINUTE_NS
-        ):
-            if self._snapshot_due_ns is not None:
-                publications.extend(self._watch.snapshots(row.time_ns))
-            self._snapshot_due_ns = row.time_ns + int(config.snapshot_min * MINUTE_NS)
+            self._watching_since_ns = time_ns
+        if due_ns is None or not 0 <= due_ns - time_ns <= self._snapshot_ns:
+            if due_ns is not None:
+                publications.extend(self._watch.snapshots(time_ns))
+            self._snapshot_due_ns = time_ns + self._snapshot_ns
 
     def _health(self, now_ns: int, phase: str) -> Publication:
         counts = self._aligner.state.counts

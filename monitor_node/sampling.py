@@ -43,10 +43,13 @@ class SamplingPeriod:
         """Take a row in; whether it follows the one before it by one period."""
         state = self.state
         last, state.last_ns = state.last_ns, time_ns
-        state.spacing_ns = None if last is None else time_ns - last
-        if state.spacing_ns is None or state.spacing_ns <= 0:
+        if last is None:
             return False
-        spacing = state.spacing_ns
+        spacing = state.spacing_ns = time_ns - last
+        if spacing == state.period_ns:  # as mostly
+            return True
+        if spacing <= 0:
+            return False
         if state.period_ns is None:
             state.spacings_ns.append(spacing)
             if len(state.spacings_ns) == LEARN_FROM:
@@ -64,4 +67,6 @@ class SamplingPeriod:
     def gap(self) -> bool:
         """Whether there is a gap before the row that was taken in last."""
         spacing = self.state.spacing_ns
-        return spacing is not None and (spacing <= 0 or spacing > LARGEST_GAP * self.period_ns)
+        if spacing is None or spacing == self.state.period_ns:
+            return False
+        return spacing <= 0 or spacing > LARGEST_GAP * self.period_ns

@@ -92,6 +92,11 @@ class Spacing(msgspec.Struct, forbid_unknown_fields=True):
             return None
         return int(limit * (self.mean_ns + DEVIATIONS * self.deviation_ns))
 
+    @property
+    def steady_ns(self) -> float | None:
+        """The spacing, if all were the same."""
+        return self.mean_ns if self.count == MEMORY and self.deviation_ns == 0.0 else None
+
     def learn(self, spacing_ns: float) -> None:
         """Take the next spacing in."""
         self.count = min(self.count + 1, MEMORY)
@@ -146,6 +151,7 @@ class Silence:
         self._rows, self._receipts = Spacing(), Spacing()
         self._last_ns: int | None = None
         self._received_ns: int | None = None
+        self._steady_ns: float | None = None
         self.standing = False
 
     @classmethod
@@ -154,6 +160,7 @@ class Silence:
         silence = cls(state.limit, state.least_s)
         silence._rows, silence._receipts = msgspec.structs.replace(state.rows), msgspec.structs.replace(state.receipts)
         silence._last_ns, silence.standing = state.last_ns, state.standing
+        silence._steady_ns = silence._rows.steady_ns
         return silence
 
     @property
@@ -174,13 +181,12 @@ class Silence:
             time_ns: of the row.
             present: whether what is watched has a value in it.
         """
-        last_ns, rows = self._last_ns, self._rows
+        last_ns = self._last_ns
         if last_ns is None or time_ns <= last_ns:
             self._last_ns = time_ns
             return self._change(None, time_ns) if present else NOTHING
-        spacing_ns = time_ns - last_ns
-        as_always = spacing_ns == rows.mean_ns and not rows.deviation_ns and rows.count == MEMORY
-        if as_always and present and not self.standing:
+        rows, spacing_ns = self._rows, time_ns - last_ns
+        if present and spacing_ns == self._steady_ns and not self.standing:
             self._last_ns = time_ns  # there is nothing to learn
             return NOTHING
         allowed_ns = rows.allowed_ns(self._limit)
@@ -190,6 +196,7 @@ class Silence:
         if not present:
             return NOTHING if raised_ns is None else Change(raised_ns, None)
         rows.learn(spacing_ns if allowed_ns is None else min(spacing_ns, allowed_ns))
+        self._steady_ns = rows.steady_ns
         self._last_ns = time_ns
         return self._change(raised_ns, max(time_ns, last_ns + (allowed_ns or 0)))
 

@@ -6,6 +6,7 @@ frozen: a model that goes on adapting would learn a fault and call it normal. It
 far it has gone from the reference is told as drift.
 """
 
+from collections.abc import Iterator, Sequence
 from math import isfinite, nan
 
 from monitor_node import false_alarm_budget
@@ -63,6 +64,7 @@ class PlantWatch:
         self._checks: list[Check] = []
         self._reference: Reference | None = None
         self._whiteners: list[Prewhitener] = []
+        self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
         self._withheld = (False,) * len(config.outputs)
@@ -167,6 +169,7 @@ class PlantWatch:
         )
         self._reference, self._checks = trained.reference, trained.checks
         self._whiteners = [Prewhitener(item) for item in trained.learned]
+        self._whitened_sds = [item.sd for item in trained.learned]
         if config.isolation and isinstance(trained.reference, ProcessReference):
             self._suspicion = Suspicion(config, self._board, trained.reference)
         self._charts.start(trained.learned, trained.e, self._arl0)
@@ -207,19 +210,13 @@ class PlantWatch:
             for whitener in self._whiteners:
                 whitener.restart()
         predictions, sds = reference.update(time_ns, input_value, values, self._withheld)
-        e: list[float] = []
-        scales: list[float] = []
-        for index, whitener in enumerate(self._whiteners):
-            residual, sd = values[index] - predictions[index], sds[index]
-            scale = sd * whitener.learned.sd
-            if self._points and isfinite(residual):
-                usual, reach = predictions[index] + sd * whitener.expected(), scale * self._charts.widths[index]
-                estimate = _estimate(time_ns, predictions[index], residual, units[index])
-                estimate.residual_sd = scale
-                estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach
-                publications.append(Publication(self._estimate_keys[index], estimate))
-            e.append(whitener.update(residual / sd))
-            scales.append(scale)
+        scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
+        if self._points:
+            publications.extend(self._estimates(time_ns, values, predictions, sds, scales, units))
+        e = [
+            whitener.update((value - prediction) / sd)
+            for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
+        ]
         self.rows_watched += 1
         withheld, told = self.signals.withheld(time_ns, e, scales, units)
         self._withheld = withheld
@@ -232,6 +229,25 @@ class PlantWatch:
         publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._suspicion.update(time_ns, input_value, values, units, stuck))
+
+    def _estimates(
+        self,
+        time_ns: int,
+        values: list[float],
+        predictions: Sequence[float],
+        sds: Sequence[float],
+        scales: list[float],
+        units: list[str],
+    ) -> Iterator[Publication]:
+        """What was expected of a row, before it is taken into the residuals' past."""
+        for index, whitener in enumerate(self._whiteners):
+            prediction, residual = predictions[index], values[index] - predictions[index]
+            if isfinite(residual):
+                usual, reach = prediction + sds[index] * whitener.expected(), scales[index] * self._charts.widths[index]
+                estimate = _estimate(time_ns, prediction, residual, units[index])
+                estimate.residual_sd = scales[index]
+                estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach
+                yield Publication(self._estimate_keys[index], estimate)
 
 
 def _model(config: MonitorConfig) -> ProcessModel | None:

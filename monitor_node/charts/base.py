@@ -224,8 +224,7 @@ class Bank(Generic[Kind]):
         if len(kinds) != 1:
             raise InputError(f"charts must be one or more of one kind, got {sorted(kind.__name__ for kind in kinds)}")
         (self._kind,) = kinds
-        self._columns: Array = np.ascontiguousarray(np.concatenate([chart._columns for chart in charts], axis=1))
-        self._row = Struct(f"{len(charts)}d")
+        self._hold(np.concatenate([chart._columns for chart in charts], axis=1))
 
     @classmethod
     def from_state(cls, kind: type[Kind], state: SignalState) -> Self:
@@ -235,9 +234,15 @@ class Bank(Generic[Kind]):
             ValueError: the state is of another chart, or damaged.
         """
         bank = cls.__new__(cls)
-        bank._kind, bank._columns = kind, _columns(kind, state)
-        bank._row = Struct(f"{state.plants}d")
+        bank._kind = kind
+        bank._hold(_columns(kind, state))
         return bank
+
+    def _hold(self, columns: Array) -> None:
+        self._columns = np.ascontiguousarray(columns)
+        self._buffer, plants = self._columns.data, columns.shape[1]
+        self._come, self._out = Struct(f"{2 * plants}d").pack_into, Struct(f"{plants}d").unpack_from
+        self._out_offset = OUT * plants * self._columns.itemsize
 
     @property
     def state(self) -> SignalState:
@@ -281,14 +286,10 @@ class Bank(Generic[Kind]):
             values: one a chart, finite where present.
             present: False leaves a chart as it is.
         """
-        columns, row = self._columns, self._row
-        row.pack_into(columns, X * row.size, *values)
-        row.pack_into(columns, PRESENT * row.size, *present)
-        self._kind.kernel(columns)
-        for here, out in zip(present, row.unpack_from(columns, OUT * row.size), strict=True):
-            if out > 0.0 and here:
-                return True
-        return False
+        self._come(self._buffer, 0, *values, *present)  # X and PRESENT are the first rows
+        self._kind.kernel(self._columns)
+        out = self._out(self._buffer, self._out_offset)
+        return any(out) and any(here and much > 0.0 for here, much in zip(present, out, strict=True))
 
     def judgement(self, plant: int) -> Judgement:
         """What a chart said of its last value."""

@@ -5,6 +5,7 @@ and its version. A payload is decoded by that name alone, so a stranger's bytes 
 instead of guessed at: protobuf itself would take many of them for an empty message.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 from google.protobuf.message import DecodeError as ProtobufDecodeError
@@ -81,6 +82,7 @@ def encoding_of(message_type: type[Message]) -> str:
 
 
 _BY_ENCODING: dict[str, type[Message]] = {encoding_of(kind): kind for kind in MESSAGES}
+_READERS: dict[str, Callable[[bytes], Message]] = {text: kind.FromString for text, kind in _BY_ENCODING.items()}
 _ENCODINGS: dict[type[Message], str] = {kind: text for text, kind in _BY_ENCODING.items()}
 
 
@@ -106,12 +108,11 @@ def decode(payload: bytes, encoding: str) -> Message:
     Raises:
         DecodeError: the encoding is not ours (reason `encoding`), or the bytes do not parse (`payload`).
     """
-    kind = _BY_ENCODING.get(encoding)
-    if kind is None:
+    read = _READERS.get(encoding)
+    if read is None:
         raise DecodeError("encoding", f"encoding must be '{PREFIX}reactorwatch.v1.<message>', got {encoding!r}")
-    message = kind()
     try:
-        message.ParseFromString(payload)
+        return read(payload)
     except ProtobufDecodeError as error:
-        raise DecodeError("payload", f"{len(payload)} bytes are not a {kind.DESCRIPTOR.full_name}: {error}") from error
-    return message
+        name = encoding.removeprefix(PREFIX)
+        raise DecodeError("payload", f"{len(payload)} bytes are not a {name}: {error}") from error

@@ -227,7 +227,7 @@ class Filter:
         steps = (step, step)
         if 2.0 * step > _LONGEST_ROW_MIN or self._breaks:
             steps = self._steps(before, time_min, step)
-        limits = [inf if follow else gate for follow in accept] if accept else [gate] * n
+        limits = [inf if follow else gate for follow in accept] if True in accept else [gate] * n
         self._pack(self._new, 0, *self._inputs, *inputs, time_min, *steps, *measured, *limits)
         self._row()
         told = self._unpack(self._told)
