@@ -30,7 +30,8 @@ import numpy as np
 from monitor_node.isolation_bank import Bank
 from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_fit import Fit, Fitter
-from monitor_node.isolation_hypothesis import HUBER, Hypothesis
+from monitor_node.isolation_hypothesis import Hypothesis
+from monitor_node.isolation_stretch import HUBER
 from monitor_node.isolation_ways import linearisable
 from monitor_node.isolation_window import Row, Window, window_of
 from reactorwatch.process.effects.base import Effect
@@ -144,11 +145,12 @@ def _left(fit: Fit, window: Window) -> float:
     """Logarithm of the evidence that more than noise is left since the onset of the best cause, over that of noise."""
     since = int(np.sum(window.time_min < fit.onset_min)) - (window.time_min.size - len(fit.w))
     w = fit.w[max(since, 0) :]
+    known = np.isfinite(window.measured[window.time_min.size - len(w) :])
     found = []
     for rows in SUMMED_ROWS:
-        whole = w[: len(w) // rows * rows].reshape(-1, rows, w.shape[1])
-        counts = np.sum(np.isfinite(whole), axis=1)
-        sums = np.sum(np.clip(np.nan_to_num(whole), -HUBER, HUBER), axis=1)
+        whole = slice(len(w) // rows * rows)
+        counts = np.sum(known[whole].reshape(-1, rows, w.shape[1]), axis=1)
+        sums = np.sum(np.clip(w[whole], -HUBER, HUBER).reshape(-1, rows, w.shape[1]), axis=1)
         n = int(np.sum(counts > 0))
         square = float(np.sum(sums[counts > 0] ** 2 / counts[counts > 0]))
         if n:

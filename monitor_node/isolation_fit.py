@@ -15,7 +15,8 @@ from math import inf, log, pi, sqrt
 import numpy as np
 
 from monitor_node.isolation_bank import Scan
-from monitor_node.isolation_hypothesis import SETTLED, Descent, Hypothesis, run
+from monitor_node.isolation_hypothesis import SETTLED, Descent, Hypothesis
+from monitor_node.isolation_stretch import Stretch
 from monitor_node.isolation_window import Window
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
@@ -46,7 +47,7 @@ class Fit:
         size: of a step; of a ramp its slope, in a minute.
         onset_min: when it set in.
         gain: in log likelihood, against nothing being wrong.
-        w: the whitened innovations of the newest rows, from before any hypothesis sets in; NaN: missing.
+        w: the whitened innovations of the newest rows, from before any hypothesis sets in; 0 where nothing was measured.
         log_volume: how much of what was possible beforehand is still, of all onsets and sizes; see `isolation`.
         size_sd: standard deviation of the size.
         onset_sd_min: of the onset.
@@ -94,17 +95,14 @@ class Fitter:
         if not best:
             return []
         best = [item for item in best if item.gain > (1.0 - _HOLDS) * best[0].gain - BEHIND]
-        begin = _begin(best[:MOST], window)
-        nothing = run(self._nominal, window, begin, rows)[0]
-        promised = best[0].gain
-        kept = (
-            nothing - self.hypotheses[best[0].hypothesis].run(window, begin, rows, best[0].size, best[0].onset_min)[0]
-        )
+        stretch = Stretch(window, _begin(best[:MOST], window), rows, self._nominal)
+        promised, likeliest = best[0].gain, self.hypotheses[best[0].hypothesis]
+        kept = stretch.nothing.value - likeliest.loss(stretch, best[0].size, best[0].onset_min).value
         if not abs(kept - promised) < _HOLDS * promised + _NOISE:
             return self._followed(window, early)
         fits = []
         for item in best[:MOST]:
-            fit = self._fitted(item, window, begin, rows, nothing, first=True, last=True)
+            fit = self._fitted(item, stretch, first=True, last=True)
             onset_sd_min = max(fit.onset_sd_min, item.onset_sd_min)
             fits.append(replace(fit, onset_sd_min=onset_sd_min, log_volume=item.log_volume))
         return [*sorted(fits, key=lambda item: -item.gain), *best[MOST:]]
@@ -117,9 +115,8 @@ class Fitter:
             return []
         onset, first = int(np.searchsorted(window.time_min, fits[0].onset_min)), True
         while True:
-            last, begin = reached >= rows, _begin(fits, window)
-            nothing = run(self._nominal, window, begin, reached)[0]
-            fits = [self._fitted(item, window, begin, reached, nothing, first=first, last=last) for item in fits]
+            last, stretch = reached >= rows, Stretch(window, _begin(fits, window), reached, self._nominal)
+            fits = [self._fitted(item, stretch, first=first, last=last) for item in fits]
             fits.sort(key=lambda item: -item.gain)
             if last:
                 return [replace(item, log_volume=_log_volume(item, window)) for item in fits]
@@ -130,11 +127,10 @@ class Fitter:
             least = fits[0].gain - slack * abs(fits[0].gain) - BEHIND
             fits = [item for item in fits if item.gain >= least] or fits[:1]  # a gain may be no number
 
-    def _fitted(
-        self, fit: Fit, window: Window, begin: int, rows: int, nothing: float, *, first: bool, last: bool
-    ) -> Fit:
-        """Fitted to the rows before `rows`, from where it is."""
-        descent = Descent(self.hypotheses[fit.hypothesis], window, begin, rows)
+    def _fitted(self, fit: Fit, stretch: Stretch, *, first: bool, last: bool) -> Fit:
+        """Fitted to the rows of a stretch, from where it is."""
+        nothing = stretch.nothing.value
+        descent = Descent(self.hypotheses[fit.hypothesis], stretch)
         point = descent.at(fit.size, fit.onset_min)
         if first and nothing - point.loss < _KEPT * fit.gain:
             tried = [descent.at(share * fit.size, fit.onset_min) for share in _SHRINKS]

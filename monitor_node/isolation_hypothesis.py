@@ -1,29 +1,24 @@
 """One hypothesis: a cause that set in as a step or as a ramp, and how well it goes with some rows.
 
-Its loss is minus the log likelihood of its own filter's innovations, in the sense of Huber (1964, Robust estimation of
-a location parameter, Annals of Mathematical Statistics 35): beyond `HUBER` standard deviations it grows no faster than
-the deviation. It is lowered by Gauss and Newton's steps in size and onset, damped as Levenberg and Marquardt do, with
-derivatives that are differences of filter runs.
+Its loss is that of its own filter (see `isolation_stretch`). It is lowered by Gauss and Newton's steps in size and
+onset, damped as Levenberg and Marquardt do, with derivatives that are differences of filter runs.
 
 A sensor's step is seen at a row, no matter when between two rows it came. So that the search does not stop on such a
 plateau, the onset is moved by whole rows as long as that helps, and in the end taken from the middle of it.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import inf, sqrt
 
 import numpy as np
 
-from monitor_node.isolation_window import Window
+from monitor_node.isolation_stretch import HUBER, Loss, Stretch
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.filter_step import COMPILED
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.profiles import RAMP, STEP, Profile
-
-HUBER = 4.0
-LOST = 100.0
-"""Standard deviations that a value counts as off where a filter has lost the plant."""
 
 SETTLED = 0.05
 """In log likelihood."""
@@ -43,8 +38,8 @@ class Hypothesis:
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effect: Effect, profile: Profile) -> None:
         self.effect, self.profile = effect, profile
-        self._noise, self._extended = noise, effect.extend(model, profile)
-        self._prefix = self._extended.parameter_names[len(model.parameters)].removesuffix("size")
+        self._noise, self._extended = noise, _extended(model, effect)
+        self._names = self._extended.parameter_names[len(model.parameters) :]
 
     @cached_property
     def _filter(self) -> Filter:
@@ -56,28 +51,20 @@ class Hypothesis:
         span = end_min - onset_min if self.profile is RAMP else 1.0
         return min(max(size, self.effect.lower / span), self.effect.upper / span)
 
-    def run(self, window: Window, begin: int, rows: int, size: float, onset_min: float) -> tuple[float, Array]:
-        """The loss over the rows after `begin` and before `rows`, and the whitened innovations there."""
-        changes = {f"{self._prefix}onset": onset_min, f"{self._prefix}size": size}
+    def loss(self, stretch: Stretch, size: float, onset_min: float) -> Loss:
+        """That over the rows of a stretch."""
+        end_min = onset_min
         if self.profile is RAMP:
-            end_min = float(window.time_min[rows - 1])
-            reached = size * (end_min - onset_min)
-            changes[f"{self._prefix}size"] = min(max(reached, self.effect.lower), self.effect.upper)
-            changes[f"{self._prefix}end"] = end_min
-        self._filter.change(changes)
-        return run(self._filter, window, begin, rows)
+            end_min = stretch.end_min
+            size = min(max(size * (end_min - onset_min), self.effect.lower), self.effect.upper)
+        self._filter.change(dict(zip(self._names, (size, onset_min, end_min), strict=True)))
+        return stretch.loss(self._filter, onset_min)
 
 
-def run(kalman: Filter, window: Window, begin: int, rows: int) -> tuple[float, Array]:
-    """A filter's loss over the rows after `begin` and before `rows`, and its whitened innovations there."""
-    part = slice(begin + 1, rows)
-    found = kalman.run(window.time_min[part], window.inputs[part], window.measured[part], start=window.states[begin])
-    # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
-    lost = np.isfinite(window.measured[part]) & ~np.isfinite(found.whitened)
-    w = np.where(lost, LOST, found.whitened)
-    size = np.abs(np.nan_to_num(w))
-    losses = np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER))
-    return float(np.sum(losses) + np.sum(np.log(found.conditional_sd), where=np.isfinite(found.conditional_sd))), w
+@lru_cache(maxsize=COMPILED)
+def _extended(model: ProcessModel, effect: Effect) -> ProcessModel:
+    """The model with a ramp of the effect in it, and with a step: that is the ramp which ends where it begins."""
+    return effect.extend(model, RAMP)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +74,8 @@ class Point:
     Attributes:
         size: see `Hypothesis`.
         onset_min: when it sets in.
-        loss: see the module.
-        w: the whitened innovations, shape (rows, n_y); NaN where nothing was measured.
+        loss: see `isolation_stretch`.
+        w: the whitened innovations, shape (rows, n_y); 0 where nothing was measured.
     """
 
     size: float
@@ -126,28 +113,23 @@ class Slope:
 
 
 class Descent:
-    """The search for the size and the onset of one hypothesis, on the rows of a window after `begin` and before `rows`.
+    """The search for the size and the onset of one hypothesis.
 
     Args:
         hypothesis: whose.
-        window: the rows.
-        begin: at least two rows before `rows`.
-        rows: how far.
+        stretch: the rows.
     """
 
-    def __init__(self, hypothesis: Hypothesis, window: Window, begin: int, rows: int) -> None:
-        self._hypothesis, self._window, self._begin, self._rows = hypothesis, window, begin, rows
-        self._times = window.time_min[begin:rows]
-        self._end_min = float(self._times[-1])
-        self._earliest_min = max(window.earliest_min, float(self._times[0]))
+    def __init__(self, hypothesis: Hypothesis, stretch: Stretch) -> None:
+        self._hypothesis, self._stretch, self._times = hypothesis, stretch, stretch.times
+        self._end_min = stretch.end_min
         self._latest_min = float(self._times[-1 if hypothesis.profile is STEP else -2])
 
     def at(self, size: float, onset_min: float) -> Point:
         """The point, or the nearest one that is possible."""
-        onset_min = min(max(onset_min, self._earliest_min), self._latest_min)
+        onset_min = min(max(onset_min, self._stretch.earliest_min), self._latest_min)
         size = self._hypothesis.limited(size, onset_min, self._end_min)
-        loss, w = self._hypothesis.run(self._window, self._begin, self._rows, size, onset_min)
-        return Point(size, onset_min, loss, w)
+        return Point(size, onset_min, *self._hypothesis.loss(self._stretch, size, onset_min))
 
     def reached(self, point: Point, slope: Slope) -> tuple[float, float]:
         """The size in the last row and its standard deviation."""
@@ -165,14 +147,14 @@ class Descent:
         if point.onset_min + of_onset > self._latest_min:
             of_onset = -of_onset
         near = self.at(point.size + of_size, point.onset_min), self.at(point.size, point.onset_min + of_onset)
-        w = np.nan_to_num(point.w).ravel()
-        of_w = np.array([np.nan_to_num(item.w).ravel() - w for item in near]) / np.array([[of_size], [of_onset]])
+        w = point.w.ravel()
+        of_w = np.array([(near[0].w.ravel() - w) / of_size, (near[1].w.ravel() - w) / of_onset])
         least = np.diag([(1e-3 / size_sd) ** 2, (self._end_min - float(self._times[0])) ** -2])
         return Slope(of_w, (of_w * _weights(w)) @ of_w.T + least)
 
     def stepped(self, point: Point, slope: Slope) -> Point:
         """After a damped step; the point itself if none helps."""
-        w, damping = np.nan_to_num(point.w).ravel(), _DAMPING
+        w, damping = point.w.ravel(), _DAMPING
         gradient = slope.of_w @ (_weights(w) * w)
         longest = max(0.5 * (self._end_min - point.onset_min), 3.0 * self._spacing(point.onset_min))
         for _ in range(_TRIES):

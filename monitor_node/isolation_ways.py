@@ -7,6 +7,7 @@ rows, so that a window costs a few milliseconds.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import ceil
 
 import casadi as ca
@@ -16,7 +17,7 @@ from monitor_node.isolation_window import Window
 from reactorwatch.process.array_function import ArrayFunction, mapped
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import NoiseLevels
-from reactorwatch.process.filter_step import exponential
+from reactorwatch.process.filter_step import COMPILED, exponential
 from reactorwatch.process.integrate import LONGEST_STEP_MIN, symbolic_step
 from reactorwatch.process.model import Array, ProcessModel
 
@@ -62,9 +63,7 @@ class Linearisation:
     """
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
-        extended = model
-        for effect in effects:
-            extended = effect.extend(extended)
+        extended = _extended(model, tuple(effects))
         self._p = extended.values()
         self._piece = mapped(_piece(extended, len(effects)), CHUNK, parameters=2)
         self._shown = mapped(_shown(extended, len(effects)), CHUNK, parameters=2)
@@ -116,6 +115,14 @@ class Linearisation:
         return [result.transpose(0, 2, 1) for result in results]
 
 
+@lru_cache(maxsize=COMPILED)
+def _extended(model: ProcessModel, effects: tuple[Effect, ...]) -> ProcessModel:
+    for effect in effects:
+        model = effect.extend(model)
+    return model
+
+
+@lru_cache(maxsize=COMPILED)
 def _piece(model: ProcessModel, sizes: int) -> ca.Function:
     """(x, u, p, t, h) -> x after two steps, and its derivatives by x and by the sizes, which are the last of p.
 
@@ -139,6 +146,7 @@ def _piece(model: ProcessModel, sizes: int) -> ca.Function:
     return ca.Function("piece", [x, u, p, t, h], [ca.densify(item) for item in ca.cse([point, F, G])])
 
 
+@lru_cache(maxsize=COMPILED)
 def _shown(model: ProcessModel, sizes: int) -> ca.Function:
     """(x, u, p, t) -> derivatives of the outputs by x and by the sizes, which are the last of p."""
     x, u, p = model.arguments()

@@ -13,6 +13,8 @@ neural system models, IEEE Trans. Neural Networks 8(3). At most coolant flows th
 see `steady_state`.
 """
 
+from functools import cache
+
 import casadi as ca
 
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
@@ -33,8 +35,9 @@ FEED = "feed"
 """`feed C` and `feed T` are the terms that say what the feed brings, in the units of the outputs."""
 
 
+@cache
 def cstr() -> ProcessModel:
-    """The reactor with its nominal constants."""
+    """The reactor with its nominal constants: one model, so that what is compiled from it is compiled once."""
     C = variable("C", "mol/l", (0.0, 2.0), 0.1, "concentration of A in the reactor")
     T = variable("T", "K", (250.0, 700.0), 10.0, "temperature of the reactor")
     qc = variable("qc", "l/min", (0.0, 500.0), 10.0, "coolant flow")

@@ -28,6 +28,7 @@ What is out of the ordinary is handled like this:
 """
 
 import struct
+from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from math import ceil, inf, log, nan, pi
@@ -38,9 +39,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.process.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.process.filter_start import Beginning
-from reactorwatch.process.filter_step import chained, row_function, walk_function
-from reactorwatch.process.integrate import LONGEST_STEP_MIN
+from reactorwatch.process.filter_step import chain_function, row_function, walk_function
 from reactorwatch.process.model import Array, ProcessModel
 
 LONGEST_GAP_MIN = 30.0
@@ -48,10 +49,8 @@ LONGEST_GAP_MIN = 30.0
 LEAST_PROCESS_SD = 1e-6
 """Of the scale of a state. Without any process noise its covariance would shrink below what a number can hold."""
 
-CHUNK, UNROLLED = 16, 8
-"""Rows in one compiled chain, and how many of them are one expression."""
-
-_LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded
+CHUNKS, UNROLLED = (64, 8), 8
+"""Rows in one compiled chain, a long one or a short one, and how many of them are one expression."""
 
 
 class NoiseLevels(msgspec.Struct, frozen=True):
@@ -144,14 +143,14 @@ class Filter:
         self.model = model
         self._n_x, self._n_y = len(model.states), len(model.outputs)
         self._nothing = Innovation(*((nan,) * self._n_y,) * 4)
-        self._row_function = row_function(model)
-        self._row = ArrayFunction(self._row_function)
+        self._row = ArrayFunction(row_function(model))
         self._memory, new, self._constants = (item[0] for item in self._row.arguments)
         after, told = (item[0] for item in self._row.results)
         self._memory_view, self._new, self._after, self._told = (
             memoryview(item) for item in (self._memory, new, after, told)
         )
         self._pack, self._unpack = struct.Struct(f"{new.size}d").pack_into, struct.Struct(f"{told.size}d").unpack
+        self._break_places = [model.parameter_names.index(name) for name in model.breakpoints]
         self._time_min: float | None = None
         self._inputs: tuple[float, ...] = ()
         self._breaks: tuple[float, ...] = ()
@@ -184,8 +183,7 @@ class Filter:
         values = self.model.values(changes)
         self._changes = dict(changes)
         self._constants[: values.size] = values
-        names = self.model.parameter_names
-        self._breaks = tuple(sorted({float(values[names.index(name)]) for name in self.model.breakpoints}))
+        self._breaks = tuple(sorted({float(values[place]) for place in self._break_places}))
 
     def restart(self) -> None:
         """Begin anew with the next row."""
@@ -225,7 +223,7 @@ class Filter:
             return self._begin(time_min, inputs, measured)
         step = 0.5 * (time_min - before)
         steps = (step, step)
-        if 2.0 * step > _LONGEST_ROW_MIN or self._breaks:
+        if 2.0 * step > LONGEST_ROW_MIN or self._breaks:
             steps = self._steps(before, time_min, step)
         limits = [inf if follow else gate for follow in accept] if True in accept else [gate] * n
         self._pack(self._new, 0, *self._inputs, *inputs, time_min, *steps, *measured, *limits)
@@ -257,62 +255,55 @@ class Filter:
             accept: likewise, shape (rows, n_y).
             start: what the filter remembers of the row before the first; None: it begins with the first row.
         """
-        rows, n = time_min.size, self._n_y
-        inputs = inputs.reshape(rows, -1)
-        limits = np.where(accept, inf, gate) if accept is not None else np.full((rows, n), gate)
-        told = np.full((rows, 5 * n + 1), nan)
-        memory = np.full((rows, self._memory.size), nan)
+        return self.over(FilterRecord.of(time_min, inputs, measured, gate, accept), start)
+
+    def over(self, record: FilterRecord, start: FilterState | None = None) -> Innovations:
+        """As `run`, of a record that is laid out already."""
         if start is None:
             self.restart()
         else:
             self.state = start
-        since = np.append(nan if self._time_min is None else self._time_min, time_min[:-1])
-        first = 0.5 * (time_min - since)
-        second, plain = first.copy(), (first > 0) & (2.0 * first <= _LONGEST_ROW_MIN)
-        for point in self._breaks:
-            row = int(np.searchsorted(time_min, point))
-            if row < rows and since[row] < point < time_min[row]:
-                plain[row] &= len(self._within(since[row], time_min[row])) == 1
-                first[row], second[row] = point - since[row], time_min[row] - point
-        new = np.empty((rows, self._new.nbytes // 8))
-        n_u = inputs.shape[1]
-        new[0, :n_u], new[1:, :n_u], new[:, n_u : 2 * n_u] = self._inputs or inputs[0], inputs[:-1], inputs
-        new[:, 2 * n_u], new[:, 2 * n_u + 1], new[:, 2 * n_u + 2] = time_min, first, second
-        new[:, -2 * n : -n], new[:, -n:] = measured, limits
-        ends = np.append(np.flatnonzero(~plain), rows)
+        rows, near = record.following(self._time_min, self._inputs, self._breaks)
+        count, n, n_x = len(rows), self._n_y, self._n_x
+        told, memory = np.full((count, 5 * n + 1), nan), np.full((count, self._memory.size), nan)
+        ends = [*np.flatnonzero(~near).tolist(), count]
         row = 0
-        while row < rows:
+        while row < count:
             done = 0
-            if self._time_min is not None and plain[row]:
-                stop = min(int(ends[np.searchsorted(ends, row)]), row + CHUNK)
-                done = self._run_chunk(new[row:stop], told[row:stop], memory[row:stop])
+            if self._time_min is not None and near[row]:
+                end = ends[bisect_left(ends, row)]
+                chunk = self._chunks[0 if end - row >= CHUNKS[0] else 1]
+                part = slice(row, min(end, row + len(chunk.arguments[1])))
+                done = self._run_chunk(chunk, rows[part], told[part], memory[part])
             if done:
                 row += done
-                self._time_min, self._inputs = float(time_min[row - 1]), tuple(inputs[row - 1].tolist())
-                continue
-            values, follow = measured[row].tolist(), np.isinf(limits[row]).tolist()
-            if (
-                self.update(float(time_min[row]), inputs[row].tolist(), values, gate=gate, accept=follow)
-                is self._nothing
-            ):
-                memory[row] = self._memory if self._time_min is not None else nan
+                self._time_min, self._inputs = float(record.time_min[row - 1]), tuple(record.inputs[row - 1].tolist())
             else:
-                told[row], memory[row] = self._told, self._memory
-            row += 1
+                self._run_row(record, row, told, memory)
+                row += 1
         prediction, residual, sd, whitened, conditional_sd = (
             told[:, place * n : (place + 1) * n] for place in range(5)
         )
-        x, P = memory[:, : self._n_x], memory[:, self._n_x :].reshape(rows, self._n_x, self._n_x)
+        x, P = memory[:, :n_x], memory[:, n_x:].reshape(count, n_x, n_x)
         return Innovations(prediction, residual, sd, whitened, conditional_sd, x, P)
 
-    def _run_chunk(self, new: Array, told: Array, memory: Array) -> int:
+    def _run_row(self, record: FilterRecord, row: int, told: Array, memory: Array) -> None:
+        """Take a row in by itself."""
+        time_min, inputs, values = record.time_min[row], record.inputs[row].tolist(), record.measured[row].tolist()
+        found = self.update(float(time_min), inputs, values, gate=record.gate, accept=record.accept[row].tolist())
+        if found is not self._nothing:
+            told[row], memory[row] = self._told, self._memory
+        elif self._time_min is not None:
+            memory[row] = self._memory
+
+    def _run_chunk(self, chunk: ArrayFunction, new: Array, told: Array, memory: Array) -> int:
         """Take a chunk of rows in at once; returns how many of them, up to the first that did not go well."""
-        rows, chunk = len(new), self._chunk
+        rows = len(new)
         chunk.arguments[0][0], chunk.arguments[2][0] = self._memory, self._constants
         chunk.arguments[1][:rows] = new
         chunk()
-        after, found = (result[:rows] for result in chunk.results)
-        good = found[:, -1] > 0.0
+        after, found = chunk.results
+        good = found[:rows, -1] > 0.0
         done = rows if good.all() else int(np.argmin(good))
         if done:
             told[:done], memory[:done] = found[:done], after[:done]
@@ -320,8 +311,8 @@ class Filter:
         return done
 
     @cached_property
-    def _chunk(self) -> ArrayFunction:
-        return chained(self._row_function, CHUNK, UNROLLED)
+    def _chunks(self) -> list[ArrayFunction]:
+        return [ArrayFunction(chain_function(self.model, count, UNROLLED)) for count in CHUNKS]
 
     @cached_property
     def _walk(self) -> ArrayFunction:
@@ -334,7 +325,7 @@ class Filter:
     def _steps(self, before: float, time_min: float, half: float) -> tuple[float, float]:
         """The lengths of the last two steps of a way; up to there it is walked."""
         within = self._within(before, time_min)
-        if 2.0 * half > _LONGEST_ROW_MIN or len(within) > 1:
+        if 2.0 * half > LONGEST_ROW_MIN or len(within) > 1:
             return self._walk_to_last_steps(before, time_min)
         return (within[0] - before, time_min - within[0]) if within else (half, half)
 
@@ -342,7 +333,7 @@ class Filter:
         """Predict up to the last two steps of the way; returns their lengths."""
         edges = [before]
         for end in (*self._within(before, time_min), time_min):
-            count, begin = ceil((end - edges[-1]) / (0.5 * _LONGEST_ROW_MIN)), edges[-1]
+            count, begin = ceil((end - edges[-1]) / (0.5 * LONGEST_ROW_MIN)), edges[-1]
             edges += [begin + (end - begin) * number / count for number in range(1, count)]
             edges.append(end)
         if len(edges) % 2 == 0:

@@ -8,17 +8,21 @@ What a filter remembers is one vector: the state x, then its covariance P, colum
 vector as well: the parameters, the variances of the sensors, the variances of the process in a minute.
 """
 
+from functools import lru_cache
 from math import inf, nan
 
 import casadi as ca
 import numpy as np
 
-from reactorwatch.process.array_function import ArrayFunction
 from reactorwatch.process.integrate import symbolic_step
 from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import ProcessModel
 
+COMPILED = 64
+"""Models whose functions are kept: to make one takes some ten milliseconds."""
 
+
+@lru_cache(maxsize=COMPILED)
 def row_function(model: ProcessModel) -> ca.Function:
     """From one row to the next: (memory, new, constants) -> (memory, told).
 
@@ -67,14 +71,21 @@ def output_function(model: ProcessModel) -> ca.Function:
     return ca.Function("outputs", [x, u, p, t], [y, ca.densify(ca.jacobian(y, x))])
 
 
-def chained(row: ca.Function, count: int, unrolled: int) -> ArrayFunction:
+@lru_cache(maxsize=COMPILED)
+def _unrolled(model: ProcessModel, count: int) -> ca.Function:
+    """As many rows after each other, as one expression."""
+    return row_function(model).mapaccum("few", count).expand()
+
+
+@lru_cache(maxsize=COMPILED)
+def chain_function(model: ProcessModel, count: int, unrolled: int) -> ca.Function:
     """As many rows after each other; `unrolled` of them, which divide `count`, are one expression."""
-    few = row.mapaccum("few", unrolled).expand()
+    row, few = row_function(model), _unrolled(model, unrolled)
     memory = ca.MX.sym("memory", row.size1_in(0))
     new = ca.MX.sym("new", row.size1_in(1), count)
     constants = ca.MX.sym("constants", row.size1_in(2))
     results = few.mapaccum("many", count // unrolled)(memory, new, ca.repmat(constants, 1, count))
-    return ArrayFunction(ca.Function("rows", [memory, new, constants], list(results)))
+    return ca.Function("rows", [memory, new, constants], list(results))
 
 
 def _symbols(model: ProcessModel, new: int) -> tuple[ca.SX, ca.SX, ca.SX]:

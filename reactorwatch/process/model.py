@@ -16,6 +16,7 @@ valve that sticks. Those are in `resets`.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import casadi as ca
 import numpy as np
@@ -161,10 +162,9 @@ class ProcessModel:
         Raises:
             ValueError: there is none.
         """
-        for item in self.parameters:
-            if item.name == name:
-                return item
-        raise ValueError(f"{self.name} has no parameter {name!r} (it has {', '.join(self.parameter_names)})")
+        if name not in self._places:
+            raise ValueError(f"{self.name} has no parameter {name!r} (it has {', '.join(self.parameter_names)})")
+        return self.parameters[self._places[name]]
 
     def values(self, changes: Mapping[str, float] | None = None) -> Array:
         """The parameters' values, shape (n_p,): nominal, but for the changes.
@@ -172,11 +172,21 @@ class ProcessModel:
         Raises:
             ValueError: a change names no parameter, or lies outside its bounds.
         """
-        changes = changes or {}
-        for name, value in changes.items():
+        values = self._nominal.copy()
+        for name, value in (changes or {}).items():
             item = self.parameter(name)
             _check_bounds(name, value, item.lower, item.upper)
-        return np.array([changes.get(item.name, item.value) for item in self.parameters], dtype=float)
+            values[self._places[name]] = value
+        return values
+
+    @cached_property
+    def _nominal(self) -> Array:
+        return np.array([item.value for item in self.parameters], dtype=float)
+
+    @cached_property
+    def _places(self) -> dict[str, int]:
+        """Of the parameters."""
+        return {name: place for place, name in enumerate(self.parameter_names)}
 
     def with_values(self, changes: Mapping[str, float]) -> "ProcessModel":
         """The same model with other nominal values.

@@ -6,6 +6,7 @@ import pytest
 from monitor_node.isolation_bank import Bank, Scan, spread_onsets
 from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_hypothesis import Hypothesis
+from monitor_node.isolation_stretch import Stretch
 from monitor_node.isolation_window import Window, window_of
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects.base import Effect
@@ -45,8 +46,9 @@ def check_promise(effect: Effect, profile: Profile, window: Window, scan: Scan, 
     hypothesis = Hypothesis(cstr(), noise, effect, profile)
     begin, rows = int(np.searchsorted(window.time_min, onset_min)) - 5, window.time_min.size
     little = 0.02 / np.sqrt(b)
-    none, up = (hypothesis.run(window, begin, rows, by, onset_min)[1] for by in (0.0, little))
-    down = hypothesis.run(window, begin, rows, -little, onset_min)[1] if effect.lower < 0 else 2 * none - up
+    stretch = Stretch(window, begin, rows, Filter(cstr(), noise))
+    none, up = (hypothesis.loss(stretch, by, onset_min).w for by in (0.0, little))
+    down = hypothesis.loss(stretch, -little, onset_min).w if effect.lower < 0 else 2 * none - up
     signature = (down - up) / (2 * little)
     assert np.sum(signature**2) == pytest.approx(b, rel=0.03)
     expected = np.sum(signature * none) / b
@@ -74,7 +76,8 @@ def test_it_does_so_for_an_onset_between_two_rows(quiet: tuple[Window, Scan]) ->
         b = scan.information[place, 0, CAUSES.index(effect)]
         hypothesis, little = Hypothesis(cstr(), SENSORS, effect, STEP), 0.02 / np.sqrt(b)
         rows, onset_min = window.time_min.size, float(scan.onset_min[place])
-        none, up = (hypothesis.run(window, rows - 30, rows, by, onset_min)[1] for by in (0.0, little))
+        stretch = Stretch(window, rows - 30, rows, Filter(cstr(), SENSORS))
+        none, up = (hypothesis.loss(stretch, by, onset_min).w for by in (0.0, little))
         assert np.sum((none - up) ** 2) / little**2 == pytest.approx(b, rel=0.05)
 
 

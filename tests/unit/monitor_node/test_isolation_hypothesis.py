@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from monitor_node.isolation_causes import CAUSES
-from monitor_node.isolation_hypothesis import HUBER, LOST, Descent, Hypothesis
+from monitor_node.isolation_hypothesis import Descent, Hypothesis
+from monitor_node.isolation_stretch import HUBER, LOST, Stretch
 from monitor_node.isolation_window import Window, window_of
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects.base import Effect
@@ -30,35 +31,42 @@ def biased() -> Window:
 
 
 @pytest.fixture(scope="module")
+def stretch(biased: Window) -> Stretch:
+    return Stretch(biased, BEGIN, biased.time_min.size, Filter(cstr(), SENSORS))
+
+
+@pytest.fixture(scope="module")
 def bias() -> Hypothesis:
     return Hypothesis(cstr(), SENSORS, effect_of("temperature_bias"), STEP)
 
 
 @pytest.fixture(scope="module")
-def descent(biased: Window, bias: Hypothesis) -> Descent:
-    return Descent(bias, biased, BEGIN, biased.time_min.size)
+def descent(stretch: Stretch, bias: Hypothesis) -> Descent:
+    return Descent(bias, stretch)
 
 
-def test_the_loss_is_minus_the_log_likelihood_up_to_a_constant(biased: Window, bias: Hypothesis) -> None:
-    rows = biased.time_min.size
-    loss, w = bias.run(biased, BEGIN, rows, SIZE, ONSET_MIN)
+def test_the_loss_is_minus_the_log_likelihood_up_to_a_constant(
+    biased: Window, stretch: Stretch, bias: Hypothesis
+) -> None:
+    loss, w = bias.loss(stretch, SIZE, ONSET_MIN)
     assert np.max(np.abs(w)) < HUBER
     kalman = Filter(effect_of("temperature_bias").extend(cstr(), STEP), SENSORS)
     kalman.change({"temperature_bias.size": SIZE, "temperature_bias.onset": ONSET_MIN})
-    part = slice(BEGIN + 1, rows)
+    part = slice(BEGIN + 1, None)
     record = biased.time_min[part], biased.inputs[part], biased.measured[part]
     likelihood = np.sum(kalman.run(*record, start=biased.states[BEGIN]).log_likelihood)
     assert loss == pytest.approx(-likelihood - 0.5 * w.size * np.log(2 * np.pi), rel=1e-9)
 
 
-def test_far_values_count_in_proportion_and_those_of_a_lost_filter_as_very_far(biased: Window) -> None:
-    rows = biased.time_min.size
+def test_far_values_count_in_proportion_and_those_of_a_lost_filter_as_very_far(
+    biased: Window, stretch: Stretch
+) -> None:
     nominal = Hypothesis(cstr(), SENSORS, effect_of("temperature_bias"), STEP)
-    near, far = (nominal.run(biased, BEGIN, rows, size, ONSET_MIN)[0] for size in (-40.0, -41.0))
+    near, far = (nominal.loss(stretch, size, ONSET_MIN).value for size in (-40.0, -41.0))
     since = np.sum(biased.time_min >= ONSET_MIN)
     assert far - near == pytest.approx(HUBER * since * 1.0 / 0.3, rel=0.02)
     blown_up = Hypothesis(cstr(), SENSORS, effect_of("reaction_heat"), STEP)
-    loss, w = blown_up.run(biased, BEGIN, rows, 4.0, ONSET_MIN)
+    loss, w = blown_up.loss(stretch, 4.0, ONSET_MIN)
     assert np.isfinite(loss)
     assert np.max(w) == LOST
 
@@ -105,9 +113,9 @@ def test_sizes_stay_possible() -> None:
     assert ramp.limited(inf, 10.0, 20.0) == pytest.approx(loss_of_heat.upper / 10.0)
 
 
-def test_a_ramp_is_told_by_the_size_that_it_has_reached(biased: Window) -> None:
+def test_a_ramp_is_told_by_the_size_that_it_has_reached(biased: Window, stretch: Stretch) -> None:
     ramp = Hypothesis(cstr(), SENSORS, effect_of("temperature_bias"), RAMP)
-    descent = Descent(ramp, biased, BEGIN, biased.time_min.size)
+    descent = Descent(ramp, stretch)
     point = descent.at(0.4, 60.0)
     slope = descent.slope(point, 0.01)
     reached, sd = descent.reached(point, slope)

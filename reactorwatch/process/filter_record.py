@@ -1,0 +1,105 @@
+"""A record laid out as the compiled rows of a filter take it: once, for as many runs as are made over it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.process.integrate import LONGEST_STEP_MIN
+from reactorwatch.process.model import Array
+
+LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded
+
+
+@dataclass(frozen=True, eq=False)
+class FilterRecord:
+    """The rows of a record, for `Filter.over`.
+
+    Attributes:
+        time_min: shape (rows,).
+        inputs: shape (rows, n_u).
+        measured: shape (rows, n_y); NaN where missing.
+        gate: standard deviations beyond which a measurement does not correct the state ...
+        accept: ... unless this says so, shape (rows, n_y).
+        rows: the arguments `new` of the compiled rows, see `filter_step`; in the first one, what comes from the row
+            before is not yet there.
+        near: whether a row is so soon after the one before that two steps lead to it, shape (rows,); of the first one
+            nobody knows yet.
+    """
+
+    time_min: Array
+    inputs: Array
+    measured: Array
+    gate: float
+    accept: NDArray[np.bool_]
+    rows: Array
+    near: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls,
+        time_min: Array,
+        inputs: Array,
+        measured: Array,
+        gate: float = inf,
+        accept: NDArray[np.bool_] | None = None,
+    ) -> "FilterRecord":
+        """Lay a record out.
+
+        Args:
+            time_min: shape (rows,).
+            inputs: shape (rows, n_u) or (rows,) for one input.
+            measured: shape (rows, n_y); NaN where missing.
+            gate: see the attributes.
+            accept: see the attributes; None: for none.
+        """
+        count, n_y = measured.shape
+        inputs = inputs.reshape(count, -1)
+        n_u = inputs.shape[1]
+        accept = np.zeros(measured.shape, dtype=np.bool_) if accept is None else accept
+        rows, near = np.zeros((count, 2 * n_u + 3 + 2 * n_y)), np.zeros(count, dtype=np.bool_)
+        half = 0.5 * np.diff(time_min)
+        near[1:] = (half > 0.0) & (2.0 * half <= LONGEST_ROW_MIN)
+        rows[1:, :n_u], rows[:, n_u : 2 * n_u], rows[:, 2 * n_u] = inputs[:-1], inputs, time_min
+        rows[1:, 2 * n_u + 1], rows[1:, 2 * n_u + 2] = half, half
+        rows[:, -2 * n_y : -n_y], rows[:, -n_y:] = measured, np.where(accept, inf, gate)
+        return cls(time_min, inputs, measured, gate, accept, rows, near)
+
+    def rest(self, row: int) -> "FilterRecord":
+        """The record from a row on."""
+        return FilterRecord(
+            self.time_min[row:],
+            self.inputs[row:],
+            self.measured[row:],
+            self.gate,
+            self.accept[row:],
+            self.rows[row:],
+            self.near[row:],
+        )
+
+    def following(
+        self, before_min: float | None, inputs: Sequence[float], breaks: Sequence[float]
+    ) -> tuple[Array, NDArray[np.bool_]]:
+        """The rows and which are near, now that it is known what came before.
+
+        Args:
+            before_min: time of the row before the first one; None if there is none.
+            inputs: that held there.
+            breaks: times at which the right-hand side jumps, increasing.
+        """
+        rows, near, times, n_u = self.rows.copy(), self.near.copy(), self.time_min, self.inputs.shape[1]
+        first, second = 2 * n_u + 1, 2 * n_u + 2
+        near[0] = False
+        if before_min is not None:
+            half = 0.5 * (times[0] - before_min)
+            rows[0, :n_u], rows[0, first], rows[0, second] = inputs, half, half
+            near[0] = 0.0 < 2.0 * half <= LONGEST_ROW_MIN
+        for point in breaks:
+            row = int(times.searchsorted(point))
+            since = times[row - 1] if row else before_min
+            if row < times.size and since is not None and since < point < times[row]:
+                near[row] &= sum(since < other < times[row] for other in breaks) == 1
+                rows[row, first], rows[row, second] = point - since, times[row] - point
+        return rows, near
