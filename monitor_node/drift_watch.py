@@ -68,12 +68,14 @@ class DriftWatch:
             arl0: run length of each alarm without a fault, in rows.
         """
         notes: list[str] = []
+        if not self.wanted:
+            return notes
         for signal, predictor in zip(self._outputs, predictors, strict=True):
             try:
                 predictor.compare(arl0)
             except InputError as error:
                 notes.append(f"the drift of {signal} is not watched: {error}")
-        return notes if self.wanted else []
+        return notes
 
     def update(self, time_ns: int, predictors: list[ArxPredictor]) -> list[Publication]:
         """Look, if it is time.

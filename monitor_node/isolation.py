@@ -105,6 +105,7 @@ class Isolation:
     def clear(self) -> None:
         """Forget all rows."""
         self._rows.clear()
+        self._fitter.forget()
 
     def suspects(self, not_before_min: float = -inf) -> list[Suspect]:
         """The causes that come into question, likeliest first, and `UNKNOWN` among them.

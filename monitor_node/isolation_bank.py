@@ -7,7 +7,8 @@ of the filter's state with respect to m, between two rows and at a row
     S <- F S + G,        g = L^-1 (H S + D),        S <- S - K (H S + D),
 
 with F, G the derivatives of the way between the rows with respect to state and m, H, D those of the outputs, K the
-filter's gain and L L' the covariance of its innovations. For a given cause and onset the likeliest size is a / b, with
+filter's gain and L L' the covariance of its innovations; from row to row it is one product with S (see
+`isolation_ways`). For a given cause and onset the likeliest size is a / b, with
 a = sum(g w) and b = sum(g g) over the whitened innovations w, its variance is 1 / b, and twice the logarithm of the
 likelihood ratio a^2 / b (Willsky & Jones 1976, A generalized likelihood ratio approach to the detection and
 estimation of jumps in linear systems, IEEE Trans. Automatic Control 21).
@@ -87,36 +88,42 @@ class Bank:
             window: the rows, and the filter's run over them.
         """
         ways, rows = self._linearisation.ways(window), window.time_min.size
-        early, whole = self._scanned(window, ways, spread_onsets(window.first_onset, rows))
+        early = self._scanned(window, ways, spread_onsets(window.first_onset, rows), no_further=True)[0]
         if early.rows == rows:
-            return early, whole
+            return early, early
         near = np.max(early.ratio, axis=(1, 2)) > np.max(early.ratio) - REACH
         before = max(int(np.argmax(near)) - len(_BETWEEN) - 1, 0)
         first = int(np.searchsorted(window.time_min, early.onset_min[before], side="right")) - 1
         return self._scanned(window, ways, spread_onsets(max(first, window.first_onset), early.rows))
 
-    def _scanned(self, window: Window, ways: Ways, onsets: NDArray[np.int64]) -> tuple[Scan, Scan]:
-        times, start = window.time_min, window.time_min[onsets]
-        width = len(PROFILES) * self._count
-        S = np.zeros((ways.F.shape[1], onsets.size * width))
+    def _scanned(
+        self, window: Window, ways: Ways, onsets: NDArray[np.int64], *, no_further: bool = False
+    ) -> tuple[Scan, Scan]:
+        """What is found up to the first row at which a cause stands out, and on all rows if they are wanted."""
+        times, start, n_x = window.time_min, window.time_min[onsets], ways.A.shape[2]
+        width, half = len(PROFILES) * self._count, 0.5 * np.diff(times)
+        set_in = np.searchsorted(onsets, np.arange(times.size + 1)).tolist()  # how many before each row
+        S = np.zeros((n_x, onsets.size * width))
         a, b, c = np.zeros((3, onsets.size * width))  # c: of neighbours, each with the next one
         early: Scan | None = None
         for row in range(int(onsets[0]), times.size):
             way = row - 1  # that leads to this row
-            acting, shown = np.searchsorted(onsets, (row, row + 1)).tolist()  # set in before it, and in time for it
-            if acting:
-                part = S[:, : acting * width]
-                middle = 0.5 * (times[way] + times[row])
-                part[:] = ways.F[way] @ part + _columns(ways.G[way], middle - start[:acting])
-            part = S[:, : shown * width]
-            seen = ways.H[way] @ part + _columns(ways.D[way], times[row] - start[:shown])
-            part -= ways.K[way] @ seen
-            g = ways.L_inverse[way] @ seen
-            a[: shown * width] += ways.w[way] @ g
-            b[: shown * width] += np.einsum("ij,ij->j", g, g)
-            c[: (shown - 1) * width] += np.einsum("ij,ij->j", g[:, :-width], g[:, width:])
-            if early is None and np.max(a[: shown * width] ** 2 - STANDS_OUT * b[: shown * width]) > 0.0:
+            before, shown = set_in[row], set_in[row + 1] * width
+            G, D = ways.G[way][:, None], ways.D[way][:, None]
+            both = np.zeros((len(G), set_in[row + 1], len(PROFILES), self._count))  # S after this row, then g
+            both[:, :before] = (ways.A[way] @ S[:, : before * width]).reshape(both[:, :before].shape)
+            both[:, :before, 0] += G + D
+            both[:, :before, 1] += (G + D) * (times[row] - start[:before])[:, None] - G * half[way]
+            both[:, before:, 0] = D  # what sets in at this row shows at once, but has not acted yet
+            after = both.reshape(len(G), shown)
+            S[:, :shown], g = after[:n_x], after[n_x:]
+            a[:shown] += ways.w[way] @ g
+            b[:shown] += np.einsum("ij,ij->j", g, g)
+            c[: shown - width] += np.einsum("ij,ij->j", g[:, :-width], g[:, width:])
+            if early is None and np.max(a[:shown] ** 2 - STANDS_OUT * b[:shown]) > 0.0:
                 early = self._scan(row + 1, start, a, b, c)
+                if no_further:
+                    return early, early
         whole = self._scan(times.size, start, a, b, c)
         return early or whole, whole
 
@@ -143,12 +150,3 @@ def spread_onsets(first: int, rows: int) -> NDArray[np.int64]:
         age = rows - row
         row -= int(np.ceil(age / _SPREAD))
     return np.array([first, *reversed(found)], dtype=np.int64)
-
-
-def _columns(by_size: Array, age: Array) -> Array:
-    """Derivatives by the sizes now, as columns of S: for every onset a step of 1, then a ramp that is `age` now."""
-    n = by_size.shape[1]
-    columns = np.empty((by_size.shape[0], age.size, 2, n))
-    columns[:, :, 0] = by_size[:, None]
-    columns[:, :, 1] = by_size[:, None] * age[:, None]
-    return columns.reshape(by_size.shape[0], -1)

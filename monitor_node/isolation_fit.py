@@ -5,7 +5,8 @@ All hypotheses run over the same rows and from the same state, that of the filte
 The linearised bank is right about a small fault, so only the best few of its hypotheses are fitted then. A large fault
 is followed from where it is still small. The fit begins with what the bank found in the first rows, and the rows that
 it is fitted to are multiplied from round to round, so that it never has far to go; what falls behind on the way is left
-behind. Where even that beginning does not keep what the bank promises, smaller sizes are tried.
+behind. Where even that beginning does not keep what the bank promises, smaller sizes are tried. Asked again about the
+same fault some rows later, the fit goes on from where it was.
 """
 
 from collections.abc import Sequence
@@ -47,7 +48,7 @@ class Fit:
         size: of a step; of a ramp its slope, in a minute.
         onset_min: when it set in.
         gain: in log likelihood, against nothing being wrong.
-        w: the whitened innovations of the newest rows, from before any hypothesis sets in; 0 where nothing was measured.
+        w: the whitened innovations of the newest rows, from before any hypothesis sets in; 0: not measured.
         log_volume: how much of what was possible beforehand is still, of all onsets and sizes; see `isolation`.
         size_sd: standard deviation of the size.
         onset_sd_min: of the onset.
@@ -67,6 +68,40 @@ class Fit:
     reached_sd: float
 
 
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """How far a large fault has been followed.
+
+    Attributes:
+        stood_out_min: when its first rows stood out.
+        onset_min: about when it set in.
+        until_min: up to where it was followed.
+        first: whether that was the first round.
+        fits: that were left, best first.
+    """
+
+    stood_out_min: float
+    onset_min: float
+    until_min: float
+    first: bool
+    fits: list[Fit]
+
+    def leads_to(self, stood_out_min: float, earliest_min: float) -> bool:
+        """Whether this is the way to where the same rows stood out, if something may set in from a time on."""
+        return self.stood_out_min == stood_out_min and min(item.onset_min for item in self.fits) > earliest_min
+
+    def further(self, window: Window) -> tuple[list[Fit], int]:
+        """The fits that are not left behind, and the row before which to follow them next."""
+        onset, end = np.searchsorted(window.time_min, (self.onset_min, self.until_min)).tolist()
+        age = end + 1 - onset
+        reached = onset + max((2 if age < 2 * _FIRST_ROWS else 4) * age, _FIRST_ROWS)
+        # How far a fit can be from its best depends on how many rows it has seen; what it gains tells that best.
+        best = self.fits[0]
+        least = best.gain - (0.5 if self.first else 0.1) * abs(best.gain) - BEHIND
+        fits = [item for item in self.fits if item.gain >= least] or [best]  # a gain may be no number
+        return fits, min(reached, window.time_min.size)
+
+
 class Fitter:
     """Fits all causes, each as a step and as a ramp.
 
@@ -82,6 +117,11 @@ class Fitter:
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
         self._nominal = Filter(model, noise)
         self.hypotheses = [Hypothesis(model, noise, effect, profile) for profile in PROFILES for effect in effects]
+        self._way: _Way | None = None
+
+    def forget(self) -> None:
+        """Forget how far a fault has been followed."""
+        self._way = None
 
     def fit(self, window: Window, early: Scan, whole: Scan) -> list[Fit]:
         """The causes that come into question, likeliest first; of a small fault, then those that are not fitted.
@@ -108,24 +148,22 @@ class Fitter:
         return [*sorted(fits, key=lambda item: -item.gain), *best[MOST:]]
 
     def _followed(self, window: Window, early: Scan) -> list[Fit]:
-        """The same from where a large fault was still small."""
-        rows, reached = window.time_min.size, early.rows
-        fits = _begun(early, window)
+        """The same from where a large fault was still small, or from where it had been followed to before."""
+        fits, reached, first = _begun(early, window), early.rows, True
         if not fits:
             return []
-        onset, first = int(np.searchsorted(window.time_min, fits[0].onset_min)), True
+        onset_min, stood_out_min = fits[0].onset_min, float(window.time_min[early.rows - 1])
+        if self._way is not None and self._way.leads_to(stood_out_min, window.earliest_min):
+            onset_min, (fits, reached), first = self._way.onset_min, self._way.further(window), False
         while True:
-            last, stretch = reached >= rows, Stretch(window, _begin(fits, window), reached, self._nominal)
+            last = reached >= window.time_min.size
+            stretch = Stretch(window, _begin(fits, window), reached, self._nominal)
             fits = [self._fitted(item, stretch, first=first, last=last) for item in fits]
             fits.sort(key=lambda item: -item.gain)
+            self._way = _Way(stood_out_min, onset_min, stretch.end_min, first, fits)
             if last:
                 return [replace(item, log_volume=_log_volume(item, window)) for item in fits]
-            # How far a fit can be from its best depends on how many rows it has seen; what it gains tells that best.
-            slack = 0.5 if first else 0.1
-            age = reached - onset
-            reached, first = min(onset + max((2 if age < 2 * _FIRST_ROWS else 4) * age, _FIRST_ROWS), rows), False
-            least = fits[0].gain - slack * abs(fits[0].gain) - BEHIND
-            fits = [item for item in fits if item.gain >= least] or fits[:1]  # a gain may be no number
+            (fits, reached), first = self._way.further(window), False
 
     def _fitted(self, fit: Fit, stretch: Stretch, *, first: bool, last: bool) -> Fit:
         """Fitted to the rows of a stretch, from where it is."""

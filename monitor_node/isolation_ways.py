@@ -30,21 +30,15 @@ class Ways:
     """From each row but the last to the next one: the first axis has one place a way.
 
     Attributes:
-        F: d state / d state before, shape (n_x, n_x).
-        G: d state / d sizes, shape (n_x, causes).
-        H: d outputs / d state, shape (n_y, n_x).
-        D: d outputs / d sizes, shape (n_y, causes).
-        K: the filter's gain, shape (n_x, n_y).
-        L_inverse: whitens what the filter is off by, shape (n_y, n_y); 0 where nothing was measured.
+        A: d (the filter's state, what it is off by, whitened) / d its state before, shape (n_x + n_y, n_x).
+        G: likewise by the sizes, through what they do on the way, shape (n_x + n_y, causes).
+        D: likewise by the sizes, through what they do to the outputs, shape (n_x + n_y, causes).
         w: what it was off by, whitened, shape (n_y,); 0 where nothing was measured.
     """
 
-    F: Array
+    A: Array
     G: Array
-    H: Array
     D: Array
-    K: Array
-    L_inverse: Array
     w: Array
 
 
@@ -83,7 +77,8 @@ class Linearisation:
         L_inverse = np.asarray(np.linalg.inv(L) * both)
         w = np.einsum("kij,kj->ki", L_inverse, np.where(known, window.residual[1:], 0.0))
         K = P[1:] @ H.transpose(0, 2, 1) * (window.used[1:] / self._R)[:, None, :]
-        return Ways(F, G, H, D, K, L_inverse, w)
+        by_state = np.concatenate([np.eye(x.shape[1]) - K @ H, L_inverse @ H], axis=1)
+        return Ways(by_state @ F, by_state @ G, np.concatenate([-K, L_inverse], axis=1) @ D, w)
 
     def _walked(self, x: Array, u: Array, t: Array, step: Array) -> tuple[Array, Array, Array]:
         """Where the ways lead, and their derivatives."""

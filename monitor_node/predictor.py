@@ -82,6 +82,8 @@ class ArxPredictor:
         if self._scaling is None:
             self._learn_scaling(input_value, value)
             return nan
+        if self._put_by:
+            self.catch_up()
         input_centre, input_spread, centre, spread = self._scales
         if not follows:
             self._buffer.restart()
@@ -139,6 +141,7 @@ class ArxPredictor:
         Raises:
             InputError: the training was too short for that, or the model does not forget.
         """
+        self.catch_up()
         rows, self._fitted = self._fitted, None
         if rows is None:
             raise InputError("there is no reference to compare with")
@@ -160,7 +163,10 @@ class ArxPredictor:
             self._drifted = self._drift.update(self._rls.parameters - self._reference, regressor)
 
     def put_by(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> None:
-        """Take a row in that is to be learned from later; arguments as for `update`, after the scaling is known."""
+        """Take a row in that is to be learned from later, if ever; arguments as for `update`."""
+        if self._scaling is None:
+            self._learn_scaling(input_value, value)
+            return
         if not follows:
             self._put_by.append(_BREAK)
         self._put_by.append((time_ns, input_value, value))

@@ -127,6 +127,15 @@ class ProcessReference:
             inputs: shape (n,).
             measured: shape (n, outputs).
         """
+        if self._accept_all and np.isfinite(inputs).all():
+            times = np.round(time_min * MINUTE_NS) / MINUTE_NS
+            found = self._filter.run(times, inputs, measured, gate=GATE)
+            z = found.residual / found.sd
+            if not np.any(np.abs(z) > GATE):  # no value was to be followed or not because of the one before
+                self._last_input, self._guessed = float(inputs[-1]), False
+                self.typical_sd = _typical(found.sd)
+                return found.residual, z
+            self._filter.restart()
         residuals, z = np.full(measured.shape, np.nan), np.full(measured.shape, np.nan)
         sds = np.full(measured.shape, np.nan)
         accept = (False,) * measured.shape[1]
@@ -136,8 +145,14 @@ class ProcessReference:
             residuals[row], sds[row] = off, expected.sd
             z[row] = [size / sd for size, sd in zip(off, expected.sd, strict=True)]
             accept = tuple(abs(size) > GATE for size in z[row].tolist())
-        self.typical_sd = np.nan_to_num(np.nanmedian(sds, axis=0), nan=1.0).tolist()
+        self.typical_sd = _typical(sds)
         return residuals, z
+
+
+def _typical(sds: Array) -> list[float]:
+    """What each column mostly is; 1 where it is not known."""
+    typical: list[float] = np.nan_to_num(np.nanmedian(sds, axis=0), nan=1.0).tolist()
+    return typical
 
 
 class ArxReference:

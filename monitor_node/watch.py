@@ -151,11 +151,14 @@ class PlantWatch:
                 publications.extend(self.snapshots(time_ns))
                 return
         self._training.add(time_ns, input_value, values)
-        predictions = [
-            predictor.update(time_ns, input_value, value, follows=follows)
-            for predictor, value in zip(self._predictors, values, strict=True)
-        ]
-        if self._points:
+        if not self._points:
+            for predictor, value in zip(self._predictors, values, strict=True):
+                predictor.put_by(time_ns, input_value, value, follows=follows)
+        else:
+            predictions = [
+                predictor.update(time_ns, input_value, value, follows=follows)
+                for predictor, value in zip(self._predictors, values, strict=True)
+            ]
             for key, prediction, value, unit in zip(self._estimate_keys, predictions, values, units, strict=True):
                 residual = value - prediction
                 if isfinite(residual):

@@ -69,19 +69,21 @@ class Beginning:
         known = np.isfinite(y)
         if not known.any() or not np.all(np.isfinite(u)):
             return None
-        model = self._model.with_values(changes)
+        model = self._model.with_values(changes) if changes else self._model
         p, wide = model.values(), self._wide
         R = np.diag(np.square(measurement_sd))[np.ix_(known, known)]
         x = 0.5 * (self._lower + self._upper)
-        if np.linalg.matrix_rank(self._shown(x, u, p, time_min)[1][known]) < x.size:
+        for argument, value in zip(self._outputs.arguments[1:], (u, p, np.array([time_min])), strict=True):
+            argument[0] = value
+        if np.linalg.matrix_rank(self._shown(x)[1][known]) < x.size:
             points = self._steady_states(model, u, time_min)
             distances = [float(np.nansum(((point.outputs - y) / measurement_sd) ** 2)) for point in points]
             x = points[int(np.argmin(distances))].state if points else x
         for _ in range(CORRECTIONS):
-            expected, H = self._shown(x, u, p, time_min)
+            expected, H = self._shown(x)
             K = _gain(wide, H[known], R)
             x = np.clip(x + K @ (y - expected)[known], self._lower, self._upper)
-        H = self._shown(x, u, p, time_min)[1][known]
+        H = self._shown(x)[1][known]
         K = _gain(wide, H, START_SDS**2 * R)
         rest = np.eye(x.size) - K @ H
         return self._with_memory(x, u, p, time_min, rest @ wide @ rest.T + START_SDS**2 * K @ R @ K.T)
@@ -103,11 +105,10 @@ class Beginning:
             self._where, self._points = where, steady_states(model, u, time_min)
         return self._points
 
-    def _shown(self, x: Array, u: Array, p: Array, time_min: float) -> tuple[Array, Array]:
-        """The outputs of a state, and their derivatives with respect to it."""
+    def _shown(self, x: Array) -> tuple[Array, Array]:
+        """The outputs of a state, and their derivatives with respect to it, with the other arguments as they are."""
         outputs = self._outputs
-        for argument, value in zip(outputs.arguments, (x, u, p, np.array([time_min])), strict=True):
-            argument[0] = value
+        outputs.arguments[0][0] = x
         outputs()
         return outputs.results[0][0].copy(), outputs.results[1].T.copy()
 

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.filter_record import FilterRecord
 from reactorwatch.process.model import Array, ProcessModel
 
 SHARES = (0.3, 0.03, 0.003)
@@ -123,15 +124,16 @@ class _Tuning:
     def _take(self, rows: int) -> None:
         """Go on with so many rows from the beginning."""
         time_min, inputs, measured = self._whole
-        self._record = time_min[:rows], inputs[:rows], measured[:rows]
+        self._record = FilterRecord.of(time_min[:rows], inputs[:rows], measured[:rows], GATE)
 
     def _without_outliers(self, best: _Trial) -> _Trial:
         """The same noise levels on the record without its outliers: an outlier of one sensor whitens into all."""
-        time_min, inputs, measured = self._record
+        record = self._record
         self._filter.noise = self._levels(best.theta)
-        run = self._filter.run(*self._record, gate=GATE)
+        run = self._filter.over(record)
         with np.errstate(invalid="ignore"):
-            self._record = time_min, inputs, np.where(np.abs(run.residual) > GATE * run.sd, np.nan, measured)
+            measured = np.where(np.abs(run.residual) > GATE * run.sd, np.nan, record.measured)
+        self._record = FilterRecord.of(record.time_min, record.inputs, measured, GATE)
         return self._tried(best.theta)
 
     def _climbed(self, best: _Trial) -> _Trial:
@@ -185,7 +187,7 @@ class _Tuning:
 
     def _tried(self, theta: Array) -> _Trial:
         self._filter.noise = self._levels(theta)
-        run = self._filter.run(*self._record, gate=GATE)
+        run = self._filter.over(self._record)
         w, sd = run.whitened[BURN_IN:], run.conditional_sd[BURN_IN:]
         known = np.isfinite(w)
         w, d = np.where(known, w, 0.0), np.log(np.where(known, sd, 1.0))

@@ -156,15 +156,24 @@ def test_spikes_are_no_fault_and_hide_none(isolation: Isolation) -> None:
     assert found.onset_min == pytest.approx(ONSET_MIN, abs=0.1)
 
 
-def test_it_follows_from_the_rows_alone(isolation: Isolation) -> None:
+def test_it_follows_from_the_rows_and_from_when_it_was_asked_before_but_hardly_from_that(isolation: Isolation) -> None:
     rows = rows_of("feed_flow:step:0.06", seed=6, after_min=10.0)
     at_once = suspects_of(isolation, rows)
-    isolation.clear()
-    for place, row in enumerate(rows):
-        isolation.add(*row)
-        if place in (620, 640):
-            isolation.suspects()
-    assert isolation.suspects() == at_once
+    found = []
+    for _ in range(2):
+        isolation.clear()
+        for place, row in enumerate(rows):
+            isolation.add(*row)
+            if place in (620, 640):
+                isolation.suspects()
+        found.append(isolation.suspects())
+    assert found[0] == found[1]
+    assert [(item.cause, item.profile) for item in found[0]] == [(item.cause, item.profile) for item in at_once]
+    for now, once in zip(found[0], at_once, strict=True):
+        assert now.probability == pytest.approx(once.probability, abs=0.01)
+        if now.cause != UNKNOWN:
+            assert abs(now.size - once.size) < 0.1 * once.size_sd
+            assert abs(now.onset_min - once.onset_min) < 0.1 * once.onset_sd_min
 
 
 def test_of_too_few_rows_nothing_is_known(isolation: Isolation) -> None:
