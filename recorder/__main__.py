@@ -14,7 +14,7 @@ from reactorwatch.runtime.entry import main
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.config import RecorderConfig
 from recorder.core import NODE, Recorder
-from recorder.mcap_file import RecordingWriter, check_free
+from recorder.mcap_writer import RecordingWriter, check_free
 from recorder.node import RecorderNode
 
 log = structlog.get_logger()

@@ -12,6 +12,8 @@ class Entry(NamedTuple):
         encoding: what the bytes claim to be, as on the bus.
         log_time_ns: when it was received.
         publish_time_ns: the time of the sample that it speaks of; that of receipt where it says none.
+        repeated: it was received before the file was begun, and is said again at the start of the file so that the
+            file opens by itself. Who reads the file before passes over it.
     """
 
     key: str
@@ -19,3 +21,4 @@ class Entry(NamedTuple):
     encoding: str
     log_time_ns: int
     publish_time_ns: int
+    repeated: bool = False

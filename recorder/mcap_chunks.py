@@ -29,12 +29,15 @@ from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
 from recorder.entry import Entry
 
-_FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the summary offsets, CRC
-_RECORD = struct.Struct("<BQ")  # opcode, length
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the payload
+FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the summary offsets, CRC
+RECORD = struct.Struct("<BQ")  # opcode, length
+MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the payload
+
+REPEATED = "reactorwatch.repeated"
+"""In the metadata of a channel: its messages are said again, see `Entry.repeated`."""
 
 # what reading damaged bytes raises, in the library and in what it stands on
-_DAMAGE = (
+DAMAGE = (
     McapError,
     struct.error,
     zstandard.ZstdError,
@@ -66,27 +69,27 @@ def read_summary(path: Path) -> Summary:
             raise InputError(f"{path}: expected an MCAP recording, got an empty file")
         if magic != MCAP0_MAGIC[: len(magic)]:
             raise InputError(f"{path}: expected an MCAP recording, got another kind of file")
-        tail = _FOOTER.size + len(MCAP0_MAGIC)
+        tail = FOOTER.size + len(MCAP0_MAGIC)
         if size < len(MCAP0_MAGIC) + tail:
-            raise _damaged(path, "is cut off")
+            raise damaged(path, "is cut off")
         stream.seek(-tail, 2)
         end = stream.read()
-        opcode, length, start, _, crc = _FOOTER.unpack_from(end)
-        if not end.endswith(MCAP0_MAGIC) or opcode != Opcode.FOOTER or length != _FOOTER.size - _RECORD.size:
-            raise _damaged(path, "is cut off: the recorder was killed, or is still writing it")
+        opcode, length, start, _, crc = FOOTER.unpack_from(end)
+        if not end.endswith(MCAP0_MAGIC) or opcode != Opcode.FOOTER or length != FOOTER.size - RECORD.size:
+            raise damaged(path, "is cut off: the recorder was killed, or is still writing it")
         if not start:
             return Summary()
         if start > size - tail:
-            raise _damaged(path, "its index is damaged")
+            raise damaged(path, "its index is damaged")
         stream.seek(start)
-        summary = stream.read(size - tail - start) + end[: _FOOTER.size - 4]
+        summary = stream.read(size - tail - start) + end[: FOOTER.size - 4]
         if crc and zlib.crc32(summary) != crc:
-            raise _damaged(path, "its index is damaged: the checksum differs")
+            raise damaged(path, "its index is damaged: the checksum differs")
         stream.seek(0)
         try:
             return SeekingReader(stream, record_size_limit=size).get_summary() or Summary()
-        except _DAMAGE as error:
-            raise _damaged(path, "its index is damaged", error) from error
+        except DAMAGE as error:
+            raise damaged(path, "its index is damaged", error) from error
 
 
 def is_in_order(summary: Summary) -> bool:
@@ -96,13 +99,27 @@ def is_in_order(summary: Summary) -> bool:
     return _is_indexed(summary) and follow
 
 
+def span_ns(summary: Summary) -> tuple[int, int]:
+    """The times of receipt of the first and of the last message.
+
+    Returns:
+        Both 0 for a file without messages; from 0 to the end of time for one whose index does not say.
+    """
+    if summary.statistics is not None:
+        return summary.statistics.message_start_time, summary.statistics.message_end_time
+    chunks = summary.chunk_indexes
+    if not chunks:
+        return 0, 2**64 - 1
+    return min(chunk.message_start_time for chunk in chunks), max(chunk.message_end_time for chunk in chunks)
+
+
 def entries(path: Path, summary: Summary, wanted: set[int]) -> Iterator[Entry]:
     """The messages of the wanted channels, of a file that is in order.
 
     Raises:
         InputError: a chunk is damaged; when the reading comes there.
     """
-    channels = {number: _channel(summary.channels[number], summary.schemas) for number in wanted}
+    channels = {number: channel_of(summary.channels[number], summary.schemas) for number in wanted}
     size = path.stat().st_size
     with path.open("rb") as stream:
         for index in _chunks(summary):
@@ -111,9 +128,9 @@ def entries(path: Path, summary: Summary, wanted: set[int]) -> Iterator[Entry]:
             try:
                 data = _uncompressed(stream, index, size)
                 found = list(_messages_of(data, channels))
-            except _DAMAGE as error:
+            except DAMAGE as error:
                 where = f"the chunk at byte {index.chunk_start_offset} cannot be read"
-                raise _damaged(path, where, error) from error
+                raise damaged(path, where, error) from error
             found.sort(key=attrgetter("log_time_ns"))  # stable, and quick when there is nothing to do
             yield from found
 
@@ -129,10 +146,10 @@ def sorted_entries(path: Path, summary: Summary) -> Iterator[Entry]:
             kind = SeekingReader if _is_indexed(summary) else NonSeekingReader
             reader = kind(stream, validate_crcs=True, record_size_limit=path.stat().st_size)
             for schema, channel, message in reader.iter_messages(log_time_order=True):
-                key, encoding = _channel(channel, {schema.id: schema} if schema else {})
-                yield Entry(key, message.data, encoding, message.log_time, message.publish_time)
-        except _DAMAGE as error:
-            raise _damaged(path, "cannot be read", error) from error
+                key, encoding, repeated = channel_of(channel, {schema.id: schema} if schema else {})
+                yield Entry(key, message.data, encoding, message.log_time, message.publish_time, repeated)
+        except DAMAGE as error:
+            raise damaged(path, "cannot be read", error) from error
 
 
 def metadata_records(path: Path) -> list[Metadata]:
@@ -145,8 +162,8 @@ def metadata_records(path: Path) -> list[Metadata]:
     with path.open("rb") as stream:
         try:
             return list(SeekingReader(stream, record_size_limit=path.stat().st_size).iter_metadata())
-        except _DAMAGE as error:
-            raise _damaged(path, "its metadata cannot be read", error) from error
+        except DAMAGE as error:
+            raise damaged(path, "its metadata cannot be read", error) from error
 
 
 def _chunks(summary: Summary) -> list[ChunkIndex]:
@@ -161,43 +178,53 @@ def _is_indexed(summary: Summary) -> bool:
     )
 
 
-class _Channel(NamedTuple):
+class KeyedChannel(NamedTuple):
+    """What the messages of a channel have in common; see `Entry`."""
+
     key: str
     encoding: str
+    repeated: bool
 
 
-def _channel(channel: Channel, schemas: Mapping[int, Schema]) -> _Channel:
-    if channel.message_encoding == MessageEncoding.Protobuf and channel.schema_id:
-        return _Channel(channel.topic, PREFIX + schemas[channel.schema_id].name)
-    return _Channel(channel.topic, channel.message_encoding)
+def channel_of(channel: Channel, schemas: Mapping[int, Schema]) -> KeyedChannel:
+    """What a channel record says.
+
+    Raises:
+        KeyError: its schema is not among those given.
+    """
+    encoding = channel.message_encoding
+    if encoding == MessageEncoding.Protobuf and channel.schema_id:
+        encoding = PREFIX + schemas[channel.schema_id].name
+    return KeyedChannel(channel.topic, encoding, REPEATED in channel.metadata)
 
 
 def _uncompressed(stream: IO[bytes], index: ChunkIndex, size: int) -> bytes:
     if index.chunk_start_offset + index.chunk_length > size:
         raise ValueError("it reaches beyond the end of the file")
-    stream.seek(index.chunk_start_offset + _RECORD.size)
-    record = stream.read(index.chunk_length - _RECORD.size)  # no more, whatever lengths the chunk claims
+    stream.seek(index.chunk_start_offset + RECORD.size)
+    record = stream.read(index.chunk_length - RECORD.size)  # no more, whatever lengths the chunk claims
     chunk = Chunk.read(ReadDataStream(io.BytesIO(record)))
     data, length = get_chunk_data_stream(chunk, validate_crc=True)
     return data.read(length)
 
 
-def _messages_of(data: bytes, channels: Mapping[int, _Channel]) -> Iterator[Entry]:
+def _messages_of(data: bytes, channels: Mapping[int, KeyedChannel]) -> Iterator[Entry]:
     """The messages in an uncompressed chunk: records of opcode, length and content, one after the other."""
-    record, message = _RECORD.unpack_from, _MESSAGE.unpack_from
+    record, message = RECORD.unpack_from, MESSAGE.unpack_from
     at, end = 0, len(data)
     while at < end:
         opcode, length = record(data, at)
-        at += _RECORD.size
+        at += RECORD.size
         if opcode == Opcode.MESSAGE:
             number, _, log_time, publish_time = message(data, at)
             channel = channels.get(number)
             if channel is not None:
-                payload = data[at + _MESSAGE.size : at + length]
-                yield Entry(channel.key, payload, channel.encoding, log_time, publish_time)
+                payload = data[at + MESSAGE.size : at + length]
+                yield Entry(channel.key, payload, channel.encoding, log_time, publish_time, channel.repeated)
         at += length
 
 
-def _damaged(path: Path, what: str, error: Exception | None = None) -> InputError:
+def damaged(path: Path, what: str, error: Exception | None = None) -> InputError:
+    """The line about a damaged file."""
     why = f" ({str(error) or type(error).__name__})" if error else ""
     return InputError(f"{path}: {what}{why}; `reactorwatch recover {path}` saves what is whole in it")

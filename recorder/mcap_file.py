@@ -1,4 +1,4 @@
-"""Recordings as MCAP files: https://mcap.dev/spec.
+"""Recordings as MCAP files, read: https://mcap.dev/spec. They are written by `mcap_writer`.
 
 The topic of a message is its key, its log time the time of receipt, its publish time that of its sample. Messages of
 ours carry their protobuf schema, so that any program reads them; a stranger's bytes are kept with the encoding that
@@ -6,158 +6,42 @@ they claimed and no schema.
 
 Our metadata record, "reactorwatch", says which version wrote the file and what else its writer thought worth knowing;
 `zero_ns` in it is the time that minutes are counted from, where that is not the first sample.
+
+A folder is read as one recording: the files in it in the order of their times, and each in turn, or together where
+their times overlap. What a file says again of the one before it is passed over, but in the first.
 """
 
+import heapq
 from array import array
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple
 
 import numpy as np
-from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
-from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import Writer
+from mcap.summary import Summary
 
-from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import DecodeError, decode, encoding_of, message_type
+from reactorwatch.contract.codec import DecodeError, decode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS, UNITS, Record
 from recorder.entry import Entry
-from recorder.mcap_chunks import entries, is_in_order, metadata_records, read_summary, sorted_entries
+from recorder.mcap_chunks import entries, is_in_order, metadata_records, read_summary, sorted_entries, span_ns
+from recorder.mcap_writer import METADATA, RecordingWriter
 from recorder.measurement import measured
 
-METADATA = "reactorwatch"
+__all__ = ["RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
+
 ZERO_NS = "zero_ns"
 
 _SAMPLE = encoding_of(messages.Sample)
-
-
-class RecordingWriter:
-    """Writes a recording: to `path + ".part"` until `close`, which gives it its name.
-
-    Args:
-        path: the file; there must be none of that name yet, finished or not.
-        metadata: what the file should say about its origin, beside the version of this software.
-
-    Raises:
-        InputError: the file exists or cannot be written.
-    """
-
-    def __init__(self, path: Path, metadata: Mapping[str, str]) -> None:
-        self._path = path
-        self._part = path.with_name(path.name + ".part")
-        self._channels: dict[tuple[str, str, bool], int] = {}
-        self._schemas: dict[str, int] = {}
-        check_free(path)
-        try:
-            self._stream = self._part.open("xb")
-        except OSError as error:
-            raise self._failed(error) from error
-        self._writer = Writer(self._stream)
-        self._writer.start(library=f"reactorwatch {__version__}")
-        self._writer.add_metadata(METADATA, {"version": __version__, **metadata})
-        self.flush()
-
-    @property
-    def path(self) -> Path:
-        """The name that the file has once it is closed."""
-        return self._path
-
-    def write(self, entry: Entry, *, readable: bool = True) -> None:
-        """Append a message.
-
-        Args:
-            entry: the message.
-            readable: False keeps a payload from being given the schema that its encoding names.
-
-        Raises:
-            InputError: the file cannot be written, for lack of room perhaps.
-        """
-        try:
-            channel = self._channels.get((entry.key, entry.encoding, readable))
-            if channel is None:
-                channel = self._register(entry.key, entry.encoding, readable)
-            self._writer.add_message(channel, entry.log_time_ns, entry.payload, entry.publish_time_ns)
-        except OSError as error:
-            raise self._failed(error) from error
-
-    def flush(self) -> None:
-        """Hand everything written so far to the operating system, as chunks that are whole.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        try:
-            self._writer.flush()  # type: ignore[no-untyped-call]
-        except OSError as error:
-            raise self._failed(error) from error
-
-    def close(self) -> None:
-        """Complete the file and give it its name; a second call does nothing.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        if self._stream.closed:
-            return
-        try:
-            with self._stream:
-                self._writer.finish()  # type: ignore[no-untyped-call]
-            self._part.rename(self._path)
-        except OSError as error:
-            raise self._failed(error) from error
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close()
-
-    def _register(self, key: str, encoding: str, readable: bool) -> int:
-        kind = message_type(encoding) if readable else None
-        if kind is None:
-            channel = self._writer.register_channel(key, encoding, schema_id=0)
-        else:
-            name = kind.DESCRIPTOR.full_name
-            if name not in self._schemas:
-                self._schemas[name] = self._writer.register_schema(name, SchemaEncoding.Protobuf, _descriptors())
-            channel = self._writer.register_channel(key, MessageEncoding.Protobuf, self._schemas[name])
-        self._channels[key, encoding, readable] = channel
-        return channel
-
-    def _failed(self, error: OSError) -> InputError:
-        kept = f"; what was written is in {self._part}" if self._part.exists() else ""
-        return InputError(f"recording {self._path}: cannot be written: {error.strerror}{kept}")
-
-
-def check_free(path: Path) -> None:
-    """See that a recording of that name can be begun.
-
-    Raises:
-        InputError: there is one, finished or not, or the folder does not exist.
-    """
-    part = path.with_name(path.name + ".part")
-    if not path.parent.is_dir():
-        raise InputError(f"recording {path}: the folder {path.parent} does not exist")
-    if path.exists():
-        raise InputError(f"recording {path}: exists already and is not overwritten; choose another name")
-    if part.exists():
-        raise InputError(
-            f"recording {path}: {part} is still being written, or was left by a recorder that was killed; "
-            f"`reactorwatch recover {part}` saves what is whole in it"
-        )
 
 
 def read_messages(path: Path, kinds: Collection[str] | None = None, plant: str | None = None) -> Iterator[Entry]:
     """The messages of a recording in the order in which they were received; those of equal time as in the file.
 
     Args:
-        path: the file; of any size, a chunk is in memory at a time.
+        path: the file or the folder; of any size, a chunk of each file is in memory at a time.
         kinds: only these, such as `keys.SAMPLE`; None for all, also what has no key of ours.
         plant: only those of this plant.
 
@@ -165,7 +49,7 @@ def read_messages(path: Path, kinds: Collection[str] | None = None, plant: str |
         InputError: the file is not there, is no MCAP file, or is damaged. Damage within a chunk is raised when
             the reading comes there.
     """
-    summary = read_summary(path)  # not within a generator: what is wrong is raised at the call
+    groups = _by_time(_files(path))  # not within a generator: what is wrong is raised at the call
 
     def wanted(key: str) -> bool:
         topic = keys.parse(key)
@@ -173,9 +57,26 @@ def read_messages(path: Path, kinds: Collection[str] | None = None, plant: str |
             return kinds is None and plant is None
         return (kinds is None or topic.kind in kinds) and (plant is None or topic.plant == plant)
 
-    if is_in_order(summary):
-        return entries(path, summary, {number for number, at in summary.channels.items() if wanted(at.topic)})
-    return (entry for entry in sorted_entries(path, summary) if wanted(entry.key))
+    def of(file: _File) -> Iterator[Entry]:
+        if is_in_order(file.summary):
+            numbers = {number for number, channel in file.summary.channels.items() if wanted(channel.topic)}
+            found = entries(file.path, file.summary, numbers)
+        else:
+            found = (entry for entry in sorted_entries(file.path, file.summary) if wanted(entry.key))
+        return found if file.first else (entry for entry in found if not entry.repeated)
+
+    if len(groups) == len(groups[0]) == 1:
+        return of(groups[0][0])
+    return (entry for group in groups for entry in heapq.merge(*map(of, group), key=lambda entry: entry.log_time_ns))
+
+
+def recordings_in(path: Path) -> list[Path]:
+    """The files of a recording in the order of their times: the path itself, or those in the folder that it is.
+
+    Raises:
+        InputError: a file is damaged, or the folder holds none.
+    """
+    return [file.path for file in _files(path)]
 
 
 def plants_in(path: Path) -> tuple[str, ...]:
@@ -184,12 +85,14 @@ def plants_in(path: Path) -> tuple[str, ...]:
     Raises:
         InputError: as `read_messages`.
     """
-    summary = read_summary(path)
-    found = {channel.topic for channel in summary.channels.values()}
-    if not found:  # nothing was recorded, or the file's index does not say what
-        found = {entry.key for entry in sorted_entries(path, summary)}
-    topics = map(keys.parse, found)
-    return tuple(sorted({topic.plant for topic in topics if topic is not None and topic.kind == keys.SAMPLE}))
+    found: set[str] = set()
+    for file in _files(path):
+        topics = {channel.topic for channel in file.summary.channels.values()}
+        if not topics:  # nothing was recorded, or the file's index does not say what
+            topics = {entry.key for entry in sorted_entries(file.path, file.summary)}
+        parsed = map(keys.parse, topics)
+        found.update(topic.plant for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
+    return tuple(sorted(found))
 
 
 def one_plant_in(path: Path, plant: str | None = None) -> str:
@@ -209,12 +112,13 @@ def one_plant_in(path: Path, plant: str | None = None) -> str:
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """What the recording says about its origin; empty if it is not one of ours.
+    """What the recording, or the first of a folder, says about its origin; empty if it is not one of ours.
 
     Raises:
         InputError: as `read_messages`.
     """
-    return next((record.metadata for record in metadata_records(path) if record.name == METADATA), {})
+    first = recordings_in(path)[0]
+    return next((record.metadata for record in metadata_records(first) if record.name == METADATA), {})
 
 
 def read_record(path: Path, plant: str | None = None) -> Record:
@@ -257,7 +161,35 @@ def read_record(path: Path, plant: str | None = None) -> Record:
     return Record(time_min=(all_times - zero_ns) / MINUTE_NS, columns=columns, name=path.name)
 
 
-def _descriptors() -> bytes:
-    proto = FileDescriptorProto()
-    messages.DESCRIPTOR.CopyToProto(proto)
-    return FileDescriptorSet(file=[proto]).SerializeToString()
+class _File(NamedTuple):
+    """A recording and its index; `first` of its folder, or the only one."""
+
+    path: Path
+    summary: Summary
+    span: tuple[int, int]
+    first: bool
+
+
+def _files(path: Path) -> list[_File]:
+    if not path.is_dir():
+        summary = read_summary(path)
+        return [_File(path, summary, span_ns(summary), first=True)]
+    read = [(file, read_summary(file)) for file in sorted(path.glob("*.mcap"))]
+    if not read:
+        raise InputError(f"{path}: holds no recording (.mcap)")
+    spans = [(span_ns(summary), file, summary) for file, summary in read]
+    found = sorted((item for item in spans if item[0] != (0, 0)), key=lambda item: item[:2]) or spans[:1]
+    return [_File(file, summary, span, first=not number) for number, (span, file, summary) in enumerate(found)]
+
+
+def _by_time(files: list[_File]) -> list[list[_File]]:
+    """The files in groups that follow each other; within a group their times overlap."""
+    groups: list[list[_File]] = []
+    end_ns = -1
+    for file in files:
+        if groups and file.span[0] < end_ns:
+            groups[-1].append(file)
+        else:
+            groups.append([file])
+        end_ns = max(end_ns, file.span[1])
+    return groups

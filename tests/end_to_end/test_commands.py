@@ -23,7 +23,7 @@ from .conftest import PATIENCE_S, Command, Start, WaitAlive
 COMMANDS = (
     *("up", "demo", "alarm"),
     *("plant", "monitor", "record", "replay", "alive"),
-    *("dashboard", "import", "export"),
+    *("dashboard", "import", "export", "recover"),
     *("simulate", "backtest", "identify", "linearise", "reproduce", "charts"),
 )
 

@@ -96,5 +96,5 @@ def test_every_way_of_reading_says_the_same_and_says_it_at_the_call(tmp_path: Pa
             reading(path)
         with pytest.raises(InputError, match="there is no such file"):
             reading(tmp_path / "none.mcap")
-        with pytest.raises(InputError, match="cannot be read: Is a directory"):
-            reading(tmp_path)
+        with pytest.raises(InputError, match=r"run\.mcap: is cut off"):
+            reading(tmp_path)  # a folder is read as the recordings in it

@@ -1,0 +1,258 @@
+"""An MCAP file read from its front to its end, whatever has become of it.
+
+The file needs no index and no end, so that one which is cut off, damaged or still being written is read as well. A
+record says how long it is, so a chunk whose contents are damaged is passed over by its length. Where a length itself is
+damaged, the next chunk is looked for: its compression is written out in it, and the lengths around that word have to
+agree with each other. What a chunk holds is taken only if its checksum agrees.
+"""
+
+import io
+import mmap
+import os
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.stream_reader import get_chunk_data_stream
+from mcap.writer import MCAP0_MAGIC
+
+from reactorwatch.errors import InputError
+from recorder.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, read_summary
+
+FOREVER_NS = 2**64 - 1
+
+Described = TypeVar("Described", Channel, Schema)
+
+_CHUNK_TIMES = struct.Struct("<QQ")  # of its first and of its last message; then size, checksum and compression
+_BEFORE_COMPRESSION = RECORD.size + 8 + 8 + 8 + 4 + 4  # bytes of a chunk before the name of its compression
+_NAME_LENGTH, _DATA_LENGTH = struct.Struct("<I"), struct.Struct("<Q")
+_INDEX = struct.Struct("<HI")  # channel of a message index, and the length of what follows
+_COMPRESSIONS = (b"zstd", b"lz4")
+_KNOWN = frozenset(Opcode)
+
+
+class Stored(NamedTuple):
+    """A message as it is in a file, of whatever program; times are those of receipt and of the sample."""
+
+    channel: Channel
+    schema: Schema | None
+    sequence: int
+    log_time_ns: int
+    publish_time_ns: int
+    payload: bytes
+
+    @property
+    def repeated(self) -> bool:
+        """See `recorder.entry.Entry`."""
+        return REPEATED in self.channel.metadata
+
+
+class Damage(NamedTuple):
+    """A place of a file that could not be read; `cut_off` if it is merely the end, which is not there."""
+
+    at_byte: int
+    what: str
+    cut_off: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.what} at byte {self.at_byte}"
+
+
+class Scan:
+    """One pass over a file.
+
+    Args:
+        path: the file.
+        from_ns: chunks that hold only what was received earlier are passed over.
+        to_ns: likewise, later.
+
+    Attributes:
+        damages: the places that could not be read; complete after the pass.
+        metadata: what programs wrote into the file about it; complete after the pass.
+        orphans: messages of channels that are described nowhere any more.
+        whole: after the pass, whether the file has its end and no damage was seen.
+
+    Raises:
+        InputError: there is no such file, it is empty, or nothing in it looks like a recording.
+    """
+
+    def __init__(self, path: Path, from_ns: int = 0, to_ns: int = FOREVER_NS) -> None:
+        self.damages: list[Damage] = []
+        self.metadata: list[Metadata] = []
+        self.orphans = 0
+        self._path, self._from_ns, self._to_ns = path, from_ns, to_ns
+        self._ended = False
+        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[int, Schema] = {}
+        self._sure: set[tuple[type, int]] = set()  # channels and schemas that a checksum vouches for
+        try:
+            with path.open("rb") as stream:
+                self._size = os.fstat(stream.fileno()).st_size
+                if not self._size:
+                    raise InputError(f"{path}: expected an MCAP recording, got an empty file")
+                self._bytes = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+        except FileNotFoundError as error:
+            raise InputError(f"{path}: there is no such file") from error
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        self._start = len(MCAP0_MAGIC)
+        if self._bytes[: self._start] != MCAP0_MAGIC:
+            chunk = self._next_chunk(0)
+            if chunk is None and not MCAP0_MAGIC.startswith(self._bytes[: self._start]):
+                raise InputError(f"{path}: expected an MCAP recording, got another kind of file")
+            self.damages.append(Damage(0, "the beginning cannot be read"))
+            self._start = self._size if chunk is None else chunk
+
+    @property
+    def whole(self) -> bool:
+        """See above."""
+        return self._ended and not self.damages and not self.orphans
+
+    def __iter__(self) -> Iterator[Stored]:
+        """The messages in the order in which they are in the file."""
+        self._know_from_summary()
+        at = self._start
+        while at < self._size and not self._ended:
+            opcode, end = self._record_at(at)
+            if end is None:
+                following = self._next_chunk(at + 1)
+                if following is None:
+                    break
+                self.damages.append(Damage(at, f"{following - at} bytes"))
+                at = following
+                continue
+            try:
+                yield from self._messages(opcode, at + RECORD.size, end)
+            except DAMAGE as error:
+                name = "a chunk" if opcode == Opcode.CHUNK else "a record"
+                self.damages.append(Damage(at, f"{name} of {end - at} bytes ({str(error) or type(error).__name__})"))
+            at = end
+        if not self._ended:
+            unfinished = f", after {self._size - at} bytes of an unfinished record," if at < self._size else ""
+            self.damages.append(Damage(self._size, f"cut off{unfinished}", cut_off=True))
+
+    def _know_from_summary(self) -> None:
+        """Learn from an intact index what a damaged chunk may have described."""
+        try:
+            summary = read_summary(self._path)
+        except InputError:
+            return
+        self._channels.update(summary.channels)
+        self._schemas.update(summary.schemas)
+        self._sure.update((Channel, number) for number in summary.channels)
+        self._sure.update((Schema, number) for number in summary.schemas)
+
+    def _record_at(self, at: int) -> tuple[int, int | None]:
+        """The opcode of a record and where it ends; None if that cannot be so."""
+        if at + RECORD.size > self._size:
+            return 0, None
+        opcode, length = RECORD.unpack_from(self._bytes, at)
+        content, end = at + RECORD.size, at + RECORD.size + length
+        possible = end <= self._size and opcode != 0
+        if not possible:
+            return opcode, None
+        match opcode:
+            case Opcode.FOOTER:
+                possible = end == self._size - len(MCAP0_MAGIC) and at + FOOTER.size == end
+            case Opcode.DATA_END:
+                possible = length == _NAME_LENGTH.size
+            case Opcode.CHUNK:
+                possible = self._is_chunk(at)
+            case Opcode.MESSAGE:
+                possible = length >= MESSAGE.size
+            case Opcode.MESSAGE_INDEX:
+                possible = length >= _INDEX.size and _INDEX.unpack_from(self._bytes, content)[1] == length - _INDEX.size
+        return opcode, end if possible else None
+
+    def _messages(self, opcode: int, start: int, end: int) -> Iterator[Stored]:
+        match opcode:
+            case Opcode.CHUNK:
+                first_ns, last_ns = _CHUNK_TIMES.unpack_from(self._bytes, start)
+                if last_ns >= self._from_ns and first_ns <= self._to_ns:
+                    yield from self._in_chunk(self._bytes[start:end])
+            case Opcode.MESSAGE:
+                yield from self._in_records(self._bytes[start - RECORD.size : end], sure=False)
+            case Opcode.CHANNEL | Opcode.SCHEMA:
+                self._learn(opcode, self._bytes[start:end], sure=False)
+            case Opcode.METADATA:
+                self.metadata.append(Metadata.read(_stream(self._bytes[start:end])))
+            case Opcode.FOOTER:
+                if self._bytes[end:] != MCAP0_MAGIC:
+                    raise ValueError("the last bytes are not those of a recording")
+                self._ended = True
+            case _ if opcode not in _KNOWN:
+                raise ValueError("of no known kind")
+
+    def _in_chunk(self, record: bytes) -> list[Stored]:
+        chunk = Chunk.read(_stream(record))
+        data, length = get_chunk_data_stream(chunk, validate_crc=True)
+        return list(self._in_records(data.read(length), sure=chunk.uncompressed_crc != 0))
+
+    def _in_records(self, data: bytes, *, sure: bool) -> Iterator[Stored]:
+        at, channels, schemas = 0, self._channels, self._schemas
+        while at < len(data):
+            opcode, length = RECORD.unpack_from(data, at)
+            at += RECORD.size
+            if opcode == Opcode.MESSAGE:
+                number, sequence, log_time, publish_time = MESSAGE.unpack_from(data, at)
+                channel = channels.get(number)
+                schema = schemas.get(channel.schema_id) if channel else None
+                if channel is None or (channel.schema_id and schema is None):
+                    self.orphans += 1
+                else:
+                    yield Stored(
+                        channel, schema, sequence, log_time, publish_time, data[at + MESSAGE.size : at + length]
+                    )
+            elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
+                self._learn(opcode, data[at : at + length], sure=sure)
+            at += length
+
+    def _learn(self, opcode: int, content: bytes, *, sure: bool) -> None:
+        """Know a channel or a schema; what a checksum vouches for stays."""
+        if opcode == Opcode.CHANNEL:
+            channel = Channel.read(_stream(content))
+            self._keep(self._channels, channel.id, channel, sure=sure)
+        else:
+            schema = Schema.read(_stream(content))
+            self._keep(self._schemas, schema.id, schema, sure=sure)
+
+    def _keep(self, known: dict[int, Described], number: int, item: Described, *, sure: bool) -> None:
+        name = (type(item), number)
+        if known.get(number) != item and (sure or name not in self._sure):
+            known[number] = item  # one that is known already stays the same object
+        if sure:
+            self._sure.add(name)
+
+    def _next_chunk(self, start: int) -> int | None:
+        """Where the next thing that can only be a chunk begins; None if there is none."""
+        nearest: int | None = None
+        for name in _COMPRESSIONS:
+            at = self._bytes.find(name, start + _BEFORE_COMPRESSION)
+            while at >= 0 and (nearest is None or at - _BEFORE_COMPRESSION < nearest):
+                if self._is_chunk(at - _BEFORE_COMPRESSION):
+                    nearest = at - _BEFORE_COMPRESSION
+                    break
+                at = self._bytes.find(name, at + 1)
+        return nearest
+
+    def _is_chunk(self, at: int) -> bool:
+        """Whether the lengths of a record agree with each other as those of a chunk do."""
+        opcode, length = RECORD.unpack_from(self._bytes, at)
+        if opcode != Opcode.CHUNK or at + RECORD.size + length > self._size:
+            return False
+        head = _BEFORE_COMPRESSION - RECORD.size
+        if length < head + _DATA_LENGTH.size:
+            return False
+        (name_length,) = _NAME_LENGTH.unpack_from(self._bytes, at + _BEFORE_COMPRESSION - _NAME_LENGTH.size)
+        if head + name_length + _DATA_LENGTH.size > length:
+            return False
+        (data_length,) = _DATA_LENGTH.unpack_from(self._bytes, at + _BEFORE_COMPRESSION + name_length)
+        return bool(head + name_length + _DATA_LENGTH.size + data_length == length)
+
+
+def _stream(content: bytes) -> ReadDataStream:
+    return ReadDataStream(io.BytesIO(content))
