@@ -2,22 +2,31 @@
 
 import sys
 import time
-from datetime import UTC, datetime
+from collections.abc import Callable
+from datetime import datetime
 from pathlib import Path
 
-import structlog
+import msgspec
+import tomli_w
 
 from reactorwatch.contract import keys
+from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.entry import main
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+from recorder.black_box import BlackBox
 from recorder.config import RecorderConfig
-from recorder.core import NODE, Recorder
-from recorder.mcap_writer import RecordingWriter, check_free
-from recorder.node import RecorderNode
+from recorder.core import DISK_ALARM, NODE, Recorder
+from recorder.files import RecordingFiles
+from recorder.filing import Filing
+from recorder.head import Head
+from recorder.node import Decisions, RecorderNode
+from recorder.part_file import PartFile
+from recorder.retention import DAY_NS, Limits
+from recorder.series import Series
 
-log = structlog.get_logger()
+_MB = 1_000_000
 
 
 def run(config: RecorderConfig, bus_config: BusConfig) -> None:
@@ -34,47 +43,82 @@ def record(config: RecorderConfig, bus_config: BusConfig, stop: StopSignal) -> P
     """Record until `stop` is set.
 
     Returns:
-        The file; None if no router was there before the stop.
+        The last file; None if no router was there before the stop, or the disk was full at the end.
 
     Raises:
         InputError: as `run`.
     """
-    path = file_for(config, datetime.now(UTC))
-    check_free(path)  # before the waiting for a router
+    files = files_for(config)  # before the waiting for a router
     bus = bus_zenoh.connect(bus_config, NODE, stop)
     if bus is None:
         return None
     try:
         start_ns = time.time_ns()
-        with RecordingWriter(path, {"plant": config.plant, "key_expression": config.key_expression}) as writer:
-            node = RecorderNode(
-                Recorder(config.plant, start_ns),
-                writer,
-                health_period_ns=round(config.health_period_s * 1e9),
-                flush_period_ns=round(config.flush_period_s * 1e9),
-                start_ns=start_ns,
-            )
-            log.info("recording", file=str(path), what=config.key_expression)
+        with files:
+            files.begin((), start_ns)
+            files.recover_left_behind()
             serve(
-                node,
+                node_for(config, files, start_ns),
                 bus,
                 stop,
                 subscriptions=(config.key_expression,),
                 on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
                 linger_s=config.linger_s,
             )
+            return files.path
     finally:
         bus.close()
-    log.info("recorded", file=str(path))
-    return path
+
+
+def files_for(config: RecorderConfig, open_part: Callable[[Path], PartFile] = PartFile) -> RecordingFiles:
+    """The files that the settings ask for.
+
+    Args:
+        config: the settings.
+        open_part: see `RecordingFiles`.
+
+    Raises:
+        InputError: as `run`.
+    """
+    about = {
+        "plant": config.plant,
+        "key_expression": config.key_expression,
+        "configuration": tomli_w.dumps(msgspec.to_builtins(config)),
+        **config.about,
+    }
+    limits = Limits(config.keep_mb * _MB, config.keep_days * DAY_NS, config.keep_files)
+    return RecordingFiles(series_for(config), about, limits, synced=config.fsync != "never", open_part=open_part)
+
+
+def node_for(config: RecorderConfig, files: RecordingFiles, start_ns: int) -> RecorderNode:
+    """The node that writes to them."""
+    filing = Filing(
+        round(config.flush_period_s * 1e9),
+        config.fsync,
+        config.rotate_min * MINUTE_NS,
+        config.rotate_mb * _MB,
+        start_ns,
+    )
+    black_box = BlackBox(round(config.black_box_min * MINUTE_NS), own=DISK_ALARM)
+    return RecorderNode(
+        Recorder(config.plant, start_ns),
+        Decisions(filing, Head(), black_box),
+        files,
+        health_period_ns=round(config.health_period_s * 1e9),
+        start_ns=start_ns,
+        has_room=lambda: files.free_bytes() >= config.resume_mb * _MB,
+    )
+
+
+def series_for(config: RecorderConfig) -> Series:
+    """The names that the settings give to files."""
+    out = Path(config.out)
+    return Series.of(out, config.plant, is_folder=out.is_dir())
 
 
 def file_for(config: RecorderConfig, now: datetime) -> Path:
-    """The file that the settings name, or the one in the folder that they name."""
-    out = Path(config.out)
-    if out.suffix == ".mcap" and not out.is_dir():
-        return out
-    return out / f"{config.plant}-{now.astimezone(UTC):%Y%m%dT%H%M%SZ}.mcap"
+    """The first of them."""
+    return series_for(config).first(now)
 
 
 if __name__ == "__main__":

@@ -5,6 +5,9 @@ import math
 import msgspec
 
 from reactorwatch.contract import keys
+from recorder.filing import Fsync
+
+LONGEST_FLUSH_S = 1.0
 
 
 class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -15,7 +18,19 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         out: the file, with the ending `.mcap`; or the folder for a file named `{plant}-{UTC time}.mcap`.
         key_expression: what is recorded.
         health_period_s: between two reports of health.
-        flush_period_s: between two moments at which all that was received is handed to the file.
+        flush_period_s: between two moments at which all that was received is handed to the operating system: what a
+            recorder that is killed may lose. At most a second.
+        fsync: when to wait until what was handed over is on the disk, for the case that the machine loses its power:
+            `never`, after each `chunk` that was handed over, or once a `second`.
+        rotate_min: age of a file, in minutes, at which a new one is begun; inf: never.
+        rotate_mb: its size, likewise.
+        keep_mb: size of all files together beyond which the oldest is deleted; inf: never.
+        keep_days: age of a file, since its end, likewise.
+        keep_files: how many there may be, likewise.
+        black_box_min: minutes before and after each alarm that are kept in a file of their own, which is never
+            deleted; 0: none.
+        resume_mb: with a full disk, recording goes on when there is this much room again.
+        about: what else each file should say about its origin, such as the seed of a simulated plant.
         linger_s: asked to stop, it goes on until nothing has come for this long, at most ten times as long: others
             have last words too.
     """
@@ -24,8 +39,17 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     out: str = "."
     key_expression: str = keys.EVERYTHING
     health_period_s: float = 5.0
-    flush_period_s: float = 1.0
+    flush_period_s: float = 0.5
+    fsync: Fsync = "second"
+    rotate_min: float = 60.0
+    rotate_mb: float = 1000.0
+    keep_mb: float = math.inf
+    keep_days: float = math.inf
+    keep_files: float = math.inf
+    black_box_min: float = 10.0
+    resume_mb: float = 50.0
     linger_s: float = 0.5
+    about: dict[str, str] = {}
 
     def __post_init__(self) -> None:
         keys.checked_plant(self.plant)
@@ -33,6 +57,16 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value!r}")
+        if self.flush_period_s > LONGEST_FLUSH_S:
+            raise ValueError(f"flush_period_s must be at most {LONGEST_FLUSH_S:g}, got {self.flush_period_s!r}")
+        for name in ("rotate_min", "rotate_mb", "keep_mb", "keep_days"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"{name} must be positive, or inf, got {getattr(self, name)!r}")
+        if not self.keep_files >= 1.0:
+            raise ValueError(f"keep_files must be at least 1, or inf, got {self.keep_files!r}")
+        for name in ("black_box_min", "resume_mb"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} must be finite and not negative, got {getattr(self, name)!r}")
 
 
 class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -7,6 +7,8 @@ kept without a schema, so that it spoils no reader's day, and is counted as refu
 from collections import Counter
 from typing import Any, NamedTuple
 
+from google.protobuf.message import Message
+
 from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
@@ -22,11 +24,20 @@ _NO_SAMPLE = messages.QUALITY_UNSPECIFIED  # which protobuf reads out of bytes t
 _LARGEST_COUNT = 2**64 - 1  # a sequence number may be any nonsense; the sum of what it skips must still fit its field
 
 
+DISK_ALARM = "recording/disk"
+"""The alarm of a recorder that cannot write."""
+
+
 class Kept(NamedTuple):
-    """An entry for the file; `readable` tells whether the payload is the message that its encoding names."""
+    """An entry for the file, and the message that it holds; None if it is not the one that its encoding names."""
 
     entry: Entry
-    readable: bool
+    message: Message | None
+
+    @property
+    def readable(self) -> bool:
+        """Whether it is."""
+        return self.message is not None
 
 
 class Recorder:
@@ -45,6 +56,8 @@ class Recorder:
         self._reports = 0
         self._longest_lag_ns = 0
         self._refused: Counter[str] = Counter()
+        self._stopped: str | None = None
+        self._stopped_ns = 0
         self._checks: dict[str, SequenceCheck | None] = {}  # by key; None for a key that is not one of ours
 
     def on_message(self, message: Encoded, now_ns: int) -> Kept | None:
@@ -67,7 +80,7 @@ class Recorder:
             decoded: Any = decode(payload, encoding)
         except DecodeError as error:
             self._refused[error.reason] += 1
-            return Kept(Entry(key, payload, encoding, received_ns, received_ns), readable=False)
+            return Kept(Entry(key, payload, encoding, received_ns, received_ns), None)
         check = self._checks[key]
         if check is None:
             self._refused["key"] += 1
@@ -80,10 +93,60 @@ class Recorder:
                 self._refused["payload"] += 1
             elif check is not None:
                 check.update(decoded.sequence, time_ns)
-        return Kept(Entry(key, payload, encoding, received_ns, time_ns), readable=True)
+        return Kept(Entry(key, payload, encoding, received_ns, time_ns), decoded)
 
-    def health(self, now_ns: int, phase: str = "recording") -> Publication:
-        """How it does; the lag is the longest between receipt and work since the last call."""
+    def moment(self, now_ns: int) -> int:
+        """A time of receipt for what the recorder itself adds: nothing that comes later is recorded before it."""
+        self._last_ns = max(self._last_ns, now_ns)
+        return self._last_ns
+
+    def unrecorded(self, count: int) -> None:
+        """So many messages were received and are not in a file, because it could not be written."""
+        self._refused["disk"] += count
+
+    def stop_recording(self, why: str, now_ns: int) -> list[Publication]:
+        """The file cannot be written: what the plant's people are told."""
+        self._stopped = why
+        self._stopped_ns = now_ns
+        return [self._disk_alarm(now_ns), self.health(now_ns)]
+
+    def resume_recording(self, now_ns: int) -> list[Publication]:
+        """There is a file again: what they are told then."""
+        cleared = self._disk_alarm(now_ns, cleared_ns=now_ns)
+        self._stopped = None
+        return [cleared, self.health(now_ns)]
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether what is received cannot be written."""
+        return self._stopped is not None
+
+    def _disk_alarm(self, now_ns: int, cleared_ns: int = 0) -> Publication:
+        missing = self._refused["disk"]
+        if cleared_ns:
+            text = f"recording goes on; {missing} messages are missing so far"
+        else:
+            text = f"recording stopped: {self._stopped}; it goes on when there is room"
+        alarm = messages.Alarm(
+            time_ns=now_ns,
+            alarm=DISK_ALARM,
+            state=messages.ALARM_STATE_NORMAL if cleared_ns else messages.ALARM_STATE_UNACKNOWLEDGED,
+            priority=messages.PRIORITY_CRITICAL,
+            raised_ns=self._stopped_ns,
+            cleared_ns=cleared_ns,
+            text=text,
+            event="cleared" if cleared_ns else "raised",
+        )
+        return Publication(keys.key(self._plant, keys.ALARM, DISK_ALARM), alarm)
+
+    def health(self, now_ns: int, phase: str = "") -> Publication:
+        """How it does; the lag is the longest between receipt and work since the last call.
+
+        Args:
+            now_ns: the moment.
+            phase: in a word; empty: by whether it can write.
+        """
+        phase = phase or ("recording" if self._stopped is None else "not recording")
         checks = [check for check in self._checks.values() if check is not None]
         self._reports += 1
         health = messages.Health(

@@ -29,6 +29,7 @@ from recorder.entry import Entry
 from recorder.mcap_chunks import entries, is_in_order, metadata_records, read_summary, sorted_entries, span_ns
 from recorder.mcap_writer import METADATA, RecordingWriter
 from recorder.measurement import measured
+from recorder.turns import in_turn
 
 __all__ = ["RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
 
@@ -49,7 +50,9 @@ def read_messages(path: Path, kinds: Collection[str] | None = None, plant: str |
         InputError: the file is not there, is no MCAP file, or is damaged. Damage within a chunk is raised when
             the reading comes there.
     """
-    groups = _by_time(_files(path))  # not within a generator: what is wrong is raised at the call
+    groups = in_turn(
+        _files(path), lambda file: file.span
+    )  # not within a generator: what is wrong is raised at the call
 
     def wanted(key: str) -> bool:
         topic = keys.parse(key)
@@ -180,16 +183,3 @@ def _files(path: Path) -> list[_File]:
     spans = [(span_ns(summary), file, summary) for file, summary in read]
     found = sorted((item for item in spans if item[0] != (0, 0)), key=lambda item: item[:2]) or spans[:1]
     return [_File(file, summary, span, first=not number) for number, (span, file, summary) in enumerate(found)]
-
-
-def _by_time(files: list[_File]) -> list[list[_File]]:
-    """The files in groups that follow each other; within a group their times overlap."""
-    groups: list[list[_File]] = []
-    end_ns = -1
-    for file in files:
-        if groups and file.span[0] < end_ns:
-            groups[-1].append(file)
-        else:
-            groups.append([file])
-        end_ns = max(end_ns, file.span[1])
-    return groups

@@ -10,7 +10,7 @@ import io
 import mmap
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -24,6 +24,9 @@ from reactorwatch.errors import InputError
 from recorder.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, read_summary
 
 FOREVER_NS = 2**64 - 1
+
+Wanted = Callable[[str], bool]
+"""Whether the messages of a topic are wanted."""
 
 Described = TypeVar("Described", Channel, Schema)
 
@@ -69,6 +72,7 @@ class Scan:
         path: the file.
         from_ns: chunks that hold only what was received earlier are passed over.
         to_ns: likewise, later.
+        wanted: topics that are read; None: all.
 
     Attributes:
         damages: the places that could not be read; complete after the pass.
@@ -80,10 +84,11 @@ class Scan:
         InputError: there is no such file, it is empty, or nothing in it looks like a recording.
     """
 
-    def __init__(self, path: Path, from_ns: int = 0, to_ns: int = FOREVER_NS) -> None:
+    def __init__(self, path: Path, from_ns: int = 0, to_ns: int = FOREVER_NS, wanted: Wanted | None = None) -> None:
         self.damages: list[Damage] = []
         self.metadata: list[Metadata] = []
         self.orphans = 0
+        self._wanted = wanted
         self._path, self._from_ns, self._to_ns = path, from_ns, to_ns
         self._ended = False
         self._channels: dict[int, Channel] = {}
@@ -172,7 +177,7 @@ class Scan:
         match opcode:
             case Opcode.CHUNK:
                 first_ns, last_ns = _CHUNK_TIMES.unpack_from(self._bytes, start)
-                if last_ns >= self._from_ns and first_ns <= self._to_ns:
+                if last_ns >= self._from_ns and first_ns <= self._to_ns and self._may_be_wanted(end):
                     yield from self._in_chunk(self._bytes[start:end])
             case Opcode.MESSAGE:
                 yield from self._in_records(self._bytes[start - RECORD.size : end], sure=False)
@@ -186,6 +191,21 @@ class Scan:
                 self._ended = True
             case _ if opcode not in _KNOWN:
                 raise ValueError("of no known kind")
+
+    def _may_be_wanted(self, at: int) -> bool:
+        """Whether a chunk has to be looked into, by the indexes of its messages, which follow it."""
+        if self._wanted is None:
+            return True
+        known = False
+        while at < self._size:
+            opcode, end = self._record_at(at)
+            if opcode != Opcode.MESSAGE_INDEX or end is None:
+                break
+            channel = self._channels.get(_INDEX.unpack_from(self._bytes, at + RECORD.size)[0])
+            if channel is None or self._wanted(channel.topic):
+                return True
+            known, at = True, end
+        return not known
 
     def _in_chunk(self, record: bytes) -> list[Stored]:
         chunk = Chunk.read(_stream(record))
@@ -203,7 +223,7 @@ class Scan:
                 schema = schemas.get(channel.schema_id) if channel else None
                 if channel is None or (channel.schema_id and schema is None):
                     self.orphans += 1
-                else:
+                elif self._wanted is None or self._wanted(channel.topic):
                     yield Stored(
                         channel, schema, sequence, log_time, publish_time, data[at + MESSAGE.size : at + length]
                     )

@@ -69,6 +69,7 @@ class RecordingWriter:
             self._stream.flush()
         except OSError as error:
             self._stream.abandon()
+            self._part.unlink(missing_ok=True)  # nothing is in it
             raise self._failed(error) from error
 
     @property

@@ -1,9 +1,29 @@
-"""The recorder as a node: its core, and the file that it writes."""
+"""The recorder as a node: its core, what decides about its files, and the files."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
-from recorder.core import Recorder
-from recorder.mcap_file import RecordingWriter
+from reactorwatch.errors import InputError
+from recorder.black_box import BlackBox
+from recorder.core import Kept, Recorder
+from recorder.files import RecordingFiles
+from recorder.filing import Filing
+from recorder.head import Head
+from recorder.mcap_writer import WriteError
+
+RETRY_NS = 2_000_000_000
+"""Between two looks for room on a full disk."""
+
+
+@dataclass
+class Decisions:
+    """What decides about the files, without touching them."""
+
+    filing: Filing
+    head: Head
+    black_box: BlackBox
 
 
 class RecorderNode:
@@ -11,42 +31,66 @@ class RecorderNode:
 
     Its reports of health go out on the bus and come back as everything else does, so they are not written here. The
     last one alone is, because nobody listens any more when it would come back.
+
+    Args:
+        core: what it makes of messages.
+        decide: what decides about its files.
+        files: the files; one was begun.
+        health_period_ns: between two reports.
+        start_ns: the clock.
+        has_room: whether a full disk has room enough to go on.
     """
 
     def __init__(
-        self, core: Recorder, writer: RecordingWriter, health_period_ns: int, flush_period_ns: int, start_ns: int
+        self,
+        core: Recorder,
+        decide: Decisions,
+        files: RecordingFiles,
+        health_period_ns: int,
+        start_ns: int,
+        has_room: Callable[[], bool] = lambda: True,
     ) -> None:
         self._core = core
-        self._writer = writer
+        self._filing, self._head, self._black_box = decide.filing, decide.head, decide.black_box
+        self._files = files
         self._health_period_ns = health_period_ns
-        self._flush_period_ns = flush_period_ns
         self._next_health_ns = start_ns
-        self._next_flush_ns = start_ns + flush_period_ns
+        self._next_try_ns = start_ns
+        self._has_room = has_room
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        """Write it."""
+        """Write it, and do what is due with the file."""
         kept = self._core.on_message(message, now_ns)
-        if kept is not None:
-            self._writer.write(kept.entry, readable=kept.readable)
-        return []
+        if kept is None:
+            return []
+        told = self._write(kept, now_ns)
+        if kept.message is not None:
+            self._head.remember(kept.entry, kept.message)
+            over = self._black_box.on_message(kept.message, kept.entry.log_time_ns)
+            if over is not None:
+                self._files.keep_for_good(over)
+        return told
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """It takes none."""
         return CommandReply(accepted=False, text="the recorder takes no commands"), []
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """Flush the file and report health, each when it is due."""
-        if now_ns >= self._next_flush_ns:
-            self._writer.flush()
-            self._next_flush_ns = now_ns + self._flush_period_ns
-        if now_ns < self._next_health_ns:
-            return []
-        self._next_health_ns = now_ns + self._health_period_ns
-        return [self._core.health(now_ns)]
+        """Flush the file, look for room on a full disk, keep a stretch for good, report health: each when it is due."""
+        told = self._try_again(now_ns) if self._core.is_stopped else self._see_to_file(now_ns)
+        over = self._black_box.over(now_ns)
+        if over is not None:
+            self._files.keep_for_good(over)
+        if now_ns >= self._next_health_ns:
+            self._next_health_ns = now_ns + self._health_period_ns
+            told.append(self._core.health(now_ns))
+        return told
 
     def next_tick_ns(self) -> int:
-        """The next flush or report."""
-        return min(self._next_flush_ns, self._next_health_ns)
+        """The next of these."""
+        file_ns = self._next_try_ns if self._core.is_stopped else self._filing.next_due_ns()
+        stretch_ns = self._black_box.next_due_ns
+        return min(self._next_health_ns, file_ns, *([] if stretch_ns is None else [stretch_ns]))
 
     @property
     def finished(self) -> bool:
@@ -56,5 +100,67 @@ class RecorderNode:
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Write and send the last report."""
         last = self._core.health(now_ns, phase="stopped")
-        self.on_message(encode(last), now_ns)
-        return [last]
+        told = self.on_message(encode(last), now_ns)
+        over = self._black_box.close()
+        if over is not None:
+            try:
+                self._files.flush()
+            except WriteError as error:
+                told += self._stop(error, now_ns)
+            self._files.keep_for_good(over)
+        return [*told, last]
+
+    def _write(self, kept: Kept, now_ns: int) -> list[Publication]:
+        if self._core.is_stopped:
+            self._core.unrecorded(1)
+            return []
+        try:
+            if self._filing.is_full(now_ns, self._files.size_bytes):
+                self._begin(kept.entry.log_time_ns, now_ns)
+            self._files.write(kept)
+        except InputError as error:
+            self._core.unrecorded(1)
+            return self._stop(error, now_ns)
+        self._filing.wrote(now_ns)
+        return self._see_to_file(now_ns)
+
+    def _begin(self, begun_ns: int, now_ns: int) -> None:
+        self._files.complete()
+        self._filing.flushed()
+        self._files.begin(self._head.entries(begun_ns), now_ns)
+        self._filing.began(now_ns)
+        self._files.delete_oldest(now_ns, self._black_box.needed_since_ns(now_ns))
+
+    def _see_to_file(self, now_ns: int) -> list[Publication]:
+        try:
+            if self._filing.flush_is_due(now_ns):
+                self._files.flush()
+                self._filing.flushed()
+            if self._filing.sync_is_due(now_ns):
+                self._files.sync()
+                self._filing.synced(now_ns)
+        except InputError as error:
+            return self._stop(error, now_ns)
+        return []
+
+    def _stop(self, error: InputError, now_ns: int) -> list[Publication]:
+        """Leave the file as it is, for lack of room or worse; it is made whole when there is another one."""
+        self._core.unrecorded(self._filing.unflushed)
+        self._filing.began(now_ns)
+        self._files.abandon()
+        self._next_try_ns = now_ns + RETRY_NS
+        return self._core.stop_recording(error.reason if isinstance(error, WriteError) else str(error), now_ns)
+
+    def _try_again(self, now_ns: int) -> list[Publication]:
+        if now_ns < self._next_try_ns:
+            return []
+        self._next_try_ns = now_ns + RETRY_NS
+        if not self._has_room():
+            self._files.delete_oldest(now_ns, self._black_box.needed_since_ns(now_ns))
+            return []
+        try:
+            self._begin(self._core.moment(now_ns), now_ns)
+        except InputError:
+            self._files.abandon()
+            return []
+        return self._core.resume_recording(now_ns)

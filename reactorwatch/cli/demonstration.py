@@ -14,7 +14,7 @@ import typer
 from monitor_node import backtest
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
-from reactorwatch.cli.processes import Processes, write_settings
+from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.sources import messages
 from reactorwatch.contract import keys
@@ -118,15 +118,10 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
     )
     monitor = MonitorConfig(plant=PLANT)
     settings = folder / SETTINGS_FILE
-    write_settings(
-        settings,
-        {
-            "bus": bus_config,
-            "plant": plant,
-            "monitor": monitor,
-            "recorder": RecorderConfig(plant=PLANT, out=str(recording), linger_s=LINGER_S),
-        },
-    )
+    nodes = {"bus": bus_config, "plant": plant, "monitor": monitor}
+    about = {"seed": str(seed), "settings": settings_text(nodes)}
+    recorder = RecorderConfig(plant=PLANT, out=str(recording), linger_s=LINGER_S, black_box_min=0.0, about=about)
+    write_settings(settings, {**nodes, "recorder": recorder})
     bus = router(bus_config)
     try:
         with stop_on_signals() as stop:

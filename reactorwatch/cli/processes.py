@@ -86,10 +86,14 @@ class Processes:
 
 def write_settings(path: Path, tables: dict[str, msgspec.Struct]) -> None:
     """Write whole settings as TOML, every value spelled out, so that the file says what ran."""
+    path.write_text(settings_text(tables), encoding="utf-8")
+
+
+def settings_text(tables: dict[str, msgspec.Struct]) -> str:
+    """Whole settings as TOML, every value spelled out."""
     import tomli_w
 
-    plain = {name: _without_none(msgspec.to_builtins(table)) for name, table in tables.items()}
-    path.write_text(tomli_w.dumps(plain), encoding="utf-8")
+    return tomli_w.dumps({name: _without_none(msgspec.to_builtins(table)) for name, table in tables.items()})
 
 
 def _without_none(value: Any) -> Any:

@@ -10,7 +10,7 @@ import structlog
 
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
-from reactorwatch.cli.processes import Processes, write_settings
+from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import router
 from reactorwatch.runtime.config import BusConfig, read_settings, section
@@ -49,7 +49,7 @@ def run_until_stopped(config: Path | None, endpoint: str | None, out: Path, flag
     recorder = section(RecorderConfig, "recorder", tables, {"plant": name or plant.name})
     bus = router(bus_config)  # before anything is written: an address that is taken leaves nothing behind
     try:
-        settings = _write_down(out, recorder, {"bus": bus_config, "plant": plant, "monitor": monitor})
+        settings = _write_down(out, recorder, plant.seed, {"bus": bus_config, "plant": plant, "monitor": monitor})
         with stop_on_signals() as stop, Processes(settings) as processes:
             woken = threading.Event()
             stop.wakes(woken.set)
@@ -67,7 +67,7 @@ def run_until_stopped(config: Path | None, endpoint: str | None, out: Path, flag
         bus.close()
 
 
-def _write_down(out: Path, recorder: RecorderConfig, others: dict[str, msgspec.Struct]) -> Path:
+def _write_down(out: Path, recorder: RecorderConfig, seed: int, others: dict[str, msgspec.Struct]) -> Path:
     """Write the whole settings beside where the recording will be, under the same name; returns their file."""
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -75,5 +75,7 @@ def _write_down(out: Path, recorder: RecorderConfig, others: dict[str, msgspec.S
         raise InputError(f"--out {out}: the folder cannot be made: {error.strerror}") from error
     recording = file_for(msgspec.structs.replace(recorder, out=str(out)), datetime.now(UTC))
     settings = recording.with_suffix(".toml")
-    write_settings(settings, {**others, "recorder": msgspec.structs.replace(recorder, out=str(recording))})
+    about = {"seed": str(seed), "settings": settings_text(others), **recorder.about}
+    recorder = msgspec.structs.replace(recorder, out=str(recording), about=about)
+    write_settings(settings, {**others, "recorder": recorder})
     return settings

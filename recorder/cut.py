@@ -1,0 +1,209 @@
+"""Recordings out of recordings: a stretch of time (`cut`), or several as one (`merge`).
+
+Messages are copied as they are, of whatever program. What a stretch says first is how things stood at its beginning, as
+at the beginning of any file of ours; see `head`.
+"""
+
+import heapq
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, decode
+from reactorwatch.errors import InputError
+from reactorwatch.records.atomic import replacing
+from recorder.entry import Entry
+from recorder.head import Head
+from recorder.mcap_chunks import channel_of, damaged, read_summary, span_ns
+from recorder.mcap_scan import FOREVER_NS, Scan, Stored, Wanted
+from recorder.mcap_writer import RecordingWriter
+from recorder.turns import in_turn
+
+STANDING = frozenset({keys.MODEL, keys.ALARM, keys.FAULT})
+"""Kinds of messages whose last one tells how things stand."""
+
+
+class Window(NamedTuple):
+    """A stretch of time, both ends included.
+
+    Attributes:
+        received_ns: of the times of receipt.
+        sampled_ns: of the times of samples, by which all is judged that speaks of one; None: all is by its receipt.
+    """
+
+    received_ns: tuple[int, int]
+    sampled_ns: tuple[int, int] | None = None
+
+    def holds(self, stored: Stored) -> bool:
+        """Whether a message is in it."""
+        if self.sampled_ns is not None and speaks_of_a_sample(stored.channel.topic):
+            return self.sampled_ns[0] <= stored.publish_time_ns <= self.sampled_ns[1]
+        return self.received_ns[0] <= stored.log_time_ns <= self.received_ns[1]
+
+    def is_after(self, stored: Stored) -> bool:
+        """Whether a message was there before it began."""
+        if self.sampled_ns is not None and speaks_of_a_sample(stored.channel.topic):
+            return stored.publish_time_ns < self.sampled_ns[0]
+        return stored.log_time_ns < self.received_ns[0]
+
+
+def received_between(from_ns: int, to_ns: int) -> Window:
+    """The window of what was received within a time."""
+    return Window((from_ns, to_ns))
+
+
+def sampled_between(sources: Sequence[Path], from_ns: int, to_ns: int) -> Window:
+    """The window of what speaks of samples of a time, and of what else was received meanwhile.
+
+    Raises:
+        InputError: there is no such sample; or as `cut`.
+    """
+    first_ns, last_ns = FOREVER_NS, 0
+    for stored in _in_order(_sources(sources), wanted=speaks_of_a_sample):
+        if not stored.repeated and from_ns <= stored.publish_time_ns <= to_ns:
+            first_ns, last_ns = min(first_ns, stored.log_time_ns), max(last_ns, stored.log_time_ns)
+    if first_ns > last_ns:
+        raise InputError(f"{sources[0]}: holds no sample of that time")
+    return Window((first_ns, last_ns), (from_ns, to_ns))
+
+
+def cut(
+    sources: Sequence[Path], out: Path, window: Window, metadata: Mapping[str, str], *, tolerant: bool = False
+) -> int:
+    """Copy a stretch of time into a recording of its own.
+
+    Args:
+        sources: recordings that follow each other.
+        out: the new one; an older file of that name is replaced.
+        window: the stretch.
+        metadata: what the new one says about its origin.
+        tolerant: pass over what is damaged, and take a file as it is that is still being written.
+
+    Returns:
+        The number of messages in the stretch, without what is said again at its beginning.
+
+    Raises:
+        InputError: nothing was received then, a source is damaged, or the new file cannot be written.
+    """
+    found = _sources(sources, tolerant=tolerant)
+    _check_new(out, sources)
+    count = 0
+    with replacing(out) as temporary, RecordingWriter(temporary, metadata) as writer:
+        for stored in _in_order(found, window.received_ns, tolerant=tolerant):
+            if stored.repeated or not window.holds(stored):
+                continue
+            if not count:
+                for entry in _standing(found, window, stored.log_time_ns):
+                    writer.write(entry)
+            writer.copy(stored)
+            count += 1
+        if not count:
+            raise InputError(f"{sources[0]}: holds no message of that time")
+    return count
+
+
+def merge(sources: Sequence[Path], out: Path, metadata: Mapping[str, str]) -> int:
+    """Put several recordings into one, in the order of receipt.
+
+    Args:
+        sources: the recordings; what one says again of those before it is left out.
+        out: the new one; an older file of that name is replaced.
+        metadata: what the new one says about its origin.
+
+    Returns:
+        The number of messages.
+
+    Raises:
+        InputError: a source is damaged, or the new file cannot be written.
+    """
+    found = _sources(sources)
+    _check_new(out, sources)
+    count = 0
+    with replacing(out) as temporary, RecordingWriter(temporary, metadata) as writer:
+        for stored in _in_order(found):
+            writer.copy(stored)
+            count += 1
+    return count
+
+
+def speaks_of_a_sample(topic: str) -> bool:
+    """Whether the messages of a topic have the time of a sample, and not that of a clock."""
+    parsed = keys.parse(topic)
+    return parsed is not None and parsed.kind != keys.HEALTH
+
+
+@dataclass(frozen=True)
+class _Source:
+    path: Path
+    span: tuple[int, int]
+    first: bool
+
+
+def _sources(paths: Sequence[Path], *, tolerant: bool = False) -> list[_Source]:
+    """The files in the order of their beginnings."""
+    spans = []
+    for path in paths:
+        try:
+            span = span_ns(read_summary(path))
+        except InputError:
+            if not tolerant:
+                raise
+            begin = next(iter(Scan(path)), None)
+            span = (begin.log_time_ns if begin is not None else 0, FOREVER_NS)
+        spans.append((span, path))
+    spans.sort()
+    return [_Source(path, span, first=not number) for number, (span, path) in enumerate(spans)]
+
+
+def _in_order(
+    sources: Sequence[_Source],
+    received_ns: tuple[int, int] = (0, FOREVER_NS),
+    *,
+    wanted: Wanted | None = None,
+    tolerant: bool = False,
+) -> Iterator[Stored]:
+    """The messages of all files in the order of receipt; each file for itself is taken to be in order."""
+    from_ns, to_ns = received_ns
+
+    def of(source: _Source) -> Iterator[Stored]:
+        scan = Scan(source.path, from_ns, to_ns, wanted)
+        for stored in scan:
+            if source.first or not stored.repeated:
+                yield stored
+        if not (scan.whole or tolerant):
+            raise damaged(source.path, "; ".join(map(str, scan.damages)) or "some channels are described nowhere")
+
+    within = [source for source in sources if source.span[1] >= from_ns and source.span[0] <= to_ns]
+    for group in in_turn(within, lambda source: source.span):
+        yield from heapq.merge(*map(of, group), key=lambda stored: stored.log_time_ns)
+
+
+def _standing(sources: Sequence[_Source], window: Window, begun_ns: int) -> list[Entry]:
+    """How things stood when the window began."""
+    head = Head()
+
+    def wanted(topic: str) -> bool:
+        parsed = keys.parse(topic)
+        return parsed is not None and parsed.kind in STANDING
+
+    for source in sources:
+        if source.span[0] > begun_ns:
+            continue
+        for stored in Scan(source.path, to_ns=begun_ns, wanted=wanted):
+            if not (stored.repeated or window.is_after(stored)):
+                continue
+            schemas = {stored.schema.id: stored.schema} if stored.schema else {}
+            key, encoding, _ = channel_of(stored.channel, schemas)
+            entry = Entry(key, stored.payload, encoding, stored.log_time_ns, stored.publish_time_ns)
+            try:
+                head.remember(entry, decode(stored.payload, encoding))
+            except DecodeError:
+                continue
+    return head.entries(begun_ns)
+
+
+def _check_new(out: Path, sources: Sequence[Path]) -> None:
+    if out.exists() and any(out.samefile(source) for source in sources):
+        raise InputError(f"{out}: is one of the recordings that are read; name another file")

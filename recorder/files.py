@@ -1,0 +1,262 @@
+"""The files of a recorder: the one that it writes, those that it has written, and what a killed one left behind.
+
+What is written, and when a file is flushed or a new one begun, is decided elsewhere (`filing`, `head`, `black_box`,
+`retention`); here it is done.
+"""
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import structlog
+
+from reactorwatch.errors import InputError
+from recorder.black_box import Stretch
+from recorder.chores import Chores
+from recorder.core import Kept
+from recorder.cut import cut, received_between
+from recorder.entry import Entry
+from recorder.mcap_writer import RecordingWriter, check_free, part_of
+from recorder.part_file import PART, PartFile, is_held, left_behind
+from recorder.recover import recover
+from recorder.retention import Finished, Limits, to_delete
+from recorder.series import Series
+
+log = structlog.get_logger()
+
+BLACK_BOX = "black-box"
+"""The folder, beside the recordings, of the stretches that are kept for good."""
+DAMAGED = ".damaged"
+"""The ending of a file left behind from which not all could be recovered: it is kept, and not looked at again."""
+
+
+class RecordingFiles:
+    """What `RecorderNode` writes to. As a context, it is closed on every way out.
+
+    Args:
+        series: the names of the files.
+        metadata: what each of them says about its origin.
+        limits: of what is kept.
+        synced: whether a file that is complete is synced.
+        open_part: what opens the file that is written to.
+
+    Raises:
+        InputError: there is no such folder; the file that was asked for by name exists, or is being written.
+    """
+
+    def __init__(
+        self,
+        series: Series,
+        metadata: Mapping[str, str],
+        limits: Limits = Limits(),  # noqa: B008 (it is frozen)
+        *,
+        synced: bool = False,
+        open_part: Callable[[Path], PartFile] = PartFile,
+    ) -> None:
+        self._series = series
+        self._metadata = metadata
+        self._limits = limits
+        self._synced = synced
+        self._open_part = open_part
+        self._writer: RecordingWriter | None = None
+        self._chores = Chores()
+        self._begun = 0
+        self._before = ""
+        self._last_ns = 0
+        self._abandoned: list[Path] = []
+        first = series.first(datetime.now(UTC))
+        self._left = [] if not series.folder.is_dir() else _left_behind(series)
+        if not self._left:
+            check_free(first)
+
+    @property
+    def path(self) -> Path | None:
+        """The name that the file being written will have; None if there is none."""
+        return self._writer.path if self._writer is not None else None
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the file that is being written."""
+        return self._writer.size_bytes if self._writer is not None else 0
+
+    def recover_left_behind(self) -> None:
+        """Have what a killed recorder left behind made whole, while recording goes on."""
+        for part in self._left:
+            self._chores.add(f"recovering {part}", lambda part=part: self._recover(part))  # type: ignore[misc]
+        self._left = []
+
+    def begin(self, head: Iterable[Entry], now_ns: int) -> Path:
+        """Begin a file, after the one before is complete.
+
+        Args:
+            head: what it says first.
+            now_ns: what it may be named after.
+
+        Raises:
+            InputError: a file cannot be written; see `abandon`.
+        """
+        self.complete()
+        path = self._series.next(now_ns, {path.name.removesuffix(PART) for path in self._series.folder.iterdir()})
+        started = datetime.fromtimestamp(now_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+        about = {**self._metadata, "started": started, "file": str(self._begun + 1)}
+        if self._before:
+            about["after"] = self._before
+        self._writer = RecordingWriter(path, about, self._open_part)
+        self._begun += 1
+        self._before = path.name
+        for entry in head:
+            self._writer.write(entry)
+        log.info("recording", file=str(path))
+        for part in self._abandoned:
+            self._chores.add(f"recovering {part}", lambda part=part: self._recover(part))  # type: ignore[misc]
+        self._abandoned = []
+        return path
+
+    def write(self, kept: Kept) -> None:
+        """Append a message.
+
+        Raises:
+            WriteError: the file cannot be written; see `abandon`.
+        """
+        assert self._writer is not None, "a file was begun"
+        self._writer.write(kept.entry, readable=kept.readable)
+        self._last_ns = kept.entry.log_time_ns
+
+    def flush(self) -> None:
+        """Hand over what was written; see `RecordingWriter.flush`."""
+        if self._writer is not None:
+            self._writer.flush()
+
+    def sync(self) -> None:
+        """Wait for the disk; see `RecordingWriter.sync`."""
+        if self._writer is not None:
+            self._writer.sync()
+
+    def complete(self) -> None:
+        """Make the file whole that is being written.
+
+        Raises:
+            WriteError: it cannot be written; see `abandon`.
+        """
+        if self._writer is None:
+            return
+        if self._synced:
+            self._writer.flush()
+            self._writer.sync()
+        self._writer.close()
+        if self._last_ns:
+            os.utime(self._writer.path, ns=(self._last_ns, self._last_ns))  # by which it is old, or not yet
+        log.info("recorded", file=str(self._writer.path))
+        self._writer = None
+
+    def abandon(self) -> None:
+        """Leave the file as it was last flushed; it is recovered as soon as another one was begun."""
+        if self._writer is None:
+            return
+        self._writer.abandon()
+        part = part_of(self._writer.path)
+        if part.exists():
+            self._abandoned.append(part)
+        self._writer = None
+
+    def free_bytes(self) -> int:
+        """The room that is left on the disk."""
+        return shutil.disk_usage(self._series.folder).free
+
+    def keep_for_good(self, stretch: Stretch) -> None:
+        """Have a stretch of time copied into a file of its own; flush before."""
+        self._chores.add(f"the black box of {stretch.alarm}", lambda: self._black_box(stretch))
+
+    def delete_oldest(self, now_ns: int, needed_since_ns: int | None) -> None:
+        """Have what is beyond the limits deleted."""
+        if self._limits != Limits():
+            self._chores.add("deleting old recordings", lambda: self._delete_oldest(now_ns, needed_since_ns))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        try:
+            self.complete()
+        finally:
+            self._chores.finish()
+
+    def _finished(self) -> list[Path]:
+        return [path for path in self._series.folder.iterdir() if self._series.owns(path.name) and path.is_file()]
+
+    def _recover(self, part: Path) -> None:
+        """Make a file whole that was left behind. It is deleted only if nothing but its end is missing."""
+        with left_behind(part):
+            path = part.with_name(part.name.removesuffix(PART))
+            if path.exists():
+                path = path.with_name(f"{path.stem}-recovered{path.suffix}")
+            try:
+                saved = recover(part, path)
+            except InputError as error:
+                part.rename(part.with_name(part.name + DAMAGED))
+                log.warning("nothing recovered", why=str(error))
+                return
+            if saved.only_cut_off:
+                part.unlink()
+            else:
+                part.rename(part.with_name(part.name + DAMAGED))
+            log.info("recovered", file=str(path), messages=saved.messages, lost=saved.lost)
+
+    def _black_box(self, stretch: Stretch) -> None:
+        folder = self._series.folder / BLACK_BOX
+        folder.mkdir(exist_ok=True)
+        raised = datetime.fromtimestamp(stretch.raised_ns / 1e9, UTC)
+        name = f"{self._series.stem}-{raised:%Y%m%dT%H%M%SZ}-{stretch.alarm.replace('/', '-')}"
+        path, number = folder / f"{name}.mcap", 1
+        while path.exists():
+            number += 1
+            path = folder / f"{name}-{number}.mcap"
+        about = {**self._metadata, "alarm": stretch.alarm, "raised": raised.isoformat(timespec="milliseconds")}
+        window = received_between(stretch.from_ns, stretch.to_ns)
+        while True:
+            writing = self.path
+            sources = [source for source in self._finished() if source.stat().st_mtime_ns >= stretch.from_ns]
+            if writing is not None and writing not in sources:
+                sources.append(part_of(writing))
+            try:
+                count = cut(sources, path, window, about, tolerant=True)
+                break
+            except InputError:
+                if all(source.exists() for source in sources):
+                    raise  # else the file being written has got its name meanwhile
+        log.info("black box", file=str(path), alarm=stretch.alarm, messages=count)
+
+    def _delete_oldest(self, now_ns: int, needed_since_ns: int | None) -> None:
+        finished = []
+        for path in self._finished():
+            told = path.stat()
+            finished.append(Finished(path, told.st_size, told.st_mtime_ns))
+        for path in to_delete(finished, self.size_bytes, self._limits, now_ns, needed_since_ns):
+            path.unlink()
+            log.info("deleted", file=str(path), why="the limits of what is kept")
+
+
+def _left_behind(series: Series) -> list[Path]:
+    """What killed recorders left behind.
+
+    Raises:
+        InputError: the file that was asked for by name is being written by another recorder.
+    """
+    found = []
+    for part in sorted(series.folder.glob(f"*{PART}")):
+        name = part.name.removesuffix(PART)
+        if series.owns(name):
+            if not is_held(part):
+                found.append(part)
+            elif not series.dated:
+                raise InputError(f"recording {part.with_name(name)}: {part} is being written by another recorder")
+    for copy in (*series.folder.glob(f".{series.stem}*.tmp{PART}"), *(series.folder / BLACK_BOX).glob(f".*.tmp{PART}")):
+        if not is_held(copy):
+            copy.unlink(missing_ok=True)  # it was being made when its maker was killed
+    return found

@@ -1,0 +1,80 @@
+"""A recorder without a bus, fed by hand with messages and a clock."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.contract.messages_pb2 import Alarm, Health
+from recorder.__main__ import files_for, node_for
+from recorder.config import RecorderConfig
+from recorder.files import RecordingFiles
+from recorder.mcap_writer import part_of
+from recorder.node import RecorderNode
+from recorder.part_file import PartFile
+
+SECOND = 1_000_000_000
+MINUTE = 60 * SECOND
+
+
+@dataclass
+class Fed:
+    """A recorder that is driven as the loop drives it."""
+
+    node: RecorderNode
+    files: RecordingFiles
+    now_ns: int
+    told: list[Publication] = field(default_factory=list)
+
+    def hear(self, publications: Iterable[Publication], apart_ns: int) -> None:
+        """Publish, one message each so often, and let it do what falls due between."""
+        for publication in publications:
+            self.pass_time(apart_ns)
+            encoded = encode(publication)
+            self.told += self.node.on_message(Encoded(*encoded[:3], self.now_ns), self.now_ns)
+
+    def pass_time(self, span_ns: int) -> None:
+        """Let nothing come for a while."""
+        end_ns = self.now_ns + span_ns
+        while (due_ns := self.node.next_tick_ns()) <= end_ns:
+            self.now_ns = max(self.now_ns, due_ns)
+            self.told += self.node.on_tick(self.now_ns)
+        self.now_ns = end_ns
+
+    def stop(self) -> None:
+        """Ask it to end, and close its files."""
+        self.told += self.node.on_stop(self.now_ns)
+        with self.files:
+            pass
+
+    def kill(self) -> None:
+        """What a kill does to its file: nothing that was not handed over gets there, and nobody holds it any more."""
+        assert self.files.path is not None
+        part = part_of(self.files.path)
+        content = part.read_bytes()
+        self.files.abandon()
+        part.write_bytes(content)
+        with self.files:
+            pass
+
+    def alarms(self) -> list[Alarm]:
+        """The alarms that it has published."""
+        return [item.message for item in self.told if isinstance(item.message, Alarm)]
+
+    def last_health(self) -> Health:
+        """Its last report."""
+        return [item.message for item in self.told if isinstance(item.message, Health)][-1]
+
+
+def recorder(
+    out: Path,
+    start_ns: int,
+    open_part: Callable[[Path], PartFile] = PartFile,
+    **settings: object,
+) -> Fed:
+    """A recorder that has just begun."""
+    config = RecorderConfig(out=str(out), **settings)  # type: ignore[arg-type]
+    files = files_for(config, open_part)
+    files.begin((), start_ns)
+    files.recover_left_behind()
+    return Fed(node_for(config, files, start_ns), files, start_ns)

@@ -1,0 +1,232 @@
+"""The files of a recorder: one after the other, each of which opens by itself; what is kept, what is deleted."""
+
+import os
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from reactorwatch import __version__
+from reactorwatch.contract import keys
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import Publication, decode, encode
+from reactorwatch.errors import InputError
+from recorder.entry import Entry
+from recorder.mcap_file import plants_in, read_messages, read_metadata, read_record, recordings_in
+from tests.unit.recorder import golden
+from tests.unit.recorder.recording import MINUTE, SECOND, Fed, recorder
+
+START = golden.RECEIVED_NS
+ALL = [encode(publication) for publication in golden.publications()]
+
+
+def of_others(path: Path) -> list[Entry]:
+    return [entry for entry in read_messages(path) if not entry.key.endswith("health/recorder")]
+
+
+def alarm(name: str, event: str = "raised") -> Publication:
+    return Publication(keys.key("cstr", keys.ALARM, name), messages.Alarm(time_ns=1, alarm=name, event=event))
+
+
+def samples(count: int, first: int = 0) -> Iterator[Publication]:
+    for number in range(first, first + count):
+        sample = messages.Sample(time_ns=number * SECOND, sequence=number, value=1.0, quality=messages.QUALITY_GOOD)
+        yield Publication(keys.key("cstr", keys.SAMPLE, "T"), sample)
+
+
+def test_files_follow_each_other_by_age_and_hold_everything_between_them(tmp_path: Path) -> None:
+    fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, black_box_min=0.0)
+    fed.hear(golden.publications(), MINUTE // 700)
+    fed.stop()
+    files = sorted(tmp_path.iterdir(), key=lambda path: (len(path.name), path.name))
+    assert [path.name for path in files] == ["run.mcap", "run-2.mcap", "run-3.mcap"]
+    assert [entry[:3] for entry in of_others(tmp_path)] == [message[:3] for message in ALL]
+    for path in files:
+        times = [entry.log_time_ns for entry in read_messages(path)]
+        assert times == sorted(times)
+        assert times[-1] - times[0] <= MINUTE
+
+
+def test_files_follow_each_other_by_size(tmp_path: Path) -> None:
+    fed = recorder(tmp_path, START, rotate_mb=0.08, black_box_min=0.0)
+    fed.hear(golden.publications(), SECOND // 10)
+    fed.stop()
+    sizes = [path.stat().st_size for path in recordings_in(tmp_path)]
+    assert len(sizes) > 2
+    assert all(80_000 <= size <= 130_000 for size in sizes[:-1])  # and what its index takes
+    assert [entry[:3] for entry in of_others(tmp_path)] == [message[:3] for message in ALL]
+
+
+def test_every_file_says_first_how_things_stand_and_a_folder_says_it_once(tmp_path: Path) -> None:
+    fed = recorder(tmp_path, START, rotate_min=1.0)
+    model = messages.ModelSnapshot(time_ns=5, structure="arx", rows=7, reference=True)
+    stands = [Publication(keys.key("cstr", keys.MODEL, "T"), model), alarm("ewma/T")]
+    fed.hear([*samples(1), *stands], SECOND)
+    fed.hear(samples(200, first=1), SECOND)
+    fed.stop()
+    files = recordings_in(tmp_path)
+    assert len(files) == 4
+    for path in files[1:]:
+        first = [entry for entry in read_messages(path) if entry.repeated]
+        assert [decode(entry.payload, entry.encoding) for entry in first] == [item.message for item in stands]
+        assert list(read_messages(path))[: len(first)] == first
+        assert [entry.publish_time_ns for entry in first] == [5, 1]
+    assert not any(entry.repeated for entry in read_messages(tmp_path))
+    assert sum("/alarm/" in entry.key for entry in read_messages(tmp_path)) == 1
+
+
+def test_every_file_opens_by_itself_and_says_where_it_comes_from(tmp_path: Path) -> None:
+    fed = recorder(tmp_path, START, rotate_min=1.0, about={"seed": "7"})
+    fed.hear(samples(100), SECOND)
+    fed.stop()
+    first, second = recordings_in(tmp_path)
+    for number, path in enumerate((first, second), start=1):
+        assert read_record(path).rows
+        said = read_metadata(path)
+        assert (said["plant"], said["version"], said["seed"], said["file"]) == ("cstr", __version__, "7", str(number))
+        assert tomllib.loads(said["configuration"])["rotate_min"] == 1.0
+    assert read_metadata(second)["after"] == first.name
+
+
+def test_a_folder_is_read_as_one_recording(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    fed = recorder(tmp_path / "folder", START, rotate_min=0.5, black_box_min=0.0)
+    one = recorder(tmp_path / "one.mcap", START, black_box_min=0.0)
+    for each in (fed, one):
+        each.hear(golden.publications(), MINUTE // 500)
+        each.stop()
+    assert len(recordings_in(tmp_path / "folder")) > 2
+    assert of_others(tmp_path / "folder") == of_others(tmp_path / "one.mcap")
+    assert plants_in(tmp_path / "folder") == ("cstr",)
+    a, b = read_record(tmp_path / "folder"), read_record(tmp_path / "one.mcap")
+    assert a.time_min.tolist() == b.time_min.tolist()
+    assert a.columns["T"].tolist() == b.columns["T"].tolist()
+
+
+def test_files_that_overlap_in_time_are_read_together_in_order_of_receipt(tmp_path: Path) -> None:
+    a, b = recorder(tmp_path / "a.mcap", START), recorder(tmp_path / "b.mcap", START, plant="other")
+    for number in range(20):
+        for fed in (a, b):
+            fed.hear(samples(1, number), SECOND)
+    a.stop()
+    b.stop()
+    times = [entry.log_time_ns for entry in of_others(tmp_path)]
+    assert times == sorted(times)
+    assert len(times) == 40
+
+
+def test_a_folder_without_recordings_is_told_as_such(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"holds no recording \(\.mcap\)"):
+        read_messages(tmp_path)
+
+
+def test_the_oldest_are_deleted_and_never_the_one_being_written_nor_a_black_box(tmp_path: Path) -> None:
+    fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, keep_files=2.0, black_box_min=0.1)
+    (tmp_path / "mine.mcap").write_bytes(b"of somebody else")
+    fed.hear([*samples(30), alarm("ewma/T"), *samples(400, first=30)], SECOND)
+    fed.stop()
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["black-box", "mine.mcap", "run-7.mcap", "run-8.mcap"]
+    assert len(list((tmp_path / "black-box").iterdir())) == 1
+    last = [entry for entry in read_messages(tmp_path / "run-8.mcap") if "/sample/" in entry.key]
+    assert last
+
+
+def test_a_black_box_holds_what_came_before_and_after_the_alarm_and_how_things_stood(tmp_path: Path) -> None:
+    fed = recorder(tmp_path, START, rotate_min=1.0, black_box_min=0.5)
+    fed.hear([*samples(10), alarm("shewhart/C"), *samples(89, 10), alarm("ewma/T"), *samples(100, 99)], SECOND)
+    fed.stop()
+    first, second = sorted((tmp_path / "black-box").iterdir())
+    assert first.name.endswith("Z-shewhart-C.mcap")
+    assert second.name.endswith("Z-ewma-T.mcap")
+    assert read_metadata(second)["alarm"] == "ewma/T"
+    (standing,) = [entry for entry in read_messages(second) if entry.repeated]
+    assert standing.key == "reactor/cstr/alarm/shewhart/C"
+    kept = [entry for entry in of_others(second) if not entry.repeated]
+    (at,) = [entry.log_time_ns for entry in kept if "/alarm/" in entry.key]
+    whole = [entry for entry in of_others(tmp_path) if at - MINUTE // 2 <= entry.log_time_ns <= at + MINUTE // 2]
+    assert kept == whole
+    assert len(kept) == 61
+
+
+def test_a_stretch_that_is_not_over_when_the_recorder_stops_is_kept_as_far_as_it_goes(tmp_path: Path) -> None:
+    fed = recorder(tmp_path, START, black_box_min=5.0)
+    fed.hear([*samples(5), alarm("ewma/T"), *samples(3, 5)], SECOND)
+    fed.stop()
+    (box,) = (tmp_path / "black-box").iterdir()
+    assert len(of_others(box)) == 9
+
+
+def killed(folder: Path, count: int) -> Fed:
+    fed = recorder(folder, START)
+    fed.hear(samples(count), SECOND // 10)
+    fed.kill()
+    return fed
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "."])
+def test_the_next_start_recovers_what_a_kill_left_and_goes_on_in_a_new_file(tmp_path: Path, name: str) -> None:
+    killed(tmp_path / name, 100)
+    (part,) = tmp_path.glob("*.part")
+    fed = recorder(tmp_path / name, START + MINUTE)
+    fed.hear(samples(50, first=100), SECOND // 10)
+    fed.stop()
+    assert not list(tmp_path.glob("*.part"))
+    first, _second = recordings_in(tmp_path)
+    assert first.name == part.name.removesuffix(".part")
+    sequences = [
+        message.sequence
+        for entry in of_others(tmp_path)
+        if isinstance(message := decode(entry.payload, entry.encoding), messages.Sample)
+    ]
+    lost = sorted(set(range(150)) - set(sequences))
+    assert lost == list(range(100 - len(lost), 100))  # the last before the kill, and nothing else
+    assert len(lost) <= 10  # a second
+    last = [entry.log_time_ns for entry in of_others(first)][-1]
+    assert abs(first.stat().st_mtime_ns - last) < 2 * SECOND  # the health report may be younger
+
+
+def test_kills_one_after_the_other_leave_a_file_each(tmp_path: Path) -> None:
+    for _ in range(3):
+        killed(tmp_path / "run.mcap", 20)
+    recorder(tmp_path / "run.mcap", START).stop()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run-2.mcap", "run-3.mcap", "run-4.mcap", "run.mcap"]
+
+
+def test_what_cannot_be_recovered_is_kept_and_not_looked_at_again(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap.part").write_bytes(b"\0" * 100)
+    recorder(tmp_path / "run.mcap", START).stop()
+    assert (tmp_path / "run.mcap.part.damaged").read_bytes() == b"\0" * 100
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_of_a_file_left_behind_with_a_damaged_chunk_the_original_is_kept(tmp_path: Path) -> None:
+    killed(tmp_path / "run.mcap", 100)
+    part = tmp_path / "run.mcap.part"
+    content = part.read_bytes()
+    at = content.index(b"\x28\xb5\x2f\xfd", len(content) // 2)
+    part.write_bytes(content[:at] + bytes(30) + content[at + 30 :])
+    recorder(tmp_path / "run.mcap", START).stop()
+    assert (tmp_path / "run.mcap.part.damaged").exists()
+    assert of_others(tmp_path / "run.mcap")
+
+
+def test_a_file_that_another_recorder_writes_is_left_alone(tmp_path: Path) -> None:
+    fed = recorder(tmp_path / "run.mcap", START)
+    with pytest.raises(InputError, match="is being written by another recorder"):
+        recorder(tmp_path / "run.mcap", START)
+    fed.stop()
+    beside = recorder(tmp_path, START)
+    other = recorder(tmp_path, START)
+    beside.hear(samples(10), SECOND)
+    other.hear(samples(10), SECOND)
+    beside.stop()
+    other.stop()
+    assert len(list(tmp_path.glob("cstr-*.mcap"))) == 2
+
+
+def test_a_copy_that_a_kill_left_half_made_is_removed(tmp_path: Path) -> None:
+    (tmp_path / f".run.mcap.{os.getpid()}.tmp.part").write_bytes(b"x")
+    recorder(tmp_path / "run.mcap", START).stop()
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]

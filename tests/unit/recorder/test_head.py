@@ -1,0 +1,30 @@
+"""How things stand when a file is begun."""
+
+from google.protobuf.message import Message
+
+from reactorwatch.contract import messages_pb2 as messages
+from recorder.entry import Entry
+from recorder.head import Head
+
+
+def remembered(*told: tuple[str, Message]) -> Head:
+    head = Head()
+    for number, (key, message) in enumerate(told):
+        head.remember(Entry(key, message.SerializeToString(), "?", number, 100 + number), message)
+    return head
+
+
+def test_the_last_of_each_model_alarm_and_fault_is_said_again_and_nothing_else() -> None:
+    head = remembered(
+        ("model/T", messages.ModelSnapshot(reference=True, rows=1)),
+        ("model/T", messages.ModelSnapshot(reference=False, rows=2)),
+        ("alarm/a", messages.Alarm(alarm="a", event="raised")),
+        ("sample/T", messages.Sample(value=1.0)),
+        ("health/monitor", messages.Health()),
+        ("model/T", messages.ModelSnapshot(reference=False, rows=3)),
+        ("fault/x", messages.Fault(cause="x")),
+        ("alarm/a", messages.Alarm(alarm="a", event="cleared")),
+    )
+    entries = head.entries(1000)
+    assert [entry.publish_time_ns - 100 for entry in entries] == [0, 5, 6, 7]
+    assert {(entry.log_time_ns, entry.repeated) for entry in entries} == {(1000, True)}
