@@ -1,9 +1,11 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study pictures protobuf clean
+.PHONY: help setup demo test lint bench faults study kills pictures protobuf clean
 
 PYTHON ?= python3
 BIN := .venv/bin
+# each has a target of its own
+LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py)
 READY := .venv/.ready
 
 help: ## what there is to make
@@ -35,7 +37,7 @@ lint: $(READY) ## style, types, and who may import whom
 	@$(BIN)/lint-imports
 
 bench: $(READY) ## speed, as ratios measured in one run
-	@for file in $(filter-out benchmarks/fault_bank.py benchmarks/diagnosis_study.py,$(wildcard benchmarks/[a-z]*.py)); do \
+	@for file in $(filter-out $(LONG_STUDIES),$(wildcard benchmarks/[a-z]*.py)); do \
 		echo "== $$file"; $(BIN)/python $$file || exit 1; done
 
 faults: $(READY) ## the watch on a bank of faults, against an oracle and the report's method: most of an hour
@@ -43,6 +45,9 @@ faults: $(READY) ## the watch on a bank of faults, against an oracle and the rep
 
 study: $(READY) ## the diagnosis on records with something hidden in them; writes docs/diagnosis_study.md: hours
 	@$(BIN)/python benchmarks/diagnosis_study.py --write
+
+kills: $(READY) ## kill a recorder fifty times under load, and count what is missing: three minutes
+	@$(BIN)/python benchmarks/recorder_kills.py
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py

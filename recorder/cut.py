@@ -16,7 +16,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from recorder.entry import Entry
 from recorder.head import Head
-from recorder.mcap_chunks import channel_of, damaged, read_summary, span_ns
+from recorder.mcap_chunks import damaged, read_summary, span_ns
 from recorder.mcap_scan import FOREVER_NS, Scan, Stored, Wanted
 from recorder.mcap_writer import RecordingWriter
 from recorder.turns import in_turn
@@ -194,11 +194,9 @@ def _standing(sources: Sequence[_Source], window: Window, begun_ns: int) -> list
         for stored in Scan(source.path, to_ns=begun_ns, wanted=wanted):
             if not (stored.repeated or window.is_after(stored)):
                 continue
-            schemas = {stored.schema.id: stored.schema} if stored.schema else {}
-            key, encoding, _ = channel_of(stored.channel, schemas)
-            entry = Entry(key, stored.payload, encoding, stored.log_time_ns, stored.publish_time_ns)
+            entry = stored.entry
             try:
-                head.remember(entry, decode(stored.payload, encoding))
+                head.remember(entry, decode(entry.payload, entry.encoding))
             except DecodeError:
                 continue
     return head.entries(begun_ns)

@@ -31,7 +31,7 @@ from recorder.mcap_writer import METADATA, RecordingWriter
 from recorder.measurement import measured
 from recorder.turns import in_turn
 
-__all__ = ["RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
+__all__ = ["METADATA", "RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
 
 ZERO_NS = "zero_ns"
 

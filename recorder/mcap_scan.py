@@ -21,7 +21,8 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
-from recorder.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, read_summary
+from recorder.entry import Entry
+from recorder.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, channel_of, read_summary
 
 FOREVER_NS = 2**64 - 1
 
@@ -52,6 +53,13 @@ class Stored(NamedTuple):
     def repeated(self) -> bool:
         """See `recorder.entry.Entry`."""
         return REPEATED in self.channel.metadata
+
+    @property
+    def entry(self) -> Entry:
+        """The same as the recorder speaks of it."""
+        schemas = {self.schema.id: self.schema} if self.schema is not None else {}
+        key, encoding, repeated = channel_of(self.channel, schemas)
+        return Entry(key, self.payload, encoding, self.log_time_ns, self.publish_time_ns, repeated)
 
 
 class Damage(NamedTuple):

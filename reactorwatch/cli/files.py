@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Plant, columns, existing, new_file
+from reactorwatch.cli.options import Columns, Plant, columns, existing, existing_recording, new_file
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
 
@@ -18,7 +18,9 @@ def add_to(app: typer.Typer) -> None:
 
 
 def dashboard(
-    file: Annotated[Path, typer.Argument(help="A recording (.mcap) or a record (.csv).", show_default=False)],
+    file: Annotated[
+        Path, typer.Argument(help="A recording (.mcap), a folder of them, or a record (.csv).", show_default=False)
+    ],
     out: Out,
     plant: Plant = None,
 ) -> None:
@@ -30,7 +32,7 @@ def dashboard(
 
     out = new_file(out)
     with task(f"drawing {file.name}"):
-        write_rrd(read_run(messages(existing(file), plant)), out)
+        write_rrd(read_run(messages(existing_recording(file), plant)), out)
     typer.echo(f"wrote {out}")
 
 
@@ -50,7 +52,7 @@ def import_csv(
 
 
 def export_csv(
-    file: Annotated[Path, typer.Argument(help="A recording (.mcap).", show_default=False)],
+    file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
     out: Out,
     plant: Plant = None,
 ) -> None:
@@ -59,5 +61,5 @@ def export_csv(
     from recorder.convert import export_csv as convert
 
     with task(f"exporting {file.name}"):
-        rows = convert(existing(file), new_file(out), plant)
+        rows = convert(existing_recording(file), new_file(out), plant)
     typer.echo(f"wrote {out}: {rows} rows")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Json, Plant, columns, existing
+from reactorwatch.cli.options import Columns, Json, Plant, columns, existing_recording
 
 
 def add_to(app: typer.Typer) -> None:
@@ -40,7 +40,7 @@ def identify(
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.sources import record
 
-    measured = record(existing(file), plant, columns(column))
+    measured = record(existing_recording(file), plant, columns(column))
     with task(f"identifying {file.name}"):
         if compare:
             said = identification.compare(measured, output, order, delay, neural=neural, as_json=as_json)
@@ -79,5 +79,5 @@ def reproduce(
     from reactorwatch.cli.sources import record
     from reactorwatch.cli.study.reproduce import reproduce as reproduce_figures
 
-    measured = record(existing(file), plant, columns(column)) if file else None
+    measured = record(existing_recording(file), plant, columns(column)) if file else None
     typer.echo(reproduce_figures(out, seed, only, measured))

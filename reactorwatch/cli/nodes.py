@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from reactorwatch.cli.options import Columns, Endpoint, Plant, Settings, columns, existing, pace
+from reactorwatch.cli.options import Columns, Endpoint, Plant, Settings, columns, existing_recording, pace
 
 
 def add_to(app: typer.Typer) -> None:
@@ -107,7 +107,9 @@ def record(
 
 
 def replay(
-    file: Annotated[Path, typer.Argument(help="A recording (.mcap) or a record (.csv).", show_default=False)],
+    file: Annotated[
+        Path, typer.Argument(help="A recording (.mcap), a folder of them, or a record (.csv).", show_default=False)
+    ],
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Annotated[
@@ -124,7 +126,7 @@ def replay(
 
     tables, bus = _settings(config, endpoint)
     flags = {
-        "file": str(existing(file)),
+        "file": str(existing_recording(file)),
         "plant": name,
         "rate": pace(rate, "--rate"),
         "columns": columns(column) or None,

@@ -1,5 +1,6 @@
 """Options that several commands share, and how their values are read."""
 
+import re
 from math import inf
 from pathlib import Path
 from typing import Annotated
@@ -52,6 +53,30 @@ def pace(text: str | None, option: str) -> float | None:
     if not 0 < value < inf:
         raise InputError(f"{option} must be a positive number or 'max', got {text!r}")
     return value
+
+
+_SECONDS = {"s": 1, "min": 60, "h": 3600}
+
+
+def span_ns(text: str, option: str) -> int:
+    """A span of time, such as `90s`, `10min` or `1.5h`, in nanoseconds.
+
+    Raises:
+        InputError: no such span.
+    """
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|min|h)", text)
+    if match is None:
+        raise InputError(f"{option} must be a number with s, min or h, such as 10min, got {text!r}")
+    return round(float(match[1]) * _SECONDS[match[2]] * 1e9)
+
+
+def existing_recording(path: Path) -> Path:
+    """The path of a file that is to be read, or of a folder of recordings.
+
+    Raises:
+        InputError: there is none.
+    """
+    return path if path.is_dir() else existing(path)
 
 
 def existing(path: Path) -> Path:

@@ -4,7 +4,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from reactorwatch.contract.messages_pb2 import Priority
+from reactorwatch.records.record import to_minutes
+from recorder.look import Look
 from recorder.recover import Saved
+
+MOST_LINES = 20
+"""Gaps that people are told of one by one."""
 
 
 def saved_object(saved: Saved, out: Path) -> dict[str, Any]:
@@ -34,9 +40,104 @@ def saved_text(saved: Saved, file: Path, out: Path) -> str:
     )
 
 
+def info_object(seen: Look, file: Path) -> dict[str, Any]:
+    """The object that `info --json` prints; minutes are those of the plant, as `cut` counts them."""
+    found = seen.overview
+
+    def minutes(time_ns: int | None) -> float | None:
+        return None if time_ns is None else to_minutes(time_ns, seen.zero_ns)
+
+    return {
+        "file": str(file),
+        "whole": not seen.damages,
+        "damages": list(seen.damages),
+        "messages": found.messages,
+        "first_ns": found.first_ns,
+        "last_ns": found.last_ns,
+        "span_s": found.span_s,
+        "from_min": minutes(found.first_sample_ns) if found.first_sample_ns else None,
+        "to_min": minutes(found.last_sample_ns) if found.first_sample_ns else None,
+        "topics": [
+            {
+                "topic": topic.key,
+                "encoding": topic.encoding,
+                "messages": topic.count,
+                "rate_per_s": topic.count / found.span_s if found.span_s else None,
+            }
+            for _, topic in sorted(found.topics.items())
+        ],
+        "lost": found.lost,
+        "duplicated": found.duplicated,
+        "out_of_order": found.out_of_order,
+        "gaps": [
+            {"topic": gap.key, "first": gap.first, "last": gap.last, "after_min": minutes(gap.after_ns)}
+            for gap in found.gaps
+        ],
+        "alarms": [
+            {
+                "alarm": alarm.alarm,
+                "priority": priority_word(alarm.priority),
+                "raised_min": minutes(alarm.raised_ns),
+                "cleared_min": minutes(alarm.cleared_ns),
+                "text": alarm.text,
+            }
+            for alarm in found.alarms
+        ],
+        "metadata": seen.metadata,
+    }
+
+
+def info_text(seen: Look, file: Path) -> str:
+    """The same for people."""
+    said = info_object(seen, file)
+    lines = [
+        f"{file}: {said['messages']} messages of {len(said['topics'])} topics, received over {said['span_s']:.1f} s "
+        f"({moment(said['first_ns'])} to {moment(said['last_ns'])})"
+    ]
+    if said["from_min"] is not None:
+        lines.append(f"samples from {said['from_min']:g} to {said['to_min']:g} min")
+    told = [
+        f"{name} {seen.metadata[name]}" for name in ("plant", "version", "seed", "started") if name in seen.metadata
+    ]
+    lines += [", ".join(told)] if told else []
+    lines += [
+        f"  {topic['messages']:9d}  {topic['rate_per_s'] or 0.0:9.3g}/s  {topic['topic']}" for topic in said["topics"]
+    ]
+    if said["lost"]:
+        lines.append(f"{said['lost']} samples are missing:")
+    lines += [
+        f"  {gap['last'] - gap['first'] + 1:9d}  {gap['topic']}: {gap['first']} to {gap['last']}, "
+        f"after {gap['after_min']:g} min"
+        for gap in said["gaps"][:MOST_LINES]
+    ]
+    if len(said["gaps"]) > MOST_LINES:
+        lines.append(f"  and {len(said['gaps']) - MOST_LINES} more gaps (--json names them)")
+    if not said["lost"]:
+        lines.append("no sample is missing, by their sequence numbers")
+    lines += [
+        f"  {alarm['raised_min']:9g} min  {alarm['alarm']} ({alarm['priority']}), "
+        + ("not cleared" if alarm["cleared_min"] is None else f"cleared at {alarm['cleared_min']:g} min")
+        + f": {alarm['text']}"
+        for alarm in said["alarms"]
+    ]
+    if not said["alarms"]:
+        lines.append("no alarms")
+    if seen.damages:
+        lines.append(f"not whole: {'; '.join(seen.damages)}; `reactorwatch recover {file}` saves the rest")
+    return "\n".join(lines)
+
+
 def moment(time_ns: int) -> str:
     """A time for people."""
     try:
         return datetime.fromtimestamp(time_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     except (OverflowError, ValueError, OSError):
         return f"{time_ns} ns"
+
+
+def priority_word(priority: int) -> str:
+    """`high` for PRIORITY_HIGH; a number that means nothing is told as it is."""
+    try:
+        return Priority.Name(priority).removeprefix("PRIORITY_").lower()
+    except ValueError:
+        return str(priority)

@@ -5,13 +5,16 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Json, existing, new_file
+from reactorwatch.cli.options import Json, existing, existing_recording, new_file, span_ns
 from reactorwatch.errors import InputError
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("recover")(recover)
+    app.command("info")(info)
+    app.command("cut")(cut)
+    app.command("merge")(merge)
 
 
 def recover(
@@ -36,6 +39,70 @@ def recover(
     with task(f"recovering {file.name}"):
         saved = save(file, out)
     typer.echo(msgspec.json.encode(saved_object(saved, out)).decode() if as_json else saved_text(saved, file, out))
+
+
+def info(
+    file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
+    as_json: Json = False,
+) -> None:
+    """Say what is in a recording, and what is missing."""
+    import msgspec
+
+    from reactorwatch.cli.progress import task
+    from reactorwatch.cli.recording_reports import info_object, info_text
+    from recorder.look import look_over
+
+    with task(f"reading {file.name}"):
+        seen = look_over(existing_recording(file))
+    typer.echo(msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file))
+
+
+def cut(
+    file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.mcap).", show_default=False)],
+    begin: Annotated[
+        str | None, typer.Option("--from", help="Since the start, such as 10min [the start].", show_default=False)
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option("--to", help="Since the start, such as 20min [the end].", show_default=False)
+    ] = None,
+) -> None:
+    """Copy a stretch of plant time out of a recording."""
+    from reactorwatch.cli.progress import task
+    from recorder.cut import cut as copy
+    from recorder.cut import sampled_between
+    from recorder.look import zero_ns_of
+    from recorder.mcap_file import ZERO_NS, read_metadata, recordings_in
+
+    from_ns = span_ns(begin, "--from") if begin is not None else 0
+    to_ns = span_ns(end, "--to") if end is not None else 2**63
+    if from_ns >= to_ns:
+        raise InputError(f"--from must be before --to, got {begin} and {end}")
+    out = new_file(out)
+    with task(f"cutting {file.name}"):
+        sources = recordings_in(existing_recording(file))
+        zero_ns = zero_ns_of(file)
+        window = sampled_between(sources, zero_ns + from_ns, zero_ns + to_ns)
+        about = {**read_metadata(file), "cut": f"from {begin or 'the start'} to {end or 'the end'} of {file.name}"}
+        count = copy(sources, out, window, {**about, ZERO_NS: str(zero_ns)})
+    typer.echo(f"wrote {out}: {count} messages")
+
+
+def merge(
+    files: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders of them.", show_default=False)],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.mcap).", show_default=False)],
+) -> None:
+    """Put several recordings into one, in order of receipt."""
+    from reactorwatch.cli.progress import task
+    from recorder.cut import merge as join
+    from recorder.mcap_file import read_metadata, recordings_in
+
+    out = new_file(out)
+    with task(f"merging into {out.name}"):
+        sources = [source for file in files for source in recordings_in(existing_recording(file))]
+        about = {**read_metadata(files[0]), "merged": ", ".join(source.name for source in sources)}
+        count = join(sources, out, about)
+    typer.echo(f"wrote {out}: {count} messages")
 
 
 def _beside(file: Path) -> Path:

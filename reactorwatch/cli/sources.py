@@ -1,4 +1,7 @@
-"""Wherever a file is asked for, `.csv` and `.mcap` both serve: this turns either into a record or into messages."""
+"""Wherever a file is asked for, `.csv` and `.mcap` both serve: this turns either into a record or into messages.
+
+A folder stands for the recordings in it, as one.
+"""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,11 +63,13 @@ def zero_of(path: Path, first_ns: int) -> int:
 
 
 def kind(path: Path) -> str:
-    """`csv` or `mcap`, by the file's ending.
+    """`csv` or `mcap`, by the file's ending; a folder is of recordings.
 
     Raises:
         InputError: neither.
     """
+    if path.is_dir():
+        return "mcap"
     ending = path.suffix.lower().removeprefix(".")
     if ending not in ("csv", "mcap"):
         raise InputError(f"{path}: must be a .csv or .mcap file, got {path.suffix or 'no ending'}")

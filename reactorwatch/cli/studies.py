@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Json, Plant, Settings, columns, existing, new_file
+from reactorwatch.cli.options import Columns, Json, Plant, Settings, columns, existing_recording, new_file
 
 
 def add_to(app: typer.Typer) -> None:
@@ -33,7 +33,7 @@ def simulate(
     from reactorwatch.cli.sources import record
     from reactorwatch.records.csv_file import write_csv
 
-    measured = record(existing(file), plant, columns(column))
+    measured = record(existing_recording(file), plant, columns(column))
     out = new_file(out)
     with task(f"simulating {file.name}"):
         simulated = free_run(measured, fault or [])
@@ -59,7 +59,7 @@ def backtest(
     from reactorwatch.cli.sources import messages, plant_of, zero_of
     from reactorwatch.runtime.config import read_settings, section
 
-    existing(file)
+    existing_recording(file)
     name = plant_of(file, plant)
     flags = {"plant": name, "training_min": training}
     settings = section(MonitorConfig, "monitor", read_settings(config), flags)

@@ -68,14 +68,14 @@ def run_until_stopped(config: Path | None, endpoint: str | None, out: Path, flag
 
 
 def _write_down(out: Path, recorder: RecorderConfig, seed: int, others: dict[str, msgspec.Struct]) -> Path:
-    """Write the whole settings beside where the recording will be, under the same name; returns their file."""
+    """Write the whole settings where the recordings will be, named after the moment as they are; returns their file."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--out {out}: the folder cannot be made: {error.strerror}") from error
-    recording = file_for(msgspec.structs.replace(recorder, out=str(out)), datetime.now(UTC))
-    settings = recording.with_suffix(".toml")
+    recorder = msgspec.structs.replace(recorder, out=str(out))
+    settings = file_for(recorder, datetime.now(UTC)).with_suffix(".toml")
     about = {"seed": str(seed), "settings": settings_text(others), **recorder.about}
-    recorder = msgspec.structs.replace(recorder, out=str(recording), about=about)
+    recorder = msgspec.structs.replace(recorder, about=about)
     write_settings(settings, {**others, "recorder": recorder})
     return settings

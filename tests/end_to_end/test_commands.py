@@ -23,7 +23,7 @@ from .conftest import PATIENCE_S, Command, Start, WaitAlive
 COMMANDS = (
     *("up", "demo", "alarm"),
     *("plant", "monitor", "record", "replay", "alive"),
-    *("dashboard", "import", "export", "recover"),
+    *("dashboard", "import", "export", "recover", "info", "cut", "merge"),
     *("simulate", "backtest", "identify", "linearise", "reproduce", "charts"),
 )
 
@@ -63,7 +63,14 @@ def record_csv(tmp_path: Path) -> Path:
         (["fly"], "No such command 'fly'"),
         (["replay"], "Missing argument"),
         (["backtest", "nowhere.csv"], "nowhere.csv: there is no such file"),
-        (["backtest", "."], "is a folder"),
+        (["backtest", "."], "BAD.mcap"),  # a folder stands for the recordings in it
+        (["import", ".", "-o", "OUT"], "is a folder"),
+        (["recover", "BAD.mcap"], "BAD.mcap: expected an MCAP recording, got another kind of file"),
+        (["recover", "BAD.mcap", "-o", "no/such/a.mcap"], "folder"),
+        (["info", "BAD.mcap"], "expected an MCAP recording, got another kind of file"),
+        (["cut", "BAD.mcap", "--from", "soon", "-o", "a.mcap"], "--from must be a number with s, min or h"),
+        (["cut", "BAD.mcap", "--from", "2min", "--to", "60s", "-o", "a.mcap"], "--from must be before --to"),
+        (["merge", "BAD.mcap", "-o", "a.mcap"], "expected an MCAP recording, got another kind of file"),
         (["backtest", "BAD.txt"], "must be a .csv or .mcap file"),
         (["backtest", "BAD.csv"], "row 3"),
         (["backtest", "BAD.mcap"], "BAD.mcap"),

@@ -1,0 +1,183 @@
+"""What does a recorder lose that is killed (SIGKILL) under load?
+
+A publisher sends 5,000 samples a second through a real router. A recorder of its own process is killed at a random
+moment, started again, killed again; each start recovers what the kill before it left. Afterwards every file is read: by
+the sequence numbers nothing may be missing between its first sample and its last, and its last may be a second older
+than the kill.
+
+    python benchmarks/recorder_kills.py [how many kills]
+"""
+
+import contextlib
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from reactorwatch.contract import keys
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import Publication, decode, encode
+from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.serve import StopSignal
+from recorder.mcap_file import read_messages, recordings_in
+
+KILLS = 50
+RATE_PER_S = 5_000
+SIGNALS = 5
+BATCHES_PER_S = 100
+SOONEST_S, LATEST_S = 0.5, 4.0
+PATIENCE_S = 60.0
+
+
+@dataclass(frozen=True)
+class Killed:
+    """What a kill left.
+
+    Attributes:
+        messages: samples in the recovered file.
+        lost_s: from the last sample in the file to the kill.
+        missing: samples that are missing between the first and the last of the file, by sequence number.
+        late: samples that were published after the recorder was alive and before the first in its file.
+    """
+
+    messages: int
+    lost_s: float
+    missing: int
+    late: int
+
+
+class Publisher:
+    """Publishes samples at a rate, each with the time at which it was published, until it is closed."""
+
+    def __init__(self, bus: ZenohBus, rate_per_s: int) -> None:
+        self._bus = bus
+        self._rows = rate_per_s // SIGNALS // BATCHES_PER_S
+        self._ended = threading.Event()
+        self.sequence = 0
+        """Of the samples that are published next."""
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Publish no more."""
+        self._ended.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while not self._ended.wait(max(0.0, due - time.monotonic())):
+            due += 1.0 / BATCHES_PER_S
+            for _ in range(self._rows):
+                for number in range(SIGNALS):
+                    sample = messages.Sample(
+                        time_ns=time.time_ns(), sequence=self.sequence, value=1.0, quality=messages.QUALITY_GOOD
+                    )
+                    self._bus.publish(encode(Publication(keys.key("cstr", keys.SAMPLE, f"x{number}"), sample)))
+                self.sequence += 1
+
+
+class Tokens:
+    """Whether a recorder shows that it is alive."""
+
+    def __init__(self, bus: ZenohBus) -> None:
+        self._changed = threading.Condition()
+        self._alive = False
+        bus.watch_alive(keys.key("cstr", keys.ALIVE, "recorder"), self._on_token)
+
+    def wait(self, *, alive: bool) -> None:
+        """Wait until it does, or does not."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: self._alive == alive, PATIENCE_S), "no recorder, or no end of it"
+
+    def _on_token(self, _key: str, alive: bool) -> None:
+        with self._changed:
+            self._alive = alive
+            self._changed.notify_all()
+
+
+@contextlib.contextmanager
+def recorder(folder: Path, endpoint: str, tokens: "Tokens") -> Iterator[subprocess.Popen[bytes]]:
+    """A recorder that is alive, after the one before is known to be gone."""
+    settings = folder / "settings.toml"
+    settings.write_text(f'[bus]\nendpoint = "{endpoint}"\n[recorder]\nout = "{folder}"\n')
+    tokens.wait(alive=False)
+    process = subprocess.Popen([sys.executable, "-m", "recorder", str(settings)], stderr=subprocess.DEVNULL)
+    try:
+        tokens.wait(alive=True)
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Killed]:
+    """Kill a recorder so many times, at random moments, and look at what is there in the end."""
+    random = np.random.default_rng(seed)
+    config = BusConfig(endpoint=free_endpoint())
+    hub = router(config)
+    bus = connect(config, "kills", StopSignal())
+    assert bus is not None
+    tokens = Tokens(bus)  # on the publisher's own link, where the subscription is known before the token
+    publisher = Publisher(bus, rate_per_s)
+    alive_at, killed_ns = [], []
+    try:
+        for _ in range(kills):
+            with recorder(folder, config.endpoint, tokens) as process:
+                alive_at.append(publisher.sequence)
+                time.sleep(random.uniform(SOONEST_S, LATEST_S))
+                killed_ns.append(time.time_ns())
+                process.send_signal(signal.SIGKILL)
+        with recorder(folder, config.endpoint, tokens) as process:
+            process.terminate()  # the last start recovers, too
+            process.wait(PATIENCE_S)
+    finally:
+        publisher.close()
+        bus.close()
+        hub.close()
+    left = [path.name for path in folder.iterdir() if path.suffix not in (".mcap", ".toml")]
+    assert not left, f"not recovered: {left}"
+    files = recordings_in(folder)[:kills]
+    return [_look(path, at, alive) for path, at, alive in zip(files, killed_ns, alive_at, strict=True)]
+
+
+def _look(path: Path, killed_ns: int, alive: int) -> Killed:
+    numbers: dict[str, list[int]] = {}
+    last_ns: dict[str, int] = {}
+    for entry in read_messages(path, {keys.SAMPLE}):
+        sample = decode(entry.payload, entry.encoding)
+        assert isinstance(sample, messages.Sample)
+        numbers.setdefault(entry.key, []).append(sample.sequence)
+        last_ns[entry.key] = sample.time_ns
+    assert len(numbers) == SIGNALS, f"{path}: holds {len(numbers)} signals"
+    return Killed(
+        messages=sum(map(len, numbers.values())),
+        lost_s=(killed_ns - min(last_ns.values())) / 1e9,
+        missing=sum(found[-1] - found[0] + 1 - len(found) for found in numbers.values()),
+        late=sum(max(0, found[0] - alive) for found in numbers.values()),
+    )
+
+
+def main() -> None:
+    """Print what was lost."""
+    kills = int(sys.argv[1]) if len(sys.argv) > 1 else KILLS
+    with tempfile.TemporaryDirectory() as folder:
+        found = kill_often(Path(folder), kills, RATE_PER_S, seed=1)
+    lost = np.array([killed.lost_s for killed in found])
+    print(f"kills at {RATE_PER_S:,} samples/s               {len(found)}, each file recovered")
+    print(f"lost before the kill, s               median {np.median(lost):.2f}, longest {lost.max():.2f}")
+    print(f"samples missing within the files      {sum(killed.missing for killed in found)}")
+    print(f"samples missing at their beginnings   {sum(killed.late for killed in found)}")
+    print(f"samples in the files                  {sum(killed.messages for killed in found):,}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,74 @@
+"""A recording looked over: a file in whatever state, or the files in a folder."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, decode
+from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.errors import InputError
+from recorder.mcap_file import METADATA, ZERO_NS, read_messages, read_metadata
+from recorder.mcap_scan import Scan
+from recorder.overview import Overview, overview
+
+
+@dataclass(frozen=True)
+class Look:
+    """What was seen.
+
+    Attributes:
+        overview: what is in it.
+        metadata: what it says about its origin, or the first file of a folder does.
+        zero_ns: the time that its minutes count from.
+        damages: what of it cannot be read; empty if it is whole.
+    """
+
+    overview: Overview
+    metadata: dict[str, str]
+    zero_ns: int
+    damages: tuple[str, ...]
+
+
+def look_over(path: Path) -> Look:
+    """Look over a recording; a single file may be damaged, or still be written.
+
+    Raises:
+        InputError: it is no recording, or a file of the folder is damaged.
+    """
+    if path.is_dir():
+        found, metadata = overview(read_messages(path)), read_metadata(path)
+        return Look(found, metadata, _zero_ns(metadata, found.first_sample_ns), ())
+    scan = Scan(path)
+    found = overview(stored.entry for stored in scan)
+    metadata = next((record.metadata for record in scan.metadata if record.name == METADATA), {})
+    damages = [str(damage) for damage in scan.damages]
+    if scan.orphans:
+        damages.append(f"{scan.orphans} messages of channels that are described nowhere")
+    return Look(found, metadata, _zero_ns(metadata, found.first_sample_ns), tuple(damages))
+
+
+def zero_ns_of(path: Path) -> int:
+    """The time that the minutes of a recording count from: what it says itself, else its first sample.
+
+    Raises:
+        InputError: it holds no sample, or it is damaged.
+    """
+    first_ns: int | None = None
+    for entry in read_messages(path, {keys.SAMPLE}):
+        try:
+            sample: Any = decode(entry.payload, entry.encoding)
+        except DecodeError:
+            continue
+        if isinstance(sample, Sample) and (first_ns is None or sample.time_ns < first_ns):
+            first_ns = sample.time_ns
+    if first_ns is None:
+        raise InputError(f"{path}: holds no sample")
+    return _zero_ns(read_metadata(path), first_ns)
+
+
+def _zero_ns(metadata: dict[str, str], first_sample_ns: int) -> int:
+    try:
+        return int(metadata.get(ZERO_NS, first_sample_ns))
+    except ValueError:
+        return first_sample_ns

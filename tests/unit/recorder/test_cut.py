@@ -1,0 +1,164 @@
+"""Recordings out of recordings: a stretch of time, and several as one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reactorwatch.contract import keys
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
+from reactorwatch.errors import InputError
+from reactorwatch.records.record import to_time_ns
+from recorder.cut import cut, merge, received_between, sampled_between
+from recorder.entry import Entry
+from recorder.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
+from tests.unit.recorder import golden
+
+MINUTE = 60_000_000_000
+ENTRIES = list(golden.entries())
+
+
+def recorded(path: Path, entries: list[Entry], every: int = 100, metadata: dict[str, str] | None = None) -> Path:
+    with RecordingWriter(path, metadata or {}) as writer:
+        for number, entry in enumerate(entries, start=1):
+            writer.write(entry)
+            if number % every == 0:
+                writer.flush()
+    return path
+
+
+def at(minutes: float) -> int:
+    return to_time_ns(minutes, golden.ZERO_NS)
+
+
+def test_a_cut_by_receipt_holds_what_was_received_then(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "run.mcap", ENTRIES)
+    window = received_between(ENTRIES[250].log_time_ns, ENTRIES[449].log_time_ns)
+    assert cut([source], tmp_path / "cut.mcap", window, {}) == 200
+    kept = [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.repeated]
+    assert kept == ENTRIES[250:450]
+
+
+def test_a_cut_by_sample_time_holds_what_speaks_of_it_and_what_was_received_meanwhile(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "run.mcap", ENTRIES)
+    out = tmp_path / "cut.mcap"
+    cut([source], out, sampled_between([source], at(10.0), at(20.0)), {})
+    kept = [entry for entry in read_messages(out) if not entry.repeated]
+    spoken = [entry for entry in ENTRIES if "/health/" not in entry.key]
+    expected = [entry for entry in spoken if at(10.0) <= entry.publish_time_ns <= at(20.0)]
+    assert [entry for entry in kept if "/health/" not in entry.key] == expected
+    reports = [entry for entry in kept if "/health/" in entry.key]
+    assert [decode(entry.payload, entry.encoding) for entry in reports] == [
+        decode(entry.payload, entry.encoding)
+        for entry in ENTRIES
+        if "/health/" in entry.key and expected[0].log_time_ns <= entry.log_time_ns <= expected[-1].log_time_ns
+    ]
+    assert reports
+
+
+def test_a_cut_says_first_how_things_stood(tmp_path: Path) -> None:
+    """The fault sets in at 20 min and the alarm comes at 22: both stand when the cut begins."""
+    source = recorded(tmp_path / "run.mcap", ENTRIES)
+    out = tmp_path / "cut.mcap"
+    cut([source], out, sampled_between([source], at(24.0), at(30.0)), {})
+    entries = list(read_messages(out))
+    standing = [entry for entry in entries if entry.repeated]
+    assert entries[: len(standing)] == standing
+    assert [entry.key.split("/", 2)[2] for entry in standing] == ["fault/coolant_flow", "alarm/shewhart/T"]
+    again = tmp_path / "again.mcap"
+    cut([out], again, sampled_between([out], at(25.0), at(26.0)), {})
+    assert [entry[:3] for entry in read_messages(again) if entry.repeated] == [entry[:3] for entry in standing]
+
+
+def test_a_cut_of_several_files_goes_across_them(tmp_path: Path) -> None:
+    halves = [recorded(tmp_path / "b.mcap", ENTRIES[800:]), recorded(tmp_path / "a.mcap", ENTRIES[:800])]
+    window = received_between(ENTRIES[700].log_time_ns, ENTRIES[899].log_time_ns)
+    assert cut(halves, tmp_path / "cut.mcap", window, {}) == 200
+    assert [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.repeated] == ENTRIES[700:900]
+
+
+def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
+    strange = Entry("reactor/cstr/sample/T", b"\xff\xff", encoding_of(messages.Sample), ENTRIES[10].log_time_ns, 5)
+    path = tmp_path / "run.mcap"
+    with RecordingWriter(path, {}) as writer:
+        for entry in ENTRIES[:10]:
+            writer.write(entry)
+        writer.write(strange, readable=False)
+    window = received_between(ENTRIES[5].log_time_ns, strange.log_time_ns)
+    cut([path], tmp_path / "cut.mcap", window, {})
+    assert list(read_messages(tmp_path / "cut.mcap")) == [*ENTRIES[5:10], strange]
+
+
+def test_where_nothing_was_received_no_file_is_written(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "run.mcap", ENTRIES[:50])
+    with pytest.raises(InputError, match="holds no message of that time"):
+        cut([source], tmp_path / "cut.mcap", received_between(0, 10), {})
+    with pytest.raises(InputError, match="holds no sample of that time"):
+        sampled_between([source], at(500.0), at(600.0))
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_no_source_is_written_over(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "run.mcap", ENTRIES[:50])
+    with pytest.raises(InputError, match="is one of the recordings that are read"):
+        cut([source], source, received_between(0, 2**63), {})
+    with pytest.raises(InputError, match="is one of the recordings that are read"):
+        merge([source], source, {})
+
+
+def test_a_damaged_source_is_told_and_nothing_is_written(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "run.mcap", ENTRIES)
+    content = source.read_bytes()
+    place = content.index(b"\x28\xb5\x2f\xfd", len(content) // 2)
+    source.write_bytes(content[:place] + bytes(30) + content[place + 30 :])
+    with pytest.raises(InputError, match=r"a chunk of \d+ bytes .*`reactorwatch recover"):
+        merge([source], tmp_path / "out.mcap", {})
+    source.write_bytes(content[:-1])
+    with pytest.raises(InputError, match=r"is cut off.*`reactorwatch recover"):
+        merge([source], tmp_path / "out.mcap", {})
+    assert list(tmp_path.iterdir()) == [source]
+
+
+def test_merging_what_was_recorded_side_by_side_gives_all_in_order_of_receipt(tmp_path: Path) -> None:
+    other = [entry._replace(key=entry.key.replace("cstr", "b")) for entry in ENTRIES]
+    a = recorded(tmp_path / "a.mcap", ENTRIES)
+    b = recorded(tmp_path / "b.mcap", other, every=33)
+    assert merge([b, a], tmp_path / "both.mcap", {"plant": "both"}) == 2 * len(ENTRIES)
+    both = list(read_messages(tmp_path / "both.mcap"))
+    assert [entry.log_time_ns for entry in both] == sorted(entry.log_time_ns for entry in (*ENTRIES, *other))
+    assert [entry for entry in both if "/cstr/" in entry.key] == ENTRIES
+    assert [entry for entry in both if "/b/" in entry.key] == other
+    assert plants_in(tmp_path / "both.mcap") == ("b", "cstr")
+    assert read_metadata(tmp_path / "both.mcap")["plant"] == "both"
+
+
+def test_cutting_in_two_and_merging_gives_the_same_record(tmp_path: Path) -> None:
+    source = recorded(tmp_path / "run.mcap", ENTRIES)
+    parts = []
+    for number, (begin, end) in enumerate(((0.0, 15.0), (15.05, 40.0))):
+        parts.append(tmp_path / f"{number}.mcap")
+        cut([source], parts[-1], sampled_between([source], at(begin), at(end)), {})
+    merge(parts, tmp_path / "again.mcap", {})
+    first, again = read_record(source), read_record(tmp_path / "again.mcap")
+    assert np.array_equal(first.time_min, again.time_min)
+    for signal in ("qc", "C", "T"):
+        assert np.array_equal(first.columns[signal], again.columns[signal])
+    assert [entry for entry in read_messages(tmp_path / "again.mcap") if entry.repeated] == []
+
+
+def test_the_model_that_stands_is_that_of_the_moment_and_not_a_later_one(tmp_path: Path) -> None:
+    entries = []
+    for number in range(20):
+        kind = messages.ModelSnapshot(time_ns=number * MINUTE, rows=number) if number % 5 == 0 else None
+        sample = messages.Sample(time_ns=number * MINUTE, sequence=number, quality=messages.QUALITY_GOOD)
+        for what, message in ((keys.MODEL, kind), (keys.SAMPLE, sample)):
+            if message is not None:
+                encoded = encode(Publication(keys.key("cstr", what, "T"), message))
+                entries.append(Entry(*encoded[:3], 10 + number * MINUTE, number * MINUTE))
+    source = recorded(tmp_path / "run.mcap", entries, every=1000)
+    cut([source], tmp_path / "cut.mcap", sampled_between([source], 12 * MINUTE, 14 * MINUTE), {})
+    (standing,) = [entry for entry in read_messages(tmp_path / "cut.mcap") if entry.repeated]
+    model = decode(standing.payload, standing.encoding)
+    assert isinstance(model, messages.ModelSnapshot)
+    assert model.rows == 10

@@ -1,0 +1,100 @@
+"""What is told of a recording."""
+
+from collections import Counter
+from pathlib import Path
+
+from reactorwatch.contract import keys
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import Publication, encode
+from recorder.entry import Entry
+from recorder.look import look_over, zero_ns_of
+from recorder.mcap_file import RecordingWriter
+from recorder.overview import Gap, overview
+from tests.unit.recorder import golden
+
+SECOND = 1_000_000_000
+KEY = "reactor/cstr/sample/T"
+
+
+def entry(key: str, message: messages.Sample | messages.Alarm, received_ns: int, *, repeated: bool = False) -> Entry:
+    encoded = encode(Publication(key, message))
+    return Entry(*encoded[:3], received_ns, message.time_ns, repeated)
+
+
+def sampled(*sequences: int) -> list[Entry]:
+    """Samples that were taken a second apart, by their number, and received in this order."""
+    return [
+        entry(
+            KEY, messages.Sample(time_ns=1000 + number * SECOND, sequence=number, quality=messages.QUALITY_GOOD), place
+        )
+        for place, number in enumerate(sequences, start=1)
+    ]
+
+
+def alarm(at: int, event: str, raised: int, cleared: int = 0, *, repeated: bool = False) -> Entry:
+    key = keys.key("cstr", keys.ALARM, "ewma/T")
+    message = messages.Alarm(time_ns=at, alarm="ewma/T", event=event, raised_ns=raised, cleared_ns=cleared)
+    return entry(key, message, at, repeated=repeated)
+
+
+def test_counts_and_times_are_those_of_the_entries() -> None:
+    entries = list(golden.entries())
+    seen = overview(entries)
+    assert {key: topic.count for key, topic in seen.topics.items()} == Counter(entry.key for entry in entries)
+    assert (seen.first_ns, seen.last_ns) == (entries[0].log_time_ns, entries[-1].log_time_ns)
+    assert (seen.first_sample_ns, seen.last_sample_ns) == (golden.time_ns(0), golden.time_ns(golden.ROWS - 1))
+    assert (seen.messages, seen.lost, seen.gaps) == (len(entries), 0, [])
+
+
+def test_gaps_are_named_by_the_numbers_that_are_missing() -> None:
+    seen = overview(sampled(0, 1, 2, 5, 6, 10))
+    after = [1000 + 2 * SECOND, 1000 + 6 * SECOND]
+    assert seen.gaps == [Gap(KEY, 3, 4, after[0]), Gap(KEY, 7, 9, after[1])]
+    assert seen.lost == 5
+
+
+def test_what_came_late_is_not_missing() -> None:
+    seen = overview(sampled(0, 5, 3, 9, 1))
+    assert [(gap.first, gap.last) for gap in seen.gaps] == [(2, 2), (4, 4), (6, 8)]
+    assert (seen.lost, seen.out_of_order) == (5, 2)
+
+
+def test_what_is_said_again_is_not_counted_but_tells_of_an_alarm_that_stands() -> None:
+    seen = overview([alarm(10, "raised", 10, repeated=True), *sampled(0, 1), alarm(30, "cleared", 10, 30)])
+    assert seen.messages == 3
+    assert [(item.raised_ns, item.cleared_ns) for item in seen.alarms] == [(10, 30)]
+
+
+def test_alarms_are_told_with_their_ends() -> None:
+    seen = overview(
+        [
+            alarm(10, "raised", 10),
+            alarm(12, "suspected", 10),
+            alarm(15, "acknowledge", 10),
+            alarm(20, "cleared", 10, 20),
+            alarm(30, "raised", 30),
+        ]
+    )
+    assert [(item.alarm, item.raised_ns, item.cleared_ns) for item in seen.alarms] == [
+        ("ewma/T", 10, 20),
+        ("ewma/T", 30, None),
+    ]
+
+
+def test_a_file_that_is_cut_off_is_looked_over_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    entries = list(golden.entries())
+    with RecordingWriter(path, {"plant": "cstr", "seed": "5"}) as writer:
+        for number, item in enumerate(entries, start=1):
+            writer.write(item)
+            if number == 1000:
+                writer.flush()
+                half = (tmp_path / "run.mcap.part").stat().st_size
+    whole = look_over(path)
+    assert (whole.overview.messages, whole.damages, whole.metadata["seed"]) == (len(entries), (), "5")
+    assert whole.zero_ns == zero_ns_of(path) == golden.ZERO_NS
+    assert look_over(tmp_path).overview == whole.overview
+    path.write_bytes(path.read_bytes()[:half])
+    cut_off = look_over(path)
+    assert cut_off.overview.messages == 1000
+    assert cut_off.damages == (f"cut off at byte {half}",)
