@@ -24,6 +24,7 @@ import numpy as np
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode
+from reactorwatch.runtime import logs
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
@@ -132,7 +133,7 @@ def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Kil
     try:
         for _ in range(kills):
             with recorder(folder, config.endpoint, tokens) as process:
-                alive_at.append(publisher.sequence)
+                alive_at.append(publisher.sequence + 1)  # the row that is being published may be half heard
                 time.sleep(random.uniform(SOONEST_S, LATEST_S))
                 killed_ns.append(time.time_ns())
                 process.send_signal(signal.SIGKILL)
@@ -168,6 +169,7 @@ def _look(path: Path, killed_ns: int, alive: int) -> Killed:
 
 def main() -> None:
     """Print what was lost."""
+    logs.configure()  # to standard error
     kills = int(sys.argv[1]) if len(sys.argv) > 1 else KILLS
     with tempfile.TemporaryDirectory() as folder:
         found = kill_often(Path(folder), kills, RATE_PER_S, seed=1)

@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from mcap.reader import make_reader
@@ -32,9 +32,13 @@ from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal
+from recorder.__main__ import files_for, node_for
+from recorder.config import RecorderConfig
 from recorder.core import Recorder
 from recorder.entry import Entry
+from recorder.filing import Fsync
 from recorder.mcap_file import RecordingWriter, read_messages, read_metadata, read_record
+from recorder.part_file import PartFile
 from recorder.rerun_file import write_rrd
 from recorder.run import read_run
 
@@ -42,6 +46,7 @@ RATE_PER_S = 20_000
 SECONDS = 5
 MESSAGES = 200_000
 SIGNALS = ("qc", "C", "T")
+FSYNC_RATE_PER_S, FSYNC_SECONDS = 5_000, 30
 
 
 def samples(count: int) -> list[Encoded]:
@@ -171,6 +176,41 @@ def files(folder: Path) -> None:
     print(f"dashboard of a million samples           {per_million_s:5.1f} s (this process peaks at {peak_mb:.0f} MB)")
 
 
+class Timed(PartFile):
+    """A file that knows how long it was waited for."""
+
+    waits_s: ClassVar[list[float]] = []
+
+    def sync(self) -> None:
+        """See `PartFile`."""
+        start = time.perf_counter()
+        super().sync()
+        self.waits_s.append(time.perf_counter() - start)
+
+
+def fsync(folder: Path) -> None:
+    """What it costs to wait for the disk, for each second of traffic at 5,000 messages/s."""
+    sent = samples(FSYNC_RATE_PER_S * FSYNC_SECONDS)
+    step_ns = 1_000_000_000 // FSYNC_RATE_PER_S
+    policies: tuple[Fsync, ...] = ("never", "second", "chunk")
+    for policy in policies:
+        config = RecorderConfig(out=str(folder / f"{policy}.mcap"), fsync=policy)
+        Timed.waits_s.clear()
+        start = time.perf_counter()
+        with files_for(config, Timed) as recorded:
+            recorded.begin((), 0)
+            node = node_for(config, recorded, 0)
+            for number, message in enumerate(sent):
+                node.on_message(message, number * step_ns)
+        took_ms = (time.perf_counter() - start) * 1e3 / FSYNC_SECONDS
+        waited_ms = sum(Timed.waits_s) * 1e3 / FSYNC_SECONDS
+        longest_ms = max(Timed.waits_s, default=0.0) * 1e3
+        print(
+            f"fsync {policy:6s} of a second of traffic   {waited_ms:5.1f} ms waited, {longest_ms:.0f} ms the longest, "
+            f"{took_ms:.0f} ms work in all"
+        )
+
+
 def csv(folder: Path) -> None:
     """Reading a million rows, over NumPy's own parser."""
     path, rows = folder / "run.csv", 1_000_000
@@ -197,6 +237,7 @@ def main() -> None:
             asked = f"at {rate:,.0f}/s" if rate else "flat out"
             print(f"recorded / published, {asked:18s} {share:5.3f}   ({got:,.0f} messages/s, lag up to {lag_s:.2f} s)")
         files(folder)
+        fsync(folder)
         csv(folder)
 
 

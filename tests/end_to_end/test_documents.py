@@ -36,7 +36,7 @@ def test_the_readme_s_commands_on_a_record_work_as_they_stand(tmp_path: Path, co
     config = PlantConfig(seed=3, faults=("coolant_flow:step:-0.15@120min",))
     write_csv(tmp_path / "record.csv", simulate_record(config, 1500))
     lines = [line.removeprefix("$ ") for block in RUN_BLOCKS for line in block.splitlines()]
-    assert len(lines) == 7
+    assert len(lines) == 10
     said = []
     for line in lines:
         name, *arguments = shlex.split(line)

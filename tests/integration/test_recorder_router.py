@@ -158,11 +158,19 @@ def test_a_recorder_that_never_finds_a_router_leaves_no_file(tmp_path: Path) -> 
     assert not list(tmp_path.iterdir())
 
 
-def test_a_replay_that_waits_for_the_recorder_is_recorded_bit_for_bit(tmp_path: Path, bus_config: BusConfig) -> None:
-    first, second, stop = tmp_path / "first.mcap", tmp_path / "second.mcap", StopSignal()
-    with RecordingWriter(first, {}) as writer:
-        for entry in golden.entries():
-            writer.write(entry)
+@pytest.mark.parametrize("files", [1, 3], ids=["a file", "a folder of three"])
+def test_a_replay_that_waits_for_the_recorder_is_recorded_bit_for_bit(
+    tmp_path: Path, bus_config: BusConfig, files: int
+) -> None:
+    first, second, stop = tmp_path / "first", tmp_path / "second.mcap", StopSignal()
+    first.mkdir()
+    entries = list(golden.entries())
+    for number in range(files):
+        with RecordingWriter(first / f"{number}.mcap", {}) as writer:
+            for entry in entries[number * len(entries) // files : (number + 1) * len(entries) // files]:
+                writer.write(entry)
+    if files == 1:
+        first /= "0.mcap"
     played = ReplayConfig(file=str(first), rate=float("inf"), wait_for=("recorder",))
     player = threading.Thread(target=replay, args=(played, bus_config, StopSignal()))
     player.start()
