@@ -183,7 +183,7 @@ def _noise(circumstances: Circumstances, rows: int, rng: np.random.Generator) ->
 
 def _record(plan: Plan, played: Played, noise: Array, circumstances: Circumstances, rng: np.random.Generator) -> Record:
     """What is measured of a run."""
-    values = np.stack([played.C, played.T], axis=1) + noise
+    values = np.stack([played.concentration, played.temperature], axis=1) + noise
     if circumstances.outliers:
         off = rng.random(values.shape) < circumstances.outliers
         far = rng.uniform(10.0, 30.0, values.shape) * rng.choice([-1.0, 1.0], values.shape)
@@ -215,5 +215,7 @@ def _strength(plan: Plan, played: Played, others: dict[str, HiddenCourse], noise
         fed = replace(fed, start=(float(played.state[0, 0]), float(played.state[0, 1])))
     told = play(fed)
     sd = noise_sd
-    off = np.minimum(((told.C - played.C) / sd[0]) ** 2, 1e4) + np.minimum(((told.T - played.T) / sd[1]) ** 2, 1e4)
+    off = np.minimum(((told.concentration - played.concentration) / sd[0]) ** 2, 1e4) + np.minimum(
+        ((told.temperature - played.temperature) / sd[1]) ** 2, 1e4
+    )
     return float(np.sum(off))

@@ -111,14 +111,14 @@ class Played(NamedTuple):
 
     Attributes:
         qc: commanded, l/min.
-        C: what the analyser shows without noise, mol/l.
-        T: what the thermometer shows without noise, K.
+        concentration: that the analyser shows without noise, mol/l.
+        temperature: that the thermometer shows without noise, K.
         state: C and T in the reactor, shape (rows, 2).
     """
 
     qc: Array
-    C: Array
-    T: Array
+    concentration: Array
+    temperature: Array
     state: Array
 
 
