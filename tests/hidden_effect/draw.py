@@ -144,7 +144,7 @@ def _course(effect: HiddenEffect, kind: str | None, time_min: Array, rng: np.ran
             constant = span * float(np.exp(rng.uniform(np.log(0.02), np.log(0.3))))
             return HiddenCourse(kind, size, onset, time_constant_min=constant)
         case "sine":
-            period = float(np.exp(rng.uniform(np.log(5.0), np.log(span / 3.0))))
+            period = float(np.exp(rng.uniform(np.log(min(5.0, span / 10.0)), np.log(span / 3.0))))
             return HiddenCourse(kind, abs(size), begin, period_min=period, phase_rad=float(rng.uniform(-pi, pi)))
         case "pulses":
             return HiddenCourse(kind, size, begin, period_min=float(rng.uniform(4.0, 15.0)))

@@ -1,0 +1,87 @@
+"""The study scores what was judged, draws each cause as often, and writes it down."""
+
+import json
+from math import isnan, nan
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.diagnosis_study import judged as run_one
+from benchmarks.diagnosis_study import page
+from benchmarks.hidden.classes import CLASSES, class_named, drawn, seed_of
+from benchmarks.hidden.score import Score, confusion
+from benchmarks.hidden.tables import failures, main_table
+from tests.hidden_effect.catalogue import named
+from tests.hidden_effect.judge import Judged
+
+
+def one(truth: str, said: str, **more: object) -> Judged:
+    """A judged record, by names alone."""
+    found = Judged(1, (truth,) if truth else (), ("step",) if truth else (), (2.0,) if truth else (), 1000.0)
+    told = {"verdict": "named" if said else "nominal", "said": (said,) if said else (), "profiles": ("step",)}
+    return Judged(**(found.__dict__ | told | {"first": truth == said, "listed": truth == said, "count": 1} | more))
+
+
+def test_shares_are_shares_of_all_records() -> None:
+    score = Score.of([one("a", "a"), one("a", "b", listed=True, count=3), one("b", ""), one("b", "b")])
+    assert score.first == 0.5
+    assert score.listed == 0.75
+    assert score.count == 1.5
+    assert score.wrong == 0.25
+
+
+def test_a_quantile_is_a_value_that_occurred_and_what_is_no_number_counts_as_the_worst() -> None:
+    score = Score.of([one("a", "a", held_out=value) for value in (1.0, 1.1, 1.2, nan)])
+    assert score.held_out == (1.1, np.inf)
+
+
+def test_where_there_is_nothing_there_is_no_score() -> None:
+    assert isnan(Score.of([]).first)
+
+
+def test_a_diagnosis_that_came_to_no_end_counts_as_a_miss() -> None:
+    score = Score.of([one("a", "a"), one("a", "", verdict="", remark="InputError: no")])
+    assert score.first == 0.5
+    assert score.errors == 1
+
+
+def test_the_confusion_table_counts_what_each_truth_was_called() -> None:
+    found = dict(confusion([one("a", "a"), one("a", "b"), one("a", "a"), one("", "")]))
+    assert found == {"a": [("a", 2), ("b", 1)], "nominal": [("nominal", 1)]}
+
+
+def test_a_failure_is_told_with_its_seed() -> None:
+    (line,) = failures({"medium": [one("a", "a"), one("a", "b")]})
+    assert "seed 1" in line
+    assert "a step 2 " in line
+    assert "named b step" in line
+
+
+def test_causes_take_turns() -> None:
+    study = class_named("150 min")
+    found = [drawn(study, number, 50_000_000).causes[0] for number in range(len(named()))]
+    assert len(set(found)) >= len(named()) - 2  # one that cannot show gives way to the next
+
+
+def test_no_two_records_of_a_study_share_a_seed() -> None:
+    seeds = [seed_of(study, number, 1) for study in CLASSES for number in (0, 1, 99_999)]
+    assert len(set(seeds)) == len(seeds)
+
+
+def test_a_record_goes_through_and_comes_out_as_a_page(tmp_path: Path) -> None:
+    found = {"150 min": [run_one("150 min", 0, 60_000_000)]}
+    assert found["150 min"][0].remark == ""
+    text = page(found, 60_000_000)
+    assert main_table(found) in text
+    assert "60000000" in text
+    assert json.loads(json.dumps(found["150 min"][0].__dict__))["seconds"] > 0.0
+
+
+def test_nothing_is_hidden_in_a_nominal_record() -> None:
+    assert drawn(class_named("nominal"), 8, 70_000_000).causes == ()
+
+
+def test_an_unknown_class_is_refused_with_the_names_of_those_there_are() -> None:
+    with pytest.raises(KeyError, match=r"no class .easy.*closed loop"):
+        class_named("easy")
