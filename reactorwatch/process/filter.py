@@ -31,7 +31,7 @@ import struct
 from bisect import bisect_left
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from math import ceil, inf, log, nan, pi
+from math import ceil, inf, isfinite, log, nan, pi
 from typing import NamedTuple
 
 import msgspec
@@ -213,7 +213,7 @@ class Filter:
 
         Args:
             time_min: of the row.
-            inputs: that hold from this row on.
+            inputs: that hold from this row on; NaN: nobody knows them, so the filter begins anew with the next row.
             measured: one an output; NaN: missing.
             gate: standard deviations beyond which a measurement does not correct the state ...
             accept: ... unless this says so for its output; empty: for none.
@@ -232,8 +232,12 @@ class Filter:
         if not told[-1]:
             return self._begin(time_min, inputs, measured)
         self._memory_view[:] = self._after
-        self._time_min, self._inputs = time_min, tuple(inputs)
+        self._remember(time_min, inputs)
         return Innovation(told[:n], told[n : 2 * n], told[2 * n : 3 * n], told[3 * n : 4 * n])
+
+    def _remember(self, time_min: float, inputs: Sequence[float]) -> None:
+        """The row, if it is known what the inputs do from it on."""
+        self._time_min, self._inputs = time_min if isfinite(sum(inputs)) else None, tuple(inputs)
 
     def run(
         self,
@@ -277,7 +281,7 @@ class Filter:
                 done = self._run_chunk(chunk, rows[part], told[part], memory[part])
             if done:
                 row += done
-                self._time_min, self._inputs = float(record.time_min[row - 1]), tuple(record.inputs[row - 1].tolist())
+                self._remember(float(record.time_min[row - 1]), record.inputs[row - 1].tolist())
             else:
                 self._run_row(record, row, told, memory)
                 row += 1
@@ -360,5 +364,5 @@ class Filter:
         if found is not None:
             x, P = found
             self._memory[:] = [*x, *P.ravel()]
-            self._time_min, self._inputs = time_min, tuple(inputs)
+            self._remember(time_min, inputs)
         return self._nothing

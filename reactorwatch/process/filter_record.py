@@ -19,7 +19,7 @@ class FilterRecord:
 
     Attributes:
         time_min: shape (rows,).
-        inputs: shape (rows, n_u).
+        inputs: shape (rows, n_u); NaN where nobody knows them.
         measured: shape (rows, n_y); NaN where missing.
         gate: standard deviations beyond which a measurement does not correct the state ...
         accept: ... unless this says so, shape (rows, n_y).
@@ -61,7 +61,7 @@ class FilterRecord:
         accept = np.zeros(measured.shape, dtype=np.bool_) if accept is None else accept
         rows, near = np.zeros((count, 2 * n_u + 3 + 2 * n_y)), np.zeros(count, dtype=np.bool_)
         half = 0.5 * np.diff(time_min)
-        near[1:] = (half > 0.0) & (2.0 * half <= LONGEST_ROW_MIN)
+        near[1:] = (half > 0.0) & (2.0 * half <= LONGEST_ROW_MIN) & np.all(np.isfinite(inputs[:-1]), axis=1)
         rows[1:, :n_u], rows[:, n_u : 2 * n_u], rows[:, 2 * n_u] = inputs[:-1], inputs, time_min
         rows[1:, 2 * n_u + 1], rows[1:, 2 * n_u + 2] = half, half
         rows[:, -2 * n_y : -n_y], rows[:, -n_y:] = measured, np.where(accept, inf, gate)
