@@ -40,7 +40,9 @@ def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_m
         delay_min: shape (rows,), at least 0.
     """
     rows = run.time_min.size
-    true_min = np.maximum(run.time_min - np.maximum(delay_min, 0.0), run.time_min[0])
+    begins = np.array([0, *run.breaks])
+    begun_min = run.time_min[begins[np.searchsorted(begins, np.arange(rows), side="right") - 1]]
+    true_min = np.maximum(run.time_min - np.maximum(delay_min, 0.0), begun_min)
     times, where = np.unique(np.concatenate([run.time_min, true_min]), return_inverse=True)
     prompt, late = where[:rows], where[rows:]
     source = np.clip(np.searchsorted(run.time_min, times, side="right") - 1, 0, rows - 1)
