@@ -25,6 +25,7 @@ from diagnosis.result import (
 )
 from diagnosis.run import Run
 from diagnosis.search import Explained, Found, Search
+from diagnosis.unknown import unknown
 from reactorwatch.errors import InputError
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
@@ -71,16 +72,22 @@ def diagnose(
     found = with_pairs(search, search.found())
     best = found.best if found.nominal.bic - found.best.bic >= LEAST_GAIN else found.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
-    verdict = _verdict(found, best, adequacy)
+    verdict, location = _verdict(found, best, adequacy), best.hypothesis.sized.effects[0].location if best.key else ""
+    if verdict == UNKNOWN:
+        strange = unknown(search, best, effects)
+        if strange is not None:
+            location = strange.hypothesis.sized.effects[0].location
+        search.noise = found.noise
+        best.hypothesis.sized.noise = found.noise if best.key else found.own_noise
     before, after = gained(run, found.nominal, best)
     curves = _curves(run, model, found.nominal, best)
     return Diagnosis(
         samples=run.time_min.size,
         span_min=run.span_min,
         verdict=verdict,
-        causes=tuple(_causes(run, best)),
-        alternatives=tuple(_alternatives(found, best)),
-        location=best.hypothesis.sized.effects[0].location if best.key else "",
+        causes=tuple(_causes(run, best)) if verdict != UNKNOWN else (),
+        alternatives=tuple(_alternatives(found, best)) if verdict != UNKNOWN else (),
+        location=location,
         significant=verdict != NOMINAL,
         practical=_matters(curves, bands),
         gain=_gain(model, found, best, before, after),
@@ -92,8 +99,10 @@ def diagnose(
 
 
 def _verdict(found: Found, best: Explained, adequacy: Array) -> str:
+    if np.any(adequacy >= WHITE):
+        return UNKNOWN
     if best is found.nominal:
-        return NOMINAL if np.all(adequacy < WHITE) else UNKNOWN
+        return NOMINAL
     rivals = [item.bic - best.bic for item in found.explained if item.hypothesis.causes != best.hypothesis.causes]
     return AMBIGUOUS if rivals and min(rivals) < SURE else NAMED
 

@@ -61,7 +61,7 @@ def with_pairs(search: Search, found: Found) -> Found:
     if search.refitted(single).bic - best.bic < LEAST_PAIR_GAIN:
         return found
     explained = sorted(pairs.values(), key=lambda item: item.bic)
-    return Found(search.noise, found.nominal, explained)
+    return Found(search.noise, found.own_noise, found.nominal, explained)
 
 
 def _beginnings(explained: Sequence[Explained]) -> list[Explained]:

@@ -63,13 +63,17 @@ class Screen:
         model: of the plant.
         effects: the catalogue.
         run: the record.
+
+    Attributes:
+        direct: effects that act on the model's own states.
+        with_memory: the others.
     """
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run) -> None:
         self._model, self._run = model, run
         names = model.state_names
-        self._direct = tuple(effect for effect in effects if effect.extend(model).state_names == names)
-        self.with_memory = tuple(effect for effect in effects if effect not in self._direct)
+        self.direct = tuple(effect for effect in effects if effect.extend(model).state_names == names)
+        self.with_memory = tuple(effect for effect in effects if effect not in self.direct)
         self._period_min = float(np.median(np.diff(run.time_min)))
         self._beta = np.diff(run.time_min[1:])
         t = run.time_min
@@ -85,13 +89,9 @@ class Screen:
             replaced: places of those of its effects that rivals are looked for, to take their place; the others stay.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # about a run that has lost an unstable plant
-            w = clipped(fit.w[2:])
-            for place in replaced:
-                w = w + self._explained(hypothesis, fit, place)
-            ways = self._ways(hypothesis.sized, hypothesis.signals(fit), fit)
-            if not all(np.all(np.isfinite(item)) for item in (w, ways.F, ways.G, ways.K)):
+            ways = self.ways_of_all(hypothesis, fit, replaced)
+            if not all(np.all(np.isfinite(item)) for item in (ways.w, ways.F, ways.G, ways.K)):
                 return []
-            ways = Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, w)
             found = self._set_in(ways) + self._swinging(ways) + self._in_course(ways, self._free, np.empty(0))
             for place in replaced:
                 course, theta = hypothesis.courses[place], fit.theta[place]
@@ -99,6 +99,20 @@ class Screen:
                     found += self._in_course(ways, course, theta[course.coefficients :])
         found = [item for item in found if np.isfinite(item.gain) and np.all(np.isfinite(item.theta))]
         return sorted(found, key=lambda item: -item.score(self._run.values))
+
+    def ways_of_all(self, hypothesis: Hypothesis, fit: Fit, replaced: Sequence[int]) -> Ways:
+        """The equations of the filter's errors, of all effects in `direct`, with w as rivals have to explain it.
+
+        Args:
+            hypothesis: see `leads`.
+            fit: likewise.
+            replaced: likewise.
+        """
+        w = clipped(fit.w[2:])
+        for place in replaced:
+            w = w + self._explained(hypothesis, fit, place)
+        ways = self._ways(hypothesis.sized, hypothesis.signals(fit), fit)
+        return Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, w)
 
     def _explained(self, hypothesis: Hypothesis, fit: Fit, place: int) -> Array:
         """What a fitted deviation does to the innovations of a filter that does not know it, shape (rows, n_y)."""
@@ -114,7 +128,7 @@ class Screen:
         """Of all effects about the run of a filter."""
         extended = sized.model
         of_rates, of_outputs = [], []
-        for effect in self._direct:
+        for effect in self.direct:
             own = sized.size_symbols(effect)
             if own is None:
                 extended = effect.extend(extended)
@@ -133,7 +147,7 @@ class Screen:
         left_of_span = self._step.end_min - times
         found = signatures.onsets(ways, beta, np.ones_like(beta), 0.5 * beta)
         inner = slice(EDGE_ROWS, -EDGE_ROWS)
-        for cause, effect in enumerate(self._direct):
+        for cause, effect in enumerate(self.direct):
             size, gain = _best(found.step_a[:, cause], found.step_b[:, cause], effect)
             leads.append(Lead(effect, self._constant, size[:1], float(gain[0])))
             place = EDGE_ROWS + int(np.argmax(gain[inner]))
@@ -147,7 +161,7 @@ class Screen:
             constant = share * self._run.span_min
             gamma = np.exp(-beta / constant)
             found = signatures.onsets(ways, 1.0 - gamma, gamma, 1.0 - (1.0 - gamma) * constant / beta)
-            for cause, effect in enumerate(self._direct):
+            for cause, effect in enumerate(self.direct):
                 size, gain = _best(found.other_a[:, cause], found.other_b[:, cause], effect)
                 place = int(np.argmax(gain[:-EDGE_ROWS]))
                 theta = np.array([size[place], times[place], constant])
@@ -167,7 +181,7 @@ class Screen:
         known = np.geomspace(1.0 / frequency[inner][-1], 1.0 / frequency[inner][0], KNOWN_PERIODS)
         courses = [self._sine.basis(np.array([period])) for period in known]
         both = [np.concatenate([getattr(item, name) for item in courses], axis=1) for name in Signal._fields]
-        for cause, effect in enumerate(self._direct):
+        for cause, effect in enumerate(self.direct):
             sums = np.zeros((2, count))
             np.add.at(sums[0], place[:-1], over_row[:, cause])
             np.add.at(sums[1], place[1:], at_row[:, cause])
@@ -189,7 +203,7 @@ class Screen:
         """All causes in one course with given numbers."""
         over_row, at_row = (np.ascontiguousarray(item) for item in course.basis(shape))
         leads = []
-        for cause, effect in enumerate(self._direct):
+        for cause, effect in enumerate(self.direct):
             g = signatures.shown(ways, cause, over_row[1:-1], at_row[2:]).reshape(-1, course.coefficients)
             a, b = g.T @ ways.w.ravel(), g.T @ g
             if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):

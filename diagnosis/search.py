@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from diagnosis.courses import Free
 from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.memory_screen import MemoryScreen
 from diagnosis.run import Run
@@ -33,7 +34,7 @@ LEAST_SCORE = -20.0
 IN_QUESTION = 60.0
 """In BIC: a rival that is worse by more is out of question."""
 
-ROUNDS = 5
+ROUNDS, MOST_KNOTS = 5, 80
 _NEAR = 4.0
 _SHARE = 0.3  # of what the best lead promises: linear promises of memory are rough
 
@@ -69,11 +70,13 @@ class Found:
 
     Attributes:
         noise: of the plant and its sensors, under the best hypothesis.
+        own_noise: likewise, under the nominal one.
         nominal: the one without any effect, with the noise that it needs itself; its key is empty.
         explained: all that were fitted, the best first.
     """
 
     noise: NoiseLevels
+    own_noise: NoiseLevels
     nominal: Explained
     explained: list[Explained]
 
@@ -101,7 +104,7 @@ class Search:
 
     def found(self) -> Found:
         """The best explanations by one effect."""
-        nominal = self.nominal()
+        nominal, own_noise = self.nominal(), self.noise
         memory = MemoryScreen(self.screen.with_memory, self.run)
         remembering = self._sorted(memory.leads(nominal.fit, lambda effect: self.sized((effect,))))
         leads = self._sorted(self.screen.leads(nominal.hypothesis, nominal.fit) + remembering)
@@ -130,7 +133,10 @@ class Search:
             again, best = best, min(known.values(), key=lambda item: item.bic)
             if best is again:
                 break
-        return Found(self.noise, nominal, sorted(known.values(), key=lambda item: item.bic))
+        if best is not nominal:
+            best = self._finer(best)
+            known[best.key] = best
+        return Found(self.noise, own_noise, nominal, sorted(known.values(), key=lambda item: item.bic))
 
     def nominal(self) -> Explained:
         """Without any effect."""
@@ -152,6 +158,18 @@ class Search:
             if len(found) == count:
                 break
         return found
+
+    def _finer(self, best: Explained) -> Explained:
+        """A free curve with as many knots as it needs."""
+        course, (theta,) = best.hypothesis.courses[0], best.fit.theta
+        while isinstance(course, Free) and course.coefficients < MOST_KNOTS:
+            finer = Free(self.run.time_min, 2 * course.coefficients - 1)
+            start = np.interp(finer.knots_min, course.knots_min, theta)
+            item = self.fit(Hypothesis(best.hypothesis.sized, (finer,)), (start,))
+            if item.bic >= best.bic:
+                break
+            best, course, (theta,) = item, finer, item.fit.theta
+        return best
 
     def _sorted(self, leads: Sequence[Lead]) -> list[Lead]:
         return sorted(leads, key=lambda item: -item.score(self.run.values))

@@ -25,6 +25,7 @@ from reactorwatch.process.integrate import LONGEST_STEP_MIN, symbolic_step
 from reactorwatch.process.model import Array, ProcessModel
 
 CHUNK = 32
+_LEAST_PIVOT = 1e-12
 _LONGEST_PIECE_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a piece is two steps; times are rounded
 
 
@@ -88,9 +89,10 @@ class FilterErrors:
         H, D = self._over(self._shown, p, there, inputs[1:], time_min[1:, None])
         prior = F @ found.P[:-1] @ F.transpose(0, 2, 1) + np.eye(there.shape[1]) * q * step[:, None, None]
         covariance = H @ prior @ H.transpose(0, 2, 1) + np.diag(R)
-        known = np.isfinite(found.residual[1:]) & np.all(np.isfinite(covariance), axis=2)
+        sound = np.all(np.isfinite(covariance), axis=(1, 2))
+        known = np.isfinite(found.residual[1:]) & sound[:, None]
         both = known[:, :, None] & known[:, None, :]
-        L = np.linalg.cholesky(np.where(both, covariance, np.eye(R.size)))
+        L = _cholesky(np.where(both, covariance, np.eye(R.size)))
         L_inverse = np.asarray(np.linalg.inv(L) * both)
         w = np.einsum("kij,kj->ki", L_inverse, np.where(known, found.residual[1:], 0.0))
         K = found.P[1:] @ H.transpose(0, 2, 1) * (used[1:] / R)[:, None, :]
@@ -126,6 +128,16 @@ class FilterErrors:
             for result, found in zip(results, function.results, strict=True):
                 result[part] = found.reshape(CHUNK, *result.shape[1:])[: part.stop - first]
         return [result.transpose(0, 2, 1) for result in results]
+
+
+def _cholesky(A: Array) -> Array:
+    """L with L L' = A, of many matrices, shape (n, m, m); about a run that has lost the plant these are anything."""
+    L = np.zeros_like(A)
+    for i in range(A.shape[1]):
+        for j in range(i + 1):
+            left = A[:, i, j] - np.sum(L[:, i, :j] * L[:, j, :j], axis=1)
+            L[:, i, j] = np.sqrt(np.maximum(left, _LEAST_PIVOT * np.abs(A[:, i, i]))) if i == j else left / L[:, j, j]
+    return L
 
 
 def _piece(model: ProcessModel, size: ca.SX) -> ca.Function:
