@@ -7,6 +7,7 @@ import numpy as np
 
 from diagnosis.adequacy import WHITE, minus_log10_p
 from diagnosis.courses import Signal
+from diagnosis.extended import extended_model
 from diagnosis.held_out import Errors, free_run, gained
 from diagnosis.pairs import with_pairs
 from diagnosis.record_checks import run_of
@@ -77,23 +78,24 @@ def diagnose(
         strange = unknown(search, best, effects)
         if strange is not None:
             location = strange.hypothesis.sized.effects[0].location
-        search.noise = found.noise
-        best.hypothesis.sized.noise = found.noise if best.key else found.own_noise
+        best = found.nominal  # what is not explained is not extended
+    best.hypothesis.sized.noise, found.nominal.hypothesis.sized.noise = found.noise, found.own_noise
     before, after = gained(run, found.nominal, best)
     curves = _curves(run, model, found.nominal, best)
+    causes = tuple(_causes(run, best))
     return Diagnosis(
         samples=run.time_min.size,
         span_min=run.span_min,
         verdict=verdict,
-        causes=tuple(_causes(run, best)) if verdict != UNKNOWN else (),
-        alternatives=tuple(_alternatives(found, best)) if verdict != UNKNOWN else (),
+        causes=causes,
+        alternatives=tuple(_alternatives(found, best)),
         location=location,
         significant=verdict != NOMINAL,
         practical=_matters(curves, bands),
         gain=_gain(model, found, best, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=None,
-        extended_model={},
+        extended_model=extended_model(model, effects, causes, record.zero_ns),
         curves=curves,
     )
 

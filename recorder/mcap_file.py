@@ -161,7 +161,7 @@ def read_record(path: Path, plant: str | None = None) -> Record:
         own_times, first = np.unique(np.asarray(times, np.int64), return_index=True)
         column[np.searchsorted(all_times, own_times)] = np.asarray(values)[first]
     zero_ns = int(read_metadata(path).get(ZERO_NS, all_times[0]))
-    return Record(time_min=(all_times - zero_ns) / MINUTE_NS, columns=columns, name=path.name)
+    return Record((all_times - zero_ns) / MINUTE_NS, columns, path.name, zero_ns)
 
 
 class _File(NamedTuple):

@@ -13,7 +13,7 @@ min or h. The free profile is a curve, linear between knots: after the size come
 
 import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
 from typing import TypeVar
@@ -89,6 +89,12 @@ class FaultSpecification:
         prefix = next(name for name in new if name.endswith(".size")).removesuffix("size")
         return extended.with_values({f"{prefix}{name}": value for name, value in values.items()})
 
+    def shifted(self, by_min: float) -> "FaultSpecification":
+        """The same fault as much later."""
+        times = {item.name for item in self.profile.parameters if item.breakpoint}
+        values = {name: value + by_min if name in times else value for name, value in self.values.items()}
+        return FaultSpecification(self.effect, self.profile, values)
+
     def __str__(self) -> str:
         """The canonical text; `parse_fault` makes the same specification of it."""
         text = f"{self.effect.name}:{self.profile.name}:{_written(self.values['size'])}"
@@ -102,11 +108,15 @@ class FaultSpecification:
         return text
 
 
-def parse_fault(text: str) -> FaultSpecification:
+def parse_fault(text: str, effects: Sequence[Effect] = EFFECTS) -> FaultSpecification:
     """Read a fault specification.
 
     >>> str(parse_fault("coolant_flow:step:-0.05@1800s"))
     'coolant_flow:step:-0.05@30min'
+
+    Args:
+        text: as in `EXAMPLE`.
+        effects: the causes there are.
 
     Raises:
         InputError: a part of it is wrong; the text names the part, what would be right, and what is there.
@@ -114,7 +124,7 @@ def parse_fault(text: str) -> FaultSpecification:
     parts = [part.strip() for part in text.split(":")]
     if len(parts) != 3:
         raise InputError(f"fault {text!r}: must be cause:profile:size[@onset][,name=value]..., like {EXAMPLE}")
-    effect = _chosen(text, "cause", parts[0], {item.name: item for item in EFFECTS})
+    effect = _chosen(text, "cause", parts[0], {item.name: item for item in effects})
     profile = _chosen(text, "profile", parts[1], {item.name: item for item in PROFILES})
     first, *assignments = (part.strip() for part in parts[2].split(","))
     size, at, onset = (part.strip() for part in first.partition("@"))

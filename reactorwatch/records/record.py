@@ -34,11 +34,13 @@ class Record:
         columns: by signal name, each of shape (rows,), in the signal's unit; NaN where nothing was measured. The
             input of row k is held over [t_k, t_k+1).
         name: where it came from, for messages.
+        zero_ns: the time that its minutes count from, in nanoseconds since 1970-01-01 UTC; 0: not known.
     """
 
     time_min: NDArray[np.float64]
     columns: dict[str, NDArray[np.float64]]
     name: str
+    zero_ns: int = 0
 
     def __post_init__(self) -> None:
         for signal, values in self.columns.items():
