@@ -20,6 +20,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.entry import main
+from reactorwatch.runtime.model_file import model_on_the_bus
 from reactorwatch.runtime.serve import serve, stop_on_signals
 
 log = structlog.get_logger()
@@ -36,11 +37,11 @@ class MonitorNode(Monitor):
         start_ns: now.
 
     Raises:
-        InputError: the file that the settings name is damaged or cannot be used.
+        InputError: a file that the settings name is damaged or cannot be used.
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
-        super().__init__(config, start_ns)
+        super().__init__(config, start_ns, model=model_on_the_bus(config.model))
         self._file: AlarmFile | None = None
         self._said = ""
         if config.alarm_state_file is not None:

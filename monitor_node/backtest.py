@@ -9,6 +9,7 @@ from monitor_node.core import Monitor
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.runtime.model_file import model_on_the_bus
 
 RAISED = Event.RAISED.value
 
@@ -63,9 +64,12 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
     Args:
         messages: of any plant; only samples of `config.plant` are looked at.
         config: of the monitor.
+
+    Raises:
+        InputError: settings that do not fit together, or a model's file that cannot be used.
     """
     prefix = keys.key(config.plant, keys.SAMPLE, "")
-    monitor = Monitor(config, start_ns=0, points=False)
+    monitor = Monitor(config, start_ns=0, points=False, model=model_on_the_bus(config.model))
     alarms: list[Alarm] = []
 
     def keep(publications: list[Publication]) -> None:

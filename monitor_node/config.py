@@ -25,6 +25,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         reference: what a row is expected by: `process`, the filter of the reactor's equations; `arx`, the identified
             model as it was at the end of its training; `auto`, the first where it predicts the training at least about
             as well as the second, else the second.
+        model: file of an extended model (`diagnose -o`) whose equations they are; None: those of the nominal reactor.
         charts: that watch the residuals.
         false_alarms_per_30_days: how many alarms chance may raise in 30 days of the plant, all alarms together.
         ewma_weight: of the newest row in the EWMA chart, in (0, 1].
@@ -57,6 +58,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     forgetting: float = 0.999
     training_min: float = 100.0
     reference: Literal["auto", "process", "arx"] = "auto"
+    model: str | None = None
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
     false_alarms_per_30_days: float = 1.0
     ewma_weight: float = 0.1

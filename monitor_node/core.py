@@ -21,6 +21,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import CommandReply, Health, Quality, Sample
 from reactorwatch.errors import InputError
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 
 NODE = "monitor"
@@ -38,6 +39,7 @@ class Monitor:
         config: how it is watched.
         start_ns: now.
         points: whether estimates and points of charts are published; a back-test does without.
+        model: whose equations the process reference is, in minutes since 1970-01-01 UTC; None: the nominal reactor.
 
     Raises:
         InputError: settings that do not fit together.
@@ -49,14 +51,16 @@ class Monitor:
         last_ns: time of the last row; None before the first.
     """
 
-    def __init__(self, config: MonitorConfig, start_ns: int, *, points: bool = True) -> None:
+    def __init__(
+        self, config: MonitorConfig, start_ns: int, *, points: bool = True, model: ProcessModel | None = None
+    ) -> None:
         self.config = config
         self.refusals = Refusals()
         self._signals = (config.input, *config.outputs)
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
         self._aligner = Aligner(self._signals, config.reorder_rows)
         self.alarms = AlarmBoard(config)
-        self._watch = PlantWatch(config, self.alarms, points=points)
+        self._watch = PlantWatch(config, self.alarms, points=points, model=model)
         self._units = dict.fromkeys(self._signals, "")
         self._output_units = [""] * len(config.outputs)
         self.first_ns: int | None = None

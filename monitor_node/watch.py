@@ -38,6 +38,7 @@ class PlantWatch:
         config: of the monitor.
         board: the alarms of the plant.
         points: whether estimates, charts' points and models are to be published.
+        model: as for `Monitor`.
 
     Raises:
         InputError: the settings ask for the process model of a plant that it is not of.
@@ -48,11 +49,13 @@ class PlantWatch:
         signals: the watch over the signals themselves.
     """
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard, *, points: bool = True) -> None:
+    def __init__(
+        self, config: MonitorConfig, board: AlarmBoard, *, points: bool = True, model: ProcessModel | None = None
+    ) -> None:
         self._config = config
         self._board = board
         self._points = points
-        self._model = _model(config)
+        self._model = _model(config, model)
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self.signals = SignalWatch(config, board)
@@ -253,11 +256,11 @@ class PlantWatch:
                 yield Publication(self._estimate_keys[index], estimate)
 
 
-def _model(config: MonitorConfig) -> ProcessModel | None:
+def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
     """The process model that the plant may be watched by."""
     if config.reference == "arx":
         return None
-    model = cstr()
+    model = model or cstr()
     fits = (config.input,) == model.input_names and set(config.outputs) <= set(model.output_names)
     if fits:
         return model

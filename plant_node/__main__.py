@@ -29,7 +29,7 @@ def run(
     Args:
         config: of the plant.
         bus_config: where the bus is.
-        model: the process; the nominal reactor if not given.
+        model: the process; that of the settings if not given.
         driver: a record whose input drives the plant, instead of the scenario of `config`.
 
     Raises:

@@ -50,7 +50,9 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         noise_sd: see `NoiseSd`.
         resolution: see `Resolution`.
         valve_limits_l_min: what the coolant valve lets through, closed and fully open.
-        faults: that are in it from the start, such as `coolant_flow:step:-0.05@30min`.
+        model: file of an extended model (`diagnose -o`) that the plant is; its minutes are those of the plant. None:
+            the nominal reactor.
+        faults: that are in it from the start, such as `coolant_flow:step:-0.05@30min`; on top of those of `model`.
         start: the steady state at the first input or, under temperature control, of the closed loop (`operating`: the
             hottest, `extinguished`: the coldest), or a value for each state, such as {C = 0.1, T = 438.54}.
         health_period_s: how often health is published, in seconds of the wall clock.
@@ -72,6 +74,7 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     noise_sd: NoiseSd = NoiseSd()
     resolution: Resolution = Resolution()
     valve_limits_l_min: tuple[float, float] = (0.0, 500.0)
+    model: str | None = None
     faults: tuple[str, ...] = ()
     start: Literal["operating", "extinguished"] | dict[str, float] = "operating"
     health_period_s: float = 5.0

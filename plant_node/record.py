@@ -1,16 +1,20 @@
 """A plant from its settings, and its record without a bus: what tests and studies are made of."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace as with_changes
 
 from plant_node.config import PlantConfig
 from plant_node.core import Plant
 from plant_node.scenario import FromFile, HeldRecord
 from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects.base import TIMING
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import Record
+from reactorwatch.runtime.model_file import read_extended_model
 
 
 def plant_from(config: PlantConfig, model: ProcessModel | None = None, driver: Record | None = None) -> Plant:
@@ -18,18 +22,31 @@ def plant_from(config: PlantConfig, model: ProcessModel | None = None, driver: R
 
     Args:
         config: settings.
-        model: the process; the nominal reactor if not given.
+        model: the process; that of the settings if not given.
         driver: a record whose input drives the plant, instead of the scenario of `config`.
 
     Raises:
         InputError: settings that do not go with the model, or a file that cannot be used.
     """
     scenario = config.scenario_settings()
+    if model is None:
+        config, model = _settled(config)
     if driver is not None:
-        return Plant(config, model or cstr(), HeldRecord.of(driver))
+        return Plant(config, model, HeldRecord.of(driver))
     if isinstance(scenario, FromFile):
-        return Plant(config, model or cstr(), HeldRecord.of(read_csv(Path(scenario.path), required=("qc",))))
-    return Plant(config, model or cstr(), scenario)
+        return Plant(config, model, HeldRecord.of(read_csv(Path(scenario.path), required=("qc",))))
+    return Plant(config, model, scenario)
+
+
+def _settled(config: PlantConfig) -> tuple[PlantConfig, ProcessModel]:
+    """The process of the settings. What in it is in how rows are stamped, and not in the plant, becomes a fault."""
+    if config.model is None:
+        return config, cstr()
+    whole = read_extended_model(Path(config.model))
+    timing = [item for item in whole.effects if item.effect.location == TIMING]
+    physical = replace(whole, effects=tuple(item for item in whole.effects if item not in timing))
+    faults = (*config.faults, *(str(item) for item in timing))
+    return with_changes(config, faults=faults), physical.build()
 
 
 def simulate_record(

@@ -6,7 +6,17 @@ from typing import Annotated, Any
 
 import typer
 
-from reactorwatch.cli.options import Columns, Endpoint, Plant, Settings, columns, existing_recording, pace
+from reactorwatch.cli.options import (
+    Columns,
+    Endpoint,
+    Model,
+    Plant,
+    Settings,
+    columns,
+    existing,
+    existing_recording,
+    pace,
+)
 
 
 def add_to(app: typer.Typer) -> None:
@@ -52,6 +62,7 @@ def plant(
         list[str] | None,
         typer.Option(help="A fault, as cause:profile:size@onset: coolant_flow:step:-0.05@30min. Repeatable."),
     ] = None,
+    model: Model = None,
 ) -> None:
     """Simulate the reactor and publish what its sensors see."""
     from plant_node.__main__ import run
@@ -67,6 +78,7 @@ def plant(
         "seed": seed,
         "scenario": scenario,
         "faults": fault or None,
+        "model": str(existing(model)) if model is not None else None,
     }
     run(section(PlantConfig, "plant", tables, flags), bus)
 
@@ -78,6 +90,7 @@ def monitor(
     training: Annotated[
         float | None, typer.Option("--training", help="Minutes of plant time to learn from [100].", show_default=False)
     ] = None,
+    model: Model = None,
 ) -> None:
     """Watch a plant: predict its signals, raise alarms."""
     from monitor_node.__main__ import run
@@ -85,7 +98,8 @@ def monitor(
     from reactorwatch.runtime.config import section
 
     tables, bus = _settings(config, endpoint)
-    run(section(MonitorConfig, "monitor", tables, {"plant": name, "training_min": training}), bus)
+    flags = {"plant": name, "training_min": training, "model": str(existing(model)) if model is not None else None}
+    run(section(MonitorConfig, "monitor", tables, flags), bus)
 
 
 def record(

@@ -20,6 +20,11 @@ Columns = Annotated[
     typer.Option("--column", help="A column of another name, as signal=column: --column T=reactor_temp."),
 ]
 
+Model = Annotated[
+    Path | None,
+    typer.Option("--model", help="An extended model, as diagnose -o writes it [the nominal].", show_default=False),
+]
+
 
 def columns(pairs: list[str] | None) -> dict[str, str]:
     """The columns' names by signal, from `signal=column` pairs.
@@ -34,6 +39,22 @@ def columns(pairs: list[str] | None) -> dict[str, str]:
             raise InputError(f"--column must be signal=column, such as T=reactor_temp, got {pair!r}")
         named[signal] = column
     return named
+
+
+def tolerances(text: str | None) -> dict[str, float]:
+    """The differences that do not matter, by output, from `C=0.002,T=0.5`.
+
+    Raises:
+        InputError: not such a text.
+    """
+    found = {}
+    for part in text.split(",") if text is not None else ():
+        output, _, value = (item.strip() for item in part.partition("="))
+        try:
+            found[output] = float(value)
+        except ValueError:
+            raise InputError(f"--tolerance must be output=number, such as C=0.002,T=0.5, got {part!r}") from None
+    return found
 
 
 def pace(text: str | None, option: str) -> float | None:

@@ -5,36 +5,38 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from plant_node.initial_state import carried_over
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import UNITS, Record
 
 
-def free_run(measured: Record, faults: list[str]) -> Record:
+def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record:
     """Run the equations from the record's first row, driven by its input.
 
     Args:
-        measured: with the model's inputs and states as columns.
+        measured: with the model's inputs, C and T as columns.
+        model: the process; a state of its own that no column shows begins at rest.
         faults: specifications; their onsets are in the record's time.
 
     Raises:
         InputError: the record cannot drive the model.
     """
-    model: ProcessModel = cstr()
     for text in faults:
         model = parse_fault(text).extend(model, end_min=float(measured.time_min[-1]))
     inputs = np.column_stack([measured.columns[name] for name in model.input_names])
-    start = np.array([measured.columns[name][0] for name in ("C", "T")])
-    if not np.all(np.isfinite(start)):
-        raise InputError(f"{measured.name}: the first row must have C and T, the run starts from them; got {start}")
+    first = {name: float(measured.columns[name][0]) for name in ("C", "T")}
+    if not np.all(np.isfinite(list(first.values()))):
+        said = ", ".join(f"{name} = {value:g}" for name, value in first.items())
+        raise InputError(f"{measured.name}: the first row must have C and T, the run starts from them; got {said}")
     if not np.all(np.isfinite(inputs)):
         row = int(np.argmax(~np.all(np.isfinite(inputs), axis=1)))
         raise InputError(
             f"{measured.name}: qc must be there in every row, it is missing at {measured.time_min[row]:g} min"
         )
+    start = carried_over(model, first, inputs[0], float(measured.time_min[0]))
     try:
         trajectory = Simulator(model).run(measured.time_min, inputs, start)
     except ValueError as error:

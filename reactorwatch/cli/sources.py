@@ -1,6 +1,6 @@
 """Wherever a file is asked for, `.csv` and `.mcap` both serve: this turns either into a record or into messages.
 
-A folder stands for the recordings in it, as one.
+A folder stands for the recordings in it, as one. And `--model` is turned into a process model on the record's clock.
 """
 
 from collections.abc import Iterator
@@ -8,6 +8,7 @@ from pathlib import Path
 
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.errors import InputError
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 
 DEFAULT_PLANT = "cstr"
@@ -42,6 +43,23 @@ def messages(path: Path, plant: str | None = None, columns: dict[str, str] | Non
     from recorder.mcap_file import read_messages
 
     return (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
+
+
+def process_model(path: Path | None, measured: Record) -> ProcessModel:
+    """The model in a file, its clock that of the record; the nominal reactor if there is no file.
+
+    Where either counts its minutes from a moment that nobody knows, they are taken to count from the same.
+
+    Raises:
+        InputError: the file cannot be read, or holds no model.
+    """
+    from reactorwatch.process.cstr import cstr
+    from reactorwatch.runtime.model_file import read_extended_model
+
+    if path is None:
+        return cstr()
+    model = read_extended_model(path)
+    return (model.counted_from(measured.zero_ns) if measured.zero_ns else model).build()
 
 
 def plant_of(path: Path, plant: str | None) -> str:

@@ -1,17 +1,29 @@
-"""What a record says: `simulate` and `backtest`."""
+"""What a record says: `simulate`, `backtest` and `diagnose`."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Json, Plant, Settings, columns, existing_recording, new_file
+from reactorwatch.cli.options import (
+    Columns,
+    Json,
+    Model,
+    Plant,
+    Settings,
+    columns,
+    existing,
+    existing_recording,
+    new_file,
+    tolerances,
+)
 
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("simulate")(simulate)
     app.command("backtest")(backtest)
+    app.command("diagnose")(diagnose)
 
 
 def simulate(
@@ -21,6 +33,7 @@ def simulate(
     fault: Annotated[
         list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset, onset in the file's time.")
     ] = None,
+    model: Model = None,
     column: Columns = None,
     as_json: Json = False,
 ) -> None:
@@ -30,13 +43,14 @@ def simulate(
     """
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.simulation import free_run, report
-    from reactorwatch.cli.sources import record
+    from reactorwatch.cli.sources import process_model, record
     from reactorwatch.records.csv_file import write_csv
 
     measured = record(existing_recording(file), plant, columns(column))
+    process = process_model(model, measured)
     out = new_file(out)
     with task(f"simulating {file.name}"):
-        simulated = free_run(measured, fault or [])
+        simulated = free_run(measured, process, fault or [])
         write_csv(out, simulated)
     typer.echo(report(measured, simulated, out, as_json=as_json))
 
@@ -48,6 +62,7 @@ def backtest(
     training: Annotated[
         float | None, typer.Option("--training", help="Minutes to learn from [100].", show_default=False)
     ] = None,
+    model: Model = None,
     column: Columns = None,
     as_json: Json = False,
 ) -> None:
@@ -61,9 +76,36 @@ def backtest(
 
     existing_recording(file)
     name = plant_of(file, plant)
-    flags = {"plant": name, "training_min": training}
+    flags = {"plant": name, "training_min": training, "model": str(existing(model)) if model is not None else None}
     settings = section(MonitorConfig, "monitor", read_settings(config), flags)
     with task(f"watching {file.name}"):
         result = run(messages(file, name, columns(column)), settings)
     zero_ns = zero_of(file, result.first_ns)
     typer.echo(backtest_json(result, zero_ns) if as_json else backtest_text(result, zero_ns, file))
+
+
+def diagnose(
+    files: Annotated[list[Path], typer.Argument(help="Records (.csv) or recordings (.mcap).", show_default=False)],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for a report; of several files, a folder each.", show_default=False),
+    ] = None,
+    tolerance: Annotated[
+        str | None,
+        typer.Option(
+            help="Differences that do not matter in practice, such as C=0.002,T=0.5 [a fiftieth of the range].",
+            show_default=False,
+        ),
+    ] = None,
+    model: Model = None,
+    plant: Plant = None,
+    column: Columns = None,
+    as_json: Json = False,
+) -> None:
+    """Say what the simulation gets wrong, and why."""
+    from reactorwatch.cli.diagnosis import cases, results
+
+    accepted = tolerances(tolerance)
+    found = cases([existing_recording(file) for file in files], plant, columns(column), model, out)
+    for said in results(found, accepted, as_json=as_json):
+        typer.echo(said)

@@ -1,5 +1,8 @@
 """The faults of the catalogue in the plant: its rows are what the physics makes of them."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 from msgspec.structs import replace as with_changes
@@ -84,3 +87,16 @@ def test_a_valve_that_begins_to_stick_stands_where_it_was() -> None:
         expected.append(twin.next_row().readings)
     assert [row["qc"] for row in shown[10:30]] == [102.0] * 20
     np.testing.assert_allclose([row["T"] for row in shown], [row["T"] for row in expected], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "text", ["sample_timing:constant:0.05", "valve_stiction:constant:2", "heat_loss:step:0.01@5min"]
+)
+def test_an_extended_model_is_the_plant_that_has_its_effects_as_faults(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "extended.json"
+    path.write_text(json.dumps({"format": "reactorwatch.model.v1", "model": "cstr", "effects": [text]}))
+    leak = "coolant_flow:step:-0.02@10min"
+    of_model = simulate_record(PlantConfig(seed=3, model=str(path), faults=(leak,)), 300)
+    of_faults = simulate_record(PlantConfig(seed=3, faults=(text, leak)), 300)
+    for signal, values in of_model.columns.items():
+        assert np.array_equal(values, of_faults.columns[signal])
