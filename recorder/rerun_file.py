@@ -8,7 +8,7 @@ Two timelines carry every point: the time since the first sample, for people, an
 who compare with something else.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeAlias, assert_never
@@ -19,9 +19,9 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 from rerun.experimental import ViewerClient
 
+from reactorwatch.axis import axis
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
-from recorder.axis import axis
 from recorder.panels import PANELS
 from recorder.panels.base import EventLog, Panel, PlanePath, PlanePlot, Series, TimePlot, View
 from recorder.run import Run
@@ -48,14 +48,28 @@ def write_rrd(run: Run, path: Path, panels: tuple[Panel, ...] = PANELS) -> None:
         InputError: the folder does not exist or cannot be written to.
     """
     first_ns, _ = run.span_ns
-    drawn = [(panel, views) for panel in panels if (views := panel.draw(run))]
-    recording = rr.RecordingStream("reactorwatch", recording_id=f"{run.plant}-{first_ns}")
+    write_views({panel.title: panel.draw(run) for panel in panels}, path, f"{run.plant}-{first_ns}", first_ns)
+
+
+def write_views(drawn: Mapping[str, Sequence[View]], path: Path, name: str, first_ns: int) -> None:
+    """Draw views of anything.
+
+    Args:
+        drawn: views, by the title that they stand under.
+        path: the file; an older one of that name is replaced.
+        name: of the recording; one of the same name goes into the same window.
+        first_ns: where the time of the run begins.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written to.
+    """
+    recording = rr.RecordingStream("reactorwatch", recording_id=name)
     with replacing(path) as temporary:
         recording.save(temporary, default_blueprint=_blueprint(drawn))
         try:
-            for panel, views in drawn:
+            for title, views in drawn.items():
                 for view in views:
-                    _draw(recording, _path(panel.title, view.title), view, first_ns)
+                    _draw(recording, _path(title, view.title), view, first_ns)
         finally:
             recording.flush()
             recording.disconnect()
@@ -195,13 +209,13 @@ def _unbroken(line: PlanePath) -> Iterator[slice]:
     return (slice(int(start), int(end)) for start, end in edges.reshape(-1, 2))
 
 
-def _blueprint(drawn: list[tuple[Panel, tuple[View, ...]]]) -> rrb.Blueprint:
+def _blueprint(drawn: Mapping[str, Sequence[View]]) -> rrb.Blueprint:
     over_time: list[rrb.View] = []
     beside: list[rrb.View] = []
-    for panel, views in drawn:
+    for title, views in drawn.items():
         for view in views:
             column = over_time if isinstance(view, TimePlot) else beside
-            column.append(_view(_path(panel.title, view.title), view))
+            column.append(_view(_path(title, view.title), view))
     # time plots one under the other, so that one moment is one vertical line
     columns = [rrb.Vertical(*column) for column in (over_time, beside) if column]
     return rrb.Blueprint(

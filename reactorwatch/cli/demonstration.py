@@ -1,7 +1,8 @@
 """`demo`: the whole chain once, at accelerated plant time with a fault in it, and what came of it in plain words.
 
 Real processes on a real router on loopback. Afterwards everything that is claimed is read from the recording: when the
-fault set in, which alarms came, and that a back-test over the recording gives the same alarms, value for value.
+fault set in, which alarms came, that a back-test over the recording gives the same alarms, value for value, and what a
+diagnosis of it says.
 """
 
 import sys
@@ -36,6 +37,7 @@ START_WITHIN_S = 60.0
 DRAIN_WITHIN_S = 20.0
 LOOK_EVERY_S = 0.1
 SETTINGS_FILE = "settings.toml"
+DIAGNOSIS_FOLDER = "diagnosis"
 LINGER_S = 1.0  # silence after which the recorder, asked to stop last, takes everything as heard
 
 
@@ -174,7 +176,10 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: Path, folder: Path, pl
 
 
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
-    """Draw the recording, read from it what happened, and write that down."""
+    """Draw the recording, diagnose it, read from it what happened, and write that down."""
+    from diagnosis.report.words import verdict
+    from reactorwatch.cli.diagnosis import MODEL, PAGE, cases, diagnosed
+    from reactorwatch.process.effects import EFFECTS
     from recorder.rerun_file import write_rrd
     from recorder.run import read_run
 
@@ -183,6 +188,9 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         write_rrd(read_run(messages(recording, PLANT)), drawing)
         first_ns, faults, alarms = _events(recording)
         again = backtest.run(messages(recording, PLANT), monitor)
+    with task("diagnosing"):
+        (case,) = cases([recording], PLANT, {}, None, folder / DIAGNOSIS_FOLDER)
+        diagnosis, _ = diagnosed(case)
     same = [alarm.SerializeToString() for alarm in alarms] == [
         alarm.SerializeToString() for alarm in again.alarm_messages
     ]
@@ -218,12 +226,15 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         + (", ".join(f"`{alarm.alarm}` at {at(alarm.time_ns)}" for alarm in before) or "none")
         + f" ({again.expected_false_alarms:.2g} to be expected in the whole run)."
     )
+    lines.append(f"- Diagnosis of the whole recording: {verdict(diagnosis, EFFECTS)}")
     lines.append(f"- Back-test over the recording: {'the same alarms, value for value' if same else 'OTHER ALARMS'}.")
     lines += [
         "",
         "# Which file to open",
         "",
         f"- `{drawing.name}`: the run as a dashboard. `{_program('rerun')} {drawing}`",
+        f"- `{DIAGNOSIS_FOLDER}/{PAGE}`: what the simulation gets wrong of this run, in a browser;"
+        f" `{DIAGNOSIS_FOLDER}/{MODEL}` is the simulation that knows of it.",
         f"- `{recording.name}`: everything that went over the bus; opens in Foxglove and PlotJuggler, too.",
         f"- `{SETTINGS_FILE}`: all settings, seeds included; the `.log` files: what the nodes said.",
         "",

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from recorder.axis import axis
+from reactorwatch.axis import axis
 
 numbers = st.floats(-1e9, 1e9, allow_subnormal=False)
 

@@ -1,0 +1,74 @@
+"""A diagnosis as an object for JSON; what is no finite number is null."""
+
+from math import isfinite
+from typing import Any
+
+from diagnosis.result import Diagnosis, Estimate, HeldOut
+
+
+def as_object(diagnosis: Diagnosis, file: str, seconds: float) -> dict[str, Any]:
+    """The object that `diagnose --json` prints.
+
+    Args:
+        diagnosis: of the file.
+        file: as it was named.
+        seconds: that the diagnosis took.
+    """
+    experiment = diagnosis.experiment
+    return {
+        "file": file,
+        "samples": diagnosis.samples,
+        "span_min": _number(diagnosis.span_min),
+        "seconds": _number(round(seconds, 3)),
+        "verdict": diagnosis.verdict,
+        "causes": [
+            {
+                "cause": cause.cause,
+                "profile": cause.profile,
+                "label": cause.label,
+                "location": cause.location,
+                "parameters": {name: _estimate(item) for name, item in cause.parameters.items()},
+            }
+            for cause in diagnosis.causes
+        ],
+        "alternatives": [
+            {
+                "causes": [{"cause": cause, "profile": profile} for cause, profile in item.causes],
+                "delta_bic": _number(item.delta_bic),
+            }
+            for item in diagnosis.alternatives
+        ],
+        "location": diagnosis.location or None,
+        "significant": bool(diagnosis.significant),
+        "practical": bool(diagnosis.practical),
+        "gain": {
+            "delta_bic": _number(diagnosis.gain.delta_bic),
+            "held_out": {name: _held_out(item) for name, item in diagnosis.gain.held_out.items()},
+        },
+        "adequacy": {name: {"minus_log10_p": _number(value)} for name, value in diagnosis.adequacy.items()},
+        "experiment": None
+        if experiment is None
+        else {
+            "why": experiment.why,
+            "input": [[_number(minute), _number(value)] for minute, value in experiment.input],
+            "separates": list(experiment.separates),
+        },
+        "extended_model": diagnosis.extended_model,
+    }
+
+
+def _estimate(estimate: Estimate) -> dict[str, Any]:
+    return {"value": _number(estimate.value), "sd": _number(estimate.sd), "unit": estimate.unit}
+
+
+def _held_out(item: HeldOut) -> dict[str, Any]:
+    return {
+        "rmse_before": _number(item.rmse_before),
+        "rmse_after": _number(item.rmse_after),
+        "noise_sd": _number(item.noise_sd),
+        "unit": item.unit,
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if isfinite(value) else None

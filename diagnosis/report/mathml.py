@@ -1,0 +1,174 @@
+"""Expressions as MathML, which browsers draw by themselves; what is new in one against another is marked.
+
+An expression is a tree, and so are its two versions, without and with a deviation m in it. They are walked together
+from the root. Where the new tree is an operation on all of the old one, only the other operand is new. Where both are
+the same operation, the difference lies further down. Elsewhere the whole of the new part is marked. So in
+K3 (1 + m), put for K3, the product is marked, and in f - m (T - 298), put for f, the term behind f.
+"""
+
+import casadi as ca
+
+ADDED = "added"
+"""Class of what is new."""
+
+LONGEST, LONGEST_NEW = 60, 30
+"""Nodes of a tree that a person would still read; and of one that is all new."""
+
+_SUM, _PRODUCT, _SIGN, _ATOM = 1, 2, 3, 4
+_DEPTH = 50
+_FUNCTIONS = {
+    ca.OP_FMAX: "max", ca.OP_FMIN: "min", ca.OP_SIN: "sin", ca.OP_COS: "cos", ca.OP_TAN: "tan", ca.OP_TANH: "tanh",
+    ca.OP_SINH: "sinh", ca.OP_COSH: "cosh", ca.OP_ATAN: "arctan", ca.OP_LOG: "ln", ca.OP_SIGN: "sign",
+    ca.OP_FABS: "abs", ca.OP_ERF: "erf", ca.OP_FLOOR: "floor", ca.OP_CEIL: "ceil",
+}  # fmt: skip
+_WITH_SIGN = {
+    ca.OP_ADD, ca.OP_SUB, ca.OP_NEG, ca.OP_MUL, ca.OP_TWICE, ca.OP_DIV, ca.OP_INV, ca.OP_EXP, ca.OP_SQ, ca.OP_POW,
+    ca.OP_CONSTPOW, ca.OP_SQRT, ca.OP_IF_ELSE_ZERO, ca.OP_NOT,
+}  # fmt: skip
+_RELATIONS = {ca.OP_LT: "&lt;", ca.OP_LE: "≤", ca.OP_EQ: "=", ca.OP_NE: "≠", ca.OP_AND: "∧", ca.OP_OR: "∨"}
+
+
+def written(expression: ca.SX, before: ca.SX | None = None, new: ca.SX | None = None) -> str:
+    """The MathML of an expression, without the `math` element around it.
+
+    Args:
+        expression: a scalar.
+        before: the same without what is new; None: there was none, all of it is new.
+        new: symbols of what is new, a column; None: nothing is marked.
+
+    Raises:
+        ValueError: it has an operation without a sign.
+    """
+    return _Writer(ca.SX() if new is None else new).text(expression, before)
+
+
+def readable(expression: ca.SX, longest: int = LONGEST) -> bool:
+    """Whether a scalar can be written out, and a person would read it."""
+    return _count(expression, 0, longest) <= longest
+
+
+def name(symbol: str) -> str:
+    """A symbol: its first letter, and the rest as its index, where that is how it is meant: `Tcf`, `k0`, `E_R`.
+
+    >>> name("qc")
+    '<msub><mi>q</mi><mi>c</mi></msub>'
+    """
+    first, rest = symbol[0], symbol[1:].lstrip("_")
+    if not rest:
+        return f"<mi>{first}</mi>"
+    if len(rest) > 2 and symbol[1] != "_":
+        return f'<mi mathvariant="normal">{symbol.replace("_", " ").replace(".", " ")}</mi>'
+    return (
+        f"<msub><mi>{first}</mi><{'mn' if rest.isdigit() else 'mi'}>{rest}</{'mn' if rest.isdigit() else 'mi'}></msub>"
+    )
+
+
+def marked(text: str) -> str:
+    """As something new."""
+    return f'<mrow class="{ADDED}">{text}</mrow>'
+
+
+class _Writer:
+    def __init__(self, new: ca.SX) -> None:
+        self._new = new
+
+    def text(self, now: ca.SX, before: ca.SX | None, binds: int = 0) -> str:
+        """An expression within an operation that binds so tightly."""
+        if not self._has_new(now):
+            return self._plain(now, (None, None), binds)
+        if before is None:
+            return marked(_Writer(ca.SX())._plain(now, (None, None), binds))
+        if now.n_dep() == 2:
+            wrapped = [ca.is_equal(now.dep(place), before, _DEPTH) for place in (0, 1)]
+            if any(wrapped) and now.op() in (ca.OP_ADD, ca.OP_SUB):
+                return self._wrapped(now, wrapped.index(True), binds)
+        if not before.is_symbolic() and now.op() == before.op() and now.n_dep() == before.n_dep():
+            return self._plain(now, tuple(before.dep(place) for place in range(now.n_dep())), binds)
+        return self.text(now, None, binds)
+
+    def _wrapped(self, now: ca.SX, old: int, binds: int) -> str:
+        """What was there before, and a new term beside it, marked with its sign."""
+        sign = "+" if now.op() == ca.OP_ADD else "−"
+        kept = self.text(now.dep(old), now.dep(old), _SUM if old == 0 or sign == "+" else _PRODUCT)
+        term = _Writer(ca.SX())._plain(now.dep(1 - old), (None, None), _SUM if sign == "+" else _PRODUCT)
+        if old == 0:
+            return _within(f"{kept}{marked(f'<mo>{sign}</mo>{term}')}", _SUM, binds)
+        return _within(f"{marked(term)}<mo>{sign}</mo>{kept}", _SUM, binds)
+
+    def _plain(self, now: ca.SX, before: tuple[ca.SX | None, ...], binds: int) -> str:
+        if now.is_constant():
+            return _number(float(now), binds)
+        if now.is_symbolic():
+            return name(now.name())
+        op, parts = now.op(), [now.dep(place) for place in range(now.n_dep())]
+
+        def part(place: int, inner: int = 0) -> str:
+            return self.text(parts[place], before[place] if self._has_new(parts[place]) else None, inner)
+
+        match op:
+            case ca.OP_ADD:
+                return _within(f"{part(0, _SUM)}<mo>+</mo>{part(1, _SUM)}", _SUM, binds)
+            case ca.OP_SUB:
+                return _within(f"{part(0, _SUM)}<mo>−</mo>{part(1, _PRODUCT)}", _SUM, binds)
+            case ca.OP_NEG:
+                return _within(f"<mo>−</mo>{part(0, _PRODUCT)}", _SUM, binds)
+            case ca.OP_MUL:
+                sign = "<mo>·</mo>" if parts[1].is_constant() else '<mspace width="0.2em"/>'
+                return _within(f"{part(0, _PRODUCT)}{sign}{part(1, _PRODUCT)}", _PRODUCT, binds)
+            case ca.OP_TWICE:
+                return _within(f'<mn>2</mn><mspace width="0.2em"/>{part(0, _PRODUCT)}', _PRODUCT, binds)
+            case ca.OP_DIV:
+                return f"<mfrac><mrow>{part(0)}</mrow><mrow>{part(1)}</mrow></mfrac>"
+            case ca.OP_INV:
+                return f"<mfrac><mn>1</mn><mrow>{part(0)}</mrow></mfrac>"
+            case ca.OP_EXP:
+                return f"<msup><mi>e</mi><mrow>{part(0)}</mrow></msup>"
+            case ca.OP_SQ:
+                return f"<msup><mrow>{part(0, _ATOM)}</mrow><mn>2</mn></msup>"
+            case ca.OP_POW | ca.OP_CONSTPOW:
+                return f"<msup><mrow>{part(0, _ATOM)}</mrow><mrow>{part(1)}</mrow></msup>"
+            case ca.OP_SQRT:
+                return f"<msqrt>{part(0)}</msqrt>"
+            case ca.OP_IF_ELSE_ZERO:
+                return _within(
+                    f'{part(1, _PRODUCT)}<mspace width="0.2em"/><mo>[</mo>{part(0)}<mo>]</mo>', _PRODUCT, binds
+                )
+            case ca.OP_NOT:
+                return _within(f"<mo>¬</mo>{part(0, _ATOM)}", _SIGN, binds)
+            case _ if op in _RELATIONS:
+                return _within(f"{part(0, _SUM)}<mo>{_RELATIONS[op]}</mo>{part(1, _SUM)}", _SUM, binds)
+            case _ if op in _FUNCTIONS:
+                listed = "<mo>,</mo>".join(part(place) for place in range(len(parts)))
+                return f'<mi mathvariant="normal">{_FUNCTIONS[op]}</mi><mo>(</mo>{listed}<mo>)</mo>'
+        raise ValueError(f"operation {op} has no sign")
+
+    def _has_new(self, expression: ca.SX) -> bool:
+        return self._new.numel() > 0 and bool(ca.depends_on(expression, self._new))
+
+
+def _within(text: str, own: int, binds: int) -> str:
+    return f"<mrow><mo>(</mo>{text}<mo>)</mo></mrow>" if own < binds else text
+
+
+def _number(value: float, binds: int) -> str:
+    if value < 0.0:
+        return _within(f"<mo>−</mo>{_number(-value, 0)}", _SUM, binds)
+    mantissa, exponent, power = f"{value:.6g}".partition("e")
+    if not exponent:
+        return f"<mn>{mantissa}</mn>"
+    ten = f"<msup><mn>10</mn><mn>{int(power)}</mn></msup>".replace("<mn>-", "<mn>−")
+    return ten if mantissa == "1" else _within(f"<mn>{mantissa}</mn><mo>·</mo>{ten}", _PRODUCT, binds)
+
+
+def _count(expression: ca.SX, so_far: int, enough: int) -> int:
+    """Nodes of the tree, counted on; no further than enough, for a tree may be larger than the graph that it is of."""
+    so_far += 1
+    if expression.is_symbolic() or expression.is_constant():
+        return so_far
+    if expression.op() not in _WITH_SIGN | _FUNCTIONS.keys() | _RELATIONS.keys():
+        return enough + 1
+    for place in range(expression.n_dep()):
+        if so_far > enough:
+            break
+        so_far = _count(expression.dep(place), so_far, enough)
+    return so_far

@@ -1,0 +1,130 @@
+"""A diagnosis as one page: self-contained, without a script, readable on a light and on a dark ground."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import PurePath
+from shlex import quote
+
+import jinja2
+import numpy as np
+
+from diagnosis.adequacy import WHITE
+from diagnosis.report import pictures
+from diagnosis.report.equations import balances, meanings
+from diagnosis.report.svg import Line, plot
+from diagnosis.report.words import PLACES, causes_said, place, size_said, verdict, when, with_interval
+from diagnosis.result import NOMINAL, Cause, Diagnosis, Experiment
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import FREE_NAME, PROFILES
+
+_PAGES = jinja2.Environment(
+    loader=jinja2.PackageLoader("diagnosis", "report"),
+    autoescape=True,
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+
+
+@dataclass(frozen=True)
+class _CauseSaid:
+    name: str
+    profile: str
+    label: str
+    place: str
+    size: str
+    when: str
+    symbol: str
+    course: str
+    parameters: tuple[tuple[str, str], ...]
+
+
+def as_page(
+    diagnosis: Diagnosis,
+    model: ProcessModel,
+    effects: Sequence[Effect],
+    file: str,
+    model_file: str,
+) -> str:
+    """The page, as HTML.
+
+    Args:
+        diagnosis: with its curves.
+        model: that was diagnosed.
+        effects: the catalogue.
+        file: of the record, as it was named.
+        model_file: of the extended model.
+
+    Raises:
+        ValueError: the diagnosis has no curves.
+    """
+    catalogue = {effect.name: effect for effect in effects}
+    found = [catalogue[cause.cause] for cause in diagnosis.causes]
+    meant = meanings(found)
+    return _PAGES.get_template("page.html.j2").render(
+        diagnosis=diagnosis,
+        file=file,
+        verdict=verdict(diagnosis, effects),
+        place=place(diagnosis) if diagnosis.verdict != NOMINAL else "",
+        causes=[_said(diagnosis, cause, item.symbol) for cause, item in zip(diagnosis.causes, meant, strict=True)],
+        meanings=meant,
+        equations=balances(model, found),
+        outputs=pictures.outputs(diagnosis, model),
+        closer=pictures.closer(diagnosis, model) if diagnosis.causes else [],
+        courses=pictures.courses(diagnosis),
+        residuals=pictures.residuals(diagnosis, model),
+        white=WHITE,
+        evidence=_evidence(diagnosis, effects),
+        experiment=None if diagnosis.experiment is None else _input(diagnosis.experiment, model),
+        model_file=model_file,
+        commands=_commands(file, model_file),
+        error=lambda value: f"{value:.3g}" if isfinite(value) else "ran away",
+    )
+
+
+def _said(diagnosis: Diagnosis, cause: Cause, symbol: str) -> _CauseSaid:
+    profile = next((item for item in PROFILES if item.name == cause.profile), None)
+    return _CauseSaid(
+        cause.cause,
+        cause.profile,
+        cause.label,
+        PLACES.get(cause.location, cause.location),
+        size_said(cause),
+        when(cause, diagnosis.curves),
+        symbol,
+        cause.profile if profile is None else profile.meaning,
+        tuple(
+            (name.replace("_", " "), with_interval(item))
+            for name, item in cause.parameters.items()
+            if cause.profile != FREE_NAME or name == "size"  # a curve is better seen than read
+        ),
+    )
+
+
+def _evidence(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[str, str]]:
+    if not diagnosis.causes:
+        return [("the simulation as it is", "0")]
+    best = causes_said([(cause.cause, cause.profile) for cause in diagnosis.causes], effects)
+    rows = [(best, "0")]
+    rows += [(causes_said(item.causes, effects), f"{item.delta_bic:.1f}") for item in diagnosis.alternatives]
+    return [*rows, ("the simulation as it was", f"{diagnosis.gain.delta_bic:,.1f}")]
+
+
+def _input(experiment: Experiment, model: ProcessModel) -> pictures.Picture:
+    times, values = np.array(experiment.input).T
+    item = model.inputs[0]
+    drawing = plot(f"proposed {item.name}", times, [Line(values, "input", held=True)])
+    return pictures.Picture(f"{item.name}, {item.unit}, over minutes", ((item.meaning, "input"),), drawing)
+
+
+def _commands(file: str, model_file: str) -> list[str]:
+    record, extended = quote(file), quote(model_file)
+    simulated = quote(f"{PurePath(file).stem}-simulated.csv")
+    return [
+        f"reactorwatch simulate {record} -o {simulated} --model {extended}",
+        f"reactorwatch diagnose {record} --model {extended}",
+        f"reactorwatch monitor --model {extended}",
+        f"reactorwatch plant --model {extended}",
+    ]

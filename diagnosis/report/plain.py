@@ -1,0 +1,45 @@
+"""A diagnosis as lines for a terminal."""
+
+from collections.abc import Sequence
+
+from diagnosis.report.words import causes_said, error_left, size_said, verdict, when
+from diagnosis.result import NOMINAL, Diagnosis
+from reactorwatch.process.effects.base import Effect
+
+INDENT = 14
+
+
+def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
+    """What people read: the verdict, the causes with their 95 % intervals, the gain, the rivals, remarks.
+
+    Args:
+        diagnosis: of the file.
+        file: as it was named.
+        effects: the catalogue.
+    """
+    lines = [
+        f"{file}: {diagnosis.samples} rows over {diagnosis.span_min:g} min",
+        verdict(diagnosis, effects),
+    ]
+    for cause in diagnosis.causes:
+        lines += [
+            _line("cause", f"{cause.label} ({cause.cause}, {cause.profile})"),
+            _line("size", f"{size_said(cause)}  (95 %)"),
+            _line("when", when(cause, diagnosis.curves)),
+        ]
+    if diagnosis.verdict != NOMINAL:
+        lines.append(_line("evidence", f"{diagnosis.gain.delta_bic:,.1f} in BIC over the simulation as it was"))
+    for name, item in diagnosis.gain.held_out.items():
+        lines.append(_line("held out", error_left(name, item, improved=bool(diagnosis.causes))))
+    for rival in diagnosis.alternatives:
+        lines.append(_line("or", f"{causes_said(rival.causes, effects)}, worse by {rival.delta_bic:.1f} in BIC"))
+    if diagnosis.causes and not diagnosis.alternatives:
+        lines.append(_line("or", "nothing else in the catalogue comes near"))
+    if diagnosis.experiment is not None:
+        lines.append(_line("experiment", diagnosis.experiment.why))
+    lines += [_line("note", remark) for remark in diagnosis.remarks]
+    return "\n".join(lines)
+
+
+def _line(what: str, said: str) -> str:
+    return f"  {what:<{INDENT - 2}}{said}"

@@ -1,0 +1,183 @@
+"""Plots over time as SVG: small, without a script, in colours that the page's style sheet gives.
+
+A plot has some hundred columns. Where more rows fall on a column than it can show, the lowest and the highest of them
+are drawn, in the order in which they came, so that no peak is lost and nothing is averaged away.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+import numpy as np
+
+from reactorwatch.axis import Axis, axis
+from reactorwatch.process.model import Array
+
+WIDTH, HEIGHT = 900, 210
+LEFT, RIGHT, TOP, BOTTOM = 64, 10, 8, 30
+COLUMNS = 600
+LABEL_ROOM = 40
+
+GAP = 10.0
+"""A line is broken where rows are so many times further apart than they mostly are."""
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """Values over time.
+
+    Attributes:
+        values: shape (rows,); NaN leaves a gap.
+        kind: its class in the style sheet.
+        held: whether each value holds until the next row.
+    """
+
+    values: Array
+    kind: str
+    held: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """An area between two lines, each of shape (rows,)."""
+
+    lower: Array
+    upper: Array
+    kind: str
+
+
+def plot(
+    title: str,
+    time_min: Array,
+    lines: Sequence[Line],
+    bands: Sequence[Band] = (),
+    moments_min: Sequence[float] = (),
+    shown: tuple[float, float] | None = None,
+) -> str:
+    """An `svg` element.
+
+    Args:
+        title: for those who cannot see it.
+        time_min: shape (rows,), at least two.
+        lines: drawn in their order, above the bands.
+        bands: areas.
+        moments_min: vertical lines.
+        shown: lowest and highest value of the axis; None: all that is drawn.
+    """
+    values = np.concatenate(
+        [*(line.values for line in lines), *(part for band in bands for part in (band.lower, band.upper))]
+    )
+    known = values[np.isfinite(values)]
+    across = _Time(float(time_min[0]), float(time_min[-1]))
+    low, high = shown or (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    up = axis(low, high, 4)
+    area = f'x="{LEFT}" y="{TOP}" width="{WIDTH - LEFT - RIGHT}" height="{HEIGHT - TOP - BOTTOM}"'
+    parts = [
+        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">',
+        _grid(up),
+        f'<svg {area} viewBox="{LEFT} {TOP} {WIDTH - LEFT - RIGHT} {HEIGHT - TOP - BOTTOM}">',  # cuts off
+        *(_band(band, time_min, across, up) for band in bands),
+        *(_vertical(across.place(moment)) for moment in moments_min if across.first <= moment <= across.last),
+        *(_line(line, time_min, across, up) for line in lines),
+        "</svg>",
+        _frame(across, up),
+        "</svg>",
+    ]
+    return "".join(parts)
+
+
+def decimated(time_min: Array, values: Array, columns: int = COLUMNS) -> tuple[Array, Array]:
+    """At most two rows a column, its lowest and its highest; a column without any value is one gap.
+
+    Args:
+        time_min: shape (rows,), increasing.
+        values: shape (rows,).
+        columns: between the first time and the last.
+    """
+    if time_min.size <= 2 * columns:
+        return time_min, values
+    column = np.floor((time_min - time_min[0]) / (time_min[-1] - time_min[0]) * columns).astype(int)
+    begin = np.flatnonzero(np.diff(column, prepend=-1))
+    place = np.arange(time_min.size)
+    lowest = np.minimum.reduceat(np.where(np.isfinite(values), values, np.inf), begin)
+    highest = np.maximum.reduceat(np.where(np.isfinite(values), values, -np.inf), begin)
+    counts = np.diff(np.append(begin, time_min.size))
+    ends = []
+    for extreme in (lowest, highest):
+        found = values == np.repeat(extreme, counts)
+        ends.append(np.minimum.reduceat(np.where(found, place, time_min.size), begin))
+    first = np.where(np.isfinite(lowest), ends[0], begin)
+    second = np.where(np.isfinite(lowest), ends[1], begin)
+    kept = np.unique(np.concatenate([first, second]))
+    return time_min[kept], values[kept]
+
+
+@dataclass(frozen=True)
+class _Time:
+    first: float
+    last: float
+
+    def place(self, time_min: float) -> float:
+        share = (time_min - self.first) / (self.last - self.first)
+        return LEFT + share * (WIDTH - LEFT - RIGHT)
+
+    def ticks(self) -> list[tuple[float, str]]:
+        found = axis(self.first, self.last, 8)
+        return [
+            (self.place(float(tick)), label)
+            for tick, label in zip(found.ticks, found.labels, strict=True)
+            if self.first <= tick <= self.last
+        ]
+
+
+def _line(line: Line, time_min: Array, across: _Time, up: Axis) -> str:
+    times, values = decimated(time_min, line.values)
+    x = LEFT + (times - across.first) / (across.last - across.first) * (WIDTH - LEFT - RIGHT)
+    y = TOP + (1.0 - up.share(values)) * (HEIGHT - TOP - BOTTOM)
+    step = np.diff(times, prepend=times[0])
+    begins = ~np.isfinite(np.append(np.nan, y[:-1])) | (step > GAP * max(float(np.median(step[1:])), 1e-12))
+    drawn = []
+    for at, height, new in zip(x.tolist(), y.tolist(), begins.tolist(), strict=True):
+        if height == height:  # not NaN
+            ahead = f"H{at:.1f}V{height:.1f}" if line.held else f"L{at:.1f} {height:.1f}"
+            drawn.append(f"M{at:.1f} {height:.1f}" if new else ahead)
+    return f'<path class="line {line.kind}" d="{"".join(drawn)}"/>'
+
+
+def _band(band: Band, time_min: Array, across: _Time, up: Axis) -> str:
+    columns = COLUMNS // 2
+    edges = []
+    for values in (band.lower, band.upper):
+        times, kept = decimated(time_min, values, columns)
+        x = LEFT + (times - across.first) / (across.last - across.first) * (WIDTH - LEFT - RIGHT)
+        y = TOP + (1.0 - up.share(kept)) * (HEIGHT - TOP - BOTTOM)
+        there = np.isfinite(y)
+        edges.append(
+            [f"{at:.1f} {height:.1f}" for at, height in zip(x[there].tolist(), y[there].tolist(), strict=True)]
+        )
+    return f'<polygon class="band {band.kind}" points="{" ".join([*edges[0], *reversed(edges[1])])}"/>'
+
+
+def _vertical(x: float) -> str:
+    return f'<line class="moment" x1="{x:.1f}" x2="{x:.1f}" y1="{TOP}" y2="{HEIGHT - BOTTOM}"/>'
+
+
+def _grid(up: Axis) -> str:
+    heights = TOP + (1.0 - up.share(up.ticks)) * (HEIGHT - TOP - BOTTOM)
+    drawn = "".join(f"M{LEFT} {y:.1f}H{WIDTH - RIGHT}" for y in heights.tolist())
+    return f'<path class="grid" d="{drawn}"/>'
+
+
+def _frame(across: _Time, up: Axis) -> str:
+    floor = HEIGHT - BOTTOM
+    parts = [f'<path class="frame" d="M{LEFT} {TOP}V{floor}H{WIDTH - RIGHT}"/>']
+    ticks = across.ticks()
+    for number, (place, text) in enumerate(ticks, start=1):
+        label = text if number < len(ticks) else f"{text} min"
+        parts.append(f'<path class="frame" d="M{place:.1f} {floor}v4"/>')
+        at, anchor = (place, "middle") if place < WIDTH - LABEL_ROOM else (WIDTH - RIGHT, "end")
+        parts.append(f'<text x="{at:.1f}" y="{floor + 17}" text-anchor="{anchor}">{label}</text>')
+    for share, label in zip(up.share(up.ticks).tolist(), up.labels, strict=True):
+        y = TOP + (1.0 - share) * (floor - TOP)
+        parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+    return "".join(parts)

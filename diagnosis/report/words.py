@@ -1,0 +1,122 @@
+"""What a diagnosis says, in words."""
+
+from collections.abc import Sequence
+from math import floor, isfinite, log10
+
+import numpy as np
+
+from diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, Cause, Curves, Diagnosis, Estimate, HeldOut
+from reactorwatch.process.effects.base import Effect
+
+SD_95 = 1.959964
+"""Standard deviations to either side that hold 95 % of a normal distribution."""
+
+PLACES = {
+    "mass_balance": "in the mass balance",
+    "energy_balance": "in the energy balance",
+    "reaction": "in the reaction",
+    "feed": "in the feed",
+    "coolant": "on the side of the coolant",
+    "temperature_sensor": "in the measurement of the temperature",
+    "concentration_sensor": "in the measurement of the concentration",
+    "timing": "in the times of the record",
+}
+"""Of causes, by their location; that of a model with places of its own is said as it is."""
+
+
+def verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
+    """The answer, in a sentence or two."""
+    if diagnosis.verdict == NOMINAL:
+        return "The simulation is right: what the record shows beyond it is noise."
+    if diagnosis.verdict == AMBIGUOUS:
+        rivals = [f"{cause.label} ({when(cause, diagnosis.curves)})" for cause in diagnosis.causes]
+        names = [" with ".join(rivals), *(causes_said(item.causes, effects) for item in diagnosis.alternatives)]
+        return (
+            f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {in_practice(diagnosis)}"
+        )
+    if diagnosis.verdict == NAMED:
+        causes = [f"{cause.label}, {when(cause, diagnosis.curves)}" for cause in diagnosis.causes]
+        return f"The simulation is wrong: {'; and '.join(causes)}. {in_practice(diagnosis)}"
+    return f"The simulation is wrong, and no known cause explains it; it acts {place(diagnosis)}."
+
+
+def in_practice(diagnosis: Diagnosis) -> str:
+    """Whether it matters."""
+    return "It matters in practice." if diagnosis.practical else "In practice the difference is too small to matter."
+
+
+def place(diagnosis: Diagnosis) -> str:
+    """Where it acts."""
+    if not diagnosis.location:
+        return "where this record does not tell"
+    return PLACES.get(diagnosis.location, f"in: {diagnosis.location.replace('_', ' ')}")
+
+
+def when(cause: Cause, curves: Curves | None = None) -> str:
+    """Since when, or how it goes in time."""
+    if cause.profile == "constant":
+        return "all the time"
+    if cause.profile == "sine":
+        return f"swinging with a period of {with_interval(cause.parameters['period'])}"
+    if cause.profile == "free":
+        largest = "" if curves is None else f", largest at {_largest_min(cause, curves):.4g} min"
+        return f"changing over the record{largest}"
+    since = f"since {with_interval(cause.parameters['onset'])}"
+    if cause.profile == "ramp":
+        return f"growing {since}"
+    return f"settling {since}" if cause.profile == "decay" else since
+
+
+def size_said(cause: Cause) -> str:
+    """Its size with its interval, and of what in its course that is the size."""
+    of_what = {"ramp": " at the end", "decay": " in the end", "sine": " to either side", "free": " at its largest"}
+    return with_interval(cause.parameters["size"]) + of_what.get(cause.profile, "")
+
+
+def causes_said(causes: Sequence[tuple[str, str]], effects: Sequence[Effect]) -> str:
+    """Causes that explain a record together, as people call them.
+
+    Args:
+        causes: (cause, profile) of each.
+        effects: the catalogue.
+    """
+    named = {effect.name: effect for effect in effects}
+    labels = []
+    for cause, profile in causes:
+        effect = named.get(cause)
+        label = cause if effect is None else effect.labels.get(profile, effect.label)
+        labels.append(f"{label} ({cause}, {profile})")
+    return " with ".join(labels)
+
+
+def with_interval(estimate: Estimate) -> str:
+    """A number and half the width of its 95 % interval, with its unit.
+
+    >>> with_interval(Estimate(-0.0499634, 8.5e-5, "1"))
+    '-0.04996 ± 0.00017'
+    >>> with_interval(Estimate(299.9, 0.0, "min"))
+    '299.9 min'
+    """
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    half = SD_95 * estimate.sd
+    if not (isfinite(half) and half > 0.0):
+        return f"{estimate.value:.5g}{unit}"
+    decimals = 1 - floor(log10(half))
+    if decimals < 0:
+        return f"{round(estimate.value, decimals):.0f} ± {round(half, decimals):.0f}{unit}"
+    return f"{estimate.value:.{decimals}f} ± {half:.{decimals}f}{unit}"
+
+
+def error_said(value: float, unit: str) -> str:
+    """A root mean square error; a free run that came to an end has none."""
+    return f"{value:.3g} {unit}" if isfinite(value) else "none, it ran away"
+
+
+def error_left(name: str, item: HeldOut, *, improved: bool) -> str:
+    """The error of the free run on rows that the fit did not see, in one line."""
+    before = f", before {error_said(item.rmse_before, item.unit)}" if improved else ""
+    return f"{name} off by {error_said(item.rmse_after, item.unit)}{before}; noise {item.noise_sd:.3g} {item.unit}"
+
+
+def _largest_min(cause: Cause, curves: Curves) -> float:
+    return float(curves.time_min[int(np.argmax(np.abs(curves.deviation[cause.cause])))])

@@ -1,0 +1,145 @@
+"""`diagnose`: what the simulation gets wrong of some records, said, and written down as a report.
+
+All files are read and checked before the first is diagnosed. So a file that cannot be used is told at once, before
+anything else is said or written, and not after minutes of others.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from diagnosis.diagnose import diagnose
+from diagnosis.record_checks import run_of
+from diagnosis.report.machine import as_object
+from diagnosis.report.page import as_page
+from diagnosis.report.plain import as_text
+from diagnosis.result import Diagnosis
+from reactorwatch.cli.diagnosis_drawing import write_drawing
+from reactorwatch.cli.progress import bar, task
+from reactorwatch.cli.sources import process_model, record
+from reactorwatch.errors import InputError
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.atomic import replacing
+from reactorwatch.records.record import Record
+from reactorwatch.runtime.model_file import write_extended_model
+
+PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "report.rrd"
+"""What a report is made of."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A record to be diagnosed.
+
+    Attributes:
+        file: as it was named.
+        measured: the record.
+        model: the simulation, its clock that of the record.
+        folder: for the report; None: none is wanted.
+    """
+
+    file: Path
+    measured: Record
+    model: ProcessModel
+    folder: Path | None
+
+
+def cases(
+    files: Sequence[Path], plant: str | None, columns: dict[str, str], model: Path | None, out: Path | None
+) -> list[Case]:
+    """The records in the files, read and checked.
+
+    Args:
+        files: .csv or .mcap.
+        plant: in them.
+        columns: their names by signal.
+        model: file of an extended model; None: the nominal reactor.
+        out: folder for the report; of several files, each gets a folder in it.
+
+    Raises:
+        InputError: a file cannot be read or diagnosed, or the folder cannot be one.
+    """
+    if out is not None and out.exists() and not out.is_dir():
+        raise InputError(f"--out {out}: is a file, the name of a folder was expected")
+    found = []
+    for file, folder in zip(files, _folders(files, out), strict=True):
+        measured = record(file, plant, columns)
+        process = process_model(model, measured)
+        run_of(measured, process)
+        found.append(Case(file, measured, process, folder))
+    return found
+
+
+def results(found: Sequence[Case], tolerance: dict[str, float], *, as_json: bool) -> Iterator[str]:
+    """Diagnose one after the other, write its report if there is a folder for it, and yield what is to be said.
+
+    Raises:
+        InputError: a tolerance that cannot be, or a folder that cannot be written to.
+    """
+    if len(found) == 1:
+        with task(f"diagnosing {found[0].file.name}"):
+            said = _result(found[0], tolerance, as_json=as_json)
+        yield said
+        return
+    with bar("diagnosing", len(found)) as advance:
+        for number, case in enumerate(found):
+            advance(number, f"diagnosing {case.file.name}")
+            yield _result(case, tolerance, as_json=as_json)
+
+
+def diagnosed(case: Case, tolerance: dict[str, float] | None = None) -> tuple[Diagnosis, float]:
+    """The diagnosis of a record and the seconds that it took; its report is written if there is a folder for it.
+
+    Raises:
+        InputError: as `results`.
+    """
+    began = time.monotonic()
+    diagnosis = diagnose(case.measured, case.model, EFFECTS, tolerance)
+    seconds = time.monotonic() - began
+    if case.folder is not None:
+        write_report(diagnosis, case, seconds)
+    return diagnosis, seconds
+
+
+def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
+    """Write the four files of a report; each appears whole or not at all.
+
+    Raises:
+        InputError: the folder cannot be made or written to.
+    """
+    folder = case.folder
+    assert folder is not None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {folder}: the folder cannot be made: {error.strerror}") from error
+    page = as_page(diagnosis, case.model, EFFECTS, str(case.file), str(folder / MODEL))
+    plain = msgspec.json.format(msgspec.json.encode(as_object(diagnosis, str(case.file), seconds)), indent=2)
+    write_extended_model(folder / MODEL, diagnosis.extended_model)
+    write_drawing(diagnosis, case.model, case.measured, folder / DRAWING)
+    for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):
+        with replacing(folder / name) as temporary:
+            temporary.write_bytes(content)
+
+
+def _result(case: Case, tolerance: dict[str, float], *, as_json: bool) -> str:
+    diagnosis, seconds = diagnosed(case, tolerance)
+    if as_json:
+        return msgspec.json.encode(as_object(diagnosis, str(case.file), seconds)).decode()
+    said = as_text(diagnosis, str(case.file), EFFECTS)
+    return said if case.folder is None else f"{said}\n  report      {case.folder / PAGE}"
+
+
+def _folders(files: Sequence[Path], out: Path | None) -> list[Path | None]:
+    """One for each file: named after it, if there are several."""
+    if out is None or len(files) == 1:
+        return [out] * len(files)
+    names: list[str] = []
+    for file in files:
+        same = sum(name == file.stem or name.startswith(f"{file.stem}-") for name in names)
+        names.append(file.stem if not same else f"{file.stem}-{same + 1}")
+    return [out / name for name in names]

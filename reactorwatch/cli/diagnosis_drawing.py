@@ -1,0 +1,90 @@
+"""A diagnosis as views of a dashboard: what was measured and what either model makes of it, on one timeline."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from diagnosis.report.pictures import interval
+from diagnosis.report.words import SD_95
+from diagnosis.result import Curves, Diagnosis
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import Record, to_time_ns
+from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Series, TimePlot
+from recorder.rerun_file import write_views
+
+
+def write_drawing(diagnosis: Diagnosis, model: ProcessModel, measured: Record, path: Path) -> None:
+    """Write a Rerun file.
+
+    Args:
+        diagnosis: with its curves.
+        model: that was diagnosed.
+        measured: the record.
+        path: of the file.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written to.
+    """
+    curves = diagnosis.curves
+    assert curves is not None
+    time_ns = np.array([to_time_ns(minutes, measured.zero_ns) for minutes in curves.time_min.tolist()], dtype=np.int64)
+    views = [
+        *_outputs(curves, model, time_ns),
+        *_residuals(curves, model, time_ns),
+        *_causes(diagnosis, curves, time_ns),
+    ]
+    views += [
+        TimePlot(
+            f"{item.meaning} {item.name}",
+            item.unit,
+            (Series(item.name, time_ns, curves.inputs[item.name], INPUT, held=True),),
+        )
+        for item in model.inputs
+    ]
+    write_views({"Diagnosis": views}, path, f"diagnosis of {measured.name}", int(time_ns[0]))
+
+
+def _outputs(curves: Curves, model: ProcessModel, time_ns: NDArray[np.int64]) -> list[TimePlot]:
+    return [
+        TimePlot(
+            item.name,
+            item.unit,
+            (
+                Series("measured", time_ns, curves.measured[item.name], MEASURED, width=2.5),
+                Series("simulation as it was", time_ns, curves.free_before[item.name], ALARM, width=1.0),
+                Series("extended simulation", time_ns, curves.free_after[item.name], PREDICTED, width=1.0),
+            ),
+        )
+        for item in model.outputs
+    ]
+
+
+def _residuals(curves: Curves, model: ProcessModel, time_ns: NDArray[np.int64]) -> list[TimePlot]:
+    ends = np.full(time_ns.size, SD_95)
+    return [
+        TimePlot(
+            f"Residual of {item.name}",
+            "standard deviations",
+            (
+                Series("upper limit", time_ns, ends, LIMIT, width=1.0, legend="95 % of noise"),
+                Series("lower limit", time_ns, -ends, LIMIT, width=1.0, legend="95 % of noise"),
+                Series("as it was", time_ns, curves.residual_before[item.name], ALARM, width=1.0),
+                Series("extended", time_ns, curves.residual_after[item.name], PREDICTED, width=1.0),
+            ),
+        )
+        for item in model.outputs
+    ]
+
+
+def _causes(diagnosis: Diagnosis, curves: Curves, time_ns: NDArray[np.int64]) -> list[TimePlot]:
+    found = []
+    for cause in diagnosis.causes:
+        lower, upper = interval(cause, curves)
+        series = (
+            Series("upper end", time_ns, upper, LIMIT, width=1.0, legend="95 % interval"),
+            Series("lower end", time_ns, lower, LIMIT, width=1.0, legend="95 % interval"),
+            Series("most likely", time_ns, curves.deviation[cause.cause], PREDICTED),
+        )
+        found.append(TimePlot(f"Size of: {cause.label}", cause.parameters["size"].unit, series))
+    return found

@@ -1,0 +1,107 @@
+"""Diagnoses made up by hand, for what is said and drawn of them."""
+
+from collections.abc import Sequence
+from math import nan
+
+import numpy as np
+
+from diagnosis.result import Alternative, Cause, Curves, Diagnosis, Estimate, Experiment, Gain, HeldOut
+from reactorwatch.process.model import Array
+
+ROWS = 2000
+
+LEAK = Cause(
+    "coolant_flow",
+    "step",
+    "coolant leak",
+    "coolant",
+    {"size": Estimate(-0.0499634, 8.5e-5, "1"), "onset": Estimate(150.3349, 0.0122, "min")},
+)
+DRIFT = Cause(
+    "temperature_bias",
+    "ramp",
+    "drift of the temperature sensor",
+    "temperature_sensor",
+    {"size": Estimate(2.5, 0.1, "K"), "onset": Estimate(20.0, 3.0, "min"), "end": Estimate(199.9, 0.0, "min")},
+)
+CURVE = Cause(
+    "feed_temperature",
+    "free",
+    "wrong feed temperature",
+    "feed",
+    {
+        "size": Estimate(3.0, 0.2, "K"),
+        "time_1": Estimate(0.0, 0.0, "min"),
+        "time_2": Estimate(199.9, 0.0, "min"),
+        "value_1": Estimate(0.0, 0.07, "1"),
+        "value_2": Estimate(1.0, 0.0, "1"),
+    },
+)
+EXPERIMENT = Experiment("Wider steps of qc tell both apart.", ((0.0, 103.4), (10.0, 90.0)), ("coolant_flow",), 42.0)
+
+
+def curves(causes: Sequence[Cause], seed: int = 1) -> Curves:
+    """Noise about a sine; the rest follows the names of the causes alone."""
+    random = np.random.default_rng(seed)
+    time_min: Array = np.linspace(0.0, 199.9, ROWS)
+    truth = {"C": 0.1 + 0.01 * np.sin(time_min), "T": 440.0 + 5.0 * np.sin(time_min)}
+    noise = {name: random.standard_normal(ROWS) for name in truth}
+    measured = {name: truth[name] + sd * noise[name] for name, sd in (("C", 0.002), ("T", 0.3))}
+    off = dict.fromkeys(truth, 3.0 * (time_min > 150.0))
+    return Curves(
+        time_min,
+        {"qc": 100.0 + np.floor(time_min) % 7},
+        measured,
+        {name: truth[name] + off[name] for name in truth},
+        truth,
+        {name: noise[name] - 10.0 * off[name] for name in truth},
+        noise,
+        {cause.cause: np.where(time_min > 150.0, cause.parameters["size"].value, 0.0) for cause in causes},
+        {cause.cause: np.full(ROWS, cause.parameters["size"].sd) for cause in causes},
+    )
+
+
+def diagnosis_of(
+    verdict: str,
+    causes: tuple[Cause, ...] = (),
+    alternatives: tuple[Alternative, ...] = (),
+    *,
+    practical: bool = True,
+    location: str = "",
+    experiment: Experiment | None = None,
+    remarks: tuple[str, ...] = (),
+    ran_away: bool = False,
+) -> Diagnosis:
+    """A diagnosis of 2,000 rows."""
+    before = nan if ran_away else 3.2
+    held_out = {
+        "C": HeldOut(0.0147, 0.00202, 0.0147, 0.00202, 0.00197, "mol/l"),
+        "T": HeldOut(before, 0.292, 3.2, 0.292, 0.303, "K"),
+    }
+    return Diagnosis(
+        samples=ROWS,
+        span_min=199.9,
+        verdict=verdict,
+        causes=causes,
+        alternatives=alternatives,
+        location=location or (causes[0].location if causes else ""),
+        significant=verdict != "nominal",
+        practical=practical and verdict != "nominal",
+        gain=Gain(209025.5 if causes else 0.0, held_out),
+        adequacy={"C": 0.3, "T": 0.35},
+        experiment=experiment,
+        extended_model={"format": "reactorwatch.model.v1", "model": "cstr", "effects": []},
+        remarks=remarks,
+        curves=curves(causes),
+    )
+
+
+FEED = Alternative((("feed_temperature", "step"),), 3.21)
+CASES = {
+    "nominal": diagnosis_of("nominal"),
+    "named": diagnosis_of("named", (LEAK,)),
+    "pair": diagnosis_of("named", (LEAK, DRIFT), remarks=("The record runs under <control>.",)),
+    "curve": diagnosis_of("named", (CURVE,), practical=False),
+    "ambiguous": diagnosis_of("ambiguous", (LEAK,), (FEED,), experiment=EXPERIMENT, ran_away=True),
+    "unknown": diagnosis_of("unknown", location="energy_balance"),
+}

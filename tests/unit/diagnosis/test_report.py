@@ -1,0 +1,234 @@
+"""The page of a diagnosis: self-contained, well-formed, and its pictures hide no peak."""
+
+import re
+import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
+from functools import cache
+from html.parser import HTMLParser
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from diagnosis.report import mathml
+from diagnosis.report.equations import balances
+from diagnosis.report.page import as_page
+from diagnosis.report.svg import COLUMNS, decimated
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.model import ProcessModel
+from tests.unit.diagnosis.cases import CASES
+
+EMPTY = {"meta", "br", "hr", "img", "link", "input"}
+
+
+@cache
+def page(case: str) -> str:
+    return as_page(CASES[case], cstr(), EFFECTS, "plant <1>.csv", "out/extended.json")
+
+
+class Balanced(HTMLParser):
+    """Holds that every element is closed where it was opened."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.seen.append(tag)
+        if tag not in EMPTY:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_page_is_well_formed_and_needs_nothing_from_elsewhere(case: str) -> None:
+    text = page(case)
+    parser = Balanced()
+    parser.feed(text)
+    parser.close()
+    assert parser.open == []
+    assert not {"script", "link", "img", "iframe", "object", "base"} & set(parser.seen)
+    assert not re.search(r"https?:|//[a-z]|@import|url\(|\ssrc=|\shref=", text)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_stands_in_the_page_from_outside_is_escaped(case: str) -> None:
+    text = page(case)
+    assert "<1>" not in text
+    assert "plant &lt;1&gt;.csv" in text
+    assert "<control>" not in text
+
+
+@pytest.mark.parametrize(
+    ("case", "parts"),
+    [
+        ("nominal", ["The simulation is right", "How well it simulates", "They stay as they are"]),
+        (
+            "named",
+            ["coolant leak", "-0.04996 ± 0.00017", "What it gains", "A closer look", "209,025.5", 'class="added"'],
+        ),
+        ("pair", ["drift of the temperature sensor", "Please note", "<msub><mi>m</mi><mn>2</mn></msub>"]),
+        ("ambiguous", ["The experiment that would decide", "Wider steps", "ran away", "3.2"]),
+        ("unknown", ["no known cause explains it", "in the energy balance"]),
+    ],
+)
+def test_the_page_answers_what_it_is_asked(case: str, parts: list[str]) -> None:
+    text = page(case)
+    for part in parts:
+        assert part in text
+
+
+def test_the_page_tells_how_the_extended_model_is_used() -> None:
+    text = page("named")
+    for command in ("simulate", "diagnose", "monitor", "plant"):
+        assert re.search(rf"reactorwatch {command} .*--model out/extended.json", text)
+
+
+def test_a_page_without_curves_is_refused() -> None:
+    with pytest.raises(ValueError, match="without its curves"):
+        as_page(replace(CASES["named"], curves=None), cstr(), EFFECTS, "a.csv", "extended.json")
+
+
+def test_a_free_run_that_ran_away_and_a_size_of_unknown_spread_are_drawn_as_far_as_they_go() -> None:
+    curves = CASES["named"].curves
+    assert curves is not None
+    nothing = np.full(curves.time_min.size, np.nan)
+    for broken in (
+        replace(curves, free_before={"C": nothing, "T": nothing}),
+        replace(curves, free_before={"C": nothing, "T": nothing}, free_after={"C": nothing, "T": nothing}),
+        replace(curves, deviation_sd={"coolant_flow": nothing}),
+        replace(curves, deviation_sd={"coolant_flow": np.full(nothing.size, np.inf)}),
+        replace(curves, residual_before={"C": nothing, "T": nothing}),
+        replace(curves, measured={"C": nothing, "T": curves.measured["T"]}),
+    ):
+        text = as_page(replace(CASES["named"], curves=broken), cstr(), EFFECTS, "a.csv", "extended.json")
+        drawn = re.findall(r'\b(?:d|points)="([^"]*)"', text)
+        assert not [part for part in drawn if "nan" in part or "inf" in part]
+
+
+def test_a_page_of_many_rows_stays_small() -> None:
+    curves = CASES["named"].curves
+    assert curves is not None
+    assert len(page("named")) < 600_000
+    long = np.linspace(0.0, 750.0, 7500)
+    assert decimated(long, np.sin(long))[0].size <= 2 * (COLUMNS + 1)
+
+
+def test_no_peak_is_lost_where_rows_outnumber_columns() -> None:
+    random = np.random.default_rng(3)
+    time_min = np.cumsum(random.uniform(0.05, 0.2, 20_000))
+    values = random.standard_normal(time_min.size)
+    values[random.integers(0, time_min.size, 500)] = np.nan
+    times, kept = decimated(time_min, values, 50)
+    column = np.floor((time_min - time_min[0]) / (time_min[-1] - time_min[0]) * 50)
+    column_kept = np.floor((times - time_min[0]) / (time_min[-1] - time_min[0]) * 50)
+    for number in np.unique(column):
+        there = values[column == number]
+        drawn = kept[column_kept == number]
+        assert np.nanmax(drawn) == np.nanmax(there)
+        assert np.nanmin(drawn) == np.nanmin(there)
+        assert drawn.size <= 2
+    assert np.all(np.diff(times) > 0)
+    assert np.all(np.isin(kept[np.isfinite(kept)], values))
+
+
+def test_a_column_without_values_is_a_gap() -> None:
+    time_min = np.arange(10_000.0)
+    values = np.ones(time_min.size)
+    values[4000:6000] = np.nan
+    times, kept = decimated(time_min, values, 100)
+    assert np.all(np.isnan(kept[(times > 4100) & (times < 5900)]))
+    assert np.all(np.isfinite(kept[(times < 3900) | (times > 6100)]))
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for effect in EFFECTS])
+def test_every_effect_marks_a_part_of_some_equation_and_leaves_the_others(effect: Effect) -> None:
+    model = cstr()
+    extended = effect.apply(model, ca.SX.sym("m"))
+    for number, equation in enumerate(balances(model, [effect])):
+        ElementTree.fromstring(f"<math>{equation.left}{equation.right}</math>")
+        touched = number >= len(model.states) or not ca.is_equal(extended.rhs[number], model.rhs[number], 50)
+        assert equation.changed == touched
+        assert ("added" in equation.right) == touched
+    assert any(equation.changed for equation in balances(model, [effect]))
+
+
+def marked(text: str) -> list[str]:
+    """The marked parts, without their tags."""
+    root = ElementTree.fromstring(f"<math>{text}</math>")
+    return ["".join(item.itertext()) for item in root.iter("mrow") if item.get("class") == "added"]
+
+
+def test_what_is_marked_is_what_is_new() -> None:
+    x, k, m = (ca.SX.sym(name) for name in ("x", "k", "m"))
+    before = k * x - ca.exp(-x)
+    cases: list[tuple[ca.SX, list[str]]] = [
+        (before - m * (x - 298), ["−m(x−298)"]),
+        (before + m, ["+m"]),
+        (ca.substitute(before, k, k * (1 + m)), ["k(1+m)"]),
+        (ca.substitute(before, k, k + m), ["+m"]),
+        (ca.substitute(before, x, x * (1 + m)), ["x(1+m)", "x(1+m)"]),
+        (m * before, ["m(kx−e−x)"]),
+    ]
+    for now, expected in cases:
+        assert marked(mathml.written(now, before, m)) == expected
+    assert marked(mathml.written(before, before, m)) == []
+
+
+@pytest.mark.parametrize(
+    ("expression", "expected"),
+    [
+        (lambda x, y: (x + y) * x, "(x+y)x"),
+        (lambda x, y: x - (y - x), "x−(y−x)"),
+        (lambda x, y: x - y - x, "x−y−x"),
+        (lambda x, y: -(x + y), "−(x+y)"),
+        (lambda x, y: (x * y) ** y, "(xy)y"),
+        (lambda x, y: ca.fmax(x, 1e-6), "max(x,10−6)"),
+        (lambda x, y: x * -2.5e7, "(−2.5·107)x"),
+    ],
+)
+def test_brackets_stand_where_they_are_needed(expression: object, expected: str) -> None:
+    assert callable(expression)
+    x, y = ca.SX.sym("x"), ca.SX.sym("y")
+    root = ElementTree.fromstring(f"<math>{mathml.written(expression(x, y))}</math>")
+    assert "".join(root.itertext()) == expected
+
+
+def test_what_is_long_or_has_no_sign_is_not_written_out() -> None:
+    x = ca.SX.sym("x")
+    long = x
+    for _ in range(40):
+        long = long * (1 + long)
+    assert not mathml.readable(long)
+    assert not mathml.readable(ca.hypot(x, 1 + x))  # which has no sign here
+    assert mathml.readable(x * (1 + x))
+
+
+class Timing(Effect):
+    """The rows are stamped m too late."""
+
+    name = "late"
+    label = "late stamps"
+    location = "timing"
+    unit = "min"
+    lower = 0.0
+    upper = 1.0
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        long = size
+        for _ in range(40):
+            long = long * (1 + long)
+        return replace(model, rhs=(model.rhs[0] + long, model.rhs[1]))
+
+
+def test_a_change_that_is_too_long_is_named_beside_what_was_there() -> None:
+    nominal = balances(cstr(), [])
+    changed = balances(cstr(), [Timing()])
+    assert changed[0].right.startswith(nominal[0].right)
+    assert "changed as said above" in changed[0].right
+    assert changed[1] == nominal[1]

@@ -1,0 +1,107 @@
+"""What a diagnosis says to people and to machines."""
+
+import json
+
+import msgspec
+import pytest
+
+from diagnosis.report.machine import as_object
+from diagnosis.report.plain import as_text
+from diagnosis.report.words import verdict, with_interval
+from diagnosis.result import Diagnosis, Estimate
+from reactorwatch.process.effects import EFFECTS
+from tests.unit.diagnosis.cases import CASES
+
+
+@pytest.mark.parametrize(
+    ("case", "expected"),
+    [
+        ("nominal", "The simulation is right: what the record shows beyond it is noise."),
+        ("named", "The simulation is wrong: coolant leak, since 150.335 ± 0.024 min. It matters in practice."),
+        (
+            "pair",
+            "The simulation is wrong: coolant leak, since 150.335 ± 0.024 min; and drift of the temperature sensor, "
+            "growing since 20.0 ± 5.9 min. It matters in practice.",
+        ),
+        (
+            "curve",
+            "The simulation is wrong: wrong feed temperature, changing over the record, largest at 150.1 min. "
+            "In practice the difference is too small to matter.",
+        ),
+        (
+            "ambiguous",
+            "The simulation is wrong, and the record cannot tell why: coolant leak (since 150.335 ± 0.024 min) or "
+            "wrong feed temperature (feed_temperature, step). It matters in practice.",
+        ),
+        (
+            "unknown",
+            "The simulation is wrong, and no known cause explains it; it acts in the energy balance.",
+        ),
+    ],
+)
+def test_the_verdict_is_a_sentence(case: str, expected: str) -> None:
+    assert verdict(CASES[case], EFFECTS) == expected
+
+
+@pytest.mark.parametrize(
+    ("estimate", "expected"),
+    [
+        (Estimate(-0.0499634, 8.5e-5, "1"), "-0.04996 ± 0.00017"),
+        (Estimate(312.33, 0.1, "min"), "312.33 ± 0.20 min"),
+        (Estimate(12345.6, 100.0, "K"), "12350 ± 200 K"),
+        (Estimate(5.0, 0.0, "min"), "5 min"),
+        (Estimate(5.0, float("nan"), "min"), "5 min"),
+        (Estimate(5.0, float("inf"), "min"), "5 min"),
+    ],
+)
+def test_a_number_has_the_digits_that_its_95_percent_interval_allows(estimate: Estimate, expected: str) -> None:
+    assert with_interval(estimate) == expected
+
+
+def test_people_read_size_onset_gain_rivals_experiment_and_remarks() -> None:
+    text = as_text(CASES["ambiguous"], "run.csv", EFFECTS)
+    for part in (
+        "run.csv: 2000 rows over 199.9 min",
+        "size        -0.04996 ± 0.00017  (95 %)",
+        "when        since 150.335 ± 0.024 min",
+        "C off by 0.00202 mol/l, before 0.0147 mol/l; noise 0.00197 mol/l",
+        "T off by 0.292 K, before none, it ran away; noise 0.303 K",
+        "or          wrong feed temperature (feed_temperature, step), worse by 3.2 in BIC",
+        "experiment  Wider steps of qc tell both apart.",
+    ):
+        assert part in text
+    assert "note        The record runs under <control>." in as_text(CASES["pair"], "run.csv", EFFECTS)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -> None:
+    said = json.loads(msgspec.json.encode(as_object(CASES[case], "run.csv", 1.23456)))
+    assert list(said) == [
+        "file", "samples", "span_min", "seconds", "verdict", "causes", "alternatives", "location", "significant",
+        "practical", "gain", "adequacy", "experiment", "extended_model",
+    ]  # fmt: skip
+    assert said["seconds"] == 1.235
+    for item in said["gain"]["held_out"].values():
+        assert list(item) == ["rmse_before", "rmse_after", "noise_sd", "unit"]
+    for cause in said["causes"]:
+        assert list(cause) == ["cause", "profile", "label", "location", "parameters"]
+        assert next(iter(cause["parameters"])) == "size"
+        assert all(list(item) == ["value", "sd", "unit"] for item in cause["parameters"].values())
+
+
+def test_the_object_holds_what_was_found() -> None:
+    said = as_object(CASES["ambiguous"], "run.csv", 1.0)
+    assert said["causes"][0]["parameters"]["onset"] == {"value": 150.3349, "sd": 0.0122, "unit": "min"}
+    assert said["alternatives"] == [{"causes": [{"cause": "feed_temperature", "profile": "step"}], "delta_bic": 3.21}]
+    assert said["experiment"] == {
+        "why": "Wider steps of qc tell both apart.",
+        "input": [[0.0, 103.4], [10.0, 90.0]],
+        "separates": ["coolant_flow"],
+    }
+    assert said["adequacy"]["T"] == {"minus_log10_p": 0.35}
+
+
+def test_what_is_no_finite_number_is_null() -> None:
+    case: Diagnosis = CASES["ambiguous"]
+    assert as_object(case, "run.csv", 1.0)["gain"]["held_out"]["T"]["rmse_before"] is None
+    assert as_object(CASES["nominal"], "run.csv", 1.0)["location"] is None
