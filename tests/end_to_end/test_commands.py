@@ -24,7 +24,7 @@ COMMANDS = (
     *("up", "demo", "alarm"),
     *("plant", "monitor", "record", "replay", "alive"),
     *("dashboard", "import", "export", "recover", "info", "cut", "merge"),
-    *("simulate", "backtest", "identify", "linearise", "reproduce", "charts"),
+    *("simulate", "backtest", "diagnose", "identify", "linearise", "reproduce", "charts"),
 )
 
 
@@ -93,6 +93,16 @@ def record_csv(tmp_path: Path) -> Path:
         (["identify", "RECORD"], "rows"),
         (["identify", "RECORD", "--output", "pH"], "--output must be C or T"),
         (["linearise", "900"], "qc must be in [0, 500]"),
+        (["diagnose"], "Missing argument"),
+        (["diagnose", "nowhere.csv", "-o", "out"], "nowhere.csv: there is no such file"),
+        (["diagnose", "BAD.csv", "-o", "out"], "row 3"),
+        (["diagnose", "RECORD", "-o", "out"], "needs at least 200 rows, got 3"),
+        (["diagnose", "RECORD", "--tolerance", "C"], "--tolerance must be output=number"),
+        (["diagnose", "RECORD", "--model", "BAD.csv"], "BAD.csv: is not JSON"),
+        (["diagnose", "RECORD", "-o", "BAD.txt"], "is a file, the name of a folder was expected"),
+        (["simulate", "RECORD", "-o", "OUT", "--model", "nowhere.json"], "cannot be read"),
+        (["plant", "--model", "nowhere.json"], "nowhere.json: there is no such file"),
+        (["monitor", "--model", "BAD.txt"], "model file BAD.txt: is not JSON"),
     ],
 )
 def test_what_is_wrong_is_told_in_one_line_and_nothing_is_written(

@@ -53,6 +53,9 @@ def test_it_leaves_a_recording_a_drawing_and_a_summary(demo: tuple[Path, str]) -
     assert "set in at 150.0 min" in summary
     assert "Alarm raised" in summary
     assert "demo.rrd" in summary
+    assert "Diagnosis of the whole recording: The simulation is wrong: coolant leak, since 1" in summary
+    written = {path.name for path in (folder / "diagnosis").iterdir()}
+    assert written == {"report.html", "report.json", "report.rrd", "extended.json"}
     assert summary in said
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.records.csv_file import write_csv
 from reactorwatch.runtime.config import read_settings, section
 from recorder.config import RecorderConfig
@@ -36,7 +37,7 @@ def test_the_readme_s_commands_on_a_record_work_as_they_stand(tmp_path: Path, co
     config = PlantConfig(seed=3, faults=("coolant_flow:step:-0.15@120min",))
     write_csv(tmp_path / "record.csv", simulate_record(config, 1500))
     lines = [line.removeprefix("$ ") for block in RUN_BLOCKS for line in block.splitlines()]
-    assert len(lines) == 10
+    assert len(lines) == 12
     said = []
     for line in lines:
         name, *arguments = shlex.split(line)
@@ -48,6 +49,8 @@ def test_the_readme_s_commands_on_a_record_work_as_they_stand(tmp_path: Path, co
     first, again = (np.genfromtxt(tmp_path / name, delimiter=",", names=True) for name in ("record.csv", "again.csv"))
     assert np.array_equal(first, again)
     assert (tmp_path / "record.rrd").stat().st_size > 0
+    diagnosed = said[[line.split()[1] for line in lines].index("diagnose")]
+    assert "The simulation is wrong: coolant leak, since 1" in diagnosed
 
 
 def test_the_readme_s_make_commands_are_targets_that_set_up_by_themselves() -> None:
@@ -84,6 +87,19 @@ def test_there_is_an_example_of_each_addition() -> None:
 @pytest.mark.parametrize(("title", "code"), EXAMPLES, ids=[title for title, _ in EXAMPLES])
 def test_the_example_runs(title: str, code: str) -> None:
     exec(compile(code, f"CONTRIBUTING.md: {title}", "exec"), {"__name__": "example"})
+
+
+def test_the_example_of_a_diagnosis_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(compile(code, "docs/diagnosis.md", "exec"), {"__name__": "example"})
+    assert capsys.readouterr().out.startswith("The simulation is wrong: coolant leak, since ")
+
+
+def test_the_extended_model_of_the_docs_is_taken() -> None:
+    text = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    (written,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
+    assert parse_extended_model(written).effects[0].effect.name == "coolant_flow"
 
 
 def test_the_settings_file_of_the_docs_is_taken(tmp_path: Path) -> None:
