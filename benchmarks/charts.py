@@ -78,7 +78,7 @@ def of_a_plant() -> None:
 
         def run(watch: ChartWatch = watch) -> None:
             for time_ns, e in enumerate(rows):
-                watch.update(time_ns, e, [False, False], [1.0, 1.0], ["", ""], [], points=False)
+                watch.update(time_ns, e, (False, False), [1.0, 1.0], ["", ""], [], points=False)
 
         each = best_of(run) / ROWS
         print(f"{', '.join(charts)}: {each * 1e6:.2f} us a row of one plant   (goal: 20)")

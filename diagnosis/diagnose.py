@@ -42,6 +42,9 @@ LISTED = 10.0
 SURE = 6.0
 """In BIC, odds of twenty to one: where a rival is worse by less, the record does not rank them."""
 
+NEARLY = 1.15
+"""Times the noise: a free run that errs no more explains what matters, though something is left."""
+
 PRACTICAL_SHARE = 0.02
 """Of an output's range in the record: a difference in it that matters, where the user does not say."""
 
@@ -73,12 +76,18 @@ def diagnose(
     found = with_pairs(search, search.found())
     best = found.best if found.nominal.bic - found.best.bic >= LEAST_GAIN else found.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
-    verdict, location = _verdict(found, best, adequacy), best.hypothesis.sized.effects[0].location if best.key else ""
-    if verdict == UNKNOWN:
+    verdict, location = _verdict(found, best), best.hypothesis.sized.effects[0].location if best.key else ""
+    remarks: list[str] = []
+    if np.any(adequacy >= WHITE):
         strange = unknown(search, best, effects)
-        if strange is not None:
-            location = strange.hypothesis.sized.effects[0].location
-        best = found.nominal  # what is not explained is not extended
+        best.hypothesis.sized.noise = found.noise
+        if strange is None and best.key and _nearly_explained(found, gained(run, found.nominal, best)[1]):
+            remarks.append(
+                "what is left is small, but not white: the course in time may be rougher than what was fitted"
+            )
+        else:
+            verdict, best = UNKNOWN, found.nominal  # what is not explained is not extended
+            location = strange.hypothesis.sized.effects[0].location if strange is not None else location
     best.hypothesis.sized.noise, found.nominal.hypothesis.sized.noise = found.noise, found.own_noise
     before, after = gained(run, found.nominal, best)
     curves = _curves(run, model, found.nominal, best)
@@ -96,13 +105,17 @@ def diagnose(
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=None,
         extended_model=extended_model(model, effects, causes, record.zero_ns),
+        remarks=tuple(remarks),
         curves=curves,
     )
 
 
-def _verdict(found: Found, best: Explained, adequacy: Array) -> str:
-    if np.any(adequacy >= WHITE):
-        return UNKNOWN
+def _nearly_explained(found: Found, after: Errors) -> bool:
+    """Whether the free run's errors come near to the noise on rows that were not fitted."""
+    return bool(np.all(after.free < NEARLY * np.array(found.noise.measurement_sd)))
+
+
+def _verdict(found: Found, best: Explained) -> str:
     if best is found.nominal:
         return NOMINAL
     rivals = [item.bic - best.bic for item in found.explained if item.hypothesis.causes != best.hypothesis.causes]

@@ -225,13 +225,13 @@ class ChartWatch:
                     continue
                 if points:
                     publications.append(Publication(watched.keys[place], _point(time_ns, judgement)))
-                if judgement.out or not alarm.at_rest:
-                    explain = _explaining(watched.charts, place, scales, units)
-                    stood = alarm.memory.rule.standing
+                rule = alarm.memory.rule
+                if judgement.out or rule.standing or rule.recent:
+                    stood = rule.standing
+                    explain = None if stood else _explaining(watched.charts, place, scales, units)
                     publications.extend(self._board.judge(alarm, time_ns, judgement, SD, explain))
-                    stands = alarm.memory.rule.standing
-                    raised |= stands and not stood
-                    if stood and not stands:
+                    raised |= rule.standing and not stood
+                    if stood and not rule.standing:
                         watched.charts.restart(place)
             watched.at_rest = all(alarm.at_rest for alarm in watched.alarms)
         return raised

@@ -54,12 +54,13 @@ class Persistence:
         state = self.state
         state.recent = ((state.recent << 1) | out) & self._mask
         state.in_a_row = state.in_a_row + 1 if back_in or (back_in is None and not out) else 0
-        if not state.standing and out and state.recent.bit_count() >= self._raise_count:
+        if state.standing:
+            if state.in_a_row >= self._clear_count:
+                state.standing, state.recent = False, 0
+                return False
+        elif out and state.recent.bit_count() >= self._raise_count:
             state.standing = True
             return True
-        if state.standing and state.in_a_row >= self._clear_count:
-            state.standing, state.recent = False, 0
-            return False
         return None
 
 

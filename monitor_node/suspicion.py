@@ -49,6 +49,7 @@ class Suspicion:
     def __init__(self, config: MonitorConfig, board: AlarmBoard, reference: ProcessReference) -> None:
         self._config, self._board, self._reference = config, board, reference
         self._places = places(reference.model, config.outputs)
+        self._all_watched = self._places == list(range(len(reference.model.outputs)))
         self._isolation: Isolation | None = None
         self._rows: deque[tuple[float, float, list[float]]] = deque(maxlen=config.isolation_rows)
         self._incident = 0
@@ -76,6 +77,9 @@ class Suspicion:
         if self._isolation is not None:
             self._isolation.add(time_min, input_value, measured)
         board = self._board
+        if not board.has_unexplained and True not in stuck:  # as mostly
+            self._reconstruction = self._since = None
+            return []
         if True in stuck:
             self._reconstruct(self._config.outputs[stuck.index(True)], STUCK_SENSOR, time_min, list(self._rows)[:-1])
         elif self._cause == STUCK_SENSOR or not board.has_unexplained:
@@ -105,7 +109,7 @@ class Suspicion:
 
     def _measured(self, values: list[float]) -> list[float]:
         """The outputs of the model; NaN for those that are not watched."""
-        if self._places == list(range(len(self._reference.model.outputs))):
+        if self._all_watched:
             return values
         measured = [float("nan")] * len(self._reference.model.outputs)
         for place, value in zip(self._places, values, strict=True):

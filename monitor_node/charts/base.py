@@ -240,7 +240,8 @@ class Bank(Generic[Kind]):
 
     def _hold(self, columns: Array) -> None:
         self._columns = np.ascontiguousarray(columns)
-        self._buffer, plants = self._columns.data, columns.shape[1]
+        self._plants = plants = columns.shape[1]
+        self._numbers = self._columns.reshape(-1).data  # all of them, one row after the other
         self._come, self._out = Struct(f"{2 * plants}d").pack_into, Struct(f"{plants}d").unpack_from
         self._out_offset = OUT * plants * self._columns.itemsize
 
@@ -286,14 +287,16 @@ class Bank(Generic[Kind]):
             values: one a chart, finite where present.
             present: False leaves a chart as it is.
         """
-        self._come(self._buffer, 0, *values, *present)  # X and PRESENT are the first rows
+        self._come(self._numbers, 0, *values, *present)  # X and PRESENT are the first rows
         self._kind.kernel(self._columns)
-        out = self._out(self._buffer, self._out_offset)
+        out = self._out(self._numbers, self._out_offset)
         return any(out) and any(here and much > 0.0 for here, much in zip(present, out, strict=True))
 
     def judgement(self, plant: int) -> Judgement:
         """What a chart said of its last value."""
-        statistic, centre, lower, upper, out = self._columns[STATISTIC:SETTINGS, plant].tolist()
+        plants = self._plants
+        told = self._numbers[STATISTIC * plants + plant : SETTINGS * plants : plants].tolist()
+        statistic, centre, lower, upper, out = told
         return Judgement(statistic, centre, lower, upper, out > 0.0)
 
     def restart(self, plants: NDArray[np.bool_] | None = None) -> None:

@@ -3,6 +3,7 @@
 Only what `--help` needs is imported here; each command imports its own when it is called.
 """
 
+import os
 import sys
 from typing import cast
 
@@ -44,6 +45,9 @@ def _root(
 
 def main() -> None:
     """Run the command and end the process with its exit code."""
+    # Before NumPy is imported: our matrices are small, and threads of the linear algebra would wait for each other
+    # longer than they work. Who knows better sets it otherwise; nodes that are started from here inherit it.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = app(standalone_mode=False)
     except UsageProblem as error:

@@ -12,7 +12,7 @@ from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, AlarmState
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from recorder.player import samples_of
@@ -180,6 +180,19 @@ def test_a_board_that_was_stored_goes_on_as_if_nothing_had_happened() -> None:
     ]
     assert encode(stayed.said[-1]) == encode(back.said[-1])
     assert stayed.board.to_bytes() == back.board.to_bytes()
+
+
+def test_figures_of_each_minute_carry_its_time_and_follow_what_time_alone_changes() -> None:
+    desk = Desk()
+    for minute in range(3):
+        desk.point(float(minute), T=0.0)
+    desk.point(3.0, T=5.0)
+    for minute in (*range(4, 30), 24 * 60 + 3, 24 * 60 + 4):
+        desk.point(float(minute))
+    figures = {item.time_ns: item for item in desk.told(AlarmKpis)}
+    assert list(figures) == [to_time_ns(minute) for minute in (*range(30), 24 * 60 + 3, 24 * 60 + 4)]
+    assert [figures[to_time_ns(minute)].alarms_10min for minute in (2, 3, 12, 13)] == [0, 1, 1, 0]
+    assert [list(figures[to_time_ns(minute)].stale) for minute in (24 * 60 + 3, 24 * 60 + 4)] == [[], ["shewhart/T"]]
 
 
 def test_an_alarm_that_there_is_no_more_is_left_out() -> None:

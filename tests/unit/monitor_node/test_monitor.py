@@ -3,7 +3,7 @@
 import math
 import random
 from collections.abc import Iterable
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 import pytest
@@ -309,3 +309,18 @@ def test_a_training_full_of_holes_is_told_and_harms_nothing() -> None:
     monitor, said = watch(samples(time_min[kept], {name: values[kept] for name, values in columns.items()}))
     assert monitor.phase == "watching"
     assert [check.name for check in reference_of(said).checks] == ["record", "training"]
+
+
+@pytest.mark.parametrize("reference", ["process", "arx"])
+def test_whether_points_are_published_or_not_the_alarms_are_the_same(
+    reference: Literal["process", "arx"], leak: list[Encoded]
+) -> None:
+    """Without them, the model that adapts does not learn before somebody asks for what it predicts."""
+    config = MonitorConfig(reference=reference, isolation=False)
+    alarms = []
+    for points in (True, False):
+        monitor = Monitor(config, 0, points=points)
+        said = [item for message in leak for item in monitor.on_message(message, 0)]
+        alarms.append([item.message for item in said if isinstance(item.message, Alarm)])
+    assert alarms[0] == alarms[1]
+    assert alarms[0]

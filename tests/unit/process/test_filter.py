@@ -16,6 +16,7 @@ from plant_node.record import simulate_record
 from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, OPERATING_STATE, cstr
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.filter import Filter, FilterState, Innovation, NoiseLevels
+from reactorwatch.process.filter_record import FilterRecord
 from reactorwatch.process.model import Array, Output, ProcessModel, new_clock, variable
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states
@@ -220,6 +221,19 @@ def test_a_record_at_once_and_row_by_row_are_the_same_to_the_last_bit() -> None:
     for field in Innovation._fields:
         np.testing.assert_array_equal([getattr(row, field) for row in rows], getattr(whole, field))
     assert one.state == other.state
+
+
+@pytest.mark.parametrize("since", [1, 100, 129, 299])
+def test_over_the_rest_of_a_record_it_goes_on_bit_for_bit(since: int) -> None:
+    time_min, inputs, measured = record_of(PlantConfig(seed=7), 300)
+    time_min = time_min + np.where(np.arange(300) > 200, 2.0, 0.0)
+    model = parse_fault("coolant_flow:step:-0.2@12.37min").extend(cstr())
+    record = FilterRecord.of(time_min, inputs, measured, 6.0)
+    whole, kalman = Filter(model, SENSORS).over(record), Filter(model, SENSORS)
+    kalman.run(time_min[:since], inputs[:since], measured[:since], gate=6.0)
+    rest = kalman.over(record.rest(since), kalman.state)
+    for field in Innovation._fields:
+        np.testing.assert_array_equal(getattr(rest, field), getattr(whole, field)[since:])
 
 
 def test_from_a_stored_state_it_goes_on_bit_for_bit() -> None:

@@ -1,0 +1,29 @@
+"""The command's entry: what it settles before a subcommand runs."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from reactorwatch.cli.main import main
+
+THREADS = "OPENBLAS_NUM_THREADS"
+
+
+@pytest.mark.parametrize(("given", "then"), [(None, "1"), ("3", "3")])
+def test_linear_algebra_has_one_thread_unless_somebody_wants_more(
+    given: str | None, then: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(THREADS, given or "")
+    if given is None:
+        monkeypatch.delenv(THREADS)
+    monkeypatch.setattr(sys, "argv", ["reactorwatch", "--version"])
+    with pytest.raises(SystemExit):
+        main()
+    assert os.environ[THREADS] == then
+
+
+def test_it_is_settled_before_numpy_is_imported() -> None:
+    question = "import sys, reactorwatch.cli.main; sys.exit('numpy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", question], check=False).returncode == 0
