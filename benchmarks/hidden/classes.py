@@ -88,7 +88,9 @@ CLASSES: tuple[StudyClass, ...] = (
     StudyClass("few steps", "single", _always(NAMED_CIRCUMSTANCES["few steps"])),
     *(StudyClass(name, "single", _always(NAMED_CIRCUMSTANCES[name])) for name in _HARD),
     StudyClass("hard nominal", "nominal", _HARD_QUIET),
+    StudyClass("missing values", "single", _always(NAMED_CIRCUMSTANCES["missing values"])),
 )
+"""The seeds of a class follow from its place: a new one goes to the end."""
 
 
 def class_named(name: str) -> StudyClass:

@@ -191,6 +191,8 @@ def _record(plan: Plan, played: Played, noise: Array, circumstances: Circumstanc
     for column, resolution in enumerate(circumstances.resolution):
         if resolution:
             values[:, column] = np.round(values[:, column] / resolution) * resolution
+    if circumstances.missing_values:
+        values[rng.random(plan.time_min.size) < circumstances.missing_values] = np.nan
     there = np.ones(plan.time_min.size, dtype=bool)
     if circumstances.missing:
         there = rng.random(plan.time_min.size) >= circumstances.missing

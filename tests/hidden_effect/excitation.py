@@ -28,7 +28,8 @@ class Circumstances:
         noise_sd: of C and T, white.
         process_sd: of C and T.
         correlation: of the sensors' noise from row to row.
-        missing: share of rows that are missing.
+        missing: share of rows that are missing; a change of the input in one of them shows a row too late.
+        missing_values: share of rows in which neither C nor T was measured; qc is known.
         irregular: largest share of the period that a row comes off its time.
         resolution: of C and T, to which they are rounded; 0: not.
         outliers: share of values that are far off.
@@ -42,6 +43,7 @@ class Circumstances:
     process_sd: tuple[float, float] = NO_PROCESS_NOISE
     correlation: float = 0.0
     missing: float = 0.0
+    missing_values: float = 0.0
     irregular: float = 0.0
     resolution: tuple[float, float] = (0.0, 0.0)
     outliers: float = 0.0
@@ -57,6 +59,7 @@ NAMED_CIRCUMSTANCES: dict[str, Circumstances] = {
     "narrow": Circumstances(input="narrow"),
     "closed loop": Circumstances(input="closed"),
     "missing rows": Circumstances(missing=0.05),
+    "missing values": Circumstances(missing_values=0.05),
     "150 min": Circumstances(span_min=150.0),
     "process noise": Circumstances(process_sd=SMALL_PROCESS_NOISE),
     "more process noise": Circumstances(process_sd=MEDIUM_PROCESS_NOISE),

@@ -71,6 +71,13 @@ def test_one_row_in_twenty_is_missing_but_never_the_first() -> None:
     assert record.time_min[0] == 0.0
 
 
+def test_in_one_row_of_twenty_both_values_are_missing_and_the_flow_is_known() -> None:
+    columns = draw(2, (), NAMED_CIRCUMSTANCES["missing values"]).record.columns
+    assert np.array_equal(np.isnan(columns["C"]), np.isnan(columns["T"]))
+    assert np.isnan(columns["T"]).sum() == pytest.approx(375, abs=76)
+    assert np.all(np.isfinite(columns["qc"]))
+
+
 def test_irregular_rows_come_in_order_and_off_their_times() -> None:
     steps = np.diff(draw(2, (), replace(NAMED_CIRCUMSTANCES["irregular"], span_min=60.0)).record.time_min)
     assert steps.min() > 0.0

@@ -31,6 +31,7 @@ QUIET = (
     "more process noise",
     "closed loop",
     "missing rows",
+    "missing values",
     "narrow",
     "high noise",
 )
