@@ -31,6 +31,8 @@ SHORTEST_PERIOD_ROWS = 12
 KNOWN_PERIODS = 10
 """For so many periods the size of a sine's signature is computed; between them it is interpolated."""
 
+_WELL_INSIDE = 0.6
+
 EDGE_ROWS = 5
 """Nearer to the ends of the record no onset is looked for."""
 
@@ -209,15 +211,29 @@ class Screen:
             if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
                 continue
             by = np.asarray(np.linalg.lstsq(b, a, rcond=1e-12)[0], dtype=np.float64)
+            gain = float(by @ (2.0 * a - b @ by))
             if course.coefficients == 1:
-                by = np.clip(by, effect.lower, effect.upper)
-            leads.append(Lead(effect, course, np.append(by, shape), float(by @ (2.0 * a - b @ by))))
+                by, gains = _possible(by, a, b[0], effect)
+                gain = float(gains[0])
+            leads.append(Lead(effect, course, np.append(by, shape), gain))
         return leads
 
 
 def _best(a: Array, b: Array, effect: Effect) -> tuple[Array, Array]:
     """The likeliest possible sizes and their gains."""
-    size = np.clip(a / np.maximum(b, 1e-300), effect.lower, effect.upper)
-    gain = size * (2.0 * a - size * b)
+    size, gain = _possible(a / np.maximum(b, 1e-300), a, b, effect)
     good = np.isfinite(gain)
     return np.where(good, size, 0.0), np.where(good, gain, 0.0)
+
+
+def _possible(size: Array, a: Array, b: Array, effect: Effect) -> tuple[Array, Array]:
+    """Sizes within the effect's bounds, and their gains.
+
+    Of an effect that is far from linear the linear size may be beyond what is possible though a possible one does the
+    same: with much less heat transfer, less and less of it does ever more. So it keeps its gain, and a fit begins well
+    inside. Beyond a bound of zero there is nothing to begin with.
+    """
+    beyond = ((size < effect.lower) & (effect.lower < 0.0)) | ((size > effect.upper) & (effect.upper > 0.0))
+    inside = np.clip(size, effect.lower, effect.upper)
+    gain = np.where(beyond, size, inside) * (2.0 * a - np.where(beyond, size, inside) * b)
+    return np.where(beyond, _WELL_INSIDE * inside, inside), gain
