@@ -9,6 +9,8 @@ import structlog
 
 ROOT = Path(__file__).parents[1]
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does: the last bits depend on it
+
 
 @pytest.fixture(scope="session")
 def daisy_csv() -> Path:

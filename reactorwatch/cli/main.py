@@ -46,7 +46,8 @@ def _root(
 def main() -> None:
     """Run the command and end the process with its exit code."""
     # Before NumPy is imported: our matrices are small, and threads of the linear algebra would wait for each other
-    # longer than they work. Who knows better sets it otherwise; nodes that are started from here inherit it.
+    # longer than they work; and the last bits of a chart's limit depend on how many they are. So a back-test says what
+    # the live monitor said, on whatever machine. Who sets it otherwise has to do so for both; nodes inherit it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
         code = app(standalone_mode=False)
