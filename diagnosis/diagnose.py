@@ -9,6 +9,7 @@ from diagnosis.adequacy import WHITE, minus_log10_p
 from diagnosis.courses import Signal
 from diagnosis.extended import extended_model
 from diagnosis.held_out import Errors, free_run, gained
+from diagnosis.integration import looks_like_integration
 from diagnosis.pairs import with_pairs
 from diagnosis.record_checks import run_of
 from diagnosis.result import (
@@ -29,7 +30,7 @@ from diagnosis.search import Explained, Found, Search
 from diagnosis.unknown import unknown
 from reactorwatch.errors import InputError
 from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effects.base import TIMING, Effect
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.records.record import Record
 
@@ -88,6 +89,12 @@ def diagnose(
         else:
             verdict, best = UNKNOWN, found.nominal  # what is not explained is not extended
             location = strange.hypothesis.sized.effects[0].location if strange is not None else location
+            if looks_like_integration(model, run, found.nominal.fit.found):
+                location = TIMING
+                remarks.append(
+                    "what is left goes with the error of an integrator's steps: it looks like integration "
+                    "of the record's own making, or timing of its input"
+                )
     best.hypothesis.sized.noise, found.nominal.hypothesis.sized.noise = found.noise, found.own_noise
     before, after = gained(run, found.nominal, best)
     curves = _curves(run, model, found.nominal, best)
@@ -100,7 +107,7 @@ def diagnose(
         alternatives=tuple(_alternatives(found, best)),
         location=location,
         significant=verdict != NOMINAL,
-        practical=_matters(curves, bands),
+        practical=_left_matters(before, found, model, bands) if verdict == UNKNOWN else _matters(curves, bands),
         gain=_gain(model, found, best, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=None,
@@ -222,6 +229,13 @@ def _matters(curves: Curves, bands: Mapping[str, float]) -> bool:
         if known.size < difference.size or float(np.sqrt(np.mean(known**2))) > band:
             return True
     return False
+
+
+def _left_matters(before: Errors, found: Found, model: ProcessModel, bands: Mapping[str, float]) -> bool:
+    """Whether the nominal free run errs by more than noise and tolerance in an output."""
+    noise = np.array(found.own_noise.measurement_sd)
+    left = np.sqrt(np.maximum(before.free**2 - noise**2, 0.0))
+    return any(not value <= bands[name] for name, value in zip(model.output_names, left.tolist(), strict=True))
 
 
 def _bands(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> dict[str, float]:

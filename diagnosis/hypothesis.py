@@ -28,7 +28,7 @@ _RUNAWAY = 1e100
 """A filter that lost an unstable plant has signatures without bound, and no step makes sense."""
 
 _SHARE = 0.02
-_FIRST_SHARE, _LAST_SHARE = 0.4, 0.003
+_SCANS = ((2.0, 24), (1.06, 9), (1.015, 7))  # how far to either side, and how many
 _WIDENINGS, _WIDER = 10, 2.0
 _MOST_STEPS, _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 12, 5, 1e-3, 10.0, 0.1
 
@@ -110,14 +110,13 @@ class Hypothesis:
         return best
 
     def _scanned(self, run: Run, best: Fit) -> Fit:
-        """Of a single coefficient that the innovations depend on in jumps: the best of ever nearer ones."""
-        step = _FIRST_SHARE
-        while step > _LAST_SHARE:
-            (numbers,) = best.theta
-            for way in (1.0 / (1.0 + step), 1.0 + step):
-                trial = self.at(run, [numbers * way])
-                best = min(best, trial, key=lambda item: item.loss)
-            step *= 0.7
+        """Of a size that the innovations depend on in jumps: the best of many, then of nearer ones."""
+        for reach, count in _SCANS:
+            (numbers,), (course,) = best.theta, self.courses
+            scaled = np.arange(numbers.size) < course.coefficients
+            shares = np.geomspace(1.0 / reach, reach, count)
+            tried = [self.at(run, [np.where(scaled, share * numbers, numbers)]) for share in shares]
+            best = min(best, *tried, key=lambda item: item.loss)
         return best
 
     def covariance(self, run: Run, fit: Fit) -> Array:

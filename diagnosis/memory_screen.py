@@ -50,7 +50,9 @@ class MemoryScreen:
                 found.append(Lead(effect, self._constant, np.array([start]), gain))
             before = clipped(nominal.w)
             for _, start, w in tried:
-                found += self._scaled(effect, before, (before - clipped(w)) / start)
+                scaled = self._scaled(effect, before, (before - clipped(w)) / start)
+                # What acts in jumps does not scale: a fit has to scan its size, and can do so for one alone.
+                found += [item for item in scaled if not effect.jumps or item.course.name in ("constant", "step")]
         return found
 
     def _scaled(self, effect: Effect, w: Array, g: Array) -> list[Lead]:

@@ -37,7 +37,9 @@ def verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
     if diagnosis.verdict == NAMED:
         causes = [f"{cause.label}, {when(cause, diagnosis.curves)}" for cause in diagnosis.causes]
         return f"The simulation is wrong: {'; and '.join(causes)}. {in_practice(diagnosis)}"
-    return f"The simulation is wrong, and no known cause explains it; it acts {place(diagnosis)}."
+    return (
+        f"The simulation is wrong, and no known cause explains it; it acts {place(diagnosis)}. {in_practice(diagnosis)}"
+    )
 
 
 def in_practice(diagnosis: Diagnosis) -> str:

@@ -45,6 +45,7 @@ class Effect(ABC):
         starts: sizes that a fit begins at, where the effect is so far from linear that it may not get there from its
             neutral size; empty: it begins at neutral.
         labels: what a person calls it with a given profile, where that has a name of its own.
+        jumps: whether what it does changes with its size in jumps, so that it has no derivative.
         late_output: the output that shows by m later what was there, and that is all the effect does; None: no such.
     """
 
@@ -58,6 +59,7 @@ class Effect(ABC):
     typical: ClassVar[float]
     starts: ClassVar[tuple[float, ...]] = ()
     labels: ClassVar[dict[str, str]] = {}
+    jumps: ClassVar[bool] = False
     late_output: ClassVar[str | None] = None
 
     @abstractmethod

@@ -23,6 +23,7 @@ class ValveStiction(Effect):
     lower = 0.0
     upper = 100.0
     typical = 2.0
+    jumps = True
     starts = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:

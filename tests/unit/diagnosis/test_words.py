@@ -35,7 +35,8 @@ from tests.unit.diagnosis.cases import CASES
         ),
         (
             "unknown",
-            "The simulation is wrong, and no known cause explains it; it acts in the energy balance.",
+            "The simulation is wrong, and no known cause explains it; it acts in the energy balance. "
+            "It matters in practice.",
         ),
     ],
 )

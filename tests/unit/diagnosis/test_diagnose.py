@@ -1,0 +1,98 @@
+"""What is said of records with one thing wrong, two, nothing, or something that no catalogue has."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from diagnosis.diagnose import diagnose
+from diagnosis.result import NAMED, NOMINAL, UNKNOWN
+from reactorwatch.errors import InputError
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.model import Array
+from reactorwatch.records.csv_file import read_csv
+from reactorwatch.records.record import Record
+from tests.unit.diagnosis.runs import record_of
+
+
+def test_where_nothing_is_wrong_it_says_so() -> None:
+    found = diagnose(record_of(rows=2000), cstr())
+    assert (found.verdict, found.causes, found.significant, found.practical) == (NOMINAL, (), False, False)
+    assert found.gain.held_out["T"].rmse_before == pytest.approx(0.3, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("fault", "size", "onset"),
+    [
+        ("coolant_flow:step:-0.03@100.37min", -0.03, 100.37),
+        ("heat_transfer:ramp:-0.4@60min,end=199.9min", -0.4, 60.0),
+        ("temperature_lag:constant:0.1", 0.1, None),
+        ("concentration_delay:step:0.3@90min", 0.3, 90.0),
+    ],
+)
+def test_one_cause_is_named_with_an_interval_that_holds_it(fault: str, size: float, onset: float | None) -> None:
+    found = diagnose(record_of(fault, rows=2000), cstr())
+    (cause,) = found.causes
+    assert (found.verdict, cause.cause, cause.profile) == (NAMED, *fault.split(":")[:2])
+    said = cause.parameters["size"]
+    assert abs(said.value - size) < 4 * said.sd
+    if onset is not None:
+        assert cause.parameters["onset"].value == pytest.approx(onset, abs=3.0)
+    for held_out, noise in (found.gain.held_out["C"], 0.002), (found.gain.held_out["T"], 0.3):
+        assert held_out.rmse_after < 1.1 * noise
+        assert held_out.rmse_after <= held_out.rmse_before
+
+
+def test_two_causes_are_named_together() -> None:
+    found = diagnose(record_of("coolant_flow:step:-0.02@120min", "temperature_bias:constant:1.5", rows=2500), cstr())
+    assert found.verdict == NAMED
+    assert sorted(cause.cause for cause in found.causes) == ["coolant_flow", "temperature_bias"]
+
+
+def test_what_no_cause_explains_is_unknown() -> None:
+    record = record_of(rows=2000)
+    T = record.columns["T"]
+    bowed = T + 0.05 * (T - 440.0) ** 2
+    found = diagnose(replace(record, columns=record.columns | {"T": bowed}), cstr())
+    assert (found.verdict, found.causes, found.significant) == (UNKNOWN, (), True)
+    assert found.practical
+
+
+def test_a_tolerance_decides_what_matters_in_practice() -> None:
+    record = record_of("temperature_bias:constant:0.2", rows=2000)
+    fine, coarse = (diagnose(record, cstr(), tolerance={"T": value, "C": 0.01}) for value in (0.1, 0.5))
+    assert (fine.verdict, coarse.verdict) == (NAMED, NAMED)
+    assert (fine.practical, coarse.practical) == (True, False)
+
+
+def test_the_measured_record_differs_from_the_simulation_by_what_an_integrator_does(daisy_csv: Path) -> None:
+    found = diagnose(read_csv(daisy_csv), cstr())
+    assert (found.significant, found.practical, found.location) == (True, False, "timing")
+
+
+def changed(record: Record, **columns: Array) -> Record:
+    return replace(record, columns=record.columns | columns)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda r: Record(r.time_min[:50], {k: v[:50] for k, v in r.columns.items()}, r.name), "at least 200 rows"),
+        (lambda r: changed(r, T=np.full(r.rows, 440.0)), "T must vary"),
+        (lambda r: changed(r, T=r.columns["T"] - 273.15), "degrees C"),
+        (lambda r: changed(r, qc=np.full(r.rows, 100.0)), "qc must move"),
+        (lambda r: changed(r, C=np.full(r.rows, np.nan)), "C needs at least 100 values"),
+        (lambda r: Record(r.time_min, {"qc": r.columns["qc"], "T": r.columns["T"]}, r.name), "C is not there"),
+    ],
+)
+def test_what_cannot_be_diagnosed_is_said_in_a_line(spoil: Callable[[Record], Record], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        diagnose(spoil(record_of(rows=400)), cstr())
+
+
+@pytest.mark.parametrize(("tolerance", "said"), [({"p": 1.0}, "must be of C, T"), ({"T": -1.0}, "positive")])
+def test_a_tolerance_has_to_be_of_an_output_and_positive(tolerance: dict[str, float], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        diagnose(record_of(rows=400), cstr(), tolerance=tolerance)
