@@ -13,6 +13,7 @@ from scipy.stats import binom
 from diagnosis.diagnose import diagnose
 from diagnosis.result import NOMINAL, Diagnosis
 from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import Hidden, draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES
@@ -88,7 +89,8 @@ def test_so_many_sizes_are_within_their_95_percent_intervals() -> None:
 
 @pytest.mark.xdist_group("hidden effects")
 def test_the_onset_of_a_step_is_found_to_the_row() -> None:
-    errors = [error for name in NAMES for error in found(name)[2].onset_errors]
+    jumping = {effect.name for effect in EFFECTS if effect.jumps}  # a valve that sticks shows it when it should move
+    errors = [error for name in NAMES if name not in jumping for error in found(name)[2].onset_errors]
     assert len(errors) >= len(NAMES) // 6
     assert sorted(errors)[len(errors) // 2] < 0.1
     assert max(errors) < 1.0
