@@ -18,7 +18,7 @@ from diagnosis import signatures
 from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Signal, Sine, Step
 from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
-from diagnosis.sized import Sized, clipped
+from diagnosis.sized import Sized, clipped, ways_between
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter_errors import FilterErrors, Ways
 from reactorwatch.process.model import Array, ProcessModel
@@ -137,10 +137,8 @@ class Screen:
                 own = (extended.parameters[-1].symbol,) * 2
             of_rates.append(own[0])
             of_outputs.append(own[1])
-        errors = FilterErrors(extended, sized.noise, of_rates, of_outputs)
-        later = type(fit.found)(*(item[1:] for item in fit.found))
-        inputs = sized.inputs(self._run, signals)[1:]
-        return errors.ways(self._run.time_min[1:], inputs, later, sized.used(self._run)[1:])
+        errors = FilterErrors.of(extended, sized.noise, of_rates, of_outputs)
+        return ways_between(errors, self._run, sized.inputs(self._run, signals), fit.found, sized.used(self._run))
 
     def _set_in(self, ways: Ways) -> list[Lead]:
         """Constants, steps, ramps and decays."""

@@ -49,7 +49,9 @@ class Sized:
         self._plant = model
         self._filtered = with_size_inputs(model, [item for item in self.effects if item.late_output is None])
         self._filter = Filter(self.model, self._noise_of(noise))
-        self._errors = FilterErrors(self.model, self._filter.noise, self._filtered.of_rates, self._filtered.of_outputs)
+        self._errors = FilterErrors.of(
+            self.model, self._filter.noise, self._filtered.of_rates, self._filtered.of_outputs
+        )
 
     @property
     def model(self) -> ProcessModel:
@@ -118,9 +120,7 @@ class Sized:
 
     def ways(self, run: Run, signals: Sequence[Signal], found: Innovations) -> Ways:
         """The equations of the filter's errors about its run; from the second row on, the first that it predicts."""
-        later = Innovations(*(item[1:] for item in found))
-        used = self.used(run)[1:]
-        return self._errors.ways(run.time_min[1:], self.inputs(run, signals)[1:], later, used)
+        return ways_between(self._errors, run, self.inputs(run, signals), found, self.used(run))
 
     def used(self, run: Run) -> NDArray[np.bool_]:
         """Which values correct the filter in their own row, shape (rows, n_y); those of a late sensor do it before."""
@@ -142,6 +142,12 @@ class Sized:
         """States that an effect brings have none of their own."""
         more = len(self.model.states) - len(noise.process_sd)
         return NoiseLevels(noise.measurement_sd, (*noise.process_sd, *(0.0,) * more))
+
+
+def ways_between(errors: FilterErrors, run: Run, inputs: Array, found: Innovations, used: NDArray[np.bool_]) -> Ways:
+    """The equations of a filter's errors about its run, from the second row on, the first that it predicts."""
+    began = np.all(np.isnan(found.prediction), axis=1)
+    return errors.ways(run.time_min[1:], inputs[1:], found.x[1:], found.P[1:], found.residual[1:], used[1:], began[1:])
 
 
 def clipped(w: Array) -> Array:

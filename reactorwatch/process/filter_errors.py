@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.array_function import ArrayFunction, mapped
-from reactorwatch.process.filter import Innovations, NoiseLevels
+from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_step import exponential
 from reactorwatch.process.integrate import LONGEST_STEP_MIN, symbolic_step
 from reactorwatch.process.model import Array, ProcessModel
@@ -58,46 +58,73 @@ class FilterErrors:
     Args:
         model: that the filter ran with.
         noise: of the plant and its sensors.
-        of_rates: symbols of the model, the sizes as they act in the balances.
-        of_outputs: the same sizes as they act in the outputs; may be the same symbols.
+        piece: see `piece_function`.
+        shown: see `shown_function`.
     """
 
-    def __init__(
-        self, model: ProcessModel, noise: NoiseLevels, of_rates: Sequence[ca.SX], of_outputs: Sequence[ca.SX]
-    ) -> None:
-        self.model = model
-        self._piece = mapped(_piece(model, ca.vertcat(*of_rates)), CHUNK, parameters=2)
-        self._shown = mapped(_shown(model, ca.vertcat(*of_outputs)), CHUNK, parameters=2)
-        self.noise = noise
+    def __init__(self, model: ProcessModel, noise: NoiseLevels, piece: ca.Function, shown: ca.Function) -> None:
+        self.model, self.noise = model, noise
+        self._piece, self._shown = (mapped(function, CHUNK, parameters=2) for function in (piece, shown))
 
-    def ways(self, time_min: Array, inputs: Array, found: Innovations, used: NDArray[np.bool_]) -> Ways:
+    @classmethod
+    def of(
+        cls, model: ProcessModel, noise: NoiseLevels, of_rates: Sequence[ca.SX], of_outputs: Sequence[ca.SX]
+    ) -> "FilterErrors":
+        """With respect to some sizes.
+
+        Args:
+            model: see the class.
+            noise: likewise.
+            of_rates: symbols of the model, the sizes as they act in the balances.
+            of_outputs: the same sizes as they act in the outputs; may be the same symbols.
+        """
+        return cls(model, noise, piece_function(model, of_rates), shown_function(model, of_outputs))
+
+    def ways(
+        self,
+        time_min: Array,
+        inputs: Array,
+        x: Array,
+        P: Array,
+        residual: Array,
+        used: NDArray[np.bool_],
+        began: NDArray[np.bool_] | None = None,
+    ) -> Ways:
         """Those between the rows of a record.
 
         Args:
             time_min: shape (rows,).
             inputs: shape (rows, n_u).
-            found: the filter's run over them.
+            x: the filter's state after each row, shape (rows, n_x).
+            P: its covariance, shape (rows, n_x, n_x).
+            residual: what it was off by, shape (rows, n_y); NaN where nothing was measured.
             used: whether a value corrected the filter, shape (rows, n_y).
+            began: rows that it began anew with, shape (rows,), so that what was before is forgotten; None: none.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # about a run that has lost an unstable plant
-            return self._ways(time_min, inputs, found, used)
+            found = self._ways(time_min, inputs, x, P, residual, used)
+        if began is None:
+            return found
+        F, G, H, D, K = (
+            np.where(began[1:, None, None], 0.0, item) for item in (found.F, found.G, found.H, found.D, found.K)
+        )
+        return Ways(F, G, H, D, K, found.L_inverse, found.w)
 
-    def _ways(self, time_min: Array, inputs: Array, found: Innovations, used: NDArray[np.bool_]) -> Ways:
+    def _ways(
+        self, time_min: Array, inputs: Array, x: Array, P: Array, residual: Array, used: NDArray[np.bool_]
+    ) -> Ways:
         R, q = np.square(self.noise.measurement_sd), np.square(self.noise.process_sd)
         p, step = self.model.values(), np.diff(time_min)
-        there, F, G = self._walked(found.x[:-1], inputs[:-1], time_min[:-1], step, p)
+        there, F, G = self._walked(x[:-1], inputs[:-1], time_min[:-1], step, p)
         H, D = self._over(self._shown, p, there, inputs[1:], time_min[1:, None])
-        prior = F @ found.P[:-1] @ F.transpose(0, 2, 1) + np.eye(there.shape[1]) * q * step[:, None, None]
+        prior = F @ P[:-1] @ F.transpose(0, 2, 1) + np.eye(there.shape[1]) * q * step[:, None, None]
         covariance = H @ prior @ H.transpose(0, 2, 1) + np.diag(R)
-        sound = np.all(np.isfinite(covariance), axis=(1, 2))
-        known = np.isfinite(found.residual[1:]) & sound[:, None]
+        known = np.isfinite(residual[1:]) & np.all(np.isfinite(covariance), axis=2)
         both = known[:, :, None] & known[:, None, :]
         L = _cholesky(np.where(both, covariance, np.eye(R.size)))
         L_inverse = np.asarray(np.linalg.inv(L) * both)
-        w = np.einsum("kij,kj->ki", L_inverse, np.where(known, found.residual[1:], 0.0))
-        K = found.P[1:] @ H.transpose(0, 2, 1) * (used[1:] / R)[:, None, :]
-        began = np.all(np.isnan(found.prediction[1:]), axis=1)  # what was before is forgotten there
-        F, G, H, D, K = (np.where(began[:, None, None], 0.0, item) for item in (F, G, H, D, K))
+        w = np.einsum("kij,kj->ki", L_inverse, np.where(known, residual[1:], 0.0))
+        K = P[1:] @ H.transpose(0, 2, 1) * (used[1:] / R)[:, None, :]
         return Ways(F, G, H, D, K, L_inverse, w)
 
     def _walked(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
@@ -140,12 +167,13 @@ def _cholesky(A: Array) -> Array:
     return L
 
 
-def _piece(model: ProcessModel, size: ca.SX) -> ca.Function:
+def piece_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
     """(x, u, p, t, h) -> x after two steps, and its derivatives by x and by the sizes.
 
     With A and B the Jacobians of the right-hand side at the ends of a step, the derivative by x is the exponential of
     the mean of A, as in the filter, and that by the sizes follows from the trapezoidal rule.
     """
+    size = ca.vertcat(*sizes)
     x, u, p = model.arguments()
     t, h = ca.SX.sym("t"), ca.SX.sym("h")
     symbols = [x, u, p, model.clock.now, model.clock.middle]
@@ -163,11 +191,11 @@ def _piece(model: ProcessModel, size: ca.SX) -> ca.Function:
     return ca.Function("piece", [x, u, p, t, h], [ca.densify(item) for item in ca.cse([point, F, G])])
 
 
-def _shown(model: ProcessModel, size: ca.SX) -> ca.Function:
+def shown_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
     """(x, u, p, t) -> derivatives of the outputs by x and by the sizes."""
     x, u, p = model.arguments()
     t = ca.SX.sym("t")
     y = ca.vertcat(*(output.expression for output in model.outputs))
     y = ca.substitute(ca.substitute(y, model.clock.now, t), model.clock.middle, t)
-    by = [ca.densify(ca.jacobian(y, item)) for item in (x, size)]
+    by = [ca.densify(ca.jacobian(y, item)) for item in (x, ca.vertcat(*sizes))]
     return ca.Function("shown", [x, u, p, t], by)
