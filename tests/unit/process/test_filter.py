@@ -297,6 +297,19 @@ def test_a_sensor_that_is_all_but_exact_leaves_the_covariance_positive() -> None
     assert np.all(np.diag(P) < 1e-17)
 
 
+def test_it_begins_anew_after_a_row_whose_input_nobody_knows() -> None:
+    time_min, inputs, measured = record_of(PlantConfig(seed=3), 60)
+    inputs = inputs.copy()
+    inputs[30] = np.nan
+    found = Filter(cstr(), SENSORS).run(time_min, inputs, measured)
+    assert np.flatnonzero(np.all(np.isnan(found.prediction), axis=1)).tolist() == [0, 31]
+    kalman = Filter(cstr(), SENSORS)
+    told = [
+        kalman.update(*row) for row in zip(time_min.tolist(), inputs[:, None].tolist(), measured.tolist(), strict=True)
+    ]
+    np.testing.assert_array_equal([item.prediction for item in told], found.prediction)
+
+
 def test_over_rows_without_any_measurement_it_predicts_alone() -> None:
     start = FilterState(0.0, (OPERATING_COOLANT_FLOW,), (0.08, 440.0), (1e-6, 0.0, 0.0, 0.1))
     time_min = np.arange(1, 31, dtype=np.float64) * 0.1
