@@ -89,14 +89,15 @@ def diagnose(
         else:
             verdict, best = UNKNOWN, found.nominal  # what is not explained is not extended
             location = strange.hypothesis.sized.effects[0].location if strange is not None else location
-            if looks_like_integration(model, run, found.nominal.fit.found):
-                location = TIMING
-                remarks.append(
-                    "what is left goes with the error of an integrator's steps: it looks like integration "
-                    "of the record's own making, or timing of its input"
-                )
     best.hypothesis.sized.noise, found.nominal.hypothesis.sized.noise = found.noise, found.own_noise
     before, after = gained(run, found.nominal, best)
+    matters = verdict == UNKNOWN and _left_matters(before, found, model, bands)
+    if verdict == UNKNOWN and not matters and looks_like_integration(model, run, found.nominal.fit.found):
+        location = TIMING
+        remarks.append(
+            "what is left is small and goes with the error of an integrator's steps: it looks like integration "
+            "of the record's own making, or timing of its input"
+        )
     curves = _curves(run, model, found.nominal, best)
     causes = tuple(_causes(run, best))
     return Diagnosis(
@@ -107,7 +108,7 @@ def diagnose(
         alternatives=tuple(_alternatives(found, best)),
         location=location,
         significant=verdict != NOMINAL,
-        practical=_left_matters(before, found, model, bands) if verdict == UNKNOWN else _matters(curves, bands),
+        practical=matters or _matters(curves, bands),
         gain=_gain(model, found, best, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=None,
