@@ -28,8 +28,11 @@ from reactorwatch.process.noise import tune
 FIRST_LEADS, MOST_LEADS, LEADS, A_CAUSE = 3, 8, 10, 2
 """How many leads of the first screen are fitted, and if none of them gains anything; of each later one; of a cause."""
 
+FIRST_SCORE = 4.0
+"""What a lead of the first screen has to promise in BIC; chance alone seldom promises so much."""
+
 LEAST_SCORE = -20.0
-"""A lead that promises less in BIC is not fitted."""
+"""A rival that promises less in BIC is not fitted."""
 
 IN_QUESTION = 60.0
 """In BIC: a rival that is worse by more is out of question."""
@@ -110,7 +113,7 @@ class Search:
         leads = self._sorted(self.screen.leads(nominal.hypothesis, nominal.fit) + remembering)
         best, known = nominal, dict[Key, Explained]()
         for number, lead in enumerate(_of_different_causes(leads)):
-            if lead.score(self.run.values) < 0.0 or number >= (MOST_LEADS if best is nominal else FIRST_LEADS):
+            if lead.score(self.run.values) < FIRST_SCORE or number >= (MOST_LEADS if best is nominal else FIRST_LEADS):
                 break
             item = self.fitted(lead)
             known[item.key] = item
