@@ -6,6 +6,7 @@ that of the course.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -51,9 +52,21 @@ class MemoryScreen:
             before = clipped(nominal.w)
             for _, start, w in tried:
                 scaled = self._scaled(effect, before, (before - clipped(w)) / start)
+                kept = 1.0 if effect.jumps else self._kept(model, nominal, scaled[0])
                 # What acts in jumps does not scale: a fit has to scan its size, and can do so for one alone.
-                found += [item for item in scaled if not effect.jumps or item.course.name in ("constant", "step")]
+                found += [
+                    replace(item, gain=kept * item.gain)
+                    for item in scaled
+                    if kept > 0.0 and (not effect.jumps or item.course.name in ("constant", "step"))
+                ]
         return found
+
+    def _kept(self, model: Sized, nominal: Fit, constant: Lead) -> float:
+        """How much of the gain that scaling promises a run with that constant size keeps, at most all of it."""
+        if constant.gain <= 0.0:
+            return 1.0 if constant.gain == 0.0 else 0.0
+        loss = model.follow(self._run, [self._constant.signal(constant.theta)])[0]
+        return min(2.0 * (nominal.loss - loss) / constant.gain, 1.0)
 
     def _scaled(self, effect: Effect, w: Array, g: Array) -> list[Lead]:
         """From the signature of a size of 1 in every row."""
