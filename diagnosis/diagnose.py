@@ -6,7 +6,6 @@ from math import sqrt
 import numpy as np
 
 from diagnosis.adequacy import WHITE, minus_log10_p
-from diagnosis.courses import Signal
 from diagnosis.extended import extended_model
 from diagnosis.held_out import Errors, free_run, gained
 from diagnosis.integration import looks_like_integration
@@ -98,8 +97,9 @@ def diagnose(
             "what is left is small and goes with the error of an integrator's steps: it looks like integration "
             "of the record's own making, or timing of its input"
         )
-    curves = _curves(run, model, found.nominal, best)
-    causes = tuple(_causes(run, best))
+    covariances = _covariances(run, best)
+    curves = _curves(run, model, found.nominal, best, covariances)
+    causes = tuple(_causes(best, covariances))
     return Diagnosis(
         samples=run.time_min.size,
         span_min=run.span_min,
@@ -144,12 +144,22 @@ def _alternatives(found: Found, best: Explained) -> list[Alternative]:
     return listed
 
 
-def _causes(run: Run, best: Explained) -> list[Cause]:
-    hypothesis, causes, begin = best.hypothesis, [], 0
-    covariance = hypothesis.covariance(run, best.fit) if best.key else np.empty((0, 0))
-    for effect, course, theta in zip(hypothesis.sized.effects, hypothesis.courses, best.fit.theta, strict=True):
-        part = covariance[begin : begin + theta.size, begin : begin + theta.size]
+def _covariances(run: Run, best: Explained) -> list[Array]:
+    """Of the numbers of each effect, whatever those of the others."""
+    if not best.key:
+        return []
+    whole, parts, begin = best.hypothesis.covariance(run, best.fit), [], 0
+    for theta in best.fit.theta:
+        parts.append(whole[begin : begin + theta.size, begin : begin + theta.size])
         begin += theta.size
+    return parts
+
+
+def _causes(best: Explained, covariances: Sequence[Array]) -> list[Cause]:
+    hypothesis, causes = best.hypothesis, []
+    for effect, course, theta, part in zip(
+        hypothesis.sized.effects, hypothesis.courses, best.fit.theta, covariances, strict=True
+    ):
         value = course.parameters(theta)
         slope = {name: np.zeros(theta.size) for name in value}
         for place in range(theta.size):
@@ -185,17 +195,13 @@ def _gain(model: ProcessModel, found: Found, best: Explained, before: Errors, af
     return Gain(found.nominal.bic - best.bic, held_out)
 
 
-def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained) -> Curves:
+def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained, covariances: Sequence[Array]) -> Curves:
     outputs = model.output_names
     hypothesis, signals = best.hypothesis, best.hypothesis.signals(best.fit)
     deviation, deviation_sd = {}, {}
-    covariance = hypothesis.covariance(run, best.fit) if best.key else np.empty((0, 0))
-    begin = 0
-    for effect, course, theta, signal in zip(
-        hypothesis.sized.effects, hypothesis.courses, best.fit.theta, signals, strict=True
+    for effect, course, theta, signal, part in zip(
+        hypothesis.sized.effects, hypothesis.courses, best.fit.theta, signals, covariances, strict=True
     ):
-        part = covariance[begin : begin + theta.size, begin : begin + theta.size]
-        begin += theta.size
         slope = course.derivatives(theta, course.least_differences).at_row
         deviation[effect.name] = signal.at_row
         deviation_sd[effect.name] = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, part, slope), 0.0))
@@ -203,17 +209,13 @@ def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained) 
         run.time_min,
         dict(zip(model.input_names, run.inputs.T, strict=True)),
         dict(zip(outputs, run.measured.T, strict=True)),
-        dict(zip(outputs, _free(run, nominal, ()).T, strict=True)),
-        dict(zip(outputs, _free(run, best, signals).T, strict=True)),
+        dict(zip(outputs, free_run(run, nominal.hypothesis.sized, ()).T, strict=True)),
+        dict(zip(outputs, free_run(run, hypothesis.sized, signals).T, strict=True)),
         dict(zip(outputs, _standardised(nominal).T, strict=True)),
         dict(zip(outputs, _standardised(best).T, strict=True)),
         deviation,
         deviation_sd,
     )
-
-
-def _free(run: Run, item: Explained, signals: Sequence[Signal]) -> Array:
-    return free_run(run, item.hypothesis.sized, signals)
 
 
 def _standardised(item: Explained) -> Array:
@@ -223,9 +225,8 @@ def _standardised(item: Explained) -> Array:
 def _matters(curves: Curves, bands: Mapping[str, float]) -> bool:
     """Whether the free runs of both models differ by more than the tolerance in an output."""
     for output, band in bands.items():
-        difference = (curves.free_after[output] - curves.free_before[output])[
-            1:
-        ]  # the filter says nothing of the first
+        # The filter says nothing of the first row.
+        difference = (curves.free_after[output] - curves.free_before[output])[1:]
         known = difference[np.isfinite(difference)]
         if known.size < difference.size or float(np.sqrt(np.mean(known**2))) > band:
             return True

@@ -15,6 +15,7 @@ from diagnosis.courses import Signal
 from diagnosis.run import Run
 from diagnosis.search import Explained
 from diagnosis.sized import Sized
+from reactorwatch.process.filter import Innovations
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
@@ -51,7 +52,10 @@ def gained(run: Run, nominal: Explained, best: Explained) -> tuple[Errors, Error
 
 def free_run(run: Run, sized: Sized, signals: Sequence[Signal]) -> Array:
     """The outputs of a free run, shape (rows, n_y); the first rows are the filter's. NaN if it came to an end."""
-    _, _, found = sized.follow(run, signals)
+    return _freely(run, sized, signals, sized.follow(run, signals)[2])
+
+
+def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovations) -> Array:
     outputs = np.array(found.prediction)
     first = min(OBSERVED_ROWS, run.time_min.size - 2)
     while first < run.time_min.size - 2 and not np.all(np.isfinite(found.x[first])):
@@ -68,7 +72,7 @@ def free_run(run: Run, sized: Sized, signals: Sequence[Signal]) -> Array:
 
 def _errors(run: Run, hidden: Array, sized: Sized, signals: Sequence[Signal]) -> Errors:
     _, _, found = sized.follow(run, signals)
-    free = free_run(run, sized, signals)
+    free = _freely(run, sized, signals, found)
     with np.errstate(invalid="ignore"):
         return Errors(_rms((run.measured - free)[hidden]), _rms(found.residual[hidden]))
 

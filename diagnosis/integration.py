@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from diagnosis.run import Run
-from reactorwatch.process.array_function import mapped
+from reactorwatch.process.array_function import mapped, over_rows
 from reactorwatch.process.filter import Innovations
 from reactorwatch.process.model import Array, ProcessModel
 
@@ -49,17 +49,5 @@ def _shown_error(model: ProcessModel, run: Run, x: Array) -> Array:
     curved = after + 0.5 * h * (f(after, u, p, t, t)[0] - slope)
     error = f(curved, u, p, t, t)[1] - f(after, u, p, t, t)[1]
     function = mapped(ca.Function("error", [state, u, p, t, h], [error]), CHUNK, parameters=2)
-    step, found = np.diff(run.time_min), []
-    function.arguments[2][0] = model.values()
-    for first in range(0, step.size, CHUNK):
-        rows = slice(first, min(first + CHUNK, step.size))
-        count = rows.stop - first
-        for argument, value in zip(
-            (*function.arguments[:2], *function.arguments[3:]),
-            (x[rows], run.inputs[rows], run.time_min[rows, None], step[rows, None]),
-            strict=True,
-        ):
-            argument[:count] = value
-        function()
-        found.append(function.results[0].reshape(CHUNK, -1)[:count].copy())
-    return np.concatenate(found)
+    values = (x[:-1], run.inputs[:-1], run.time_min[:-1, None], np.diff(run.time_min)[:, None])
+    return over_rows(function, CHUNK, model.values(), values)[0][:, :, 0]

@@ -7,13 +7,17 @@ gain of `LEAST_PAIR_GAIN`.
 """
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 from diagnosis.courses import Course
 from diagnosis.hypothesis import Hypothesis
 from diagnosis.screen import Lead
-from diagnosis.search import IN_QUESTION, Explained, Found, Key, Search
+from diagnosis.search import IN_QUESTION, Explained, Found, Key, Search, keep
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array
+
+Part: TypeAlias = tuple[Effect, Course, Array]
+"""An effect, its course and its numbers."""
 
 LEAST_PAIR_GAIN = 40.0
 """In BIC, of a pair over the best single cause."""
@@ -34,15 +38,13 @@ def with_pairs(search: Search, found: Found) -> Found:
     if not found.explained or found.best is found.nominal:
         return found
     single = found.best
-    left = _promising(search, search.screen.leads(single.hypothesis, single.fit), LEAST_PAIR_GAIN)
-    if not left:
-        return found
     pairs: dict[Key, Explained] = {}
     for begin in _beginnings(found.explained):
         left = _promising(search, search.screen.leads(begin.hypothesis, begin.fit), LEAST_PAIR_GAIN)
+        if begin is single and not left:
+            return found
         for lead in _others(left, begin)[:SECONDS]:
-            first = zip(begin.hypothesis.sized.effects, begin.hypothesis.courses, begin.fit.theta, strict=True)
-            _keep(pairs, _fitted(search, [*first, (lead.effect, lead.course, lead.theta)]))
+            keep(pairs, _fitted(search, [*_parts(begin), (lead.effect, lead.course, lead.theta)]))
     if not pairs:
         return found
     best = min(pairs.values(), key=lambda item: item.bic)
@@ -54,7 +56,7 @@ def with_pairs(search: Search, found: Found) -> Found:
             leads = search.screen.leads(best.hypothesis, best.fit, replaced=(place,))
             least = max((item.score(search.run.values) for item in leads), default=0.0) - IN_QUESTION
             for lead in search.chosen(_others(leads, best, place), EXCHANGED, least):
-                _keep(pairs, _exchanged(search, best, place, lead))
+                keep(pairs, _exchanged(search, best, place, lead))
         best = min(pairs.values(), key=lambda item: item.bic)
         if best is again:
             break
@@ -84,17 +86,16 @@ def _others(leads: Sequence[Lead], beside: Explained, replaced: int | None = Non
 
 def _exchanged(search: Search, pair: Explained, place: int, lead: Lead) -> Explained:
     """With one of the two replaced."""
-    hypothesis = pair.hypothesis
-    parts = list(zip(hypothesis.sized.effects, hypothesis.courses, pair.fit.theta, strict=True))
+    parts = _parts(pair)
     parts[place] = (lead.effect, lead.course, lead.theta)
     return _fitted(search, parts)
 
 
-def _fitted(search: Search, parts: Sequence[tuple[Effect, Course, Array]]) -> Explained:
+def _parts(explained: Explained) -> list[Part]:
+    hypothesis = explained.hypothesis
+    return list(zip(hypothesis.sized.effects, hypothesis.courses, explained.fit.theta, strict=True))
+
+
+def _fitted(search: Search, parts: Sequence[Part]) -> Explained:
     effects, courses, theta = zip(*parts, strict=True)
     return search.fit(Hypothesis(search.sized(effects), courses), theta)
-
-
-def _keep(pairs: dict[Key, Explained], item: Explained) -> None:
-    if item.key not in pairs or item.bic < pairs[item.key].bic:
-        pairs[item.key] = item

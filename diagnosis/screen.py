@@ -72,7 +72,7 @@ class Screen:
     """
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run) -> None:
-        self._model, self._run = model, run
+        self._run = run
         names = model.state_names
         self.direct = tuple(effect for effect in effects if effect.extend(model).state_names == names)
         self.with_memory = tuple(effect for effect in effects if effect not in self.direct)

@@ -130,9 +130,8 @@ class Search:
             least = max([LEAST_SCORE, *(item.score(self.run.values) - IN_QUESTION for item in leads[:1])])
             for lead in [*self.chosen(leads, LEADS, least), *self._simpler(leads, best), *remembering]:
                 fresh = _key(lead) not in known or (_key(lead) == best.key and self._elsewhere(lead, best))
-                item = self.fitted(lead) if fresh else known[_key(lead)]
-                if item.key not in known or item.bic < known[item.key].bic:
-                    known[item.key] = item
+                if fresh:
+                    keep(known, self.fitted(lead))
             again, best = best, min(known.values(), key=lambda item: item.bic)
             if best is again:
                 break
@@ -220,6 +219,12 @@ class Search:
 
     def _with_bic(self, hypothesis: Hypothesis, fit: Fit) -> Explained:
         return Explained(hypothesis, fit, 2.0 * fit.loss + hypothesis.freedom * log(self.run.values))
+
+
+def keep(known: dict[Key, Explained], item: Explained) -> None:
+    """Put a fit among those that are known, unless a better one of the same effects and courses is."""
+    if item.key not in known or item.bic < known[item.key].bic:
+        known[item.key] = item
 
 
 def _of_different_causes(leads: Sequence[Lead]) -> list[Lead]:

@@ -18,7 +18,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.process.array_function import ArrayFunction, mapped
+from reactorwatch.process.array_function import ArrayFunction, mapped, over_rows
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_step import exponential
 from reactorwatch.process.integrate import LONGEST_STEP_MIN, symbolic_step
@@ -143,18 +143,7 @@ class FilterErrors:
 
     def _over(self, function: ArrayFunction, p: Array, *values: Array) -> list[Array]:
         """A function of (x, u, p, ...) for many rows; each result has the rows as its first axis."""
-        rows = len(values[0])
-        arguments = (*function.arguments[:2], *function.arguments[3:])
-        function.arguments[2][0] = p
-        results = [np.empty((rows, item.shape[0] // CHUNK, item.shape[1])) for item in function.results]
-        for first in range(0, rows, CHUNK):
-            part = slice(first, min(first + CHUNK, rows))
-            for argument, value in zip(arguments, values, strict=True):
-                argument[: part.stop - first] = value[part]
-            function()
-            for result, found in zip(results, function.results, strict=True):
-                result[part] = found.reshape(CHUNK, *result.shape[1:])[: part.stop - first]
-        return [result.transpose(0, 2, 1) for result in results]
+        return over_rows(function, CHUNK, p, values)
 
 
 def _cholesky(A: Array) -> Array:

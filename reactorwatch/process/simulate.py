@@ -18,7 +18,7 @@ from functools import cached_property
 import casadi as ca
 import numpy as np
 
-from reactorwatch.process.array_function import ArrayFunction, mapped
+from reactorwatch.process.array_function import ArrayFunction, mapped, over_rows
 from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
 from reactorwatch.process.memory import reset_function, rest_function
 from reactorwatch.process.model import Array, ProcessModel
@@ -338,18 +338,7 @@ class Simulator:
         self, function: ArrayFunction, time_min: Array, inputs: Array, p: Array, states: Array
     ) -> list[Array]:
         """Results of a function of (x, u, p, t) for every row, each of shape (rows, its rows, its columns)."""
-        rows = time_min.size
-        results = [np.empty((rows, array.shape[0] // CHUNK, array.shape[1])) for array in function.results]
-        x, u, parameters, t = function.arguments
-        parameters[0] = p
-        for first in range(0, rows, CHUNK):
-            count = min(CHUNK, rows - first)
-            part = slice(first, first + count)
-            x[:count], u[:count], t[:count, 0] = states[part], inputs[part], time_min[part]
-            function()
-            for result, array in zip(results, function.results, strict=True):
-                result[part] = array.reshape(CHUNK, *result.shape[1:])[:count]
-        return [result.transpose(0, 2, 1) for result in results]
+        return over_rows(function, CHUNK, p, (states, inputs, time_min[:, None]))
 
     def _checked(
         self, time_min: Array, inputs: Array, start: Array, changes: Mapping[str, float] | None
