@@ -24,6 +24,7 @@ from diagnosis.result import (
     Gain,
     HeldOut,
 )
+from diagnosis.rough_numbers import settled
 from diagnosis.run import Run
 from diagnosis.search import Explained, Found, Search
 from diagnosis.unknown import unknown
@@ -89,6 +90,7 @@ def diagnose(
             verdict, best = UNKNOWN, found.nominal  # what is not explained is not extended
             location = strange.hypothesis.sized.effects[0].location if strange is not None else location
     best.hypothesis.sized.noise, found.nominal.hypothesis.sized.noise = found.noise, found.own_noise
+    best, covariances = _with_rough_numbers(search, best)
     before, after = gained(run, found.nominal, best)
     matters = verdict == UNKNOWN and _left_matters(before, found, model, bands)
     if verdict == UNKNOWN and not matters and looks_like_integration(model, run, found.nominal.fit.found):
@@ -97,7 +99,6 @@ def diagnose(
             "what is left is small and goes with the error of an integrator's steps: it looks like integration "
             "of the record's own making, or timing of its input"
         )
-    covariances = _covariances(run, best)
     curves = _curves(run, model, found.nominal, best, covariances)
     causes = tuple(_causes(best, covariances))
     return Diagnosis(
@@ -153,6 +154,20 @@ def _covariances(run: Run, best: Explained) -> list[Array]:
         parts.append(whole[begin : begin + theta.size, begin : begin + theta.size])
         begin += theta.size
     return parts
+
+
+def _with_rough_numbers(search: Search, best: Explained) -> tuple[Explained, list[Array]]:
+    """With the numbers in which the likelihood is rough where it is largest; and the covariances with their spread."""
+    sds = [np.sqrt(np.maximum(np.diag(item), 0.0)) for item in _covariances(search.run, best)]
+    best, rough = settled(search, best, sds)
+    covariances = _covariances(search.run, best)
+    for effect, whole, numbers in zip(best.hypothesis.sized.effects, covariances, rough, strict=True):
+        for number, sd in numbers.items():
+            share = sd / max(float(np.sqrt(whole[number, number])), 1e-300)
+            share = share if effect.jumps else max(share, 1.0)  # by derivatives, all other numbers may move as well
+            whole[number] *= share
+            whole[:, number] *= share
+    return best, covariances
 
 
 def _causes(best: Explained, covariances: Sequence[Array]) -> list[Cause]:

@@ -32,12 +32,13 @@ class MemoryScreen:
         t = run.time_min
         self._constant, self._step, self._ramp, self._free = Constant(t), Step(t), Ramp(t), Free(t, KNOTS)
 
-    def leads(self, nominal: Fit, sized: Callable[[Effect], Sized]) -> list[Lead]:
+    def leads(self, nominal: Fit, sized: Callable[[Effect], Sized], least_score: float) -> list[Lead]:
         """The best size of each effect as a constant, and from there a step, a ramp and a free curve.
 
         Args:
             nominal: the fit without any effect.
             sized: makes the model with an effect.
+            least_score: promises of less, in BIC, are not held against a run of the filter.
         """
         found = []
         for effect in self._effects:
@@ -52,7 +53,8 @@ class MemoryScreen:
             before = clipped(nominal.w)
             for _, start, w in tried:
                 scaled = self._scaled(effect, before, (before - clipped(w)) / start)
-                kept = 1.0 if effect.jumps else self._kept(model, nominal, scaled[0])
+                promising = max(item.score(self._run.values) for item in scaled) > least_score
+                kept = self._kept(model, nominal, scaled[0]) if promising and not effect.jumps else 1.0
                 # What acts in jumps does not scale: a fit has to scan its size, and can do so for one alone.
                 found += [
                     replace(item, gain=kept * item.gain)

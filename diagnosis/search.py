@@ -28,8 +28,9 @@ from reactorwatch.process.noise import tune
 FIRST_LEADS, MOST_LEADS, LEADS, A_CAUSE = 3, 8, 10, 2
 """How many leads of the first screen are fitted, and if none of them gains anything; of each later one; of a cause."""
 
-FIRST_SCORE = 4.0
-"""What a lead of the first screen has to promise in BIC; chance alone seldom promises so much."""
+FIRST_SCORE, SCAN_SCORE = 4.0, 30.0
+"""What a lead of the first screen has to promise in BIC; chance alone seldom promises so much. And one of an effect
+that acts in jumps, whose fit is a scan, and costs as much as ten others."""
 
 LEAST_SCORE = -20.0
 """A rival that promises less in BIC is not fitted."""
@@ -109,11 +110,12 @@ class Search:
         """The best explanations by one effect."""
         nominal, own_noise = self.nominal(), self.noise
         memory = MemoryScreen(self.screen.with_memory, self.run)
-        remembering = self._sorted(memory.leads(nominal.fit, lambda effect: self.sized((effect,))))
+        remembering = self._sorted(memory.leads(nominal.fit, lambda effect: self.sized((effect,)), FIRST_SCORE))
         leads = self._sorted(self.screen.leads(nominal.hypothesis, nominal.fit) + remembering)
         best, known = nominal, dict[Key, Explained]()
-        for number, lead in enumerate(_of_different_causes(leads)):
-            if lead.score(self.run.values) < FIRST_SCORE or number >= (MOST_LEADS if best is nominal else FIRST_LEADS):
+        worth = [lead for lead in leads if lead.score(self.run.values) > _least_score(lead)]
+        for number, lead in enumerate(_of_different_causes(worth)):
+            if number >= (MOST_LEADS if best is nominal else FIRST_LEADS):
                 break
             item = self.fitted(lead)
             known[item.key] = item
@@ -233,6 +235,10 @@ def _of_different_causes(leads: Sequence[Lead]) -> list[Lead]:
     for lead in leads:
         found.setdefault(lead.effect.name, lead)
     return list(found.values())
+
+
+def _least_score(lead: Lead) -> float:
+    return SCAN_SCORE if lead.effect.jumps else FIRST_SCORE
 
 
 def _key(lead: Lead) -> Key:

@@ -157,5 +157,10 @@ def clipped(w: Array) -> Array:
 
 def loss_of(w: Array) -> float:
     """Of whitened innovations, without what they were divided by."""
+    return float(np.sum(row_losses(w)))
+
+
+def row_losses(w: Array) -> Array:
+    """Likewise, of each row, shape (rows,)."""
     size = np.abs(np.nan_to_num(w))
-    return float(np.sum(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER))))
+    return np.asarray(np.sum(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)), axis=1))

@@ -1,0 +1,69 @@
+"""Where the likelihood is rough in a number, its interval follows what the record can tell of it."""
+
+import numpy as np
+import pytest
+
+from diagnosis.courses import Step
+from diagnosis.hypothesis import Hypothesis
+from diagnosis.result import Estimate
+from diagnosis.rough_numbers import settled
+from diagnosis.search import Search
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
+from tests.unit.diagnosis.runs import run_of
+
+PERIOD_MIN = 0.1
+
+
+def step_of(cause: str, size: float, onset_min: float, begun_min: float) -> tuple[Estimate, Estimate, float]:
+    """Onset and size of a step in a plant, fitted from another onset; and the onset's standard deviation by the fit."""
+    run = run_of(f"{cause}:step:{size}@{onset_min}min", rows=600)
+    search = Search(cstr(), EFFECTS, run, (1e-4, 1e-2))
+    effect = next(item for item in EFFECTS if item.name == cause)
+    hypothesis = Hypothesis(search.sized((effect,)), (Step(run.time_min),))
+    fitted = search.fit(hypothesis, (np.array([size, begun_min]),))
+    search.settle(fitted)
+    fitted = search.refitted(fitted)
+    by_fit = np.sqrt(np.diag(hypothesis.covariance(run, fitted.fit)))
+    best, (sds,) = settled(search, fitted, [by_fit])
+    size_of, onset = best.fit.theta[0].tolist()
+    return (
+        Estimate(onset, sds[1], "min"),
+        Estimate(size_of, sds.get(0, float(by_fit[0])), effect.unit),
+        float(by_fit[1]),
+    )
+
+
+@pytest.mark.parametrize("onset_min", [30.005, 30.05, 30.095])
+def test_a_sensor_tells_between_which_rows_it_went_wrong_and_no_more(onset_min: float) -> None:
+    """Of a time that may lie anywhere in an interval, the standard deviation is its length over the root of 12."""
+    onset, _, _ = step_of("temperature_bias", 4.0, onset_min, 30.3)
+    assert onset.value == pytest.approx(30.05, abs=0.02)
+    assert onset.sd == pytest.approx(PERIOD_MIN / np.sqrt(12.0), rel=0.2)
+
+
+def test_a_lag_tells_between_which_moves_of_the_input_it_began() -> None:
+    """The input moves every minute: within one nothing shows when the valve became slow."""
+    onset, _, _ = step_of("valve_lag", 0.2, 30.35, 30.35)
+    assert onset.value == pytest.approx(30.5, abs=0.15)
+    assert onset.sd == pytest.approx(1.0 / np.sqrt(12.0), rel=0.25)
+
+
+def test_a_lag_is_found_from_an_onset_that_is_far_off() -> None:
+    """From a hollow of the likelihood ten minutes away."""
+    onset, _, _ = step_of("valve_lag", 0.2, 30.35, 20.35)
+    assert onset.value == pytest.approx(30.5, abs=0.15)
+
+
+def test_a_valve_that_sticks_says_between_which_sizes_it_does_the_same() -> None:
+    """The interval of its size holds the truth, and is not without bounds."""
+    onset, size, _ = step_of("valve_stiction", 3.0, 30.35, 30.35)
+    assert abs(size.value - 3.0) < 2.0 * size.sd < 1.0
+    assert abs(onset.value - 30.35) < 2.0 * onset.sd < 10.0
+
+
+def test_a_smooth_onset_is_left_to_the_fit() -> None:
+    """A leak's onset shows in the mean of a row: no interval is wider than by the curvature of the likelihood."""
+    onset, _, by_fit = step_of("coolant_flow", -0.05, 30.35, 30.35)
+    assert onset.sd == pytest.approx(by_fit, rel=0.35)
+    assert onset.value == pytest.approx(30.35, abs=3.0 * by_fit)
