@@ -6,6 +6,7 @@ from math import sqrt
 import numpy as np
 
 from diagnosis.adequacy import WHITE, minus_log10_p
+from diagnosis.difference import Difference, difference
 from diagnosis.extended import extended_model
 from diagnosis.held_out import Errors, free_run, gained
 from diagnosis.integration import looks_like_integration
@@ -110,6 +111,7 @@ def diagnose(
         location=location,
         significant=verdict != NOMINAL,
         practical=matters or _matters(curves, bands),
+        differences=_differences(model, found, curves),
         gain=_gain(model, found, best, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=None,
@@ -231,6 +233,23 @@ def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained, 
         deviation,
         deviation_sd,
     )
+
+
+def _differences(model: ProcessModel, found: Found, curves: Curves) -> dict[str, Difference]:
+    columns = curves.inputs | curves.free_before
+    units = {item.name: item.unit for item in model.inputs} | {item.name: item.unit for item in model.outputs}
+    signals = {name: (columns[name], unit) for name, unit in units.items()}
+    return {
+        output.name: difference(
+            curves.measured[output.name] - curves.free_before[output.name],
+            curves.residual_before[output.name],
+            found.noise.measurement_sd[place],
+            output.unit,
+            curves.time_min,
+            signals,
+        )
+        for place, output in enumerate(model.outputs)
+    }
 
 
 def _standardised(item: Explained) -> Array:

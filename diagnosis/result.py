@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+from diagnosis.difference import Difference
 from reactorwatch.process.model import Array
 
 NOMINAL, NAMED, AMBIGUOUS, UNKNOWN = "nominal", "named", "ambiguous", "unknown"
@@ -140,6 +141,7 @@ class Diagnosis:
         location: where the deviation acts; empty if nominal.
         significant: whether the nominal model is refuted statistically.
         practical: whether the difference is larger than the user's tolerance.
+        differences: of the simulation and the record, by output: where, when, and how much of them is noise.
         gain: what the extended model is better by.
         adequacy: minus the decimal logarithm of the p-value that what is left is white, by output.
         experiment: that would tell the alternatives apart; None where there is nothing to tell.
@@ -156,6 +158,7 @@ class Diagnosis:
     location: str
     significant: bool
     practical: bool
+    differences: dict[str, Difference]
     gain: Gain
     adequacy: dict[str, float]
     experiment: Experiment | None

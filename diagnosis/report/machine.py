@@ -3,6 +3,7 @@
 from math import isfinite
 from typing import Any
 
+from diagnosis.difference import Difference
 from diagnosis.result import Diagnosis, Estimate, HeldOut
 
 
@@ -57,8 +58,31 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float) -> dict[str, Any]
     }
 
 
+def with_differences(diagnosis: Diagnosis, file: str, seconds: float) -> dict[str, Any]:
+    """The same, and where the simulation differs from the record: what report.json holds."""
+    differences = {name: _difference(item) for name, item in diagnosis.differences.items()}
+    return as_object(diagnosis, file, seconds) | {"differences": differences}
+
+
 def _estimate(estimate: Estimate) -> dict[str, Any]:
     return {"value": _number(estimate.value), "sd": _number(estimate.sd), "unit": estimate.unit}
+
+
+def _difference(item: Difference) -> dict[str, Any]:
+    return {
+        "rmse": _number(item.rmse),
+        "noise_sd": _number(item.noise_sd),
+        "noise_share": _number(item.noise_share),
+        "one_step": _number(item.one_step),
+        "unit": item.unit,
+        "along": {
+            axis: [
+                {"from": part.lower, "to": part.upper, "mean": part.mean, "rmse": part.rmse, "rows": part.rows}
+                for part in ranges
+            ]
+            for axis, ranges in item.along.items()
+        },
+    }
 
 
 def _held_out(item: HeldOut) -> dict[str, Any]:

@@ -10,10 +10,11 @@ import jinja2
 import numpy as np
 
 from diagnosis.adequacy import WHITE
+from diagnosis.difference import Difference
 from diagnosis.report import pictures
 from diagnosis.report.equations import balances, meanings
 from diagnosis.report.svg import Line, plot
-from diagnosis.report.words import PLACES, causes_said, place, size_said, verdict, when, with_interval
+from diagnosis.report.words import PLACES, causes_said, difference_said, place, size_said, verdict, when, with_interval
 from diagnosis.result import NOMINAL, Cause, Diagnosis, Experiment
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import ProcessModel
@@ -75,6 +76,7 @@ def as_page(
         closer=pictures.closer(diagnosis, model) if diagnosis.causes else [],
         courses=pictures.courses(diagnosis),
         residuals=pictures.residuals(diagnosis, model),
+        differences=[(difference_said(name, item), _strips(item)) for name, item in diagnosis.differences.items()],
         white=WHITE,
         evidence=_evidence(diagnosis, effects),
         experiment=None if diagnosis.experiment is None else _input(diagnosis.experiment, model),
@@ -101,6 +103,26 @@ def _said(diagnosis: Diagnosis, cause: Cause, symbol: str) -> _CauseSaid:
             if cause.profile != FREE_NAME or name == "size"  # a curve is better seen than read
         ),
     )
+
+
+def _strips(item: Difference) -> list[tuple[str, list[tuple[str, str, int]]]]:
+    """By axis: each range, the error in it, and how dark it is, from 0 (noise) to 100 (the worst)."""
+    ranges = [part for parts in item.along.values() for part in parts]
+    most = max((part.rmse for part in ranges), default=0.0) - item.noise_sd
+    return [
+        (
+            axis,
+            [
+                (
+                    f"{part.lower:.4g} – {part.upper:.4g}",
+                    f"{part.rmse:.3g}",
+                    round(100 * min(max((part.rmse - item.noise_sd) / max(most, item.noise_sd), 0.0), 1.0)),
+                )
+                for part in parts
+            ],
+        )
+        for axis, parts in item.along.items()
+    ]
 
 
 def _evidence(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[str, str]]:

@@ -5,11 +5,15 @@ from math import floor, isfinite, log10
 
 import numpy as np
 
+from diagnosis.difference import TIME, Difference
 from diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, Cause, Curves, Diagnosis, Estimate, HeldOut
 from reactorwatch.process.effects.base import Effect
 
 SD_95 = 1.959964
 """Standard deviations to either side that hold 95 % of a normal distribution."""
+
+MOSTLY_NOISE, WORSE = 0.9, 1.2
+"""Of the mean square error: nothing worth locating is left. Times the error of all rows: a range is told as worse."""
 
 PLACES = {
     "mass_balance": "in the mass balance",
@@ -118,6 +122,25 @@ def error_left(name: str, item: HeldOut, *, improved: bool) -> str:
     """The error of the free run on rows that the fit did not see, in one line."""
     before = f", before {error_said(item.rmse_before, item.unit)}" if improved else ""
     return f"{name} off by {error_said(item.rmse_after, item.unit)}{before}; noise {item.noise_sd:.3g} {item.unit}"
+
+
+def difference_said(name: str, item: Difference) -> str:
+    """By how much the simulation errs, where most, and how much of it is noise, in a sentence."""
+    if not isfinite(item.rmse):
+        return f"{name}: the simulation ran away from the record."
+    said = f"{name}: the simulation errs by {item.rmse:.3g} {item.unit}, {_percent(item.noise_share)} of it noise"
+    if item.noise_share > MOSTLY_NOISE:
+        return f"{said}."
+    places = [
+        f"{'from' if axis == TIME else f'at {axis}'} {part.lower:.4g} to {part.upper:.4g} {unit} ({part.rmse:.3g})"
+        for axis, unit in item.units.items()
+        if (part := item.worst(axis)) is not None and part.rmse > WORSE * item.rmse
+    ]
+    return f"{said}; most {', '.join(places)}." if places else f"{said}; everywhere alike."
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
 
 
 def _largest_min(cause: Cause, curves: Curves) -> float:

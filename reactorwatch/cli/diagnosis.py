@@ -13,7 +13,7 @@ import msgspec
 
 from diagnosis.diagnose import diagnose
 from diagnosis.record_checks import run_of
-from diagnosis.report.machine import as_object
+from diagnosis.report.machine import as_object, with_differences
 from diagnosis.report.page import as_page
 from diagnosis.report.plain import as_text
 from diagnosis.result import Diagnosis
@@ -118,7 +118,7 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     except OSError as error:
         raise InputError(f"--out {folder}: the folder cannot be made: {error.strerror}") from error
     page = as_page(diagnosis, case.model, EFFECTS, str(case.file), str(folder / MODEL))
-    plain = msgspec.json.format(msgspec.json.encode(as_object(diagnosis, str(case.file), seconds)), indent=2)
+    plain = msgspec.json.format(msgspec.json.encode(with_differences(diagnosis, str(case.file), seconds)), indent=2)
     write_extended_model(folder / MODEL, diagnosis.extended_model)
     write_drawing(diagnosis, case.model, case.measured, folder / DRAWING)
     for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):

@@ -5,6 +5,7 @@ from math import nan
 
 import numpy as np
 
+from diagnosis.difference import difference
 from diagnosis.result import Alternative, Cause, Curves, Diagnosis, Estimate, Experiment, Gain, HeldOut
 from reactorwatch.process.model import Array
 
@@ -78,6 +79,14 @@ def diagnosis_of(
         "C": HeldOut(0.0147, 0.00202, 0.0147, 0.00202, 0.00197, "mol/l"),
         "T": HeldOut(before, 0.292, 3.2, 0.292, 0.303, "K"),
     }
+    drawn = curves(causes)
+    signals = {"qc": (drawn.inputs["qc"], "l/min"), "C": (drawn.free_before["C"], "mol/l")}
+    differences = {
+        name: difference(
+            drawn.measured[name] - run, drawn.residual_before[name], item.noise_sd, item.unit, drawn.time_min, signals
+        )
+        for (name, run), item in zip(drawn.free_before.items(), held_out.values(), strict=True)
+    }
     return Diagnosis(
         samples=ROWS,
         span_min=199.9,
@@ -87,12 +96,13 @@ def diagnosis_of(
         location=location or (causes[0].location if causes else ""),
         significant=verdict != "nominal",
         practical=practical and verdict != "nominal",
+        differences=differences,
         gain=Gain(209025.5 if causes else 0.0, held_out),
         adequacy={"C": 0.3, "T": 0.35},
         experiment=experiment,
         extended_model={"format": "reactorwatch.model.v1", "model": "cstr", "effects": []},
         remarks=remarks,
-        curves=curves(causes),
+        curves=drawn,
     )
 
 

@@ -5,12 +5,12 @@ import json
 import msgspec
 import pytest
 
-from diagnosis.report.machine import as_object
+from diagnosis.report.machine import as_object, with_differences
 from diagnosis.report.plain import as_text
 from diagnosis.report.words import verdict, with_interval
 from diagnosis.result import Diagnosis, Estimate
 from reactorwatch.process.effects import EFFECTS
-from tests.unit.diagnosis.cases import CASES
+from tests.unit.diagnosis.cases import CASES, ROWS
 
 
 @pytest.mark.parametrize(
@@ -106,3 +106,12 @@ def test_what_is_no_finite_number_is_null() -> None:
     case: Diagnosis = CASES["ambiguous"]
     assert as_object(case, "run.csv", 1.0)["gain"]["held_out"]["T"]["rmse_before"] is None
     assert as_object(CASES["nominal"], "run.csv", 1.0)["location"] is None
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_report_for_machines_adds_where_the_simulation_differs(case: str) -> None:
+    said = json.loads(msgspec.json.encode(with_differences(CASES[case], "run.csv", 1.0)))
+    assert said.keys() - as_object(CASES[case], "run.csv", 1.0).keys() == {"differences"}
+    for name, item in said["differences"].items():
+        assert item["unit"] == CASES[case].gain.held_out[name].unit
+        assert sum(part["rows"] for part in item["along"]["time"]) == ROWS
