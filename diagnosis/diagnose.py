@@ -30,7 +30,7 @@ from diagnosis.run import Run
 from diagnosis.search import Explained, Found, Search
 from diagnosis.unknown import unknown
 from reactorwatch.errors import InputError
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process import effects_of
 from reactorwatch.process.effects.base import TIMING, Effect
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.records.record import Record
@@ -57,7 +57,7 @@ SMALLEST_NOISE = 1e-3
 def diagnose(
     record: Record,
     model: ProcessModel,
-    effects: Sequence[Effect] = EFFECTS,
+    effects: Sequence[Effect] | None = None,
     tolerance: Mapping[str, float] | None = None,
 ) -> Diagnosis:
     """What a simulation by the model gets wrong of a record.
@@ -65,13 +65,14 @@ def diagnose(
     Args:
         record: with the model's inputs and outputs as columns.
         model: the simulation.
-        effects: the causes that may be named.
+        effects: the causes that may be named; None: those of the model's own catalogue.
         tolerance: by output, the root mean square difference that does not matter in practice, in its unit; where
             nothing is said, a fiftieth of the output's range.
 
     Raises:
         InputError: the record cannot be diagnosed, or a tolerance is of no output or not positive.
     """
+    effects = effects_of(model) if effects is None else effects
     run = run_of(record, model)
     bands = _bands(run, model, tolerance or {})
     search = Search(model, effects, run, _smallest_sd(model))

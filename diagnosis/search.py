@@ -39,6 +39,9 @@ IN_QUESTION = 60.0
 """In BIC: a rival that is worse by more is out of question."""
 
 ROUNDS, MOST_KNOTS = 5, 80
+SETTLED_NOISE = 10.0
+"""In BIC: a noise that gains less is not worth another round."""
+
 _NEAR = 4.0
 _SHARE = 0.3  # of what the best lead promises: linear promises of memory are rough
 
@@ -122,21 +125,21 @@ class Search:
             best = min(best, item, key=lambda item: item.bic)
         least = max([LEAST_SCORE, *(_SHARE * item.score(self.run.values) for item in leads[:1])])
         remembering = self.chosen(remembering, LEADS, least, of_a_cause=1)
+        searched = nominal
         for _ in range(ROUNDS):
-            if best is nominal:
+            if best is nominal or (best is searched and not self._settled_anew(best)):
                 break
-            self.settle(best)
+            if best is not searched:
+                self.settle(best)
             known = {best.key: self.refitted(best)}
-            best = known[best.key]
+            best = searched = known[best.key]
             leads = self.screen.leads(best.hypothesis, best.fit, replaced=(0,))
             least = max([LEAST_SCORE, *(item.score(self.run.values) - IN_QUESTION for item in leads[:1])])
             for lead in [*self.chosen(leads, LEADS, least), *self._simpler(leads, best), *remembering]:
                 fresh = _key(lead) not in known or (_key(lead) == best.key and self._elsewhere(lead, best))
                 if fresh:
                     keep(known, self.fitted(lead))
-            again, best = best, min(known.values(), key=lambda item: item.bic)
-            if best is again:
-                break
+            best = min(known.values(), key=lambda item: item.bic)
         if best is not nominal:
             best = self._finer(best)
             known[best.key] = best
@@ -150,6 +153,17 @@ class Search:
         """Take the noise that a hypothesis needs for that of all."""
         signals = best.hypothesis.signals(best.fit)
         self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd)
+
+    def _settled_anew(self, best: Explained) -> bool:
+        """Whether another noise goes with its numbers than with the rougher ones it was found with; then it holds."""
+        held, sized = self.noise, best.hypothesis.sized
+        self.settle(best)
+        self._use_noise(sized)
+        if self.explained(best.hypothesis, best.fit.theta).bic < best.bic - SETTLED_NOISE:
+            return True
+        self.noise = held
+        self._use_noise(sized)
+        return False
 
     def chosen(self, leads: Sequence[Lead], count: int, least: float, of_a_cause: int = A_CAUSE) -> list[Lead]:
         """The best leads that promise enough, not too many of one cause."""

@@ -176,8 +176,9 @@ class PlantWatch:
         self._reference, self._checks = trained.reference, trained.checks
         self._whiteners = [Prewhitener(item) for item in trained.learned]
         self._whitened_sds = [item.sd for item in trained.learned]
-        if config.isolation and isinstance(trained.reference, ProcessReference):
-            self._suspicion = Suspicion(config, self._board, trained.reference)
+        reference = trained.reference
+        if config.isolation and isinstance(reference, ProcessReference) and reference.model.name == cstr().name:
+            self._suspicion = Suspicion(config, self._board, reference)  # its causes are those of the reactor
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         self.notes += self._drift.start(self._predictors, self._arl0)
@@ -260,14 +261,14 @@ def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | 
     """The process model that the plant may be watched by."""
     if config.reference == "arx":
         return None
-    model = model or cstr()
+    given, model = model is not None, model or cstr()
     fits = (config.input,) == model.input_names and set(config.outputs) <= set(model.output_names)
     if fits:
         return model
-    if config.reference == "auto":
+    if config.reference == "auto" and not given:
         return None
     raise InputError(
-        f"reference 'process' needs the reactor's signals, input {', '.join(model.input_names)} and outputs of "
+        f"reference 'process' needs the signals of {model.name}, input {', '.join(model.input_names)} and outputs of "
         f"{', '.join(model.output_names)}, got {config.input} and {', '.join(config.outputs)}; "
         'set reference = "arx"'
     )

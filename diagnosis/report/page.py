@@ -14,7 +14,16 @@ from diagnosis.difference import Difference
 from diagnosis.report import pictures
 from diagnosis.report.equations import balances, meanings
 from diagnosis.report.svg import Line, plot
-from diagnosis.report.words import PLACES, causes_said, difference_said, place, size_said, verdict, when, with_interval
+from diagnosis.report.words import (
+    causes_said,
+    difference_said,
+    place,
+    place_of,
+    size_said,
+    verdict,
+    when,
+    with_interval,
+)
 from diagnosis.result import NOMINAL, Cause, Diagnosis, Experiment
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import ProcessModel
@@ -48,6 +57,8 @@ def as_page(
     effects: Sequence[Effect],
     file: str,
     model_file: str,
+    *,
+    on_the_bus: bool = True,
 ) -> str:
     """The page, as HTML.
 
@@ -57,6 +68,7 @@ def as_page(
         effects: the catalogue.
         file: of the record, as it was named.
         model_file: of the extended model.
+        on_the_bus: whether there are nodes that could take it.
 
     Raises:
         ValueError: the diagnosis has no curves.
@@ -81,7 +93,7 @@ def as_page(
         evidence=_evidence(diagnosis, effects),
         experiment=None if diagnosis.experiment is None else _input(diagnosis.experiment, model),
         model_file=model_file,
-        commands=_commands(file, model_file),
+        commands=_commands(file, model_file, on_the_bus=on_the_bus),
         error=lambda value: f"{value:.3g}" if isfinite(value) else "ran away",
     )
 
@@ -92,7 +104,7 @@ def _said(diagnosis: Diagnosis, cause: Cause, symbol: str) -> _CauseSaid:
         cause.cause,
         cause.profile,
         cause.label,
-        PLACES.get(cause.location, cause.location),
+        place_of(cause.location),
         size_said(cause),
         when(cause, diagnosis.curves),
         symbol,
@@ -141,12 +153,12 @@ def _input(experiment: Experiment, model: ProcessModel) -> pictures.Picture:
     return pictures.Picture(f"{item.name}, {item.unit}, over minutes", ((item.meaning, "input"),), drawing)
 
 
-def _commands(file: str, model_file: str) -> list[str]:
+def _commands(file: str, model_file: str, *, on_the_bus: bool) -> list[str]:
     record, extended = quote(file), quote(model_file)
     simulated = quote(f"{PurePath(file).stem}-simulated.csv")
+    nodes = [f"reactorwatch {node} --model {extended}" for node in ("monitor", "plant")]
     return [
         f"reactorwatch simulate {record} -o {simulated} --model {extended}",
         f"reactorwatch diagnose {record} --model {extended}",
-        f"reactorwatch monitor --model {extended}",
-        f"reactorwatch plant --model {extended}",
+        *(nodes if on_the_bus else []),
     ]

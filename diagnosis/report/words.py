@@ -25,7 +25,7 @@ PLACES = {
     "concentration_sensor": "in the measurement of the concentration",
     "timing": "in the times of the record",
 }
-"""Of causes, by their location; that of a model with places of its own is said as it is."""
+"""Of causes, by their location, where it takes more words than the name of the location."""
 
 
 def verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
@@ -55,7 +55,16 @@ def place(diagnosis: Diagnosis) -> str:
     """Where it acts."""
     if not diagnosis.location:
         return "where this record does not tell"
-    return PLACES.get(diagnosis.location, f"in: {diagnosis.location.replace('_', ' ')}")
+    return place_of(diagnosis.location)
+
+
+def place_of(location: str) -> str:
+    """Where that is.
+
+    >>> place_of("upper_tank")
+    'in the upper tank'
+    """
+    return PLACES.get(location, f"in the {location.replace('_', ' ')}")
 
 
 def when(cause: Cause, curves: Curves | None = None) -> str:

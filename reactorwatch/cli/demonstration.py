@@ -179,7 +179,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     """Draw the recording, diagnose it, read from it what happened, and write that down."""
     from diagnosis.report.words import verdict
     from reactorwatch.cli.diagnosis import MODEL, PAGE, cases, diagnosed
-    from reactorwatch.process.effects import EFFECTS
+    from reactorwatch.process import effects_of
     from recorder.rerun_file import write_rrd
     from recorder.run import read_run
 
@@ -226,7 +226,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         + (", ".join(f"`{alarm.alarm}` at {at(alarm.time_ns)}" for alarm in before) or "none")
         + f" ({again.expected_false_alarms:.2g} to be expected in the whole run)."
     )
-    lines.append(f"- Diagnosis of the whole recording: {verdict(diagnosis, EFFECTS)}")
+    lines.append(f"- Diagnosis of the whole recording: {verdict(diagnosis, effects_of(case.model))}")
     lines.append(f"- Back-test over the recording: {'the same alarms, value for value' if same else 'OTHER ALARMS'}.")
     lines += [
         "",

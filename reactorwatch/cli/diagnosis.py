@@ -19,9 +19,9 @@ from diagnosis.report.plain import as_text
 from diagnosis.result import Diagnosis
 from reactorwatch.cli.diagnosis_drawing import write_drawing
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.cli.sources import process_model, record
+from reactorwatch.cli.sources import process_model, record, signals_of
 from reactorwatch.errors import InputError
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.record import Record
@@ -29,6 +29,9 @@ from reactorwatch.runtime.model_file import write_extended_model
 
 PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "report.rrd"
 """What a report is made of."""
+
+PLANT = "cstr"
+"""The process that the plant node simulates and the monitor watches."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +68,10 @@ def cases(
     """
     if out is not None and out.exists() and not out.is_dir():
         raise InputError(f"--out {out}: is a file, the name of a folder was expected")
+    signals = signals_of(model)
     found = []
     for file, folder in zip(files, _folders(files, out), strict=True):
-        measured = record(file, plant, columns)
+        measured = record(file, plant, columns, signals)
         process = process_model(model, measured)
         run_of(measured, process)
         found.append(Case(file, measured, process, folder))
@@ -98,7 +102,7 @@ def diagnosed(case: Case, tolerance: dict[str, float] | None = None) -> tuple[Di
         InputError: as `results`.
     """
     began = time.monotonic()
-    diagnosis = diagnose(case.measured, case.model, EFFECTS, tolerance)
+    diagnosis = diagnose(case.measured, case.model, tolerance=tolerance)
     seconds = time.monotonic() - began
     if case.folder is not None:
         write_report(diagnosis, case, seconds)
@@ -117,7 +121,8 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--out {folder}: the folder cannot be made: {error.strerror}") from error
-    page = as_page(diagnosis, case.model, EFFECTS, str(case.file), str(folder / MODEL))
+    catalogue, on_the_bus = effects_of(case.model), case.model.name == PLANT
+    page = as_page(diagnosis, case.model, catalogue, str(case.file), str(folder / MODEL), on_the_bus=on_the_bus)
     plain = msgspec.json.format(msgspec.json.encode(with_differences(diagnosis, str(case.file), seconds)), indent=2)
     write_extended_model(folder / MODEL, diagnosis.extended_model)
     write_drawing(diagnosis, case.model, case.measured, folder / DRAWING)
@@ -130,7 +135,7 @@ def _result(case: Case, tolerance: dict[str, float], *, as_json: bool) -> str:
     diagnosis, seconds = diagnosed(case, tolerance)
     if as_json:
         return msgspec.json.encode(as_object(diagnosis, str(case.file), seconds)).decode()
-    said = as_text(diagnosis, str(case.file), EFFECTS)
+    said = as_text(diagnosis, str(case.file), effects_of(case.model))
     return said if case.folder is None else f"{said}\n  report      {case.folder / PAGE}"
 
 

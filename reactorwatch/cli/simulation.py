@@ -7,17 +7,18 @@ import numpy as np
 
 from plant_node.initial_state import carried_over
 from reactorwatch.errors import InputError
+from reactorwatch.process import effects_of
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.records.record import UNITS, Record
+from reactorwatch.records.record import Record
 
 
 def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record:
     """Run the equations from the record's first row, driven by its input.
 
     Args:
-        measured: with the model's inputs, C and T as columns.
+        measured: with the model's inputs and outputs as columns.
         model: the process; a state of its own that no column shows begins at rest.
         faults: specifications; their onsets are in the record's time.
 
@@ -25,16 +26,19 @@ def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record
         InputError: the record cannot drive the model.
     """
     for text in faults:
-        model = parse_fault(text).extend(model, end_min=float(measured.time_min[-1]))
+        model = parse_fault(text, effects_of(model)).extend(model, end_min=float(measured.time_min[-1]))
     inputs = np.column_stack([measured.columns[name] for name in model.input_names])
-    first = {name: float(measured.columns[name][0]) for name in ("C", "T")}
+    first = {name: float(measured.columns[name][0]) for name in model.output_names}
     if not np.all(np.isfinite(list(first.values()))):
         said = ", ".join(f"{name} = {value:g}" for name, value in first.items())
-        raise InputError(f"{measured.name}: the first row must have C and T, the run starts from them; got {said}")
+        raise InputError(
+            f"{measured.name}: the first row must have {' and '.join(first)}, the run starts from them; got {said}"
+        )
     if not np.all(np.isfinite(inputs)):
         row = int(np.argmax(~np.all(np.isfinite(inputs), axis=1)))
+        names = ", ".join(model.input_names)
         raise InputError(
-            f"{measured.name}: qc must be there in every row, it is missing at {measured.time_min[row]:g} min"
+            f"{measured.name}: {names} must be there in every row, it is missing at {measured.time_min[row]:g} min"
         )
     start = carried_over(model, first, inputs[0], float(measured.time_min[0]))
     try:
@@ -46,18 +50,18 @@ def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record
     return Record(measured.time_min, columns, f"simulation of {measured.name}")
 
 
-def report(measured: Record, simulated: Record, out: Path, *, as_json: bool) -> str:
+def report(measured: Record, simulated: Record, model: ProcessModel, out: Path, *, as_json: bool) -> str:
     """How far the simulation is from the record, by signal."""
-    rmse = {}
-    for name in ("C", "T"):
+    rmse, units = {}, {output.name: output.unit for output in model.outputs}
+    for name in model.output_names:
         difference = simulated.columns[name] - measured.columns[name]
         rmse[name] = float(np.sqrt(np.nanmean(difference**2)))
     if as_json:
         said = {
             "file": str(out),
             "rows": measured.rows,
-            "rmse": {name: {"value": value, "unit": UNITS[name]} for name, value in rmse.items()},
+            "rmse": {name: {"value": value, "unit": units[name]} for name, value in rmse.items()},
         }
         return msgspec.json.encode(said).decode()
-    parts = ", ".join(f"{name} {value:.3g} {UNITS[name]}" for name, value in rmse.items())
+    parts = ", ".join(f"{name} {value:.3g} {units[name]}" for name, value in rmse.items())
     return f"wrote {out}: {measured.rows} rows; root mean square difference from the record: {parts}"

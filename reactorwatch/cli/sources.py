@@ -9,13 +9,24 @@ from pathlib import Path
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.record import Record
+from reactorwatch.records.record import UNITS, Record
 
 DEFAULT_PLANT = "cstr"
 
 
-def record(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Record:
+def record(
+    path: Path,
+    plant: str | None = None,
+    columns: dict[str, str] | None = None,
+    required: tuple[str, ...] = tuple(UNITS),
+) -> Record:
     """The columns of a file.
+
+    Args:
+        path: of a .csv, an .mcap or a folder.
+        plant: in a recording.
+        columns: a .csv's own names, by signal.
+        required: signals that a .csv must have.
 
     Raises:
         InputError: the file is not one of the two kinds, or is malformed.
@@ -23,7 +34,7 @@ def record(path: Path, plant: str | None = None, columns: dict[str, str] | None 
     if kind(path) == "csv":
         from reactorwatch.records.csv_file import read_csv
 
-        return read_csv(path, columns)
+        return read_csv(path, columns, required)
     from recorder.mcap_file import read_record
 
     return read_record(path, plant)
@@ -43,6 +54,19 @@ def messages(path: Path, plant: str | None = None, columns: dict[str, str] | Non
     from recorder.mcap_file import read_messages
 
     return (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
+
+
+def signals_of(path: Path | None) -> tuple[str, ...]:
+    """What the model in a file needs of a record: its inputs and outputs.
+
+    Raises:
+        InputError: as `process_model`.
+    """
+    from reactorwatch.process.cstr import cstr
+    from reactorwatch.runtime.model_file import read_extended_model
+
+    model = cstr() if path is None else read_extended_model(path).build()
+    return (*model.input_names, *model.output_names)
 
 
 def process_model(path: Path | None, measured: Record) -> ProcessModel:

@@ -39,20 +39,20 @@ def simulate(
 ) -> None:
     """Run the plant's equations along a record.
 
-    They start from its first row and run freely, driven by its qc.
+    They start from its first row and run freely, driven by its inputs.
     """
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.simulation import free_run, report
-    from reactorwatch.cli.sources import process_model, record
+    from reactorwatch.cli.sources import process_model, record, signals_of
     from reactorwatch.records.csv_file import write_csv
 
-    measured = record(existing_recording(file), plant, columns(column))
+    measured = record(existing_recording(file), plant, columns(column), signals_of(model))
     process = process_model(model, measured)
     out = new_file(out)
     with task(f"simulating {file.name}"):
         simulated = free_run(measured, process, fault or [])
         write_csv(out, simulated)
-    typer.echo(report(measured, simulated, out, as_json=as_json))
+    typer.echo(report(measured, simulated, process, out, as_json=as_json))
 
 
 def backtest(

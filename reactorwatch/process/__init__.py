@@ -1,6 +1,21 @@
 """The process description, said once: models, their simulation, their steady states, and deviations from them."""
 
-from reactorwatch.process.cstr import cstr
+from collections.abc import Mapping
 
-MODELS = (cstr,)
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.tank_effects import TANK_EFFECTS
+from reactorwatch.process.tanks import tanks
+
+MODELS = (cstr, tanks)
 """The process models there are: functions that build them."""
+
+EFFECTS_OF: Mapping[str, tuple[Effect, ...]] = {"cstr": EFFECTS, "tanks": TANK_EFFECTS}
+"""By the name of a model, the catalogue of what may be different in it."""
+
+
+def effects_of(model: ProcessModel) -> tuple[Effect, ...]:
+    """The catalogue of a model's effects; empty for a model that has none."""
+    return EFFECTS_OF.get(model.name, ())

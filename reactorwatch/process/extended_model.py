@@ -22,8 +22,7 @@ from typing import Any
 import msgspec
 
 from reactorwatch.errors import InputError
-from reactorwatch.process import MODELS
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process import EFFECTS_OF, MODELS, effects_of
 from reactorwatch.process.effects.base import TIMING, Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.model import ProcessModel
@@ -103,14 +102,14 @@ class ExtendedModel:
 def parse_extended_model(
     text: str | bytes,
     models: Sequence[Callable[[], ProcessModel]] = MODELS,
-    effects: Sequence[Effect] = EFFECTS,
+    effects: Sequence[Effect] | None = None,
 ) -> ExtendedModel:
     """Read what `ExtendedModel.to_object` said, as JSON.
 
     Args:
         text: of the file.
         models: that may be meant.
-        effects: that may be in it.
+        effects: that may be in it; None: those of the model's own catalogue.
 
     Raises:
         InputError: it is something else, or a part of it is wrong.
@@ -123,6 +122,9 @@ def parse_extended_model(
         raise InputError(f"is not JSON: {error}") from error
     if written.format != FORMAT:
         raise InputError(f"format must be {FORMAT!r}, got {written.format!r}")
+    if effects is None:
+        ExtendedModel(written.model).build(models)  # so that an unknown model is told before its effects
+        effects = EFFECTS_OF.get(written.model, ())
     found = ExtendedModel(
         written.model,
         tuple(parse_fault(item, effects).settled() for item in written.effects),
@@ -135,7 +137,7 @@ def parse_extended_model(
 
 def extended_model_of(
     model: ProcessModel,
-    effects: Sequence[Effect] = EFFECTS,
+    effects: Sequence[Effect] | None = None,
     models: Sequence[Callable[[], ProcessModel]] = MODELS,
     zero_ns: int = 0,
 ) -> ExtendedModel:
@@ -143,10 +145,11 @@ def extended_model_of(
 
     Args:
         model: with or without effects.
-        effects: that it may have.
+        effects: that it may have; None: those of its own catalogue.
         models: the catalogue; of one that is not there, no parameter is taken to differ.
         zero_ns: what the minutes of its effects count from.
     """
+    effects = effects_of(model) if effects is None else effects
     values = {item.name: item.value for item in model.parameters}
     found = []
     for name in values:

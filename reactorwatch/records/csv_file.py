@@ -46,7 +46,7 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None, required: tup
     Args:
         path: the file: UTF-8, comma separated.
         columns: the file's own name for a column, where it has another: `{"T": "reactor_temp", "time_s": "t"}`.
-        required: the signals that must be there; the others are read if they are.
+        required: the signals that must be there; the reactor's others are read if they are.
 
     Returns:
         The record; an empty cell is NaN.
@@ -110,8 +110,9 @@ def _text(path: Path) -> str:
 
 
 def _layout(path: Path, text: str, columns: Mapping[str, str], required: tuple[str, ...]) -> _Layout:
-    known = (*_MINUTES_PER_UNIT, *UNITS)
-    for name in (*columns, *required):
+    wanted = tuple(dict.fromkeys((*UNITS, *required)))
+    known = (*_MINUTES_PER_UNIT, *wanted)
+    for name in columns:
         if name not in known:
             raise InputError(f"{path}: unknown column {name!r} asked for (valid: {', '.join(known)})")
     row, cells = next(_rows(path, text), (1, []))
@@ -131,7 +132,7 @@ def _layout(path: Path, text: str, columns: Mapping[str, str], required: tuple[s
     if not times:
         asked = " or ".join(repr(columns.get(name, name)) for name in _MINUTES_PER_UNIT)
         raise InputError(f"{path}, row {row}: expected a column {asked} in the header, {found}")
-    signals = {signal: at for signal in UNITS if (at := column(signal))}
+    signals = {signal: at for signal in wanted if (at := column(signal))}
     for signal in required:
         if signal not in signals:
             asked = repr(columns.get(signal, signal))

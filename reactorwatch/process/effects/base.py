@@ -27,7 +27,7 @@ LOCATIONS = (
     "concentration_sensor",
     TIMING,
 )
-"""Where an effect can act."""
+"""Where an effect on the reactor can act."""
 
 
 class Effect(ABC):
@@ -36,7 +36,7 @@ class Effect(ABC):
     Attributes:
         name: as in the catalogue of causes.
         label: what a person calls it.
-        location: where in the plant it acts, one of `LOCATIONS`.
+        location: where in the plant it acts; of the reactor's effects one of `LOCATIONS`.
         unit: of its size.
         lower: smallest size that makes physical sense.
         upper: largest size that makes physical sense.

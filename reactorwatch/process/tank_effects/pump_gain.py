@@ -1,0 +1,16 @@
+"""The pump gives more than its command says, or less."""
+
+from reactorwatch.process.effects.base import ParameterEffect
+
+
+class PumpGain(ParameterEffect):
+    """k4 (1 + m)."""
+
+    name = "pump_gain"
+    label = "wrong flow of the pump"
+    location = "pump"
+    unit = "1"
+    lower = -0.99
+    upper = 4.0
+    typical = 0.03
+    parameter = "k4"
