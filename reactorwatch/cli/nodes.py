@@ -8,6 +8,7 @@ import typer
 
 from reactorwatch.cli.options import (
     Columns,
+    Diagnose,
     Endpoint,
     Model,
     Plant,
@@ -91,15 +92,22 @@ def monitor(
         float | None, typer.Option("--training", help="Minutes of plant time to learn from [100].", show_default=False)
     ] = None,
     model: Model = None,
+    diagnose: Diagnose = None,
 ) -> None:
     """Watch a plant: predict its signals, raise alarms."""
+    from contextlib import nullcontext
+
     from monitor_node.__main__ import run
     from monitor_node.config import MonitorConfig
+    from reactorwatch.cli.supervise import diagnosing, diagnosis_settings
     from reactorwatch.runtime.config import section
 
     tables, bus = _settings(config, endpoint)
     flags = {"plant": name, "training_min": training, "model": str(existing(model)) if model is not None else None}
-    run(section(MonitorConfig, "monitor", tables, flags), bus)
+    config_of_monitor = section(MonitorConfig, "monitor", tables, flags)
+    diagnosis = diagnosis_settings(tables, config_of_monitor, diagnose)
+    with diagnosing(diagnosis, bus) if diagnosis.out else nullcontext():
+        run(config_of_monitor, bus)
 
 
 def record(

@@ -25,6 +25,13 @@ Model = Annotated[
     typer.Option("--model", help="An extended model, as diagnose -o writes it [the nominal].", show_default=False),
 ]
 
+Diagnose = Annotated[
+    Path | None,
+    typer.Option(
+        "--diagnose", help="After an alarm, diagnose the recent rows into a folder in this one.", show_default=False
+    ),
+]
+
 
 def columns(pairs: list[str] | None) -> dict[str, str]:
     """The columns' names by signal, from `signal=column` pairs.

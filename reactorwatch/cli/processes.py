@@ -17,7 +17,12 @@ import structlog
 
 log = structlog.get_logger()
 
-MODULES = {"plant": "plant_node", "monitor": "monitor_node", "recorder": "recorder"}
+MODULES = {
+    "plant": "plant_node",
+    "monitor": "monitor_node",
+    "diagnosis": "reactorwatch.cli.live_diagnosis",
+    "recorder": "recorder",
+}
 STOP_WITHIN_S = 15.0
 
 

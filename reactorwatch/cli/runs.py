@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Endpoint, Plant, Settings, pace
+from reactorwatch.cli.options import Diagnose, Endpoint, Plant, Settings, pace
 
 
 def add_to(app: typer.Typer) -> None:
@@ -24,12 +24,13 @@ def up(
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the input and the noise.", show_default=False)] = None,
     fault: Annotated[list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset. Repeatable.")] = None,
+    diagnose: Diagnose = None,
 ) -> None:
     """Run router, plant, monitor and recorder until stopped."""
     from reactorwatch.cli.supervise import run_until_stopped
 
     flags = {"name": name, "speed": pace(speed, "--speed"), "seed": seed, "faults": fault or None}
-    raise typer.Exit(run_until_stopped(config, endpoint, out, flags))
+    raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose))
 
 
 def demo(

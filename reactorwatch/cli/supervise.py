@@ -1,8 +1,11 @@
 """`up`: the router in this process, the nodes as processes, until somebody says stop."""
 
+import contextlib
 import threading
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import msgspec
@@ -10,11 +13,13 @@ import structlog
 
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
+from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import router
 from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.logs import configure
+from reactorwatch.runtime.model_file import read_extended_model
 from reactorwatch.runtime.serve import stop_on_signals
 from recorder.__main__ import file_for
 from recorder.config import RecorderConfig
@@ -24,7 +29,9 @@ log = structlog.get_logger()
 LOOK_EVERY_S = 0.5
 
 
-def run_until_stopped(config: Path | None, endpoint: str | None, out: Path, flags: dict[str, Any]) -> int:
+def run_until_stopped(
+    config: Path | None, endpoint: str | None, out: Path, flags: dict[str, Any], diagnose: Path | None = None
+) -> int:
     """Run everything until SIGINT or SIGTERM, or until a node ends by itself.
 
     Args:
@@ -32,6 +39,7 @@ def run_until_stopped(config: Path | None, endpoint: str | None, out: Path, flag
         endpoint: the router's address, or None.
         out: folder for the recording and the settings that ran; made if it is not there.
         flags: of the plant; None: not said.
+        diagnose: folder for diagnoses after alarms; None: that of the settings, or none.
 
     Returns:
         0 if it was stopped or the plant came to its end, 1 if a node failed.
@@ -47,13 +55,15 @@ def run_until_stopped(config: Path | None, endpoint: str | None, out: Path, flag
     plant = section(PlantConfig, "plant", {"plant": {**waiting, **tables.get("plant", {})}}, flags)
     monitor = section(MonitorConfig, "monitor", tables, {"plant": name or plant.name})
     recorder = section(RecorderConfig, "recorder", tables, {"plant": name or plant.name})
+    diagnosis = diagnosis_settings(tables, monitor, diagnose)
     bus = router(bus_config)  # before anything is written: an address that is taken leaves nothing behind
     try:
-        settings = _write_down(out, recorder, plant.seed, {"bus": bus_config, "plant": plant, "monitor": monitor})
+        tables_written = {"bus": bus_config, "plant": plant, "monitor": monitor, "diagnosis": diagnosis}
+        settings = _write_down(out, recorder, plant.seed, tables_written)
         with stop_on_signals() as stop, Processes(settings) as processes:
             woken = threading.Event()
             stop.wakes(woken.set)
-            for node in ("recorder", "monitor", "plant"):
+            for node in ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", "plant"):
                 processes.start(node)
             log.info("running", plant=plant.name, router=bus_config.endpoint, folder=str(out), stop="Ctrl-C")
             while not woken.wait(LOOK_EVERY_S):
@@ -65,6 +75,38 @@ def run_until_stopped(config: Path | None, endpoint: str | None, out: Path, flag
             return 0
     finally:
         bus.close()
+
+
+def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig, out: Path | None) -> DiagnosisConfig:
+    """Those of diagnoses after alarms.
+
+    Args:
+        tables: of the settings file.
+        monitor: whose plant is diagnosed, against the model that it has, unless the settings say another.
+        out: folder for the reports; None: as in the settings.
+
+    Raises:
+        InputError: settings that cannot be used, or a folder that is a file.
+    """
+    of_monitor = {"plant": monitor.plant, **({"model": monitor.model} if monitor.model else {})}
+    tables = {"diagnosis": {**of_monitor, **tables.get("diagnosis", {})}}
+    found = section(DiagnosisConfig, "diagnosis", tables, {"out": str(out) if out is not None else None})
+    if found.out is not None and Path(found.out).exists() and not Path(found.out).is_dir():
+        raise InputError(f"--diagnose {found.out}: is a file, the name of a folder was expected")
+    if found.out is not None and found.model is not None:
+        read_extended_model(Path(found.model))  # so that what cannot be is told now, and not after an alarm
+    return found
+
+
+@contextlib.contextmanager
+def diagnosing(config: DiagnosisConfig, bus_config: BusConfig) -> Iterator[None]:
+    """Diagnose after alarms, in a process of its own, while the context lasts."""
+    with TemporaryDirectory() as folder:
+        settings = Path(folder) / "settings.toml"
+        write_settings(settings, {"bus": bus_config, "diagnosis": config})
+        with Processes(settings) as processes:
+            processes.start("diagnosis")
+            yield
 
 
 def _write_down(out: Path, recorder: RecorderConfig, seed: int, others: dict[str, msgspec.Struct]) -> Path:

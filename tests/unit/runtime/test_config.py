@@ -7,6 +7,7 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
+from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import SECTIONS, BusConfig, read_settings, section
@@ -64,7 +65,7 @@ def test_an_endpoint_that_is_none_is_refused(endpoint: str) -> None:
 
 
 def test_every_node_has_a_table() -> None:
-    assert set(SECTIONS) == {"bus", "plant", "monitor", "recorder", "replay"}
+    assert set(SECTIONS) == {"bus", "plant", "monitor", "recorder", "replay", "diagnosis"}
 
 
 def test_settings_that_are_written_are_read_as_they_were(tmp_path: Path) -> None:
@@ -74,6 +75,7 @@ def test_settings_that_are_written_are_read_as_they_were(tmp_path: Path) -> None
         "monitor": MonitorConfig(order=2),
         "recorder": RecorderConfig(out="somewhere"),
         "replay": ReplayConfig(file="a.csv"),
+        "diagnosis": DiagnosisConfig(out="reports", tolerance={"T": 0.5}),
     }
     path = tmp_path / "settings.toml"
     write_settings(path, written)

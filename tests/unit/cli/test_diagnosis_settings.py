@@ -1,0 +1,44 @@
+"""What diagnoses after alarms take from the settings, the flags and the monitor."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from monitor_node.config import MonitorConfig
+from reactorwatch.cli.after_alarm import DiagnosisConfig
+from reactorwatch.cli.supervise import diagnosis_settings
+from reactorwatch.errors import InputError
+
+MODEL = '{"format": "reactorwatch.model.v1", "model": "cstr"}'
+
+
+def test_plant_and_model_are_those_of_the_monitor(tmp_path: Path) -> None:
+    (tmp_path / "known.json").write_text(MODEL)
+    monitor = MonitorConfig(plant="unit_2", model=str(tmp_path / "known.json"))
+    found = diagnosis_settings({}, monitor, tmp_path / "reports")
+    assert found == DiagnosisConfig(plant="unit_2", out=str(tmp_path / "reports"), model=monitor.model)
+
+
+def test_settings_say_otherwise_and_a_flag_says_more(tmp_path: Path) -> None:
+    table = {"out": "here", "after_min": 12.0}
+    assert diagnosis_settings({"diagnosis": table}, MonitorConfig(), None) == DiagnosisConfig(out="here", after_min=12)
+    assert diagnosis_settings({"diagnosis": table}, MonitorConfig(), tmp_path).out == str(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("table", "said"),
+    [
+        ({"out": "FILE"}, "FILE: is a file, the name of a folder was expected"),
+        ({"out": "new", "model": "none.json"}, "model file none.json: cannot be read"),
+        ({"after": 3}, r"unknown key 'after'; did you mean 'after_min'\?"),
+        ({"window_min": 10.0}, r"window_min must be in \[20, 1e\+06\], got 10"),
+    ],
+)
+def test_what_cannot_be_is_told_before_anything_runs(
+    table: dict[str, Any], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("FILE").write_text("")
+    with pytest.raises(InputError, match=said):
+        diagnosis_settings({"diagnosis": table}, MonitorConfig(), None)
