@@ -6,7 +6,8 @@ measured there, and then both models run freely through the whole record, from w
 late would otherwise never be both learned and tested.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from diagnosis.courses import Signal
 from diagnosis.run import Run
 from diagnosis.search import Explained
 from diagnosis.sized import Sized
+from diagnosis.uncertain import beginning_with
 from reactorwatch.process.filter import Innovations
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.model import Array
@@ -22,6 +24,8 @@ from reactorwatch.process.simulate import Simulator
 
 EVERY, BLOCK_MIN = 4, 10.0
 OBSERVED_ROWS = 100
+WAKE_ROWS = 30
+"""After a break in what is known of the inputs, so many rows are not judged: the plant itself was driven otherwise."""
 
 
 class Errors(NamedTuple):
@@ -35,27 +39,44 @@ def held_out_rows(run: Run) -> Array:
     """Which rows are held out, shape (rows,)."""
     block = np.floor((run.time_min - run.time_min[0]) / BLOCK_MIN)
     found = block % EVERY == EVERY - 1
+    for row in run.breaks:
+        found[row : row + WAKE_ROWS] = False
     found[:OBSERVED_ROWS] = False
     return np.asarray(found)
 
 
 def gained(run: Run, nominal: Explained, best: Explained) -> tuple[Errors, Errors]:
-    """Errors of the nominal model and of the best hypothesis."""
+    """Errors of the nominal model and of the best hypothesis; in both uncertain parameters are as the latter has them.
+
+    So the difference is that of the causes alone.
+    """
     hidden = held_out_rows(run)
-    seen = Run(run.time_min, run.inputs, np.where(hidden[:, None], np.nan, run.measured))
-    before = _errors(run, hidden, nominal.hypothesis.sized, ())
+    seen = replace(run, measured=np.where(hidden[:, None], np.nan, run.measured))
+    fit = best.fit
+    if best is not nominal:
+        fit = best.hypothesis.fit(seen, best.fit.theta)
+    elif best.hypothesis.sized.model.lasting:
+        fit = best.hypothesis.at(seen, ())
+    known = best.hypothesis.offsets(fit)
+    before = _errors(run, hidden, nominal.hypothesis.sized, (), known)
     if best is nominal:
         return before, before
-    fit = best.hypothesis.fit(seen, best.fit.theta)
-    return before, _errors(run, hidden, best.hypothesis.sized, best.hypothesis.signals(fit))
+    return before, _errors(run, hidden, best.hypothesis.sized, best.hypothesis.signals(fit), known)
 
 
-def free_run(run: Run, sized: Sized, signals: Sequence[Signal]) -> Array:
-    """The outputs of a free run, shape (rows, n_y); the first rows are the filter's. NaN if it came to an end."""
-    return _freely(run, sized, signals, sized.follow(run, signals)[2])
+def free_run(run: Run, sized: Sized, signals: Sequence[Signal], known: Mapping[str, float]) -> Array:
+    """The outputs of a free run, shape (rows, n_y); the first rows are the filter's. NaN if it came to an end.
+
+    Args:
+        run: the record.
+        sized: the model.
+        signals: the deviations in it.
+        known: what uncertain parameters are off by, by name.
+    """
+    return _freely(run, sized, signals, sized.follow(run, signals)[2], known)
 
 
-def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovations) -> Array:
+def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovations, known: Mapping[str, float]) -> Array:
     outputs = np.array(found.prediction)
     first = min(OBSERVED_ROWS, run.time_min.size - 2)
     while first < run.time_min.size - 2 and not np.all(np.isfinite(found.x[first])):
@@ -64,15 +85,16 @@ def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovation
         whole = sized.whole
         inputs = whole.inputs(run.inputs, signals)[first:]
         start = found.x[first][: sized.own_states]  # memory is short: it begins at rest
-        outputs[first:] = Simulator(whole.model).run(run.time_min[first:], inputs, start).outputs
+        run_freely = Simulator(whole.model).run
+        outputs[first:] = run_freely(run.time_min[first:], inputs, start, beginning_with(known)).outputs
     except SimulationError:
         outputs[first:] = np.nan
     return outputs
 
 
-def _errors(run: Run, hidden: Array, sized: Sized, signals: Sequence[Signal]) -> Errors:
+def _errors(run: Run, hidden: Array, sized: Sized, signals: Sequence[Signal], known: Mapping[str, float]) -> Errors:
     _, _, found = sized.follow(run, signals)
-    free = _freely(run, sized, signals, found)
+    free = _freely(run, sized, signals, found, known)
     with np.errstate(invalid="ignore"):
         return Errors(_rms((run.measured - free)[hidden]), _rms(found.residual[hidden]))
 

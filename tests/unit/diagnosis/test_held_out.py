@@ -1,0 +1,40 @@
+"""What is held out is judged fairly: not where nobody knows what was done to the plant."""
+
+import numpy as np
+import pytest
+
+from diagnosis.courses import Step
+from diagnosis.held_out import gained, held_out_rows
+from diagnosis.hypothesis import Hypothesis
+from diagnosis.run import Run
+from diagnosis.search import Explained
+from diagnosis.sized import Sized
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.filter import NoiseLevels
+from tests.unit.diagnosis.runs import run_of
+
+SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
+COOLANT = next(effect for effect in EFFECTS if effect.name == "coolant_flow")
+
+
+def without_changes(run: Run) -> Run:
+    """The run with the rows missing in which its input changed, every fourth time."""
+    changed = np.flatnonzero(np.diff(run.inputs[:, 0])) + 1
+    there = np.ones(run.time_min.size, dtype=bool)
+    there[changed[::4]] = False
+    breaks = np.flatnonzero(np.diff(run.time_min[there]) > 0.15) + 1
+    return Run(run.time_min[there], run.inputs[there], run.measured[there], tuple(breaks.tolist()))
+
+
+def test_where_nobody_knows_when_the_input_changed_no_model_is_blamed_for_it() -> None:
+    run = without_changes(run_of("coolant_flow:step:-0.03@100.37min", rows=6000))
+    course, truth = Step(run.time_min), np.array([-0.03, 100.37])
+    nominal = Hypothesis(Sized(cstr(), (), SENSORS), ())
+    leaking = Hypothesis(Sized(cstr(), (COOLANT,), SENSORS), (course,))
+    before, after = gained(
+        run, Explained(nominal, nominal.at(run, ()), 0.0), Explained(leaking, leaking.at(run, (truth,)), 0.0)
+    )
+    assert np.count_nonzero(held_out_rows(run)) > 500
+    assert after.free / SENSORS.measurement_sd == pytest.approx(1.0, abs=0.09)  # of 500 values, 3 % by chance
+    assert before.free[1] > 4.0 * after.free[1]
