@@ -17,6 +17,7 @@ from diagnosis.result import (
     NAMED,
     NOMINAL,
     UNKNOWN,
+    Adjusted,
     Alternative,
     Cause,
     Curves,
@@ -28,6 +29,7 @@ from diagnosis.result import (
 from diagnosis.rough_numbers import settled
 from diagnosis.run import Run
 from diagnosis.search import Explained, Found, Search
+from diagnosis.uncertain import with_uncertain
 from diagnosis.unknown import unknown
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
@@ -59,6 +61,7 @@ def diagnose(
     model: ProcessModel,
     effects: Sequence[Effect] | None = None,
     tolerance: Mapping[str, float] | None = None,
+    uncertain: Mapping[str, float] | None = None,
 ) -> Diagnosis:
     """What a simulation by the model gets wrong of a record.
 
@@ -68,14 +71,18 @@ def diagnose(
         effects: the causes that may be named; None: those of the model's own catalogue.
         tolerance: by output, the root mean square difference that does not matter in practice, in its unit; where
             nothing is said, a fiftieth of the output's range.
+        uncertain: by parameter of the model, the standard deviation to which its value is known, in its unit; the
+            others are known exactly. See `diagnosis.uncertain`.
 
     Raises:
-        InputError: the record cannot be diagnosed, or a tolerance is of no output or not positive.
+        InputError: the record cannot be diagnosed, a tolerance is of no output or not positive, or what is uncertain is
+            no parameter, or its standard deviation not positive.
     """
     effects = effects_of(model) if effects is None else effects
     run = run_of(record, model)
     bands = _bands(run, model, tolerance or {})
-    search = Search(model, effects, run, _smallest_sd(model))
+    plant = with_uncertain(model, uncertain or {})
+    search = Search(plant, effects, run, _smallest_sd(model))
     found = with_pairs(search, search.found())
     best = found.best if found.nominal.bic - found.best.bic >= LEAST_GAIN else found.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
@@ -95,7 +102,7 @@ def diagnose(
     best, covariances = _with_rough_numbers(search, best)
     before, after = gained(run, found.nominal, best)
     matters = verdict == UNKNOWN and _left_matters(before, found, model, bands)
-    if verdict == UNKNOWN and not matters and looks_like_integration(model, run, found.nominal.fit.found):
+    if verdict == UNKNOWN and not matters and looks_like_integration(plant, run, found.nominal.fit.found):
         location = TIMING
         remarks.append(
             "what is left is small and goes with the error of an integrator's steps: it looks like integration "
@@ -103,6 +110,8 @@ def diagnose(
         )
     curves = _curves(run, model, found.nominal, best, covariances)
     causes = tuple(_causes(best, covariances))
+    parameters = _parameters(run, model, uncertain or {}, best)
+    adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
     return Diagnosis(
         samples=run.time_min.size,
         span_min=run.span_min,
@@ -116,8 +125,9 @@ def diagnose(
         gain=_gain(model, found, best, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=None,
-        extended_model=extended_model(model, effects, causes, record.zero_ns),
+        extended_model=extended_model(adjusted, effects, causes, record.zero_ns),
         remarks=tuple(remarks),
+        parameters=parameters,
         curves=curves,
     )
 
@@ -173,6 +183,17 @@ def _with_rough_numbers(search: Search, best: Explained) -> tuple[Explained, lis
     return best, covariances
 
 
+def _parameters(run: Run, model: ProcessModel, uncertain: Mapping[str, float], best: Explained) -> dict[str, Adjusted]:
+    """The uncertain parameters under the best explanation, whatever its numbers may be."""
+    sds = best.hypothesis.offset_sds(run, best.fit) if uncertain else {}
+    off = best.hypothesis.offsets(best.fit)
+    found = {}
+    for name, stated_sd in uncertain.items():
+        item = model.parameter(name)
+        found[name] = Adjusted(item.value, stated_sd, Estimate(item.value + off[name], sds[name], item.unit))
+    return found
+
+
 def _causes(best: Explained, covariances: Sequence[Array]) -> list[Cause]:
     hypothesis, causes = best.hypothesis, []
     for effect, course, theta, part in zip(
@@ -216,6 +237,7 @@ def _gain(model: ProcessModel, found: Found, best: Explained, before: Errors, af
 def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained, covariances: Sequence[Array]) -> Curves:
     outputs = model.output_names
     hypothesis, signals = best.hypothesis, best.hypothesis.signals(best.fit)
+    known = hypothesis.offsets(best.fit)
     deviation, deviation_sd = {}, {}
     for effect, course, theta, signal, part in zip(
         hypothesis.sized.effects, hypothesis.courses, best.fit.theta, signals, covariances, strict=True
@@ -227,8 +249,8 @@ def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained, 
         run.time_min,
         dict(zip(model.input_names, run.inputs.T, strict=True)),
         dict(zip(outputs, run.measured.T, strict=True)),
-        dict(zip(outputs, free_run(run, nominal.hypothesis.sized, ()).T, strict=True)),
-        dict(zip(outputs, free_run(run, hypothesis.sized, signals).T, strict=True)),
+        dict(zip(outputs, free_run(run, nominal.hypothesis.sized, (), known).T, strict=True)),
+        dict(zip(outputs, free_run(run, hypothesis.sized, signals, known).T, strict=True)),
         dict(zip(outputs, _standardised(nominal).T, strict=True)),
         dict(zip(outputs, _standardised(best).T, strict=True)),
         deviation,

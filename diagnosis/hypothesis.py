@@ -17,6 +17,7 @@ from diagnosis import signatures
 from diagnosis.courses import Course, Signal
 from diagnosis.run import Run
 from diagnosis.sized import HUBER, Sized, clipped
+from diagnosis.uncertain import last_state, offsets
 from reactorwatch.process.filter import Innovations
 from reactorwatch.process.filter_errors import Ways
 from reactorwatch.process.model import Array
@@ -133,6 +134,26 @@ class Hypothesis:
             if all(np.array_equal(*pair) for pair in zip(before, differences, strict=True)):
                 break
         return found
+
+    def offsets(self, fit: Fit) -> dict[str, float]:
+        """What the uncertain parameters of the plant are off by, by name."""
+        return offsets(self.sized.model, fit.found.x[last_state(fit.found)])
+
+    def offset_sds(self, run: Run, fit: Fit) -> dict[str, float]:
+        """The standard deviations of these, whatever the numbers may be."""
+        row = last_state(fit.found)
+        variances = np.diag(fit.found.P[row]).copy()
+        if self.freedom == 0:
+            return offsets(self.sized.model, np.sqrt(variances))
+        covariance = self.covariance(run, fit)
+        moved = []
+        for number, sd in enumerate(np.sqrt(np.maximum(np.diag(covariance), 0.0))):
+            change = np.zeros(self.freedom)
+            change[number] = max(sd, 1e-300)
+            there = self.sized.follow(run, self._signals(self._moved(fit.theta, change)))[2].x[row]
+            moved.append((there - fit.found.x[row]) / change[number])
+        by = np.nan_to_num(np.array(moved))
+        return offsets(self.sized.model, np.sqrt(variances + np.einsum("ni,nm,mi->i", by, covariance, by)))
 
     def _inverse(self, g: Array) -> Array:
         """Covariance of the numbers whose derivatives these are."""

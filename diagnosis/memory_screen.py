@@ -92,6 +92,7 @@ class MemoryScreen:
 
 
 def _lead(effect: Effect, course: Constant | Step | Ramp, a: float, b: float, shape: tuple[float, ...]) -> Lead:
+    """At the nearest possible size, with the gain of just that: a run with it is held against this gain."""
     size = float(np.clip(a / max(b, 1e-300), effect.lower, effect.upper))
     return Lead(effect, course, np.array([size, *shape]), size * (2.0 * float(a) - size * float(b)))
 

@@ -8,6 +8,9 @@ from reactorwatch.process.model import Array
 
 NOMINAL, NAMED, AMBIGUOUS, UNKNOWN = "nominal", "named", "ambiguous", "unknown"
 
+SD_95 = 1.959964
+"""Standard deviations to either side that hold 95 % of a normal distribution."""
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -35,6 +38,26 @@ class Cause:
     label: str
     location: str
     parameters: dict[str, Estimate]
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """A parameter that was stated to be known but roughly, and what the record says of it.
+
+    Attributes:
+        nominal: its value in the simulation.
+        stated_sd: standard deviation that it was stated to be known to.
+        estimate: of it, from what was stated and the record together.
+    """
+
+    nominal: float
+    stated_sd: float
+    estimate: Estimate
+
+    @property
+    def off(self) -> bool:
+        """Whether the record says that it is not the nominal value: that is out of its 95 % interval."""
+        return abs(self.estimate.value - self.nominal) > SD_95 * self.estimate.sd
 
 
 @dataclass(frozen=True)
@@ -147,6 +170,7 @@ class Diagnosis:
         experiment: that would tell the alternatives apart; None where there is nothing to tell.
         extended_model: as in its file (`diagnosis.extended_model`).
         remarks: what else people should know, in sentences.
+        parameters: that were stated to be uncertain, by name.
         curves: for pictures.
     """
 
@@ -164,4 +188,5 @@ class Diagnosis:
     experiment: Experiment | None
     extended_model: dict[str, Any]
     remarks: tuple[str, ...] = ()
+    parameters: dict[str, Adjusted] = field(default_factory=dict)
     curves: Curves | None = field(default=None, repr=False, compare=False)

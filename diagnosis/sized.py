@@ -60,8 +60,8 @@ class Sized:
 
     @property
     def own_states(self) -> int:
-        """How many states the plant has without these effects; they are the first."""
-        return len(self._plant.states)
+        """How many states the plant has that are no memory; they are the first."""
+        return sum(state.name not in self._plant.at_rest for state in self._plant.states)
 
     @cached_property
     def whole(self) -> SizedModel:

@@ -55,6 +55,15 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float) -> dict[str, Any]
             "separates": list(experiment.separates),
         },
         "extended_model": diagnosis.extended_model,
+        **({"parameters": _parameters(diagnosis)} if diagnosis.parameters else {}),
+    }
+
+
+def _parameters(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Those that were stated to be uncertain."""
+    return {
+        name: {"nominal": _number(item.nominal), "stated_sd": _number(item.stated_sd), **_estimate(item.estimate)}
+        for name, item in diagnosis.parameters.items()
     }
 
 

@@ -15,6 +15,7 @@ from diagnosis.report import pictures
 from diagnosis.report.equations import balances, meanings
 from diagnosis.report.svg import Line, plot
 from diagnosis.report.words import (
+    adjusted_said,
     causes_said,
     difference_said,
     place,
@@ -82,6 +83,7 @@ def as_page(
         verdict=verdict(diagnosis, effects),
         place=place(diagnosis) if diagnosis.verdict != NOMINAL else "",
         causes=[_said(diagnosis, cause, item.symbol) for cause, item in zip(diagnosis.causes, meant, strict=True)],
+        parameters=[(name, adjusted_said(item)) for name, item in diagnosis.parameters.items()],
         meanings=meant,
         equations=balances(model, found),
         outputs=pictures.outputs(diagnosis, model),

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diagnosis.report.svg import Band, Line, plot
-from diagnosis.report.words import SD_95
-from diagnosis.result import NOMINAL, Cause, Curves, Diagnosis
+from diagnosis.result import NOMINAL, SD_95, Cause, Curves, Diagnosis
 from reactorwatch.process.model import Array, ProcessModel
 
 BEFORE_ROWS, AFTER_ROWS = 100, 200

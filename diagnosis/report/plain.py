@@ -2,7 +2,15 @@
 
 from collections.abc import Sequence
 
-from diagnosis.report.words import causes_said, difference_said, error_left, size_said, verdict, when
+from diagnosis.report.words import (
+    adjusted_said,
+    causes_said,
+    difference_said,
+    error_left,
+    size_said,
+    verdict,
+    when,
+)
 from diagnosis.result import NOMINAL, Diagnosis
 from reactorwatch.process.effects.base import Effect
 
@@ -30,6 +38,8 @@ def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
     if diagnosis.verdict != NOMINAL:
         lines.append(_line("evidence", f"{diagnosis.gain.delta_bic:,.1f} in BIC over the simulation as it was"))
         lines += [_line("differs", difference_said(name, item)) for name, item in diagnosis.differences.items()]
+    for name, known in diagnosis.parameters.items():
+        lines.append(_line("parameter", f"{name} {adjusted_said(known)}  (95 %)"))
     for name, item in diagnosis.gain.held_out.items():
         lines.append(_line("held out", error_left(name, item, improved=bool(diagnosis.causes))))
     for rival in diagnosis.alternatives:

@@ -6,11 +6,8 @@ from math import floor, isfinite, log10
 import numpy as np
 
 from diagnosis.difference import TIME, Difference
-from diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, Cause, Curves, Diagnosis, Estimate, HeldOut
+from diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, SD_95, Adjusted, Cause, Curves, Diagnosis, Estimate, HeldOut
 from reactorwatch.process.effects.base import Effect
-
-SD_95 = 1.959964
-"""Standard deviations to either side that hold 95 % of a normal distribution."""
 
 MOSTLY_NOISE, WORSE = 0.9, 1.2
 """Of the mean square error: nothing worth locating is left. Times the error of all rows: a range is told as worse."""
@@ -30,6 +27,12 @@ PLACES = {
 
 def verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
     """The answer, in a sentence or two."""
+    off = [name for name, item in diagnosis.parameters.items() if item.off]
+    if diagnosis.verdict == NOMINAL and off:
+        return (
+            f"The simulation is right within what was stated of its parameters: {' and '.join(off)} "
+            f"{'is' if len(off) == 1 else 'are'} a little off, and what the record shows beyond that is noise."
+        )
     if diagnosis.verdict == NOMINAL:
         return "The simulation is right: what the record shows beyond it is noise."
     if diagnosis.verdict == AMBIGUOUS:
@@ -120,6 +123,12 @@ def with_interval(estimate: Estimate) -> str:
     if decimals < 0:
         return f"{round(estimate.value, decimals):.0f} ± {round(half, decimals):.0f}{unit}"
     return f"{estimate.value:.{decimals}f} ± {half:.{decimals}f}{unit}"
+
+
+def adjusted_said(item: Adjusted) -> str:
+    """An uncertain parameter as the record has it, beside what was stated."""
+    stated = Estimate(item.nominal, item.stated_sd, item.estimate.unit)
+    return f"{with_interval(item.estimate)}; stated: {with_interval(stated)}"
 
 
 def error_said(value: float, unit: str) -> str:

@@ -6,7 +6,7 @@ anything else is said or written, and not after minutes of others.
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -17,6 +17,7 @@ from diagnosis.report.machine import as_object, with_differences
 from diagnosis.report.page import as_page
 from diagnosis.report.plain import as_text
 from diagnosis.result import Diagnosis
+from diagnosis.uncertain import stated
 from reactorwatch.cli.diagnosis_drawing import write_drawing
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.sources import process_model, record, signals_of
@@ -43,16 +44,23 @@ class Case:
         measured: the record.
         model: the simulation, its clock that of the record.
         folder: for the report; None: none is wanted.
+        uncertain: parameters that are known but to a standard deviation.
     """
 
     file: Path
     measured: Record
     model: ProcessModel
     folder: Path | None
+    uncertain: dict[str, float] = field(default_factory=dict)
 
 
 def cases(
-    files: Sequence[Path], plant: str | None, columns: dict[str, str], model: Path | None, out: Path | None
+    files: Sequence[Path],
+    plant: str | None,
+    columns: dict[str, str],
+    model: Path | None,
+    out: Path | None,
+    uncertain: str | None = None,
 ) -> list[Case]:
     """The records in the files, read and checked.
 
@@ -62,9 +70,10 @@ def cases(
         columns: their names by signal.
         model: file of an extended model; None: the nominal reactor.
         out: folder for the report; of several files, each gets a folder in it.
+        uncertain: which parameters are known but to a standard deviation, as text; None: none.
 
     Raises:
-        InputError: a file cannot be read or diagnosed, or the folder cannot be one.
+        InputError: a file cannot be read or diagnosed, the folder cannot be one, or what is uncertain is no parameter.
     """
     if out is not None and out.exists() and not out.is_dir():
         raise InputError(f"--out {out}: is a file, the name of a folder was expected")
@@ -73,8 +82,9 @@ def cases(
     for file, folder in zip(files, _folders(files, out), strict=True):
         measured = record(file, plant, columns, signals)
         process = process_model(model, measured)
+        known = stated(uncertain, process) if uncertain is not None else {}
         run_of(measured, process)
-        found.append(Case(file, measured, process, folder))
+        found.append(Case(file, measured, process, folder, known))
     return found
 
 
@@ -102,7 +112,7 @@ def diagnosed(case: Case, tolerance: dict[str, float] | None = None) -> tuple[Di
         InputError: as `results`.
     """
     began = time.monotonic()
-    diagnosis = diagnose(case.measured, case.model, tolerance=tolerance)
+    diagnosis = diagnose(case.measured, case.model, tolerance=tolerance, uncertain=case.uncertain)
     seconds = time.monotonic() - began
     if case.folder is not None:
         write_report(diagnosis, case, seconds)

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnosis.report.pictures import interval
-from diagnosis.report.words import SD_95
-from diagnosis.result import Curves, Diagnosis
+from diagnosis.result import SD_95, Curves, Diagnosis
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record, to_time_ns
 from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Series, TimePlot

@@ -97,6 +97,13 @@ def diagnose(
             show_default=False,
         ),
     ] = None,
+    uncertain: Annotated[
+        str | None,
+        typer.Option(
+            help="Parameters that are known but to a standard deviation, such as K3=2%,Tf=0.5K [none].",
+            show_default=False,
+        ),
+    ] = None,
     model: Model = None,
     plant: Plant = None,
     column: Columns = None,
@@ -106,6 +113,6 @@ def diagnose(
     from reactorwatch.cli.diagnosis import cases, results
 
     accepted = tolerances(tolerance)
-    found = cases([existing_recording(file) for file in files], plant, columns(column), model, out)
+    found = cases([existing_recording(file) for file in files], plant, columns(column), model, out, uncertain)
     for said in results(found, accepted, as_json=as_json):
         typer.echo(said)

@@ -25,6 +25,7 @@ What is out of the ordinary is handled like this:
 - It begins anew as well where the equations leave the bounds of the states, or are no numbers any more. A correction
   that leads out of the bounds is cut off there.
 - It begins at what is measured (see `filter_start`), and says nothing of that row; as long as nothing is, it waits.
+- What it has learned of a state that never changes (`ProcessModel.lasting`) outlasts a beginning.
 """
 
 import struct
@@ -152,6 +153,7 @@ class Filter:
         self._pack, self._unpack = struct.Struct(f"{new.size}d").pack_into, struct.Struct(f"{told.size}d").unpack
         self._break_places = [model.parameter_names.index(name) for name in model.breakpoints]
         self._time_min: float | None = None
+        self._lasting, self._learned = list(model.lasting), False
         self._inputs: tuple[float, ...] = ()
         self._breaks: tuple[float, ...] = ()
         self.noise = noise
@@ -186,8 +188,8 @@ class Filter:
         self._breaks = tuple(sorted({float(values[place]) for place in self._break_places}))
 
     def restart(self) -> None:
-        """Begin anew with the next row."""
-        self._time_min = None
+        """Begin anew with the next row, knowing nothing."""
+        self._time_min, self._learned = None, False
 
     @property
     def state(self) -> FilterState:
@@ -198,6 +200,7 @@ class Filter:
     @state.setter
     def state(self, state: FilterState) -> None:
         self._time_min, self._inputs = state.time_min, state.inputs
+        self._learned = state.time_min is not None
         self._memory[:] = [*state.x, *state.P]
 
     def update(
@@ -363,6 +366,16 @@ class Filter:
         found = self._beginning.at(time_min, inputs, measured, self._noise.measurement_sd, self._changes)
         if found is not None:
             x, P = found
+            if self._lasting and self._learned:
+                self._keep_lasting(x, P)
+            self._learned = True
             self._memory[:] = [*x, *P.ravel()]
             self._remember(time_min, inputs)
         return self._nothing
+
+    def _keep_lasting(self, x: Array, P: Array) -> None:
+        """Put what is known of the states that never change into a beginning."""
+        known, n_x = self._lasting, self._n_x
+        P[known], P[:, known] = 0.0, 0.0
+        x[known] = self._memory[known]
+        P[np.ix_(known, known)] = self._memory[n_x:].reshape(n_x, n_x)[np.ix_(known, known)]

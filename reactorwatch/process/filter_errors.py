@@ -10,7 +10,7 @@ the filter was, about which all this is linearised, is known from its run; rows 
 All of it is one compiled map over many rows, so that a thousand rows cost some milliseconds.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import ceil
 
@@ -60,10 +60,15 @@ class FilterErrors:
         noise: of the plant and its sensors.
         piece: see `piece_function`.
         shown: see `shown_function`.
+
+    Attributes:
+        noise: as given.
+        changes: parameters that differ from the model's values.
     """
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, piece: ca.Function, shown: ca.Function) -> None:
         self.model, self.noise = model, noise
+        self.changes: Mapping[str, float] = {}
         self._piece, self._shown = (mapped(function, CHUNK, parameters=2) for function in (piece, shown))
 
     @classmethod
@@ -99,22 +104,24 @@ class FilterErrors:
             P: its covariance, shape (rows, n_x, n_x).
             residual: what it was off by, shape (rows, n_y); NaN where nothing was measured.
             used: whether a value corrected the filter, shape (rows, n_y).
-            began: rows that it began anew with, shape (rows,), so that what was before is forgotten; None: none.
+            began: rows that it began anew with, shape (rows,), so that what was before is forgotten, but for states
+                that never change; None: none.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # about a run that has lost an unstable plant
             found = self._ways(time_min, inputs, x, P, residual, used)
         if began is None:
             return found
-        F, G, H, D, K = (
-            np.where(began[1:, None, None], 0.0, item) for item in (found.F, found.G, found.H, found.D, found.K)
-        )
+        kept = np.zeros(found.F.shape[1:])
+        kept[self.model.lasting, self.model.lasting] = 1.0
+        F = np.where(began[1:, None, None], kept, found.F)
+        G, H, D, K = (np.where(began[1:, None, None], 0.0, item) for item in (found.G, found.H, found.D, found.K))
         return Ways(F, G, H, D, K, found.L_inverse, found.w)
 
     def _ways(
         self, time_min: Array, inputs: Array, x: Array, P: Array, residual: Array, used: NDArray[np.bool_]
     ) -> Ways:
         R, q = np.square(self.noise.measurement_sd), np.square(self.noise.process_sd)
-        p, step = self.model.values(), np.diff(time_min)
+        p, step = self.model.values(self.changes), np.diff(time_min)
         there, F, G = self._walked(x[:-1], inputs[:-1], time_min[:-1], step, p)
         H, D = self._over(self._shown, p, there, inputs[1:], time_min[1:, None])
         prior = F @ P[:-1] @ F.transpose(0, 2, 1) + np.eye(there.shape[1]) * q * step[:, None, None]

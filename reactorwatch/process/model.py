@@ -156,6 +156,15 @@ class ProcessModel:
         """Names of the parameters, in order."""
         return tuple(item.name for item in self.parameters)
 
+    @cached_property
+    def lasting(self) -> tuple[int, ...]:
+        """Places of the states in `at_rest` that neither flow nor jump: numbers that hold, though nobody knows them."""
+        return tuple(
+            place
+            for place, (state, rate) in enumerate(zip(self.states, self.rhs, strict=True))
+            if rate.is_zero() and state.name in self.at_rest and state.name not in self.resets
+        )
+
     def parameter(self, name: str) -> Parameter:
         """The parameter of that name.
 

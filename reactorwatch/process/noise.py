@@ -13,6 +13,10 @@ and steps are shortened until they gain. The search begins with a process noise 
 of a few; the sensors' noise there is what makes the mean square of the innovations what the filter expects. In the end
 a state whose noise the record does not need has none: a plant that the model describes perfectly is described so.
 
+States that never change (`ProcessModel.lasting`) have no noise. Other numbers that the likelihood depends on, such as
+how long the noise of a sensor remembers, are learned likewise, if they are parameters of the model: their logarithms
+are further components of theta.
+
 Outliers do not pass for noise: those beyond `GATE` standard deviations are left out, and beyond `CLIP` it does not
 matter how far off a value is. So as not to take the tails of normal noise for outliers, squares are compared with those
 of normal values that are cut off likewise (Huber 1981, Robust Statistics, ch. 5).
@@ -66,7 +70,7 @@ class _Trial(NamedTuple):
     """The logarithms of some noise levels, and what they make of the record.
 
     Attributes:
-        theta: shape (n_y + n_x,), the sensors first.
+        theta: the sensors' first, then those of the states that change, then those of further numbers.
         loss: minus the log likelihood.
         w: the whitened innovations, shape (rows, n_y); 0 where there are none.
         d: logarithms of what the innovations were divided by to be so, likewise.
@@ -90,36 +94,69 @@ def tune(
         measured: shape (rows, n_y); NaN where missing or not to be learned from.
         smallest_sd: of the sensors, one an output, in its unit, above 0: theirs are at least so large.
     """
-    return _Tuning(model, time_min, inputs, measured, np.asarray(smallest_sd, dtype=float)).found()
+    return tune_with(model, time_min, inputs, measured, smallest_sd, ())[0]
+
+
+def tune_with(
+    model: ProcessModel,
+    time_min: Array,
+    inputs: Array,
+    measured: Array,
+    smallest_sd: Sequence[float],
+    learned: Sequence[str],
+) -> tuple[NoiseLevels, dict[str, float]]:
+    """The noise levels, and positive parameters of the model, under which a record is likeliest.
+
+    Args:
+        model: see `tune`, as for the next four.
+        time_min: likewise.
+        inputs: likewise.
+        measured: likewise.
+        smallest_sd: likewise.
+        learned: names of the parameters; the search begins at their values.
+    """
+    return _Tuning(model, time_min, inputs, measured, np.asarray(smallest_sd, dtype=float), learned).found()
 
 
 class _Tuning:
     """The search for the noise levels of one record."""
 
     def __init__(
-        self, model: ProcessModel, time_min: Array, inputs: Array, measured: Array, smallest_sd: Array
+        self,
+        model: ProcessModel,
+        time_min: Array,
+        inputs: Array,
+        measured: Array,
+        smallest_sd: Array,
+        learned: Sequence[str],
     ) -> None:
         self._whole, self._rows = (time_min, inputs, measured), time_min.size
         self._take(FIRST_ROWS)
         self._n_y = len(model.outputs)
-        self._scales = np.array([state.scale for state in model.states])
-        self._lowest = np.log(np.concatenate([smallest_sd, LEAST_SHARE * self._scales]))
+        self._states = [place for place in range(len(model.states)) if place not in model.lasting]
+        self._of_states = range(self._n_y, self._n_y + len(self._states))
+        self._scales = np.array([model.states[place].scale for place in self._states])
+        self._learned = [model.parameter(name) for name in learned]
+        limits = np.log([[item.lower, item.upper] for item in self._learned]).reshape(-1, 2).T
+        self._lowest = np.concatenate([np.log(smallest_sd), np.log(LEAST_SHARE * self._scales), limits[0]])
+        self._highest = np.concatenate([np.full(self._of_states.stop, inf), limits[1]])
         self._first = np.maximum(_rough(measured), smallest_sd)
-        self._filter = Filter(model, NoiseLevels(tuple(self._first.tolist()), (0.0,) * self._scales.size))
+        self._filter = Filter(model, NoiseLevels(tuple(self._first.tolist()), (0.0,) * len(model.states)))
 
-    def found(self) -> NoiseLevels:
-        """The best noise levels."""
+    def found(self) -> tuple[NoiseLevels, dict[str, float]]:
+        """The best noise levels, and the best values of what else was to be learned."""
         best = self._climbed(self._without_outliers(self._begun()))
         if self._rows > FIRST_ROWS:
             self._take(self._rows)
             best = self._climbed(self._without_outliers(best))
-        for index in range(self._n_y, best.theta.size):
+        for index in self._of_states:
             theta = best.theta.copy()
             theta[index] = self._lowest[index]
             without = self._tried(theta)
             if without.loss < best.loss + LEAST_GAIN:
                 best = without
-        return self._levels(self._stepped(best, range(self._n_y)).theta)
+        theta = self._stepped(best, range(self._n_y)).theta
+        return self._levels(theta), self._changes(theta)
 
     def _take(self, rows: int) -> None:
         """Go on with so many rows from the beginning."""
@@ -129,7 +166,7 @@ class _Tuning:
     def _without_outliers(self, best: _Trial) -> _Trial:
         """The same noise levels on the record without its outliers: an outlier of one sensor whitens into all."""
         record = self._record
-        self._filter.noise = self._levels(best.theta)
+        self._use(best.theta)
         run = self._filter.over(record)
         with np.errstate(invalid="ignore"):
             measured = np.where(np.abs(run.residual) > GATE * run.sd, np.nan, record.measured)
@@ -146,9 +183,10 @@ class _Tuning:
 
     def _begun(self) -> _Trial:
         """The best of those that move every state alike."""
-        sensors, tried = np.log(self._first), []
+        sensors, tried = np.log(self._first), list[_Trial]()
+        others = np.log([item.value for item in self._learned])
         for share in SHARES:
-            trial = self._tried(np.concatenate([sensors, np.log(share * self._scales)]))
+            trial = self._tried(np.concatenate([sensors, np.log(share * self._scales), others]))
             inside = (trial.w != 0.0) & (np.abs(trial.w) < CLIP)
             mean_square = np.sum(trial.w**2 * inside, axis=0) / np.maximum(np.sum(inside, axis=0), 1)
             sensors = sensors + 0.5 * np.log(np.maximum(mean_square, 1e-6))
@@ -174,19 +212,32 @@ class _Tuning:
         step[chosen] = -np.linalg.solve(information + np.diag(_RIDGE * np.diag(information) + 1.0), gradient)
         step *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(step))), LONGEST_STEP))
         for _ in range(MOST_CUTS):
-            trial = self._tried(np.maximum(best.theta + step, self._lowest))
+            trial = self._tried(np.clip(best.theta + step, self._lowest, self._highest))
             if trial.loss < best.loss:
                 return trial
             step *= _CUT
         return best
 
     def _levels(self, theta: Array) -> NoiseLevels:
-        sds = np.exp(theta)
-        sds[self._n_y :] *= theta[self._n_y :] > self._lowest[self._n_y :]
-        return NoiseLevels(tuple(sds[: self._n_y].tolist()), tuple(sds[self._n_y :].tolist()))
+        sds, of_states = np.exp(theta), np.zeros(len(self._filter.model.states))
+        own = slice(self._of_states.start, self._of_states.stop)
+        of_states[self._states] = sds[own] * (theta[own] > self._lowest[own])
+        return NoiseLevels(tuple(sds[: self._n_y].tolist()), tuple(of_states.tolist()))
+
+    def _changes(self, theta: Array) -> dict[str, float]:
+        values = np.exp(theta[self._of_states.stop :]).tolist()
+        return {
+            item.name: min(max(value, item.lower), item.upper)
+            for item, value in zip(self._learned, values, strict=True)
+        }
+
+    def _use(self, theta: Array) -> None:
+        self._filter.noise = self._levels(theta)
+        if self._learned:
+            self._filter.change(self._changes(theta))
 
     def _tried(self, theta: Array) -> _Trial:
-        self._filter.noise = self._levels(theta)
+        self._use(theta)
         run = self._filter.over(self._record)
         w, sd = run.whitened[BURN_IN:], run.conditional_sd[BURN_IN:]
         known = np.isfinite(w)

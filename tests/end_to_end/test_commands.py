@@ -98,6 +98,7 @@ def record_csv(tmp_path: Path) -> Path:
         (["diagnose", "BAD.csv", "-o", "out"], "row 3"),
         (["diagnose", "RECORD", "-o", "out"], "needs at least 200 rows, got 3"),
         (["diagnose", "RECORD", "--tolerance", "C"], "--tolerance must be output=number"),
+        (["diagnose", "RECORD", "--uncertain", "K3=2"], "uncertain K3 must be in % or in l/min, got '2'"),
         (["diagnose", "RECORD", "--model", "BAD.csv"], "BAD.csv: is not JSON"),
         (["diagnose", "RECORD", "-o", "BAD.txt"], "is a file, the name of a folder was expected"),
         (["simulate", "RECORD", "-o", "OUT", "--model", "nowhere.json"], "cannot be read"),

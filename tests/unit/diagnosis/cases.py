@@ -6,7 +6,7 @@ from math import nan
 import numpy as np
 
 from diagnosis.difference import difference
-from diagnosis.result import Alternative, Cause, Curves, Diagnosis, Estimate, Experiment, Gain, HeldOut
+from diagnosis.result import Adjusted, Alternative, Cause, Curves, Diagnosis, Estimate, Experiment, Gain, HeldOut
 from reactorwatch.process.model import Array
 
 ROWS = 2000
@@ -72,6 +72,7 @@ def diagnosis_of(
     experiment: Experiment | None = None,
     remarks: tuple[str, ...] = (),
     ran_away: bool = False,
+    parameters: dict[str, Adjusted] | None = None,
 ) -> Diagnosis:
     """A diagnosis of 2,000 rows."""
     before = nan if ran_away else 3.2
@@ -102,6 +103,7 @@ def diagnosis_of(
         experiment=experiment,
         extended_model={"format": "reactorwatch.model.v1", "model": "cstr", "effects": []},
         remarks=remarks,
+        parameters=parameters or {},
         curves=drawn,
     )
 
@@ -115,3 +117,9 @@ CASES = {
     "ambiguous": diagnosis_of("ambiguous", (LEAK,), (FEED,), experiment=EXPERIMENT, ran_away=True),
     "unknown": diagnosis_of("unknown", location="energy_balance"),
 }
+ROUGHLY = {
+    "K3": Adjusted(700.0, 14.0, Estimate(711.2, 1.5, "l/min")),
+    "Tf": Adjusted(350.0, 0.5, Estimate(350.0, 0.1, "K")),
+}
+ADJUSTED = diagnosis_of("nominal", parameters=ROUGHLY)
+"""Where parameters were stated to be uncertain."""

@@ -18,7 +18,7 @@ from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import ProcessModel
-from tests.unit.diagnosis.cases import CASES
+from tests.unit.diagnosis.cases import ADJUSTED, CASES
 
 EMPTY = {"meta", "br", "hr", "img", "link", "input"}
 
@@ -87,6 +87,11 @@ def test_the_page_tells_how_the_extended_model_is_used() -> None:
     text = page("named")
     for command in ("simulate", "diagnose", "monitor", "plant"):
         assert re.search(rf"reactorwatch {command} .*--model out/extended.json", text)
+
+
+def test_the_page_tells_what_is_known_now_of_uncertain_parameters() -> None:
+    text = as_page(ADJUSTED, cstr(), EFFECTS, "plant.csv", "extended.json")
+    assert "<tr><th>K3</th><td>711.2 ± 2.9 l/min; stated: 700 ± 27 l/min" in text
 
 
 def test_a_page_without_curves_is_refused() -> None:

@@ -10,7 +10,7 @@ from diagnosis.report.plain import as_text
 from diagnosis.report.words import verdict, with_interval
 from diagnosis.result import Diagnosis, Estimate
 from reactorwatch.process.effects import EFFECTS
-from tests.unit.diagnosis.cases import CASES, ROWS
+from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
 
 
 @pytest.mark.parametrize(
@@ -100,6 +100,17 @@ def test_the_object_holds_what_was_found() -> None:
         "separates": ["coolant_flow"],
     }
     assert said["adequacy"]["T"] == {"minus_log10_p": 0.35}
+
+
+def test_what_was_stated_to_be_uncertain_is_told_as_it_is_known_now() -> None:
+    assert verdict(ADJUSTED, EFFECTS) == (
+        "The simulation is right within what was stated of its parameters: K3 is a little off, "
+        "and what the record shows beyond that is noise."
+    )
+    assert "parameter   K3 711.2 ± 2.9 l/min; stated: 700 ± 27 l/min  (95 %)" in as_text(ADJUSTED, "run.csv", EFFECTS)
+    said = as_object(ADJUSTED, "run.csv", 1.0)["parameters"]
+    assert list(said) == ["K3", "Tf"]
+    assert said["K3"] == {"nominal": 700.0, "stated_sd": 14.0, "value": 711.2, "sd": 1.5, "unit": "l/min"}
 
 
 def test_what_is_no_finite_number_is_null() -> None:

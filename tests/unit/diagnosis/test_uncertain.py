@@ -1,0 +1,129 @@
+"""Parameters that are known to a stated standard deviation: what is within it is no finding, and is allowed for."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from diagnosis.diagnose import diagnose
+from diagnosis.result import NAMED, NOMINAL
+from diagnosis.run import Run
+from diagnosis.sized import Sized
+from diagnosis.uncertain import offsets, stated, with_uncertain
+from reactorwatch.errors import InputError
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.extended_model import parse_extended_model
+from reactorwatch.process.filter import Filter, NoiseLevels
+from tests.unit.diagnosis.runs import record_of, run_of
+
+SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
+WARMER = "feed_temperature:constant:0.5"
+
+
+def followed(run: Run, sds: dict[str, float]) -> tuple[float, float]:
+    """Offset of the feed's temperature in the end, and its standard deviation."""
+    noise = NoiseLevels(SENSORS.measurement_sd, (0.0,) * (2 + len(sds)))
+    _, _, found = Sized(with_uncertain(cstr(), sds), (), noise).follow(run, ())
+    return float(found.x[-1, 2]), float(np.sqrt(found.P[-1, 2, 2]))
+
+
+def test_the_likelihood_is_that_of_all_offsets_weighed_by_what_was_stated() -> None:
+    run, sd = run_of(WARMER, rows=400), 0.5
+    noise = NoiseLevels(SENSORS.measurement_sd, (0.0, 0.0, 0.0))
+    uncertain = Filter(with_uncertain(cstr(), {"Tf": sd}), noise).run(run.time_min, run.inputs, run.measured)
+    grid = np.linspace(0.0, 1.0, 101)
+    given = []
+    for offset in grid:
+        known = Filter(cstr().with_values({"Tf": 350.0 + offset}), SENSORS)
+        given.append(float(np.sum(known.run(run.time_min, run.inputs, run.measured).log_likelihood)))
+    weighed = np.array(given) - 0.5 * (grid / sd) ** 2 - np.log(np.sqrt(2.0 * np.pi) * sd)
+    marginal = weighed.max() + np.log(np.sum(np.exp(weighed - weighed.max())) * (grid[1] - grid[0]))
+    assert float(np.sum(uncertain.log_likelihood)) == pytest.approx(marginal, abs=0.5)
+    assert float(uncertain.x[-1, 2]) == pytest.approx(
+        float(np.average(grid, weights=np.exp(weighed - weighed.max()))), abs=0.01
+    )
+
+
+def test_what_was_learned_of_a_parameter_outlasts_a_break_in_the_record() -> None:
+    run = run_of(WARMER, rows=1000)
+    whole, broken = followed(run, {"Tf": 0.5}), followed(replace(run, breaks=(500, 980)), {"Tf": 0.5})
+    assert whole[0] == pytest.approx(0.5, abs=4 * whole[1])
+    assert broken[0] == pytest.approx(whole[0], abs=2 * whole[1])
+    assert broken[1] < 1.2 * whole[1]
+
+
+def test_a_parameter_off_by_as_much_as_stated_is_no_finding_and_without_the_statement_it_is() -> None:
+    record = record_of(WARMER, rows=1500)
+    exact, rough = diagnose(record, cstr()), diagnose(record, cstr(), uncertain={"Tf": 0.5})
+    assert exact.verdict != NOMINAL
+    assert (rough.verdict, rough.significant, rough.practical, rough.causes) == (NOMINAL, False, False, ())
+    said = rough.parameters["Tf"]
+    assert said.off
+    assert abs(said.estimate.value - 350.5) < 4 * said.estimate.sd
+    assert said.estimate.sd < 0.2 * said.stated_sd
+    assert rough.gain.held_out["T"].rmse_before < 1.1 * 0.3
+    adjusted = parse_extended_model(json.dumps(rough.extended_model)).build()
+    assert diagnose(record, adjusted).verdict == NOMINAL
+
+
+def test_a_cause_is_found_beside_parameters_that_are_off_and_its_interval_is_wider() -> None:
+    record = record_of("heat_transfer:constant:0.02", "coolant_temperature:constant:1.5", rows=1500)
+    exact, rough = (diagnose(record, cstr(), uncertain=item) for item in ({}, {"K3": 14.0, "Tf": 0.5}))
+    (cause,) = rough.causes
+    size = cause.parameters["size"]
+    assert (rough.verdict, cause.cause, cause.profile) == (NAMED, "coolant_temperature", "constant")
+    assert abs(size.value - 1.5) < 4 * size.sd
+    assert size.sd > 1.5 * exact.causes[0].parameters["size"].sd
+
+
+@pytest.mark.parametrize(("size", "named"), [(-0.03, False), (-0.3, True)])
+def test_the_uncertain_parameter_itself_is_a_cause_only_if_it_is_far_from_what_was_stated(
+    size: float, named: bool
+) -> None:
+    found = diagnose(record_of(f"heat_transfer:constant:{size}", rows=1500), cstr(), uncertain={"K3": 14.0})
+    causes = {cause.cause for cause in found.causes} | {name for item in found.alternatives for name, _ in item.causes}
+    assert ("heat_transfer" in causes) == named
+    assert found.practical == named
+    if named:
+        said = found.causes[0].parameters["size"]
+        assert said.value == pytest.approx(size, abs=0.06)
+        assert said.sd > 0.015  # it is known no better than the parameter that it multiplies, 2 %
+
+
+def test_no_parameter_costs_the_filter_a_state_unless_it_is_uncertain() -> None:
+    assert with_uncertain(cstr(), {}) is cstr()
+    assert offsets(with_uncertain(cstr(), {"V": 1.0, "q": 2.0}), np.array([0.1, 440.0, 3.0, 4.0])) == {
+        "V": 3.0,
+        "q": 4.0,
+    }
+
+
+def test_tolerances_are_shares_or_numbers_with_the_unit_of_the_parameter() -> None:
+    assert stated("K3=2%, Tf = 0.5K,V=1.5e0 l", cstr()) == pytest.approx({"K3": 14.0, "Tf": 0.5, "V": 1.5})
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("K9=2%", "must be of q, V, Cf, .*, got K9"),
+        ("K3", "parameter=tolerance, such as K3=2%,Tf=0.5K, got 'K3'"),
+        ("K3=2", "in % or in l/min, got '2'"),
+        ("Tf=0.5C", "in % or in K, got '0.5C'"),
+        ("Tf=-1K", "parameter=tolerance"),
+        ("Tf=0K", "positive number of K, got 0"),
+        ("Tf=1.2.3K", "must be a number with % or K"),
+        ("", "parameter=tolerance"),
+    ],
+)
+def test_what_cannot_be_stated_is_said_in_a_line(text: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        stated(text, cstr())
+
+
+@pytest.mark.parametrize(
+    ("uncertain", "said"), [({"p": 1.0}, "got p"), ({"K3": 0.0}, "positive"), ({"K3": np.nan}, "positive")]
+)
+def test_a_standard_deviation_has_to_be_of_a_parameter_and_positive(uncertain: dict[str, float], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        diagnose(record_of(rows=400), cstr(), uncertain=uncertain)
