@@ -27,6 +27,9 @@ OBSERVED_ROWS = 100
 WAKE_ROWS = 30
 """After a break in what is known of the inputs, so many rows are not judged: the plant itself was driven otherwise."""
 
+FEWEST_ROWS = 100
+"""Where that leaves less, they are."""
+
 
 class Errors(NamedTuple):
     """Root mean square errors on the rows held out, each of shape (n_y,); NaN where the free run came to an end."""
@@ -39,10 +42,11 @@ def held_out_rows(run: Run) -> Array:
     """Which rows are held out, shape (rows,)."""
     block = np.floor((run.time_min - run.time_min[0]) / BLOCK_MIN)
     found = block % EVERY == EVERY - 1
-    for row in run.breaks:
-        found[row : row + WAKE_ROWS] = False
     found[:OBSERVED_ROWS] = False
-    return np.asarray(found)
+    calm = found.copy()
+    for row in run.breaks:
+        calm[row : row + WAKE_ROWS] = False
+    return np.asarray(calm if np.count_nonzero(calm) >= FEWEST_ROWS else found)
 
 
 def gained(run: Run, nominal: Explained, best: Explained) -> tuple[Errors, Errors]:
