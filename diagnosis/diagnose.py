@@ -134,7 +134,8 @@ def diagnose(
 
 def _nearly_explained(found: Found, after: Errors) -> bool:
     """Whether the free run's errors come near to the noise on rows that were not fitted."""
-    return bool(np.all(after.free < NEARLY * np.array(found.noise.measurement_sd)))
+    outputs = found.nominal.hypothesis.sized.model.output_names
+    return bool(np.all(after.free < NEARLY * found.noise.sensor_sd(outputs)))
 
 
 def _verdict(found: Found, best: Explained) -> str:
@@ -220,13 +221,14 @@ def _causes(best: Explained, covariances: Sequence[Array]) -> list[Cause]:
 
 
 def _gain(model: ProcessModel, found: Found, best: Explained, before: Errors, after: Errors) -> Gain:
+    noise_sd = found.noise.sensor_sd(model.output_names)
     held_out = {
         output.name: HeldOut(
             float(before.free[place]),
             float(after.free[place]),
             float(before.one_step[place]),
             float(after.one_step[place]),
-            found.noise.measurement_sd[place],
+            float(noise_sd[place]),
             output.unit,
         )
         for place, output in enumerate(model.outputs)
@@ -292,7 +294,7 @@ def _matters(curves: Curves, bands: Mapping[str, float]) -> bool:
 
 def _left_matters(before: Errors, found: Found, model: ProcessModel, bands: Mapping[str, float]) -> bool:
     """Whether the nominal free run errs by more than noise and tolerance in an output."""
-    noise = np.array(found.own_noise.measurement_sd)
+    noise = found.own_noise.sensor_sd(model.output_names)
     left = np.sqrt(np.maximum(before.free**2 - noise**2, 0.0))
     return any(not value <= bands[name] for name, value in zip(model.output_names, left.tolist(), strict=True))
 

@@ -20,10 +20,9 @@ from diagnosis.memory_screen import MemoryScreen
 from diagnosis.run import Run
 from diagnosis.screen import Lead, Screen
 from diagnosis.sized import Sized
+from diagnosis.wandering import Noise, suspected
 from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.process.noise import tune
 
 FIRST_LEADS, MOST_LEADS, LEADS, A_CAUSE = 3, 8, 10, 2
 """How many leads of the first screen are fitted, and if none of them gains anything; of each later one; of a cause."""
@@ -76,14 +75,14 @@ class Found:
     """What a search found.
 
     Attributes:
-        noise: of the plant and its sensors, under the best hypothesis.
+        noise: of the plant and its sensors, under the best hypothesis; the same sensors' noise remembers under all.
         own_noise: likewise, under the nominal one.
         nominal: the one without any effect, with the noise that it needs itself; its key is empty.
         explained: all that were fitted, the best first.
     """
 
-    noise: NoiseLevels
-    own_noise: NoiseLevels
+    noise: Noise
+    own_noise: Noise
     nominal: Explained
     explained: list[Explained]
 
@@ -107,7 +106,8 @@ class Search:
         self._model, self.run, self._smallest_sd = model, run, list(smallest_sd)
         self.screen = Screen(model, effects, run)
         self._sized: dict[tuple[str, ...], Sized] = {}
-        self.noise = tune(model, run.time_min, run.known_inputs, run.measured, self._smallest_sd)
+        self._period_min = float(np.median(np.diff(run.time_min)))
+        self.noise = self._chosen_noise()
 
     def found(self) -> Found:
         """The best explanations by one effect."""
@@ -144,6 +144,31 @@ class Search:
             best = self._finer(best)
             known[best.key] = best
         return Found(self.noise, own_noise, nominal, sorted(known.values(), key=lambda item: item.bic))
+
+    def _chosen_noise(self) -> Noise:
+        """Under which the nominal model is likeliest; a sensor's noise remembers only if the BIC says so."""
+        nothing = (0.0,) * len(self._model.states)
+        white = self._nominal_with(Noise((1.0,) * len(self._model.outputs), nothing))
+        levels = white.tuned(self.run, (), self._smallest_sd)
+        white.noise = Noise(levels.measurement_sd, nothing)
+        loss, _, found = white.follow(self.run, ())
+        wandering = suspected(levels, self._model.output_names, found.residual, self._period_min)
+        if not wandering:
+            return levels
+        if any(levels.process_sd):
+            white.noise = levels
+            loss = white.follow(self.run, ())[0]
+        beside = self._nominal_with(Noise(levels.measurement_sd, levels.process_sd, wandering))
+        beside.noise = remembering = beside.tuned(self.run, (), self._smallest_sd)
+        if 2.0 * (loss - beside.follow(self.run, ())[0]) > 2 * len(wandering) * log(self.run.values):
+            return remembering
+        self._sized[()] = white
+        return levels
+
+    def _nominal_with(self, noise: Noise) -> Sized:
+        """Without any effect; kept for `sized`."""
+        self._sized[()] = Sized(self._model, (), noise, self._period_min)
+        return self._sized[()]
 
     def nominal(self) -> Explained:
         """Without any effect."""
@@ -226,7 +251,7 @@ class Search:
         """The model with these effects, made once."""
         names = tuple(effect.name for effect in effects)
         if names not in self._sized:
-            self._sized[names] = Sized(self._model, effects, self.noise)
+            self._sized[names] = Sized(self._model, effects, self.noise, self._period_min)
         self._use_noise(self._sized[names])
         return self._sized[names]
 

@@ -1,6 +1,7 @@
 """The filter of a model with some effects in it, whose sizes are signals."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import casadi as ca
@@ -11,11 +12,12 @@ from diagnosis.courses import Signal
 from diagnosis.late_output import Moved, gathered, moved
 from diagnosis.run import Run
 from diagnosis.size_inputs import SizedModel, with_size_inputs
+from diagnosis.wandering import Noise, first_rate_sd, learned, with_wandering
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, Innovations, NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors, Ways
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.process.noise import tune
+from reactorwatch.process.noise import tune_with
 
 HUBER = 4.0
 """Standard deviations beyond which an innovation counts no more than in proportion."""
@@ -36,22 +38,23 @@ class Sized:
         model: of the plant.
         effects: that are in it; at most one makes an output late.
         noise: of the plant and its sensors.
+        period_min: usual distance of rows.
 
     Attributes:
         effects: as given.
         late: place of the effect that makes an output late; None: no such.
     """
 
-    def __init__(self, model: ProcessModel, effects: Sequence[Effect], noise: NoiseLevels) -> None:
+    def __init__(self, model: ProcessModel, effects: Sequence[Effect], noise: Noise, period_min: float = 0.1) -> None:
         self.effects = tuple(effects)
         places = [place for place, effect in enumerate(self.effects) if effect.late_output is not None]
         self.late = places[0] if places else None
-        self._plant = model
-        self._filtered = with_size_inputs(model, [item for item in self.effects if item.late_output is None])
-        self._filter = Filter(self.model, self._noise_of(noise))
-        self._errors = FilterErrors.of(
-            self.model, self._filter.noise, self._filtered.of_rates, self._filtered.of_outputs
-        )
+        self._plant, self._noise, self._period_min = model, noise, period_min
+        sized = with_size_inputs(model, [item for item in self.effects if item.late_output is None])
+        self._filtered = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
+        self._filter = Filter(self.model, self._levels_of(noise))
+        self._errors = FilterErrors.of(self.model, self.levels, self._filtered.of_rates, self._filtered.of_outputs)
+        self.noise = noise
 
     @property
     def model(self) -> ProcessModel:
@@ -69,14 +72,20 @@ class Sized:
         return with_size_inputs(self._plant, self.effects)
 
     @property
-    def noise(self) -> NoiseLevels:
-        """Of the plant and its sensors."""
-        return self._filter.noise
+    def noise(self) -> Noise:
+        """Of the plant and its sensors; the same sensors' noise remembers all the time."""
+        return self._noise
 
     @noise.setter
-    def noise(self, noise: NoiseLevels) -> None:
-        self._filter.noise = self._noise_of(noise)
-        self._errors.noise = self._filter.noise
+    def noise(self, noise: Noise) -> None:
+        self._noise, self._filter.noise = noise, self._levels_of(noise)
+        self._errors.noise, self._errors.changes = self.levels, noise.times
+        self._filter.change(noise.times)
+
+    @property
+    def levels(self) -> NoiseLevels:
+        """The noise as the filter has it, of all its states."""
+        return self._filter.noise
 
     def size_symbols(self, effect: Effect) -> tuple[ca.SX, ca.SX] | None:
         """The inputs that are the size of an effect, as balances and outputs have it; None if it has none."""
@@ -109,14 +118,19 @@ class Sized:
         spread = np.log(np.where(known & good, found.conditional_sd, 1.0))
         return loss_of(w) + float(np.sum(spread)), w, found
 
-    def tuned(self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float]) -> NoiseLevels:
+    def tuned(self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float]) -> Noise:
         """The noise under which the run is likeliest with these deviations."""
         inputs = self.inputs(run, signals)
         if self.late is not None:
             run = self._moved(run, signals, self.late).run
             inputs = run.inputs
-        found = tune(self.model, run.time_min, inputs, run.measured, smallest_sd)
-        return NoiseLevels(found.measurement_sd, found.process_sd[: len(self._plant.states)])
+        times = self._noise.times
+        # It begins anew with a short memory: a model that lacks something makes it seem long, and there it would stay.
+        first_sd = {f"{item.output}.noise": first_rate_sd(item.sd, self._period_min) for item in self._noise.wandering}
+        found, times = tune_with(self.model, run.time_min, inputs, run.measured, smallest_sd, tuple(times), first_sd)
+        of_sensors = len(found.process_sd) - len(times)
+        wandering = learned(self._noise.wandering, found.process_sd[of_sensors:], times, self._period_min)
+        return Noise(found.measurement_sd, found.process_sd[: len(self._plant.states)], wandering)
 
     def ways(self, run: Run, signals: Sequence[Signal], found: Innovations) -> Ways:
         """The equations of the filter's errors about its run; from the second row on, the first that it predicts."""
@@ -138,10 +152,11 @@ class Sized:
     def _output(self, late: int) -> int:
         return self._plant.output_names.index(str(self.effects[late].late_output))
 
-    def _noise_of(self, noise: NoiseLevels) -> NoiseLevels:
-        """States that an effect brings have none of their own."""
-        more = len(self.model.states) - len(noise.process_sd)
-        return NoiseLevels(noise.measurement_sd, (*noise.process_sd, *(0.0,) * more))
+    def _levels_of(self, noise: Noise) -> NoiseLevels:
+        """States that an effect brings have none of their own; those of the sensors come last."""
+        of_sensors = tuple(item.rate_sd for item in noise.wandering)
+        more = len(self.model.states) - len(noise.process_sd) - len(of_sensors)
+        return NoiseLevels(noise.measurement_sd, (*noise.process_sd, *(0.0,) * more, *of_sensors))
 
 
 def ways_between(errors: FilterErrors, run: Run, inputs: Array, found: Innovations, used: NDArray[np.bool_]) -> Ways:

@@ -22,7 +22,7 @@ matter how far off a value is. So as not to take the tails of normal noise for o
 of normal values that are cut off likewise (Huber 1981, Robust Statistics, ch. 5).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from math import erf, exp, inf, pi, sqrt
 from typing import NamedTuple
 
@@ -94,7 +94,7 @@ def tune(
         measured: shape (rows, n_y); NaN where missing or not to be learned from.
         smallest_sd: of the sensors, one an output, in its unit, above 0: theirs are at least so large.
     """
-    return tune_with(model, time_min, inputs, measured, smallest_sd, ())[0]
+    return tune_with(model, time_min, inputs, measured, smallest_sd, (), {})[0]
 
 
 def tune_with(
@@ -104,6 +104,7 @@ def tune_with(
     measured: Array,
     smallest_sd: Sequence[float],
     learned: Sequence[str],
+    first_sd: Mapping[str, float],
 ) -> tuple[NoiseLevels, dict[str, float]]:
     """The noise levels, and positive parameters of the model, under which a record is likeliest.
 
@@ -114,8 +115,9 @@ def tune_with(
         measured: likewise.
         smallest_sd: likewise.
         learned: names of the parameters; the search begins at their values.
+        first_sd: by name of a state, its process noise to begin with, where it is not one of those that move alike.
     """
-    return _Tuning(model, time_min, inputs, measured, np.asarray(smallest_sd, dtype=float), learned).found()
+    return _Tuning(model, time_min, inputs, measured, np.asarray(smallest_sd, dtype=float), learned, first_sd).found()
 
 
 class _Tuning:
@@ -129,6 +131,7 @@ class _Tuning:
         measured: Array,
         smallest_sd: Array,
         learned: Sequence[str],
+        first_sd: Mapping[str, float],
     ) -> None:
         self._whole, self._rows = (time_min, inputs, measured), time_min.size
         self._take(FIRST_ROWS)
@@ -136,6 +139,8 @@ class _Tuning:
         self._states = [place for place in range(len(model.states)) if place not in model.lasting]
         self._of_states = range(self._n_y, self._n_y + len(self._states))
         self._scales = np.array([model.states[place].scale for place in self._states])
+        names = [model.states[place].name for place in self._states]
+        self._apart = np.array([first_sd.get(name, 0.0) for name in names])
         self._learned = [model.parameter(name) for name in learned]
         limits = np.log([[item.lower, item.upper] for item in self._learned]).reshape(-1, 2).T
         self._lowest = np.concatenate([np.log(smallest_sd), np.log(LEAST_SHARE * self._scales), limits[0]])
@@ -186,7 +191,8 @@ class _Tuning:
         sensors, tried = np.log(self._first), list[_Trial]()
         others = np.log([item.value for item in self._learned])
         for share in SHARES:
-            trial = self._tried(np.concatenate([sensors, np.log(share * self._scales), others]))
+            states = np.where(self._apart > 0.0, self._apart, share * self._scales)
+            trial = self._tried(np.concatenate([sensors, np.log(states), others]))
             inside = (trial.w != 0.0) & (np.abs(trial.w) < CLIP)
             mean_square = np.sum(trial.w**2 * inside, axis=0) / np.maximum(np.sum(inside, axis=0), 1)
             sensors = sensors + 0.5 * np.log(np.maximum(mean_square, 1e-6))

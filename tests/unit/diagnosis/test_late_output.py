@@ -7,12 +7,12 @@ from diagnosis.courses import Constant
 from diagnosis.late_output import moved
 from diagnosis.run import Run
 from diagnosis.sized import Sized
+from diagnosis.wandering import Noise
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.filter import NoiseLevels
 from tests.unit.diagnosis.runs import run_of
 
-SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
+SENSORS = Noise((0.002, 0.3), (0.0, 0.0))
 DELAY = next(effect for effect in EFFECTS if effect.name == "concentration_delay")
 
 

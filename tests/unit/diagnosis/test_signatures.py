@@ -8,15 +8,15 @@ from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Sine, Step
 from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
 from diagnosis.sized import Sized
+from diagnosis.wandering import Noise
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_errors import Ways
 from reactorwatch.process.model import Array
 from tests.unit.diagnosis.runs import run_of
 
-NOISY = NoiseLevels((0.002, 0.3), (0.001, 0.3))
+NOISY = Noise((0.002, 0.3), (0.001, 0.3))
 NAMES = ("coolant_flow", "reaction_rate", "temperature_bias", "concentration_gain")
 
 

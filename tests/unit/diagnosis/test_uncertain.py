@@ -11,26 +11,27 @@ from diagnosis.result import NAMED, NOMINAL
 from diagnosis.run import Run
 from diagnosis.sized import Sized
 from diagnosis.uncertain import offsets, stated, with_uncertain
+from diagnosis.wandering import Noise
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.filter import Filter
 from tests.unit.diagnosis.runs import record_of, run_of
 
-SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
+SENSORS = Noise((0.002, 0.3), (0.0, 0.0))
 WARMER = "feed_temperature:constant:0.5"
 
 
 def followed(run: Run, sds: dict[str, float]) -> tuple[float, float]:
     """Offset of the feed's temperature in the end, and its standard deviation."""
-    noise = NoiseLevels(SENSORS.measurement_sd, (0.0,) * (2 + len(sds)))
+    noise = Noise(SENSORS.measurement_sd, (0.0,) * (2 + len(sds)))
     _, _, found = Sized(with_uncertain(cstr(), sds), (), noise).follow(run, ())
     return float(found.x[-1, 2]), float(np.sqrt(found.P[-1, 2, 2]))
 
 
 def test_the_likelihood_is_that_of_all_offsets_weighed_by_what_was_stated() -> None:
     run, sd = run_of(WARMER, rows=400), 0.5
-    noise = NoiseLevels(SENSORS.measurement_sd, (0.0, 0.0, 0.0))
+    noise = Noise(SENSORS.measurement_sd, (0.0, 0.0, 0.0))
     uncertain = Filter(with_uncertain(cstr(), {"Tf": sd}), noise).run(run.time_min, run.inputs, run.measured)
     grid = np.linspace(0.0, 1.0, 101)
     given = []
