@@ -62,6 +62,7 @@ class Monitor:
         self.alarms = AlarmBoard(config)
         self._watch = PlantWatch(config, self.alarms, points=points, model=model)
         self._units = dict.fromkeys(self._signals, "")
+        self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
         self.first_ns: int | None = None
         self.last_ns: int | None = None
@@ -112,7 +113,8 @@ class Monitor:
         if quality == BAD:
             self.refusals.add("bad_quality", f"{signal} is marked bad at {sample.time_ns} ns")
             return []
-        if sample.unit != self._units[signal]:
+        if sample.unit != self._units[signal] or signal not in self._heard_from_ns:
+            self._heard_from_ns.setdefault(signal, sample.time_ns)
             self._units[signal] = sample.unit
             self._output_units = [self._units[output] for output in self.config.outputs]
         publications: list[Publication] = []
@@ -188,6 +190,17 @@ class Monitor:
         """What people are to be told of the training; whoever tells them empties it."""
         return self._watch.notes
 
+    # --- what a recording tells beside the samples -----------------------------------------------------------
+
+    @property
+    def silent_from_ns(self) -> int | None:
+        """When the plant will have been silent, in the time of the samples, if nothing more comes; None: not known."""
+        return self._watch.signals.deadline_ns
+
+    def fall_silent(self) -> list[Publication]:
+        """Take the plant as silent, as the clock of receipt told it when this was recorded."""
+        return self._watch.signals.fall_silent()
+
     # --- rows ------------------------------------------------------------------------------------------------
 
     def finish(self) -> list[Publication]:
@@ -230,6 +243,7 @@ class Monitor:
             published=self._published,
             rows=counts.rows,
             incomplete_rows=counts.incomplete_rows,
+            heard_from_ns=self._heard_from_ns,
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

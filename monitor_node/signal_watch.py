@@ -167,9 +167,19 @@ class SignalWatch:
         """When to `check`, unless something comes before; None: there is nothing to wait for."""
         return self._silences[0].due_ns()
 
+    @property
+    def deadline_ns(self) -> int | None:
+        """Until when the next row is allowed, in the time of the samples."""
+        return self._silences[0].deadline_ns()
+
     def check(self, now_ns: int) -> list[Publication]:
         """Look whether the plant is silent, by the clock of receipt."""
         change = self._silences[0].check(now_ns)
+        return self._tell(0, change) if change is not NOTHING else []
+
+    def fall_silent(self) -> list[Publication]:
+        """Take the plant as silent, as the clock of receipt told it when this was recorded."""
+        change = self._silences[0].begin()
         return self._tell(0, change) if change is not NOTHING else []
 
     # --- within ----------------------------------------------------------------------------------------------

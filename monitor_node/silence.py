@@ -216,7 +216,7 @@ class Silence:
     def due_ns(self) -> int | None:
         """When to `check` unless something comes before; None: there is nothing to wait for."""
         patience_ns = self._patience_ns()
-        if self._received_ns is None or patience_ns is None or self.standing or self._deadline_ns() is None:
+        if self._received_ns is None or patience_ns is None or self.standing or self.deadline_ns() is None:
             return None
         return self._received_ns + patience_ns
 
@@ -227,13 +227,17 @@ class Silence:
             now_ns: by the clock that `received` was told.
         """
         due_ns = self.due_ns()
-        if due_ns is None or now_ns < due_ns:
+        return NOTHING if due_ns is None or now_ns < due_ns else self.begin()
+
+    def begin(self) -> Change:
+        """It is silent from now on, whoever says so."""
+        if self.standing or self.deadline_ns() is None:
             return NOTHING
         self.standing = True
-        return Change(self._deadline_ns(), None)
+        return Change(self.deadline_ns(), None)
 
-    def _deadline_ns(self) -> int | None:
-        """Until when the next row is allowed, in the time of the samples."""
+    def deadline_ns(self) -> int | None:
+        """Until when the next row is allowed, in the time of the samples; None while too little is known."""
         allowed_ns = self._rows.allowed_ns(self._limit)
         return None if self._last_ns is None or allowed_ns is None else self._last_ns + allowed_ns
 

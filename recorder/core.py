@@ -24,7 +24,7 @@ _NO_SAMPLE = messages.QUALITY_UNSPECIFIED  # which protobuf reads out of bytes t
 _LARGEST_COUNT = 2**64 - 1  # a sequence number may be any nonsense; the sum of what it skips must still fit its field
 
 
-DISK_ALARM = "recording/disk"
+DISK_ALARM = f"{keys.RECORDING}/disk"
 """The alarm of a recorder that cannot write."""
 
 

@@ -10,6 +10,7 @@ from reactorwatch.cli.options import (
     Columns,
     Diagnose,
     Endpoint,
+    Json,
     Model,
     Plant,
     Settings,
@@ -141,8 +142,21 @@ def replay(
         str | None, typer.Option(help="Times real time: a number, or 'max' [1].", show_default=False)
     ] = None,
     column: Columns = None,
+    verify: Annotated[
+        bool,
+        typer.Option(
+            "--verify",
+            help="Publish nothing; run it through the monitor's core and compare what that says with what was "
+            "recorded. Ends with 0 if all is equal, 1 if not.",
+        ),
+    ] = False,
+    as_json: Json = False,
 ) -> None:
-    """Publish a recording or a record as the plant did."""
+    """Publish a recording or a record as the plant did, or verify a recording."""
+    if verify:
+        from reactorwatch.cli.verification import run
+
+        raise typer.Exit(run(existing_recording(file), config, name, as_json=as_json))
     from reactorwatch.runtime.config import section
     from recorder.replay import ReplayConfig, run_replay
 

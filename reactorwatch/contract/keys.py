@@ -22,6 +22,9 @@ FAULT = "fault"
 COMMAND = "command"
 ALIVE = "alive"
 
+RECORDING = "recording"
+"""What the names of a recorder's own alarms begin with: no monitor raises them, and no command acts on them."""
+
 _PLANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 

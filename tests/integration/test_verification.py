@@ -1,0 +1,215 @@
+"""The monitor's core says again what was recorded of it, value for value; and what it does not is found out."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from reactorwatch.cli.verification import run
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import decode, encode_message
+from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Sample
+from reactorwatch.errors import InputError
+from recorder.cut import cut, sampled_between
+from recorder.entry import Entry
+from recorder.mcap_file import RecordingWriter, read_messages, read_metadata, recordings_in
+from recorder.recover import recover
+
+from .watched_hour import ROWS, START_NS, record_hour
+
+Told = dict[str, Any]
+Change = Callable[[Entry], Entry | None]
+
+
+@pytest.fixture(scope="module")
+def hour(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The hour in one file."""
+    path = tmp_path_factory.mktemp("hour") / "run.mcap"
+    record_hour(path, black_box_min=0.0).stop()
+    return path
+
+
+def verified(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, Told]:
+    """The exit code, and the JSON object."""
+    code = run(path, None, None, as_json=True)
+    return code, json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+def recorded(path: Path, kind: str) -> int:
+    return sum(1 for entry in read_messages(path, {kind}) if not entry.repeated)
+
+
+def events(path: Path) -> set[tuple[str, str]]:
+    alarms = (decode(entry.payload, entry.encoding) for entry in read_messages(path, {keys.ALARM}))
+    return {(alarm.alarm, alarm.event) for alarm in alarms if isinstance(alarm, Alarm)}
+
+
+def rewritten(path: Path, out: Path, change: Change) -> Path:
+    """The recording with its messages changed; those for which None is returned are left out."""
+    with RecordingWriter(out, read_metadata(path)) as writer:
+        for entry in read_messages(path):
+            if (changed := change(entry)) is not None:
+                writer.write(changed)
+    return out
+
+
+def first_after(path: Path, key: str, minutes: float) -> Entry:
+    return next(e for e in read_messages(path) if e.key == key and e.publish_time_ns >= START_NS + minutes * 60e9)
+
+
+def test_an_hour_with_faults_is_said_again_value_for_value(hour: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, told = verified(hour, capsys)
+    assert (code, told["exact"], told["rows"], told["differing"], told["after_the_end"]) == (0, True, ROWS, 0, 0)
+    assert told["kinds"] == [
+        {"kind": kind, "recorded": recorded(hour, kind), "equal": recorded(hour, kind)}
+        for kind in (keys.ALARM, keys.ALARM_KPIS, keys.CHART, keys.ESTIMATE, keys.MODEL)
+    ]
+
+
+def test_what_people_did_and_what_the_clock_told_is_said_again_too(hour: Path) -> None:
+    """Else the test before would prove less than it says."""
+    assert {
+        ("ewma/T", "raised"),
+        ("ewma/T", "acknowledge"),
+        ("shewhart/T", "shelve"),
+        ("shewhart/T", "shelf time over"),
+        ("silence/T", "raised"),
+        ("silence/plant", "raised"),
+        ("silence/plant", "cleared"),
+    } <= events(hour)
+
+
+def test_a_rotated_run_is_exact_as_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record_hour(tmp_path, rotate_min=0.2, black_box_min=0.0).stop()
+    assert len(recordings_in(tmp_path)) >= 4
+    code, told = verified(tmp_path, capsys)
+    assert (code, told["rows"], told["differing"]) == (0, ROWS, 0)
+
+
+def test_its_second_file_alone_cannot_be_verified_and_says_why(tmp_path: Path) -> None:
+    record_hour(tmp_path, rotate_min=0.5, black_box_min=0.0).stop()
+    with pytest.raises(InputError, match=r"the monitor was running before this recording begins.*verify the folder"):
+        run(recordings_in(tmp_path)[1], None, None, as_json=False)
+
+
+def test_a_recovered_run_is_exact_up_to_where_it_was_cut_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record_hour(tmp_path / "run.mcap", black_box_min=0.0).kill()
+    recover(tmp_path / "run.mcap.part", tmp_path / "saved.mcap")
+    code, told = verified(tmp_path / "saved.mcap", capsys)
+    assert (code, told["differing"]) == (0, 0)
+    assert ROWS - 10 < told["rows"] < ROWS + 1
+
+
+def test_a_recording_that_ends_between_a_sample_and_what_was_said_of_it_is_exact(
+    hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    last = list(read_messages(hour))[:-5][-1]
+    cut_off = rewritten(
+        hour, tmp_path / "x.mcap", lambda entry: entry if entry.log_time_ns < last.log_time_ns else None
+    )
+    more = rewritten(
+        hour,
+        tmp_path / "y.mcap",
+        lambda e: e if e.log_time_ns < last.log_time_ns or keys.SAMPLE in e.key else None,
+    )
+    assert verified(cut_off, capsys)[0] == 0
+    code, told = verified(more, capsys)
+    assert (code, told["differing"]) == (0, 0)
+    assert told["after_the_end"] > 0
+
+
+def test_a_sample_that_was_changed_in_its_last_digit_is_found_out(
+    hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    key = keys.key("cstr", keys.SAMPLE, "T")
+    target = first_after(hour, key, 20.0)
+
+    def change(entry: Entry) -> Entry:
+        if entry != target:
+            return entry
+        sample = decode(entry.payload, entry.encoding)
+        assert isinstance(sample, Sample)
+        sample.value *= 1.0 + 1e-15
+        return entry._replace(payload=encode_message(sample)[0])
+
+    code, told = verified(rewritten(hour, tmp_path / "x.mcap", change), capsys)
+    assert (code, told["exact"]) == (1, False)
+    assert told["differences"][0]["at_min"] == 20.0
+
+
+def test_an_estimate_that_was_changed_is_named_with_both_values(
+    hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = first_after(hour, keys.key("cstr", keys.ESTIMATE, "T"), 25.0)
+
+    def change(entry: Entry) -> Entry:
+        if entry != target:
+            return entry
+        estimate = decode(entry.payload, entry.encoding)
+        assert isinstance(estimate, Estimate)
+        estimate.prediction = 438.0
+        return entry._replace(payload=encode_message(estimate)[0])
+
+    code, told = verified(rewritten(hour, tmp_path / "x.mcap", change), capsys)
+    assert (code, told["differing"]) == (1, 1)
+    difference = told["differences"][0]
+    assert (difference["topic"], difference["at_min"]) == ("reactor/cstr/estimate/T", 25.0)
+    assert (difference["what"], difference["recorded"]) == ("prediction", "438.0")
+
+
+def test_an_alarm_that_was_taken_out_or_put_in_is_found_out(
+    hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alarm = first_after(hour, keys.key("cstr", keys.ALARM, "ewma/T"), 0.0)
+    code, told = verified(rewritten(hour, tmp_path / "a.mcap", lambda e: None if e == alarm else e), capsys)
+    assert (code, told["differing"], told["differences"][0]["what"]) == (1, 1, "not recorded")
+    other = alarm._replace(key=alarm.key.replace("ewma", "cusum"))
+    forged = rewritten(hour, tmp_path / "b.mcap", lambda e: e)
+    with RecordingWriter(tmp_path / "c.mcap", read_metadata(forged)) as writer:
+        for entry in read_messages(forged):
+            writer.write(entry)
+            if entry == alarm:
+                writer.write(other)
+    code, told = verified(tmp_path / "c.mcap", capsys)
+    assert (code, told["differing"], told["differences"][0]["what"]) == (1, 1, "not said again")
+
+
+def test_a_monitor_that_was_started_anew_is_verified_as_two(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record_hour(tmp_path / "run.mcap", restart_at=250, black_box_min=0.0).stop()
+    code, told = verified(tmp_path / "run.mcap", capsys)
+    assert (code, told["rows"], told["differing"]) == (0, ROWS, 0)
+    assert "the monitor was started 2 times; 2 of these runs were verified" in told["notes"]
+
+
+def test_a_cut_from_the_middle_says_that_it_cannot_be_verified(hour: Path, tmp_path: Path) -> None:
+    window = sampled_between([hour], START_NS + 20 * 60 * 10**9, START_NS + 40 * 60 * 10**9)
+    cut([hour], tmp_path / "cut.mcap", window, read_metadata(hour))
+    with pytest.raises(InputError, match="was running before this recording begins"):
+        run(tmp_path / "cut.mcap", None, None, as_json=False)
+
+
+def test_people_are_shown_a_table_and_the_first_differences(
+    hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(hour, None, None, as_json=False) == 0
+    assert "are said again, value for value" in capsys.readouterr().out
+    target = first_after(hour, keys.key("cstr", keys.ESTIMATE, "T"), 25.0)
+    tampered = rewritten(hour, tmp_path / "x.mcap", lambda e: None if e == target else e)
+    assert run(tampered, None, None, as_json=False) == 1
+    said = capsys.readouterr().out
+    assert "1 DIFFER" in said
+    assert "25 min  reactor/cstr/estimate/T: not recorded" in said
+    bare = tmp_path / "bare.mcap"
+    with RecordingWriter(bare, {}) as writer:
+        for entry in read_messages(hour):
+            writer.write(entry)
+    with pytest.raises(InputError, match=r"does not say how the monitor was set.*--config"):
+        run(bare, None, None, as_json=False)
+    (tmp_path / "settings.toml").write_text("[monitor]\ntraining_min = 15.0\n")
+    assert run(bare, tmp_path / "settings.toml", None, as_json=False) == 0
+    (tmp_path / "settings.toml").write_text("[monitor]\ntraining_min = 16.0\n")
+    assert run(bare, tmp_path / "settings.toml", None, as_json=False) == 1
