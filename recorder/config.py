@@ -75,6 +75,9 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         file: the recording, `.mcap`, or a record, `.csv`.
         rate: plant time over clock time: 1 plays as the plant ran, 60 an hour in a minute, inf as fast as it goes.
+        from_min: where it begins, in minutes since the first sample; of a CSV file by its own time.
+        to_min: where it ends, likewise.
+        loop: whether it begins anew at the end.
         plant: the plant's name on the bus; empty: as recorded (`cstr` for a CSV file).
         everything: play estimates, charts, alarms and faults too, not the samples alone.
         wait_for: nodes, by name, that must be alive before the first sample goes out.
@@ -83,6 +86,9 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     file: str
     rate: float = 1.0
+    from_min: float = -math.inf
+    to_min: float = math.inf
+    loop: bool = False
     plant: str = ""
     everything: bool = False
     wait_for: tuple[str, ...] = ()
@@ -91,5 +97,7 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if not self.rate > 0.0:
             raise ValueError(f"rate must be positive, got {self.rate!r}")
+        if not self.from_min < self.to_min:
+            raise ValueError(f"from_min must be before to_min, got {self.from_min:g} and {self.to_min:g}")
         if self.plant:
             keys.checked_plant(self.plant)

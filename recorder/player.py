@@ -6,18 +6,24 @@ which they were received; one whose sample is older than what went before goes o
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import cast
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, encoding_of
 from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.errors import InputError
 from reactorwatch.records.record import UNITS, Record, to_time_ns
 from recorder.entry import Entry
 
 BATCH = 256
 """Messages that go out before the loop looks for a stop again."""
+
+NEVER_NS = 2**62
+
+COMMANDS = ("pause", "resume", "step", "set_rate")
+"""Of the queryables `reactor/{plant}/command/{name}`; each carries a `ReplayCommand`."""
 
 SAMPLES = frozenset({keys.SAMPLE})
 EVERYTHING = frozenset(
@@ -88,38 +94,54 @@ def playable(entries: Iterable[Entry], plant: str = "", kinds: frozenset[str] = 
             yield Publication(keys.key(plant or topic.plant, topic.kind, topic.name), cast(Body, message))
 
 
+def between(publications: Iterable[Publication], from_ns: int, to_ns: int) -> Iterator[Publication]:
+    """Those that speak of samples from one time to another, both included."""
+    return (publication for publication in publications if from_ns <= publication.message.time_ns <= to_ns)
+
+
 class Player:
     """Hands out publications when they are due; see `reactorwatch.runtime.serve.Node`.
 
     Args:
-        publications: what is to be played.
+        open_tape: gives what is to be played, from its beginning each time it is called.
         rate: plant time over clock time; infinite: without waiting.
+        loop: whether it begins anew at the end, one row's time after the last row.
+
+    Attributes:
+        published: messages so far.
     """
 
-    def __init__(self, publications: Iterator[Publication], rate: float) -> None:
-        self._publications = publications
+    def __init__(self, open_tape: Callable[[], Iterator[Publication]], rate: float, *, loop: bool = False) -> None:
+        self._open_tape = open_tape
+        self._tape = open_tape()
         self._rate = rate
-        self._next = next(publications, None)
-        self._first_ns = self._next.message.time_ns if self._next is not None else 0
-        self._start_ns: int | None = None
+        self._loop = loop
+        self._paused = False
+        self._next = next(self._tape, None)
+        self._spacing_ns = 0  # of the last two rows
+        self._anchor: tuple[int, int] | None = None  # a moment of the clock, and the plant's time then
         self.published = 0
+
+    # --- what the loop calls ---------------------------------------------------------------------------------
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """What is due; the first call starts the play."""
-        if self._start_ns is None:
-            self._start_ns = now_ns
+        if self._next is not None and self._anchor is None:
+            self._anchor = now_ns, self._next.message.time_ns
         due: list[Publication] = []
         while self._next is not None and len(due) < BATCH and self.next_tick_ns() <= now_ns:
-            due.append(self._next)
-            self._next = next(self._publications, None)
+            due.append(self._take(self._next))
         self.published += len(due)
         return due
 
     def next_tick_ns(self) -> int:
         """When the next message is due."""
-        if self._start_ns is None or self._next is None:
+        if self._paused:
+            return NEVER_NS
+        if self._anchor is None or self._next is None:
             return 0
-        return self._start_ns + round((self._next.message.time_ns - self._first_ns) / self._rate)
+        clock_ns, plant_ns = self._anchor
+        return clock_ns + round((self._next.message.time_ns - plant_ns) / self._rate)
 
     @property
     def finished(self) -> bool:
@@ -131,9 +153,80 @@ class Player:
         return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """It takes none."""
-        return CommandReply(accepted=False, text="the replay takes no commands"), []
+        """Pause, go on, go a step, or change the rate; or say why not."""
+        try:
+            text, publications = self._obey(question, now_ns)
+        except (InputError, DecodeError) as error:
+            return CommandReply(accepted=False, text=str(error)), []
+        self.published += len(publications)
+        return CommandReply(accepted=True, text=text), publications
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """It has no last words."""
         return []
+
+    # --- within ----------------------------------------------------------------------------------------------
+
+    def _obey(self, question: Encoded, now_ns: int) -> tuple[str, list[Publication]]:
+        topic = keys.parse(question.key)
+        name = topic.name if topic is not None and topic.kind == keys.COMMAND else question.key
+        if name not in COMMANDS:
+            raise InputError(f"unknown command {name!r} (valid: {', '.join(COMMANDS)})")
+        command = decode(question.payload, question.encoding)
+        if not isinstance(command, messages.ReplayCommand):
+            wanted = encoding_of(messages.ReplayCommand)
+            raise DecodeError("encoding", f"command {name} must carry {wanted!r}, got {question.encoding!r}")
+        if name == "set_rate" and not command.rate > 0.0:
+            raise InputError(f"rate must be positive, got {command.rate:g}")
+        if name == "step" and not self._paused:
+            raise InputError("the replay is not paused; pause it before a step")
+        plant_ns = self._plant_time_ns(now_ns)
+        if plant_ns is not None:
+            self._anchor = now_ns, plant_ns
+        stepped: list[Publication] = []
+        if name == "step":
+            for _ in range(command.rows or 1):
+                stepped += self._row(now_ns)
+        elif name == "set_rate":
+            self._rate = command.rate
+        else:
+            self._paused = name == "pause"
+        return f"{self._doing} at {self._rate:g} times the plant's pace", stepped
+
+    @property
+    def _doing(self) -> str:
+        if self._next is None:
+            return "at the end"
+        return "paused" if self._paused else "playing"
+
+    def _plant_time_ns(self, now_ns: int) -> int | None:
+        """How far the play has come; None before its start. It is never beyond what is due next."""
+        if self._anchor is None or self._next is None:
+            return None
+        clock_ns, plant_ns = self._anchor
+        next_ns = self._next.message.time_ns
+        if self._paused or math.isinf(self._rate):
+            return plant_ns if self._paused else next_ns
+        return min(next_ns, plant_ns + round((now_ns - clock_ns) * self._rate))
+
+    def _row(self, now_ns: int) -> list[Publication]:
+        """All messages of the next time, which the play has then come to."""
+        row: list[Publication] = []
+        while self._next is not None and (not row or self._next.message.time_ns == row[0].message.time_ns):
+            self._anchor = now_ns, self._next.message.time_ns
+            row.append(self._take(self._next))
+        return row
+
+    def _take(self, publication: Publication) -> Publication:
+        """Move on behind a message, at the end to the beginning."""
+        time_ns = publication.message.time_ns
+        self._next = next(self._tape, None)
+        if self._next is not None:
+            self._spacing_ns = self._next.message.time_ns - time_ns or self._spacing_ns
+        elif self._loop:
+            self._tape = self._open_tape()
+            self._next = next(self._tape, None)
+            if self._next is not None and self._anchor is not None:
+                clock_ns, plant_ns = self._anchor
+                self._anchor = clock_ns, plant_ns - (time_ns + max(self._spacing_ns, 0) - self._next.message.time_ns)
+        return publication

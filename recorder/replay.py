@@ -1,6 +1,7 @@
 """Replay: a recording or a record onto the bus, as the plant published it."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from math import inf, isinf
 from pathlib import Path
 
 import structlog
@@ -9,13 +10,15 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
 from reactorwatch.records.csv_file import read_csv
+from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.config import ReplayConfig
+from recorder.look import zero_ns_of
 from recorder.mcap_file import plants_in, read_messages
-from recorder.player import EVERYTHING, SAMPLES, Player, playable, samples_of
+from recorder.player import COMMANDS, EVERYTHING, NEVER_NS, SAMPLES, Player, between, playable, samples_of
 
 __all__ = ["Player", "ReplayConfig", "replay", "run_replay", "samples_of"]
 
@@ -45,34 +48,52 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
     Raises:
         InputError: as `run_replay`.
     """
-    plants, publications = _opened(config)
-    player = Player(publications, config.rate)
+    plants, tape = _opened(config)
+    player = Player(tape, config.rate, loop=config.loop)
+    if player.finished:
+        raise InputError(f"{config.file}: holds nothing to play from {config.from_min:g} to {config.to_min:g} min")
     bus = bus_zenoh.connect(bus_config, NODE, stop)
     if bus is None:
         return 0
     try:
+        commands = tuple(keys.key(plant, keys.COMMAND, name) for plant in plants for name in COMMANDS)
         for plant in plants:
             wait_alive(bus, plant, config.wait_for, stop, NODE)
         log.info("replaying", file=config.file, plant=", ".join(plants), rate=config.rate)
         for plant in plants:
             bus.announce(keys.key(plant, keys.ALIVE, NODE))
-        serve(player, bus, stop)
+        serve(player, bus, stop, commands=commands)
     finally:
         bus.close()
     log.info("replayed", file=config.file, messages=player.published, to_the_end=player.finished)
     return player.published
 
 
-def _opened(config: ReplayConfig) -> tuple[tuple[str, ...], Iterator[Publication]]:
-    """The names of the plants as they will be on the bus, and what will be published."""
+def _opened(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterator[Publication]]]:
+    """The names of the plants as they will be on the bus, and what gives that which will be published."""
     path = Path(config.file)
     if path.suffix.lower() == ".csv":
-        plant = config.plant or PLANT
-        return (plant,), samples_of(read_csv(path, config.columns), plant)
+        plant, record = config.plant or PLANT, read_csv(path, config.columns)
+        return (plant,), lambda: between(samples_of(record, plant), *_span_ns(config, 0))
     plants = plants_in(path)
     if not plants:
         raise InputError(f"{path}: holds no samples")
     if config.plant and len(plants) > 1:
         raise InputError(f"{path}: holds samples of {', '.join(plants)}; they cannot all be played as {config.plant!r}")
     kinds = EVERYTHING if config.everything else SAMPLES
-    return (config.plant,) if config.plant else plants, playable(read_messages(path, kinds), config.plant, kinds)
+    whole = (config.from_min, config.to_min) == (-inf, inf)
+    from_ns, to_ns = _span_ns(config, 0 if whole else zero_ns_of(path))
+
+    def tape() -> Iterator[Publication]:
+        return between(playable(read_messages(path, kinds), config.plant, kinds), from_ns, to_ns)
+
+    return (config.plant,) if config.plant else plants, tape
+
+
+def _span_ns(config: ReplayConfig, zero_ns: int) -> tuple[int, int]:
+    """Where the play begins and ends, in the time of the samples."""
+    begin, end = config.from_min, config.to_min
+    return (
+        -NEVER_NS if isinf(begin) else to_time_ns(begin, zero_ns),
+        NEVER_NS if isinf(end) else to_time_ns(end, zero_ns),
+    )

@@ -1,16 +1,13 @@
 """`alarm`: what the operator does with alarms, asked of the running monitor."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from reactorwatch.cli.asking import PATIENCE_S, ask
 from reactorwatch.cli.options import Endpoint, Json, Plant, Settings
-from reactorwatch.errors import InputError
 
 if TYPE_CHECKING:
-    from google.protobuf.message import Message
-
     from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 
 Name = Annotated[str, typer.Argument(help="As `alarm list` names it: shewhart/T.", show_default=False)]
@@ -18,7 +15,7 @@ By = Annotated[str, typer.Option("--by", help="Who you are.", show_default=False
 Comment = Annotated[str, typer.Option("--comment", help="Why.", show_default=False)]
 Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the monitor.", min=0.1)]
 
-PATIENCE_S = 5.0
+MONITOR = "monitor"
 
 alarms = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -39,7 +36,7 @@ def list_alarms(
     """Show all alarms as they are now."""
     from reactorwatch.contract.messages_pb2 import ListAlarms
 
-    reply = _ask(config, endpoint, name, timeout, "list_alarms", ListAlarms())
+    reply = ask(MONITOR, config, endpoint, name, timeout, "list_alarms", ListAlarms())
     _show(reply, json=json)
 
 
@@ -59,7 +56,7 @@ def shelve(
     from reactorwatch.contract.messages_pb2 import ShelveAlarm
 
     command = ShelveAlarm(alarm=alarm, by=by, comment=comment, minutes=minutes)
-    _show(_ask(config, endpoint, name, timeout, "shelve", command), json=json)
+    _show(ask(MONITOR, config, endpoint, name, timeout, "shelve", command), json=json)
 
 
 def _register(word: str, command: str, description: str) -> None:
@@ -78,7 +75,7 @@ def _register(word: str, command: str, description: str) -> None:
         from reactorwatch.contract.messages_pb2 import AlarmCommand
 
         asked = AlarmCommand(alarm=alarm, by=by, comment=comment)
-        _show(_ask(config, endpoint, name, timeout, command, asked), json=json)
+        _show(ask(MONITOR, config, endpoint, name, timeout, command, asked), json=json)
 
     alarms.command(word, help=description)(act)
 
@@ -93,54 +90,6 @@ for _word, _command, _description in (
     ("comment", "comment", "Say something about an alarm, with --comment."),
 ):
     _register(_word, _command, _description)
-
-
-def _ask(
-    config: Path | None, endpoint: str | None, plant: str | None, timeout_s: float, name: str, message: "Message"
-) -> "CommandReply":
-    """The monitor's answer to a command.
-
-    Raises:
-        InputError: no router or no monitor within the time, or the monitor refuses.
-    """
-    import logging
-    import threading
-
-    from reactorwatch.contract import keys
-    from reactorwatch.contract.codec import Encoded, decode, encode_message
-    from reactorwatch.contract.messages_pb2 import CommandReply
-    from reactorwatch.runtime.bus_zenoh import connect
-    from reactorwatch.runtime.config import BusConfig, read_settings, section
-    from reactorwatch.runtime.logs import configure
-    from reactorwatch.runtime.serve import StopSignal
-
-    configure(logging.WARNING)
-    tables = read_settings(config)
-    bus_config = section(BusConfig, "bus", tables, {"endpoint": endpoint})
-    try:
-        plant = keys.checked_plant(plant or str(tables.get("monitor", {}).get("plant", "cstr")))
-    except ValueError as error:
-        raise InputError(str(error)) from error
-    stop = StopSignal()
-    timer = threading.Timer(timeout_s, stop.set)
-    timer.start()
-    try:
-        bus = connect(bus_config, "alarm", stop)
-    finally:
-        timer.cancel()
-    if bus is None:
-        raise InputError(f"no router at {bus_config.endpoint} within {timeout_s:g} s; is it running?")
-    try:
-        answers = bus.ask(Encoded(keys.key(plant, keys.COMMAND, name), *encode_message(message)), timeout_s)
-    finally:
-        bus.close()
-    replies = [decode(answer.payload, answer.encoding) for answer in answers]
-    reply = next((item for item in replies if isinstance(item, CommandReply)), None)
-    if reply is None:
-        raise InputError(f"no monitor of plant {plant!r} answered within {timeout_s:g} s; is it running?")
-    if not reply.accepted:
-        raise InputError(reply.text)
-    return reply
 
 
 def _show(reply: "CommandReply", *, json: bool) -> None:

@@ -18,6 +18,7 @@ from reactorwatch.cli.options import (
     existing,
     existing_recording,
     pace,
+    span_ns,
 )
 
 
@@ -141,6 +142,13 @@ def replay(
     rate: Annotated[
         str | None, typer.Option(help="Times real time: a number, or 'max' [1].", show_default=False)
     ] = None,
+    begin: Annotated[
+        str | None, typer.Option("--from", help="Since the start, such as 10min [the start].", show_default=False)
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option("--to", help="Since the start, such as 20min [the end].", show_default=False)
+    ] = None,
+    loop: Annotated[bool | None, typer.Option("--loop", help="Begin anew at the end.", show_default=False)] = None,
     column: Columns = None,
     verify: Annotated[
         bool,
@@ -152,11 +160,15 @@ def replay(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Publish a recording or a record as the plant did, or verify a recording."""
+    """Publish a recording or a record as the plant did, or verify a recording.
+
+    While it plays, `playback` pauses it, goes on step by step, or changes its rate.
+    """
     if verify:
         from reactorwatch.cli.verification import run
 
         raise typer.Exit(run(existing_recording(file), config, name, as_json=as_json))
+    from reactorwatch.records.record import MINUTE_NS
     from reactorwatch.runtime.config import section
     from recorder.replay import ReplayConfig, run_replay
 
@@ -165,6 +177,9 @@ def replay(
         "file": str(existing_recording(file)),
         "plant": name,
         "rate": pace(rate, "--rate"),
+        "from_min": span_ns(begin, "--from") / MINUTE_NS if begin is not None else None,
+        "to_min": span_ns(end, "--to") / MINUTE_NS if end is not None else None,
+        "loop": loop,
         "columns": columns(column) or None,
     }
     run_replay(section(ReplayConfig, "replay", tables, flags), bus)

@@ -31,6 +31,7 @@ MESSAGES: tuple[type[Message], ...] = (
     messages.AlarmCommand,
     messages.ShelveAlarm,
     messages.ListAlarms,
+    messages.ReplayCommand,
     messages.CommandReply,
 )
 

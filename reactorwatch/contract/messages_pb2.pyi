@@ -378,6 +378,14 @@ class ListAlarms(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
 
+class ReplayCommand(_message.Message):
+    __slots__ = ("rows", "rate")
+    ROWS_FIELD_NUMBER: _ClassVar[int]
+    RATE_FIELD_NUMBER: _ClassVar[int]
+    rows: int
+    rate: float
+    def __init__(self, rows: _Optional[int] = ..., rate: _Optional[float] = ...) -> None: ...
+
 class CommandReply(_message.Message):
     __slots__ = ("accepted", "text", "alarms")
     ACCEPTED_FIELD_NUMBER: _ClassVar[int]

@@ -8,13 +8,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from queue import SimpleQueue
 
 import pytest
 import structlog
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Encoded, Publication, decode, encode
+from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encode_message
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus
@@ -184,6 +185,41 @@ def test_a_replay_that_waits_for_the_recorder_is_recorded_bit_for_bit(
     ]
 
 
+def test_a_stretch_is_replayed_under_another_name_and_can_be_paused_and_stepped(
+    tmp_path: Path, bus_config: BusConfig
+) -> None:
+    path, stop, heard = tmp_path / "run.mcap", StopSignal(), SimpleQueue[Encoded]()
+    with RecordingWriter(path, {}) as writer:
+        for entry in golden.entries():
+            writer.write(entry)
+    played = ReplayConfig(file=str(path), from_min=10.0, to_min=10.3, plant="twin", rate=0.1)
+    with client(bus_config) as operator:
+        alive = threading.Event()
+        operator.watch_alive("reactor/twin/alive/replay", lambda _, there: alive.set() if there else None)
+        operator.subscribe("reactor/twin/sample/*", heard.put)
+
+        def tell(command: str, **how: float) -> None:
+            question = encode_message(messages.ReplayCommand(**how))  # type: ignore[arg-type]
+            (answer,) = operator.ask(Encoded(f"reactor/twin/command/{command}", *question), WITHIN_S)
+            assert messages.CommandReply.FromString(answer.payload).accepted
+
+        def minutes(count: int) -> list[float]:
+            bodies = [messages.Sample.FromString(heard.get(timeout=WITHIN_S).payload) for _ in range(count)]
+            return [(body.time_ns - golden.ZERO_NS) / 60e9 for body in bodies]
+
+        with running(lambda: replay(played, bus_config, stop), stop):
+            assert alive.wait(WITHIN_S)
+            first = minutes(3)
+            tell("pause")
+            tell("step", rows=2)
+            stepped = minutes(6)
+            tell("set_rate", rate=float("inf"))
+            tell("resume")
+            rest = minutes(3)
+    assert (first, stepped, rest) == ([10.0] * 3, [10.1] * 3 + [10.2] * 3, [10.3] * 3)
+    assert heard.empty()
+
+
 def test_a_replay_that_waits_in_vain_can_be_stopped(tmp_path: Path, bus_config: BusConfig) -> None:
     csv, stop = tmp_path / "run.csv", StopSignal()
     csv.write_text("time_min,qc,C,T\n0,1,2,3\n")
@@ -199,7 +235,8 @@ def test_a_replay_that_waits_in_vain_can_be_stopped(tmp_path: Path, bus_config: 
 
 
 def test_what_cannot_be_replayed_is_told_before_the_waiting_for_a_router(tmp_path: Path) -> None:
-    empty, two = tmp_path / "empty.mcap", tmp_path / "two.mcap"
+    empty, two, path = tmp_path / "empty.mcap", tmp_path / "two.mcap", tmp_path / "one.csv"
+    path.write_text("time_min,qc,C,T\n0,1,2,3\n")
     with RecordingWriter(empty, {}), RecordingWriter(two, {}) as writer:
         for message in samples(1):
             writer.write(Entry(*message[:3], 0, 0))
@@ -207,6 +244,7 @@ def test_what_cannot_be_replayed_is_told_before_the_waiting_for_a_router(tmp_pat
     for config, said in (
         (ReplayConfig(file=str(empty)), "holds no samples"),
         (ReplayConfig(file=str(two), plant="c"), "holds samples of b, cstr; they cannot all be played as 'c'"),
+        (ReplayConfig(file=str(path), from_min=60.0), "holds nothing to play from 60 to inf min"),
         (ReplayConfig(file=str(tmp_path / "none.csv")), "there is no such file"),
     ):
         with pytest.raises(InputError, match=said):

@@ -45,6 +45,8 @@ def test_a_replay_may_be_as_fast_as_it_goes_but_not_stand_still() -> None:
     assert section(ReplayConfig, "replay", {}, {"file": "x.csv", "rate": math.inf}).rate == math.inf
     with pytest.raises(InputError, match=r"rate must be positive, got 0\.0"):
         section(ReplayConfig, "replay", {}, {"file": "x.csv", "rate": 0.0})
+    with pytest.raises(InputError, match="from_min must be before to_min, got 5 and 5"):
+        section(ReplayConfig, "replay", {}, {"file": "x.csv", "from_min": 5.0, "to_min": 5.0})
     with pytest.raises(InputError, match="file"):
         section(ReplayConfig, "replay", {}, {})
 

@@ -1,24 +1,40 @@
 """Playing back: what goes out, and when."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.records.record import Record
 from recorder.entry import Entry
-from recorder.player import BATCH, EVERYTHING, Player, playable, samples_of
+from recorder.player import BATCH, EVERYTHING, NEVER_NS, Player, between, playable, samples_of
 from tests.unit.recorder import golden
 
 SECOND = 10**9
 
 
-def at(*seconds: float) -> Iterator[Publication]:
-    return (Publication("reactor/x/sample/T", messages.Sample(time_ns=round(second * SECOND))) for second in seconds)
+def at(*seconds: float) -> Callable[[], Iterator[Publication]]:
+    """A tape with a message at each of these times."""
+    return lambda: (
+        Publication("reactor/x/sample/T", messages.Sample(time_ns=round(second * SECOND))) for second in seconds
+    )
+
+
+def tell(player: Player, command: str, now_s: float, rows: int = 0, rate: float = 0.0) -> list[float]:
+    """Give a command that is accepted; the sample times of what goes out because of it."""
+    message = messages.ReplayCommand(rows=rows, rate=rate)
+    question = Encoded(f"reactor/x/command/{command}", *encode_message(message))
+    reply, publications = player.on_command(question, round(now_s * SECOND))
+    assert reply.accepted, reply.text
+    return [publication.message.time_ns / SECOND for publication in publications]
+
+
+def ticked(player: Player, now_s: float) -> list[float]:
+    return [publication.message.time_ns / SECOND for publication in player.on_tick(round(now_s * SECOND))]
 
 
 def played(player: Player, start_ns: int = 0) -> list[tuple[float, float]]:
@@ -59,7 +75,7 @@ def test_the_loop_gets_a_word_in_between_batches() -> None:
 
 
 def test_nothing_to_play_is_finished_at_once() -> None:
-    assert Player(iter(()), 1.0).finished
+    assert Player(lambda: iter(()), 1.0).finished
 
 
 def test_only_samples_go_out_unless_more_is_asked_for() -> None:
@@ -114,9 +130,97 @@ def test_a_row_in_which_nothing_was_measured_says_so() -> None:
     assert (body.quality, math.isnan(body.value)) == (messages.QUALITY_BAD, True)
 
 
-def test_it_takes_no_commands_and_listens_to_nothing() -> None:
+def test_a_slow_play_takes_ten_times_as_long() -> None:
+    assert played(Player(at(0, 1, 3), 0.1)) == [(0, 0), (10, 1), (30, 3)]
+
+
+def test_a_stretch_is_played_with_both_its_ends_at_the_times_of_its_samples() -> None:
+    tape = at(0, 10, 11, 14, 15, 90)
+    player = Player(lambda: between(tape(), 10 * SECOND, 15 * SECOND), 1.0)
+    assert played(player, 100 * SECOND) == [(100, 10), (101, 11), (104, 14), (105, 15)]
+
+
+def test_a_loop_begins_anew_one_row_after_the_last_and_keeps_the_times_of_the_samples() -> None:
+    player, now, out = Player(at(0, 0, 2, 4), 2.0, loop=True), 0, list[tuple[float, float]]()
+    while len(out) < 9:
+        now = max(now, player.next_tick_ns())
+        out += [(now / SECOND, time) for time in ticked(player, now / SECOND)]
+    assert out[:9] == [(0, 0), (0, 0), (1, 2), (2, 4), (3, 0), (3, 0), (4, 2), (5, 4), (6, 0)]
+    assert not player.finished
+
+
+def test_a_loop_as_fast_as_it_goes_leaves_the_loop_its_word() -> None:
+    player = Player(at(0, 1), math.inf, loop=True)
+    assert len(player.on_tick(5)) == BATCH
+    assert len(player.on_tick(5)) == BATCH
+
+
+def test_a_pause_holds_the_plants_time_and_the_rest_of_a_row_is_waited_for_afterwards() -> None:
+    player = Player(at(0, 10, 20), 1.0)
+    assert ticked(player, 0) == [0]
+    assert tell(player, "pause", 4) == []
+    assert player.next_tick_ns() >= NEVER_NS
+    assert ticked(player, 500) == []
+    assert tell(player, "resume", 1000) == []
+    assert player.next_tick_ns() == 1006 * SECOND
+    assert ticked(player, 1006) == [10]
+
+
+def test_a_step_is_a_row_and_the_play_goes_on_from_it() -> None:
+    player = Player(at(0, 0, 10, 10, 20, 30), 1.0)
+    tell(player, "pause", 0)
+    assert [tell(player, "step", 1), tell(player, "step", 2, rows=2)] == [[0, 0], [10, 10, 20]]
+    tell(player, "resume", 50)
+    assert played(player, 50 * SECOND) == [(60, 30)]
+    assert player.published == 6
+
+
+def test_a_step_goes_over_the_end_of_a_loop_and_not_over_that_of_a_play() -> None:
+    looped, once = Player(at(0, 1), 1.0, loop=True), Player(at(0, 1), 1.0)
+    for player in (looped, once):
+        tell(player, "pause", 0)
+    assert tell(looped, "step", 1, rows=3) == [0, 1, 0]
+    tell(looped, "resume", 10)
+    assert looped.next_tick_ns() == 11 * SECOND
+    assert tell(once, "step", 1, rows=3) == [0, 1]
+    assert once.finished
+
+
+def test_the_rate_changes_from_now_on() -> None:
+    player = Player(at(0, 10, 20), 1.0)
+    ticked(player, 0)
+    tell(player, "set_rate", 4, rate=0.5)
+    assert played(player) == [(16, 10), (36, 20)]
+
+
+def test_a_play_as_fast_as_it_goes_can_be_slowed_down() -> None:
+    player = Player(at(*range(0, 10 * BATCH, 10), 10 * BATCH, 10 * BATCH + 10), math.inf)
+    assert len(ticked(player, 7)) == BATCH
+    tell(player, "set_rate", 8, rate=5.0)
+    assert played(player, 8 * SECOND) == [(8, 10 * BATCH), (10, 10 * BATCH + 10)]
+
+
+@pytest.mark.parametrize(
+    ("command", "message", "why"),
+    [
+        ("set_rate", messages.ReplayCommand(rate=-1.0), "rate must be positive, got -1"),
+        ("set_rate", messages.ReplayCommand(rate=math.nan), "rate must be positive, got nan"),
+        ("step", messages.ReplayCommand(), "pause it before a step"),
+        ("rewind", messages.ReplayCommand(), "unknown command 'rewind'"),
+        ("pause", messages.ListAlarms(), "must carry"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_and_changes_nothing(
+    command: str, message: messages.ReplayCommand | messages.ListAlarms, why: str
+) -> None:
+    player = Player(at(0, 1), 1.0)
+    reply, publications = player.on_command(Encoded(f"reactor/x/command/{command}", *encode_message(message)), 0)
+    assert (reply.accepted, publications) == (False, [])
+    assert why in reply.text
+    assert played(player) == [(0, 0), (1, 1)]
+
+
+def test_it_listens_to_nothing_and_has_no_last_words() -> None:
     player = Player(at(1), 1.0)
-    message = Encoded("reactor/x/command/y", b"", "")
-    assert player.on_message(message, 0) == []
-    assert not player.on_command(message, 0)[0].accepted
+    assert player.on_message(Encoded("reactor/x/command/y", b"", ""), 0) == []
     assert player.on_stop(0) == []
