@@ -40,6 +40,7 @@ def said(*names: str, verdict: str = "named", others: tuple[str, ...] = (), loca
         location=location,
         significant=True,
         practical=True,
+        differences={},
         gain=Gain(100.0, held_out),
         adequacy={},
         experiment=None,
