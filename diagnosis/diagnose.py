@@ -264,11 +264,12 @@ def _differences(model: ProcessModel, found: Found, curves: Curves) -> dict[str,
     columns = curves.inputs | curves.free_before
     units = {item.name: item.unit for item in model.inputs} | {item.name: item.unit for item in model.outputs}
     signals = {name: (columns[name], unit) for name, unit in units.items()}
+    noise_sd = found.noise.sensor_sd(model.output_names)
     return {
         output.name: difference(
             curves.measured[output.name] - curves.free_before[output.name],
             curves.residual_before[output.name],
-            found.noise.measurement_sd[place],
+            float(noise_sd[place]),
             output.unit,
             curves.time_min,
             signals,
