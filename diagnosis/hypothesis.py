@@ -25,13 +25,16 @@ from reactorwatch.process.model import Array
 SETTLED = 0.05
 """In log likelihood: a step that gains less ends the search."""
 
+MOST_STEPS = 12
+"""Of a fit."""
+
 _RUNAWAY = 1e100
 """A filter that lost an unstable plant has signatures without bound, and no step makes sense."""
 
 _SHARE = 0.02
 _SCANS = ((2.0, 24), (1.06, 9), (1.015, 7))  # how far to either side, and how many
 _WIDENINGS, _WIDER = 10, 2.0
-_MOST_STEPS, _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 12, 5, 1e-3, 10.0, 0.1
+_TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 5, 1e-3, 10.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,20 +84,34 @@ class Hypothesis:
         loss, w, found = self.sized.follow(run, self._signals(theta))
         return Fit(theta, loss, w, found)
 
-    def fit(self, run: Run, start: Sequence[Array], steps: int = _MOST_STEPS) -> Fit:
-        """The best numbers that are found from a start."""
-        best, damping = self.at(run, start), _DAMPING
+    def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS) -> Fit:
+        """The best numbers that are found from a start.
+
+        Args:
+            run: the record.
+            start: where it begins, theta of each effect.
+            steps: at most; fewer than `MOST_STEPS` are for a rough fit, in which sizes that act in jumps stay.
+        """
+        best = self._climbed(run, self.at(run, start), steps)
+        jumping = [place for place, effect in enumerate(self.sized.effects) if effect.jumps]
+        for place in jumping if steps >= MOST_STEPS else ():
+            best = self._scanned(run, best, place)
+            if len(self.courses) > 1:
+                best = self._climbed(run, best, steps)
+        return best
+
+    def _climbed(self, run: Run, best: Fit, steps: int) -> Fit:
+        """What so many steps of least squares find."""
+        damping = _DAMPING
         differences = self._least_differences()
         for _ in range(steps):
             with np.errstate(over="ignore", invalid="ignore"):
-                g = self._slope(run, best, differences)
+                g = self._slope(run, best, differences, rough=steps < MOST_STEPS)
             w = np.nan_to_num(best.w[2:]).ravel()
-            if not np.max(np.abs(g)) < _RUNAWAY:
+            if not np.any(g) or not np.max(np.abs(g)) < _RUNAWAY:
                 break
             weights = HUBER / np.maximum(np.abs(w), HUBER)
             information, gradient = (g * weights[:, None]).T @ g + self._least_information(), g.T @ (weights * w)
-            if len(self.courses) == 1 and not np.any(g[:, : self.courses[0].coefficients]):
-                return self._scanned(run, best)
             scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
             information, gradient = information / np.outer(scale, scale), gradient / scale
             before = best
@@ -110,13 +127,16 @@ class Hypothesis:
             differences = self._widened(self._inverse(g), differences)
         return best
 
-    def _scanned(self, run: Run, best: Fit) -> Fit:
+    def _scanned(self, run: Run, best: Fit, place: int) -> Fit:
         """Of a size that the innovations depend on in jumps: the best of many, then of nearer ones."""
         for reach, count in _SCANS:
-            (numbers,), (course,) = best.theta, self.courses
+            numbers, course = best.theta[place], self.courses[place]
             scaled = np.arange(numbers.size) < course.coefficients
-            shares = np.geomspace(1.0 / reach, reach, count)
-            tried = [self.at(run, [np.where(scaled, share * numbers, numbers)]) for share in shares]
+            tried = []
+            for share in np.geomspace(1.0 / reach, reach, count):
+                theta = list(best.theta)
+                theta[place] = np.where(scaled, share * numbers, numbers)
+                tried.append(self.at(run, theta))
             best = min(best, *tried, key=lambda item: item.loss)
         return best
 
@@ -170,28 +190,35 @@ class Hypothesis:
             widths += [number.upper - number.lower for number in course.numbers]
         return np.diag(np.square(1.0 / np.array(widths)))
 
-    def _slope(self, run: Run, fit: Fit, differences: Sequence[Array], ways: Ways | None = None) -> Array:
-        """What the whitened innovations lose as the numbers grow, shape (values from the third row on, freedom)."""
-        if self.sized.late is not None:
-            return self._slope_by_differences(run, fit, differences)
-        if ways is None:
+    def _slope(
+        self, run: Run, fit: Fit, differences: Sequence[Array], ways: Ways | None = None, rough: bool = False
+    ) -> Array:
+        """What the whitened innovations lose as the numbers grow, shape (values from the third row on, freedom).
+
+        Where an output is late, the equations of the filter's errors hold roughly for what is beside it.
+        """
+        late = self.sized.late
+        if ways is None and (late is None or (rough and len(self.courses) > 1)):
             ways = self.sized.ways(run, self._signals(fit.theta), fit.found)
         columns = []
         for place, (course, numbers, moved) in enumerate(zip(self.courses, fit.theta, differences, strict=True)):
+            if place == late or ways is None:
+                columns.append(self._slope_by_differences(run, fit, place, moved))
+                continue
             over_row, at_row = course.derivatives(numbers, moved)
-            g = signatures.shown(ways, place, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
+            column = place - (late is not None and late < place)  # ways know nothing of the late output
+            g = signatures.shown(ways, column, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
             columns.append(g.reshape(-1, course.freedom))
         return np.concatenate(columns, axis=1)
 
-    def _slope_by_differences(self, run: Run, fit: Fit, differences: Sequence[Array]) -> Array:
-        columns = []
-        for place, (course, moved) in enumerate(zip(self.courses, differences, strict=True)):
-            size = _SHARE * self.sized.effects[place].typical
-            for number, step in enumerate([*(size,) * course.coefficients, *moved.tolist()]):
-                theta = [item.copy() for item in fit.theta]
-                theta[place][number] += step
-                _, w, _ = self.sized.follow(run, self._signals(theta))
-                columns.append((clipped(fit.w[2:]) - clipped(w[2:])).ravel() / step)
+    def _slope_by_differences(self, run: Run, fit: Fit, place: int, moved: Array) -> Array:
+        course, columns = self.courses[place], []
+        size = _SHARE * self.sized.effects[place].typical
+        for number, step in enumerate([*(size,) * course.coefficients, *moved.tolist()]):
+            theta = [item.copy() for item in fit.theta]
+            theta[place][number] += step
+            _, w, _ = self.sized.follow(run, self._signals(theta))
+            columns.append((clipped(fit.w[2:]) - clipped(w[2:])).ravel() / step)
         return np.stack(columns, axis=1)
 
     def without(self, run: Run, fit: Fit, place: int) -> Array:

@@ -7,16 +7,20 @@ that of the course.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
 
-from diagnosis.courses import Constant, Free, Ramp, Step
+from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Signal, Step
 from diagnosis.hypothesis import Fit
 from diagnosis.run import Run
-from diagnosis.screen import EDGE_ROWS, KNOTS, Lead
-from diagnosis.sized import Sized, clipped
+from diagnosis.screen import DECAYS, EDGE_ROWS, KNOTS, Lead
+from diagnosis.sized import clipped
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array
+
+Follow: TypeAlias = Callable[[Effect, Signal], tuple[float, Array]]
+"""From a deviation of an effect to the loss and the whitened innovations of a filter that knows of it."""
 
 
 class MemoryScreen:
@@ -30,31 +34,34 @@ class MemoryScreen:
     def __init__(self, effects: Sequence[Effect], run: Run) -> None:
         self._effects, self._run = tuple(effects), run
         t = run.time_min
-        self._constant, self._step, self._ramp, self._free = Constant(t), Step(t), Ramp(t), Free(t, KNOTS)
+        self._constant, self._step, self._ramp, self._decay = Constant(t), Step(t), Ramp(t), Decay(t)
+        self._free = Free(t, KNOTS)
 
-    def leads(self, nominal: Fit, sized: Callable[[Effect], Sized], least_score: float) -> list[Lead]:
-        """The best size of each effect as a constant, and from there a step, a ramp and a free curve.
+    def leads(
+        self, without: Fit, follow: Follow, of: Sequence[Effect] | None = None, least_score: float = 0.0
+    ) -> list[Lead]:
+        """The best size of each effect as a constant, and from there a step, a ramp, decays and a free curve.
 
         Args:
-            nominal: the fit without any effect.
-            sized: makes the model with an effect.
+            without: a fit without any of the effects.
+            follow: loss and whitened innovations of the same with a deviation of one effect in it.
+            of: these effects alone; None: all.
             least_score: promises of less, in BIC, are not held against a run of the filter.
         """
         found = []
-        for effect in self._effects:
-            model = sized(effect)
+        for effect in self._effects if of is None else of:
             tried = []
             for start in effect.starts or (effect.typical,):
-                loss, w, _ = model.follow(self._run, [self._constant.signal(np.array([start]))])
-                tried.append((2.0 * (nominal.loss - loss), start, w))
+                loss, w = follow(effect, self._constant.signal(np.array([start])))
+                tried.append((2.0 * (without.loss - loss), start, w))
             gain, start, w = max(tried, key=lambda item: item[0])
             if gain > 0.0:
                 found.append(Lead(effect, self._constant, np.array([start]), gain))
-            before = clipped(nominal.w)
+            before = clipped(without.w)
             for _, start, w in tried:
-                scaled = self._scaled(effect, before, (before - clipped(w)) / start)
+                scaled = self.scaled(effect, before, (before - clipped(w)) / start)
                 promising = max(item.score(self._run.values) for item in scaled) > least_score
-                kept = self._kept(model, nominal, scaled[0]) if promising and not effect.jumps else 1.0
+                kept = self._kept(without, follow, scaled[0]) if promising and not effect.jumps else 1.0
                 # What acts in jumps does not scale: a fit has to scan its size, and can do so for one alone.
                 found += [
                     replace(item, gain=kept * item.gain)
@@ -63,27 +70,40 @@ class MemoryScreen:
                 ]
         return found
 
-    def _kept(self, model: Sized, nominal: Fit, constant: Lead) -> float:
+    def _kept(self, without: Fit, follow: Follow, constant: Lead) -> float:
         """How much of the gain that scaling promises a run with that constant size keeps, at most all of it."""
         if constant.gain <= 0.0:
             return 1.0 if constant.gain == 0.0 else 0.0
-        loss = model.follow(self._run, [self._constant.signal(constant.theta)])[0]
-        return min(2.0 * (nominal.loss - loss) / constant.gain, 1.0)
+        loss = follow(constant.effect, self._constant.signal(constant.theta))[0]
+        return min(2.0 * (without.loss - loss) / constant.gain, 1.0)
 
-    def _scaled(self, effect: Effect, w: Array, g: Array) -> list[Lead]:
-        """From the signature of a size of 1 in every row."""
+    def scaled(self, effect: Effect, w: Array, g: Array) -> list[Lead]:
+        """From the signature of a size of 1 in every row.
+
+        Args:
+            effect: whose.
+            w: what there is to explain, shape (rows, n_y).
+            g: the signature, likewise.
+        """
         a, b = np.sum(w * g, axis=1), np.sum(g * g, axis=1)
         t = self._run.time_min
         leads = [_lead(effect, self._constant, a.sum(), b.sum(), ())]
-        later_a, later_b = (np.cumsum(item[::-1])[::-1] for item in (a, b))
+        later_a, later_b = _later(a), _later(b)
         place = _best(later_a, later_b, effect)
         leads.append(_lead(effect, self._step, later_a[place], later_b[place], (t[place],)))
-        moments = [np.cumsum((item * t**power)[::-1])[::-1] for item in (a, b) for power in (0, 1, 2)]
+        moments = [_later(item * t**power) for item in (a, b) for power in (0, 1, 2)]
         span = np.maximum(t[-1] - t, self._ramp.period_min)
         grown_a = (moments[1] - t * moments[0]) / span
         grown_b = np.maximum(moments[5] - 2 * t * moments[4] + t**2 * moments[3], 0.0) / span**2
         place = _best(grown_a, grown_b, effect)
         leads.append(_lead(effect, self._ramp, grown_a[place], grown_b[place], (t[place],)))
+        for share in DECAYS:
+            constant = share * self._run.span_min
+            left = np.exp((t[-1] - t) / constant)  # of the way, seen from the end
+            short_a, short_b, shorter_b = (_later(item * w) / w for item, w in ((a, left), (b, left), (b, left**2)))
+            grown_a, grown_b = later_a - short_a, np.maximum(later_b - 2.0 * short_b + shorter_b, 0.0)
+            place = _best(grown_a, grown_b, effect)
+            leads.append(_lead(effect, self._decay, grown_a[place], grown_b[place], (t[place], constant)))
         hats = self._free.functions(np.empty(0))[0]
         A, B = hats.T @ a, hats.T @ (hats * b[:, None])
         by = np.clip(np.asarray(np.linalg.lstsq(B, A, rcond=1e-9)[0]), effect.lower, effect.upper)
@@ -91,7 +111,12 @@ class MemoryScreen:
         return leads
 
 
-def _lead(effect: Effect, course: Constant | Step | Ramp, a: float, b: float, shape: tuple[float, ...]) -> Lead:
+def _later(values: Array) -> Array:
+    """Sums from each row to the last."""
+    return np.asarray(np.cumsum(values[::-1])[::-1])
+
+
+def _lead(effect: Effect, course: Course, a: float, b: float, shape: tuple[float, ...]) -> Lead:
     """At the nearest possible size, with the gain of just that: a run with it is held against this gain."""
     size = float(np.clip(a / max(b, 1e-300), effect.lower, effect.upper))
     return Lead(effect, course, np.array([size, *shape]), size * (2.0 * float(a) - size * float(b)))

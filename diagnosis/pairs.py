@@ -1,31 +1,53 @@
 """Two causes at once.
 
 Two deviations that are there together can look like a third one, and then the best single cause is neither of them. So
-a second one is not only put beside the best: each of the two is then exchanged, the other held, for whatever explains
-the rest better, until nothing does; and it all begins from several single causes. A pair is a strong claim and takes a
-gain of `LEAST_PAIR_GAIN`.
+all pairs are screened together (`pair_screen`), about the run of the best single cause, and the best
+are fitted roughly, with curves that can be anything. Of the best of these each cause takes the simplest course
+that does, and about its run, where linear equations hold, all pairs are screened again. In the end each of the two is
+exchanged, the other held, for whatever explains the rest better, until nothing does. A pair is a strong claim and takes
+a gain of `LEAST_PAIR_GAIN`.
 """
 
 from collections.abc import Sequence
-from typing import TypeAlias
+from dataclasses import dataclass
+from math import inf
 
-from diagnosis.courses import Course
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.screen import Lead
-from diagnosis.search import IN_QUESTION, Explained, Found, Key, Search, keep
+import numpy as np
+
+from diagnosis.adequacy import minus_log10_p
+from diagnosis.courses import Constant, Course, Free, Signal
+from diagnosis.hypothesis import MOST_STEPS, Hypothesis
+from diagnosis.pair_screen import PairLead, PairScreen, Remembered
+from diagnosis.screen import KNOTS, Lead
+from diagnosis.search import IN_QUESTION, MOST_KNOTS, Explained, Found, Key, Search, keep
+from diagnosis.sized import clipped
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array
-
-Part: TypeAlias = tuple[Effect, Course, Array]
-"""An effect, its course and its numbers."""
 
 LEAST_PAIR_GAIN = 40.0
 """In BIC, of a pair over the best single cause."""
 
-BEGINNINGS, SECONDS, EXCHANGED = 2, 2, 4
-"""How many single causes it begins from, leads that are put beside each, and leads that are tried in an exchange."""
+DOUBTFUL = 3.0
+"""Minus the decimal logarithm of the p-value that what the best single cause leaves is white: beyond, it may be two."""
 
-EXCHANGES = 4
+SHORTLIST, AGAIN, REFINED = 6, 3, 2
+"""How many pairs of a screen are fitted, how many of these again with the noise of the best, and how many well."""
+
+COURSES, EXCHANGED = 2, 4
+"""How many courses of one cause are fitted, and how many leads in an exchange."""
+
+ROUNDS, EXCHANGES = 3, 3
+ROUGH_STEPS, EXCHANGE_STEPS = 3, 6
+_NEAR = 0.05  # of what a pair gains: what a rough fit may fall short
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One cause of a pair."""
+
+    effect: Effect
+    course: Course
+    theta: Array
 
 
 def with_pairs(search: Search, found: Found) -> Found:
@@ -35,67 +57,236 @@ def with_pairs(search: Search, found: Found) -> Found:
         search: that found it.
         found: single causes.
     """
-    if not found.explained or found.best is found.nominal:
-        return found
     single = found.best
-    pairs: dict[Key, Explained] = {}
-    for begin in _beginnings(found.explained):
-        left = _promising(search, search.screen.leads(begin.hypothesis, begin.fit), LEAST_PAIR_GAIN)
-        if begin is single and not left:
-            return found
-        for lead in _others(left, begin)[:SECONDS]:
-            keep(pairs, _fitted(search, [*_parts(begin), (lead.effect, lead.course, lead.theta)]))
-    if not pairs:
+    if not _inadequate(search, single):
         return found
-    best = min(pairs.values(), key=lambda item: item.bic)
-    for _ in range(EXCHANGES):
-        search.settle(best)
-        pairs = {best.key: search.refitted(best)}
-        best = again = pairs[best.key]
-        for place in (0, 1):
-            leads = search.screen.leads(best.hypothesis, best.fit, replaced=(place,))
-            least = max((item.score(search.run.values) for item in leads), default=0.0) - IN_QUESTION
-            for lead in search.chosen(_others(leads, best, place), EXCHANGED, least):
-                keep(pairs, _exchanged(search, best, place, lead))
-        best = min(pairs.values(), key=lambda item: item.bic)
-        if best is again:
-            break
-    if search.refitted(single).bic - best.bic < LEAST_PAIR_GAIN:
+    pairs = PairSearch(search, found)
+    best, known = pairs.found()
+    if best is not None and pairs.gain(best) >= LEAST_PAIR_GAIN:
+        return Found(search.noise, found.own_noise, found.nominal, sorted(known.values(), key=_bic))
+    if pairs.single.key == single.key:
+        search.noise = found.noise
         return found
-    explained = sorted(pairs.values(), key=lambda item: item.bic)
+    # One of a pair, alone, in a course that was not tried before.
+    search.settle(pairs.single)
+    rivals = [item for item in found.explained if item.bic < single.bic + IN_QUESTION]
+    explained = sorted((search.refitted(item) for item in (pairs.single, *rivals)), key=_bic)
     return Found(search.noise, found.own_noise, found.nominal, explained)
 
 
-def _beginnings(explained: Sequence[Explained]) -> list[Explained]:
-    """The best of different causes."""
-    found: dict[tuple[str, ...], Explained] = {}
-    for item in explained:
-        found.setdefault(item.hypothesis.causes, item)
-    return list(found.values())[:BEGINNINGS]
+def _inadequate(search: Search, single: Explained) -> bool:
+    """Whether a single cause leaves so much that there may be a second."""
+    if np.any(minus_log10_p(single.fit.w, search.run.inputs) > DOUBTFUL):
+        return True
+    leads = search.screen.leads(single.hypothesis, single.fit) if single.key else []
+    return any(lead.score(search.run.values) > LEAST_PAIR_GAIN for lead in leads)
 
 
-def _promising(search: Search, leads: Sequence[Lead], least: float) -> list[Lead]:
-    return [lead for lead in leads if lead.score(search.run.values) > least]
+class PairSearch:
+    """Searches one run for two causes.
+
+    Args:
+        search: of the run.
+        found: single causes.
+
+    Attributes:
+        single: the best single cause.
+    """
+
+    def __init__(self, search: Search, found: Found) -> None:
+        self._search, self._run, self._found = search, search.run, found
+        self._pair_screen = PairScreen(search.screen, search.run)
+        self._order = {effect.name: place for place, effect in enumerate(search.screen.effects)}
+        self._constant = Constant(search.run.time_min)
+        self._tried: set[frozenset[str]] = set()
+        self.single = found.best
+
+    def found(self) -> tuple[Explained | None, dict[Key, Explained]]:
+        """The best pair, and all that were fitted well under the same noise."""
+        search, nominal = self._search, self._found.nominal
+        best: Explained | None = None
+        leads = self._screened(self._found.best)
+        for _ in range(ROUNDS):
+            rough = sorted((self._fitted(_parts_of(lead), ROUGH_STEPS) for lead in self._fresh(leads, best)), key=_bic)
+            if not rough:
+                break
+            if best is None:
+                search.settle(rough[0])
+                rough = sorted((self._fitted(_parts(item), ROUGH_STEPS) for item in rough[:AGAIN]), key=_bic)
+            before, near = best, min(item.bic for item in (*rough, best) if item is not None)
+            near += _NEAR * max(nominal.bic - near, 0.0)
+            refined = [self._refined(item) for item in rough[:REFINED] if item.bic < near]
+            best = min((item for item in (best, *refined) if item is not None), key=_bic)
+            if best is before:
+                break
+            search.settle(best)
+            best = search.refitted(best)
+            if self.gain(best) < LEAST_PAIR_GAIN:
+                return None, {}
+            if not np.any(minus_log10_p(best.fit.w, self._run.inputs) > DOUBTFUL):
+                break
+            leads = self._screened(best)
+        return (None, {}) if best is None else self._exchanged(best)
+
+    def gain(self, pair: Explained) -> float:
+        """In BIC, of a pair over the best single cause, with the noise that holds now; either of the two, too."""
+        singles = [self._search.refitted(self.single)] if self.single.key else [self._search.nominal()]
+        singles += [self._fitted([part]) for part in _parts(pair)]
+        self.single = min(singles, key=_bic)
+        return self.single.bic - pair.bic
+
+    def _fresh(self, leads: Sequence[PairLead], best: Explained | None) -> list[PairLead]:
+        """Those that were not fitted yet and promise more than the best pair itself, which has been fitted."""
+        found = []
+        for lead in leads:
+            if best is not None and lead.causes == set(best.hypothesis.causes):
+                break
+            if lead.causes not in self._tried:
+                self._tried.add(lead.causes)
+                found.append(lead)
+        return found
+
+    def _exchanged(self, best: Explained) -> tuple[Explained, dict[Key, Explained]]:
+        """Each of the two exchanged for whatever is better, until nothing is."""
+        search = self._search
+        known: dict[Key, Explained] = {best.key: best}
+        for turn in range(EXCHANGES):
+            if turn:
+                search.settle(best)
+                best = search.refitted(best)
+            best = self._finer(best)
+            known, again = {best.key: best}, best
+            for place in (0, 1):
+                leads = self._new(self._leads(best, place), best)
+                least = max((item.score(self._run.values) for item in leads), default=0.0) - IN_QUESTION
+                for lead in search.chosen(leads, EXCHANGED, least):
+                    knots = best.hypothesis.courses[place].coefficients
+                    item = self._fitted(_with(best, place, lead, knots), EXCHANGE_STEPS)
+                    if item.bic < best.bic + IN_QUESTION:
+                        keep(known, self._fitted(_parts(item)))
+            best = min(known.values(), key=_bic)
+            if best.key == again.key:
+                break
+        return best, known
+
+    def _refined(self, pair: Explained) -> Explained:
+        """Each cause with the best of its courses. What acts in jumps had a curve only until a course is found."""
+        best = pair
+        for place in (0, 1):
+            about, jumps = best, best.hypothesis.sized.effects[place].jumps
+            provisional = jumps and isinstance(about.hypothesis.courses[place], Free)
+            leads = self._new(self._leads(about, place, own=True), about)
+            items = [
+                self._fitted(_with(about, place, lead), MOST_STEPS if jumps else EXCHANGE_STEPS)
+                for lead in self._search.chosen(leads, COURSES, -inf, of_a_cause=COURSES)
+            ]
+            best = min(items if provisional and items else [*items, about], key=_bic)
+        return self._fitted(_parts(best))
+
+    def _finer(self, best: Explained) -> Explained:
+        """Curves with as many knots as they need."""
+        for place in (0, 1):
+            while isinstance(best.hypothesis.courses[place], Free):
+                parts = _parts(best)
+                knots = 2 * parts[place].course.coefficients - 1
+                parts[place] = _with_knots(parts[place], knots)
+                item = self._fitted(parts, EXCHANGE_STEPS) if knots <= MOST_KNOTS else best
+                if item.bic >= best.bic:
+                    break
+                best = item
+        return best
+
+    def _new(self, leads: Sequence[Lead], pair: Explained) -> list[Lead]:
+        """Those that are no part of a pair with the same course already, unless there may be another optimum."""
+        there = {(part.effect.name, part.course.name) for part in _parts(pair) if not part.course.numbers}
+        return [lead for lead in leads if (lead.effect.name, lead.course.name) not in there]
+
+    def _leads(self, pair: Explained, place: int, own: bool = False) -> list[Lead]:
+        """What may take the place of one of the two.
+
+        Args:
+            pair: the two.
+            place: of the one.
+            own: its own cause alone, in any course.
+        """
+        search, parts = self._search, _parts(pair)
+        effect, other = parts[place].effect, parts[1 - place]
+        leads: list[Lead] = []
+        if not own or effect in search.screen.direct:
+            leads += search.screen.leads(pair.hypothesis, pair.fit, (place,), (effect,) if own else None)
+        if effect in search.screen.with_memory:
+            alone = search.explained(Hypothesis(search.sized((other.effect,)), (other.course,)), (other.theta,))
+            of = [
+                item for item in search.screen.with_memory if item is not other.effect and (item is effect or not own)
+            ]
+            leads += search.memory.leads(alone.fit, lambda item, signal: self._followed([other], item, signal), of)
+        leads = [lead for lead in leads if lead.effect is not other.effect]
+        return sorted(leads, key=lambda item: -item.score(self._run.values))
+
+    def _followed(self, beside: Sequence[Part], effect: Effect, signal: Signal) -> tuple[float, Array]:
+        """Loss and whitened innovations with one more deviation."""
+        signals = {part.effect.name: part.course.signal(part.theta) for part in beside} | {effect.name: signal}
+        effects = self._sorted([*(part.effect for part in beside), effect])
+        return self._search.sized(effects).follow(self._run, [signals[item.name] for item in effects])[:2]
+
+    def _screened(self, about: Explained) -> list[PairLead]:
+        """Pairs that may explain all that there is to explain, linearised about a run."""
+        search = self._search
+        hypothesis, fit = about.hypothesis, about.fit
+        with np.errstate(over="ignore", invalid="ignore"):
+            ways = search.screen.ways_of_all(hypothesis, fit, range(len(hypothesis.courses)))
+            return self._pair_screen.leads(ways, self._remembered(about), SHORTLIST)
+
+    def _remembered(self, about: Explained) -> list[Remembered]:
+        found = []
+        parts = _parts(about)
+        own = {part.effect.name: place for place, part in enumerate(parts)}
+        for effect in self._search.screen.with_memory:
+            starts = effect.starts or (effect.typical,)
+            beside, before = parts, about.fit.w
+            if effect.name in own:
+                part = parts[own[effect.name]]
+                starts = (max(float(np.mean(np.abs(part.course.signal(part.theta).at_row))), 0.1 * effect.typical),)
+                beside = [item for item in parts if item is not part]
+                before = about.hypothesis.without(self._run, about.fit, own[effect.name])
+            for start in starts:
+                w = self._followed(beside, effect, self._constant.signal(np.array([start])))[1]
+                found.append(Remembered(effect, start, clipped(before) - clipped(w)))
+        return found
+
+    def _fitted(self, parts: Sequence[Part], steps: int = MOST_STEPS) -> Explained:
+        search = self._search
+        parts = sorted(parts, key=lambda part: self._order[part.effect.name])
+        hypothesis = Hypothesis(search.sized(tuple(part.effect for part in parts)), [part.course for part in parts])
+        return search.fit(hypothesis, [part.theta for part in parts], steps)
+
+    def _sorted(self, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+        return tuple(sorted(effects, key=lambda effect: self._order[effect.name]))
 
 
-def _others(leads: Sequence[Lead], beside: Explained, replaced: int | None = None) -> list[Lead]:
-    """Leads of causes that are not there already, but for the one to be replaced."""
-    taken = [effect for place, effect in enumerate(beside.hypothesis.sized.effects) if place != replaced]
-    return [lead for lead in leads if lead.effect not in taken]
-
-
-def _exchanged(search: Search, pair: Explained, place: int, lead: Lead) -> Explained:
-    """With one of the two replaced."""
-    parts = _parts(pair)
-    parts[place] = (lead.effect, lead.course, lead.theta)
-    return _fitted(search, parts)
+def _parts_of(lead: PairLead) -> list[Part]:
+    return [Part(*part) for part in lead.parts]
 
 
 def _parts(explained: Explained) -> list[Part]:
     hypothesis = explained.hypothesis
-    return list(zip(hypothesis.sized.effects, hypothesis.courses, explained.fit.theta, strict=True))
+    whole = zip(hypothesis.sized.effects, hypothesis.courses, explained.fit.theta, strict=True)
+    return [Part(*item) for item in whole]
 
 
-def _fitted(search: Search, parts: Sequence[Part]) -> Explained:
-    effects, courses, theta = zip(*parts, strict=True)
-    return search.fit(Hypothesis(search.sized(effects), courses), theta)
+def _with(explained: Explained, place: int, lead: Lead, knots: int = KNOTS) -> list[Part]:
+    """One of the two exchanged; a curve with at least so many knots."""
+    parts, part = _parts(explained), Part(lead.effect, lead.course, lead.theta)
+    parts[place] = _with_knots(part, knots) if isinstance(lead.course, Free) and knots > KNOTS else part
+    return parts
+
+
+def _with_knots(part: Part, knots: int) -> Part:
+    """The same curve with more knots."""
+    finer = Free(part.course.time_min, knots)
+    values = part.course.functions(np.empty(0))[0] @ part.theta
+    return Part(part.effect, finer, np.interp(finer.knots_min, part.course.time_min, values))
+
+
+def _bic(explained: Explained) -> float:
+    return explained.bic

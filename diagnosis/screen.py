@@ -67,12 +67,13 @@ class Screen:
         run: the record.
 
     Attributes:
+        effects: the catalogue.
         direct: effects that act on the model's own states.
         with_memory: the others.
     """
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run) -> None:
-        self._run = run
+        self._run, self.effects = run, tuple(effects)
         names = model.state_names
         self.direct = tuple(effect for effect in effects if effect.extend(model).state_names == names)
         self.with_memory = tuple(effect for effect in effects if effect not in self.direct)
@@ -82,43 +83,52 @@ class Screen:
         self._constant, self._step, self._ramp, self._decay = Constant(t), Step(t), Ramp(t), Decay(t)
         self._sine, self._free = Sine(t), Free(t, KNOTS)
 
-    def leads(self, hypothesis: Hypothesis, fit: Fit, replaced: Sequence[int] = ()) -> list[Lead]:
+    def leads(
+        self, hypothesis: Hypothesis, fit: Fit, replaced: Sequence[int] = (), of: Sequence[Effect] | None = None
+    ) -> list[Lead]:
         """The best of each cause and course, the most promising first.
 
         Args:
             hypothesis: about whose run all is linearised.
             fit: of it.
             replaced: places of those of its effects that rivals are looked for, to take their place; the others stay.
+            of: these causes alone, of those in `direct`; None: all of them.
         """
+        effects = self.direct if of is None else of
         with np.errstate(over="ignore", invalid="ignore"):  # about a run that has lost an unstable plant
-            ways = self.ways_of_all(hypothesis, fit, replaced)
-            if not all(np.all(np.isfinite(item)) for item in (ways.w, ways.F, ways.G, ways.K)):
+            ways = self.ways_of_all(hypothesis, fit, replaced, effects)
+            if not usable(ways):
                 return []
-            found = self._set_in(ways) + self._swinging(ways) + self._in_course(ways, self._free, np.empty(0))
+            found = self._set_in(ways, effects) + self.swinging(ways, effects)
+            found += self._in_course(ways, effects, self._free, np.empty(0))
             for place in replaced:
                 course, theta = hypothesis.courses[place], fit.theta[place]
                 if course.name != self._free.name:
-                    found += self._in_course(ways, course, theta[course.coefficients :])
+                    found += self._in_course(ways, effects, course, theta[course.coefficients :])
         found = [item for item in found if np.isfinite(item.gain) and np.all(np.isfinite(item.theta))]
         return sorted(found, key=lambda item: -item.score(self._run.values))
 
-    def ways_of_all(self, hypothesis: Hypothesis, fit: Fit, replaced: Sequence[int]) -> Ways:
+    def ways_of_all(
+        self, hypothesis: Hypothesis, fit: Fit, replaced: Sequence[int], of: Sequence[Effect] | None = None
+    ) -> Ways:
         """The equations of the filter's errors, of all effects in `direct`, with w as rivals have to explain it.
 
         Args:
             hypothesis: see `leads`.
             fit: likewise.
             replaced: likewise.
+            of: likewise.
         """
         w = clipped(fit.w[2:])
         for place in replaced:
             w = w + self._explained(hypothesis, fit, place)
-        ways = self._ways(hypothesis.sized, hypothesis.signals(fit), fit)
+        effects = self.direct if of is None else of
+        ways = self._ways(hypothesis.sized, hypothesis.signals(fit), fit, effects)
         return Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, w)
 
     def _explained(self, hypothesis: Hypothesis, fit: Fit, place: int) -> Array:
         """What a fitted deviation does to the innovations of a filter that does not know it, shape (rows, n_y)."""
-        if place == hypothesis.sized.late:
+        if place == hypothesis.sized.late or hypothesis.sized.effects[place].jumps:
             return clipped(hypothesis.without(self._run, fit, place)[2:]) - clipped(fit.w[2:])
         signals = hypothesis.signals(fit)
         ways = hypothesis.sized.ways(self._run, signals, fit.found)
@@ -126,11 +136,11 @@ class Screen:
         column = place - (hypothesis.sized.late is not None and hypothesis.sized.late < place)
         return signatures.shown(ways, column, over_row[1:-1, None], at_row[2:, None])[:, :, 0]
 
-    def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit) -> Ways:
-        """Of all effects about the run of a filter."""
+    def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit, effects: Sequence[Effect]) -> Ways:
+        """Of some effects about the run of a filter."""
         extended = sized.model
         of_rates, of_outputs = [], []
-        for effect in self.direct:
+        for effect in effects:
             own = sized.size_symbols(effect)
             if own is None:
                 extended = effect.extend(extended)
@@ -141,14 +151,14 @@ class Screen:
         errors.changes = sized.noise.times
         return ways_between(errors, self._run, sized.inputs(self._run, signals), fit.found, sized.used(self._run))
 
-    def _set_in(self, ways: Ways) -> list[Lead]:
+    def _set_in(self, ways: Ways, effects: Sequence[Effect]) -> list[Lead]:
         """Constants, steps, ramps and decays."""
         times, leads = self._run.time_min[1:-1], []
         beta = self._beta
         left_of_span = self._step.end_min - times
         found = signatures.onsets(ways, beta, np.ones_like(beta), 0.5 * beta)
         inner = slice(EDGE_ROWS, -EDGE_ROWS)
-        for cause, effect in enumerate(self.direct):
+        for cause, effect in enumerate(effects):
             size, gain = _best(found.step_a[:, cause], found.step_b[:, cause], effect)
             leads.append(Lead(effect, self._constant, size[:1], float(gain[0])))
             place = EDGE_ROWS + int(np.argmax(gain[inner]))
@@ -162,15 +172,15 @@ class Screen:
             constant = share * self._run.span_min
             gamma = np.exp(-beta / constant)
             found = signatures.onsets(ways, 1.0 - gamma, gamma, 1.0 - (1.0 - gamma) * constant / beta)
-            for cause, effect in enumerate(self.direct):
+            for cause, effect in enumerate(effects):
                 size, gain = _best(found.other_a[:, cause], found.other_b[:, cause], effect)
                 place = int(np.argmax(gain[:-EDGE_ROWS]))
                 theta = np.array([size[place], times[place], constant])
                 leads.append(Lead(effect, self._decay, self._decay.limited(theta, -np.inf, np.inf), float(gain[place])))
         return leads
 
-    def _swinging(self, ways: Ways) -> list[Lead]:
-        """Sines."""
+    def swinging(self, ways: Ways, effects: Sequence[Effect]) -> list[Lead]:
+        """The best sine of each cause whose ways these are."""
         over_row, at_row = signatures.sought(ways)
         rows = round(self._run.span_min / self._period_min) + 1
         place = np.round((self._run.time_min[1:] - self._sine.begin_min) / self._period_min).astype(int)
@@ -182,7 +192,7 @@ class Screen:
         known = np.geomspace(1.0 / frequency[inner][-1], 1.0 / frequency[inner][0], KNOWN_PERIODS)
         courses = [self._sine.basis(np.array([period])) for period in known]
         both = [np.concatenate([getattr(item, name) for item in courses], axis=1) for name in Signal._fields]
-        for cause, effect in enumerate(self.direct):
+        for cause, effect in enumerate(effects):
             sums = np.zeros((2, count))
             np.add.at(sums[0], place[:-1], over_row[:, cause])
             np.add.at(sums[1], place[1:], at_row[:, cause])
@@ -200,11 +210,11 @@ class Screen:
             leads.append(Lead(effect, self._sine, theta, float(gain[best])))
         return leads
 
-    def _in_course(self, ways: Ways, course: Course, shape: Array) -> list[Lead]:
+    def _in_course(self, ways: Ways, effects: Sequence[Effect], course: Course, shape: Array) -> list[Lead]:
         """All causes in one course with given numbers."""
         over_row, at_row = (np.ascontiguousarray(item) for item in course.basis(shape))
         leads = []
-        for cause, effect in enumerate(self.direct):
+        for cause, effect in enumerate(effects):
             g = signatures.shown(ways, cause, over_row[1:-1], at_row[2:]).reshape(-1, course.coefficients)
             a, b = g.T @ ways.w.ravel(), g.T @ g
             if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
@@ -216,6 +226,11 @@ class Screen:
                 gain = float(gains[0])
             leads.append(Lead(effect, course, np.append(by, shape), gain))
         return leads
+
+
+def usable(ways: Ways) -> bool:
+    """Whether they are numbers: about a run that has lost an unstable plant they may not be."""
+    return all(bool(np.all(np.isfinite(item))) for item in (ways.w, ways.F, ways.G, ways.K))
 
 
 def _best(a: Array, b: Array, effect: Effect) -> tuple[Array, Array]:

@@ -14,8 +14,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from diagnosis.courses import Free
-from diagnosis.hypothesis import Fit, Hypothesis
+from diagnosis.courses import Free, Signal
+from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.memory_screen import MemoryScreen
 from diagnosis.run import Run
 from diagnosis.screen import Lead, Screen
@@ -105,6 +105,7 @@ class Search:
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run, smallest_sd: Sequence[float]) -> None:
         self._model, self.run, self._smallest_sd = model, run, list(smallest_sd)
         self.screen = Screen(model, effects, run)
+        self.memory = MemoryScreen(self.screen.with_memory, run)
         self._sized: dict[tuple[str, ...], Sized] = {}
         self._period_min = float(np.median(np.diff(run.time_min)))
         self.noise = self._chosen_noise()
@@ -112,8 +113,7 @@ class Search:
     def found(self) -> Found:
         """The best explanations by one effect."""
         nominal, own_noise = self.nominal(), self.noise
-        memory = MemoryScreen(self.screen.with_memory, self.run)
-        remembering = self._sorted(memory.leads(nominal.fit, lambda effect: self.sized((effect,)), FIRST_SCORE))
+        remembering = self._sorted(self.memory.leads(nominal.fit, self._followed, least_score=FIRST_SCORE))
         leads = self._sorted(self.screen.leads(nominal.hypothesis, nominal.fit) + remembering)
         best, known = nominal, dict[Key, Explained]()
         worth = [lead for lead in leads if lead.score(self.run.values) > _least_score(lead)]
@@ -202,6 +202,9 @@ class Search:
                 break
         return found
 
+    def _followed(self, effect: Effect, signal: Signal) -> tuple[float, Array]:
+        return self.sized((effect,)).follow(self.run, [signal])[:2]
+
     def _finer(self, best: Explained) -> Explained:
         """A free curve with as many knots as it needs."""
         course, (theta,) = best.hypothesis.courses[0], best.fit.theta
@@ -228,9 +231,9 @@ class Search:
         """A lead as a hypothesis."""
         return self.fit(Hypothesis(self.sized((lead.effect,)), (lead.course,)), (lead.theta,))
 
-    def fit(self, hypothesis: Hypothesis, start: Sequence[Array]) -> Explained:
-        """A hypothesis, fitted from a start."""
-        return self._with_bic(hypothesis, hypothesis.fit(self.run, start))
+    def fit(self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS) -> Explained:
+        """A hypothesis, fitted from a start in at most so many steps."""
+        return self._with_bic(hypothesis, hypothesis.fit(self.run, start, steps))
 
     def _elsewhere(self, lead: Lead, best: Explained) -> bool:
         """Whether a lead of the best's own cause and course begins where its fit is not."""

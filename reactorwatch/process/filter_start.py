@@ -121,4 +121,12 @@ def _with_derivative(function: ca.Function) -> ca.Function:
 
 
 def _gain(P: Array, H: Array, R: Array) -> Array:
-    return np.asarray(np.linalg.solve(H @ P @ H.T + R, H @ P).T, dtype=np.float64)
+    """Of a correction. Far from where it runs, a model may have outputs that grow without bound: they tell little."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        S, shown = H @ P @ H.T + R, H @ P
+    if not np.all(np.isfinite(S)):
+        return np.zeros((P.shape[0], H.shape[0]))
+    try:
+        return np.asarray(np.linalg.solve(S, shown).T, dtype=np.float64)
+    except np.linalg.LinAlgError:  # beside the largest of them the noise of the sensors is lost
+        return np.asarray((np.linalg.pinv(S, hermitian=True) @ shown).T, dtype=np.float64)

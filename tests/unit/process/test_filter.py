@@ -14,6 +14,7 @@ from scipy.stats import chi2, multivariate_normal
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, OPERATING_STATE, cstr
+from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.filter import Filter, FilterState, Innovation, NoiseLevels
 from reactorwatch.process.filter_record import FilterRecord
@@ -416,6 +417,13 @@ def test_parameters_may_change_under_way() -> None:
         predictions.append(kalman.update(0.1, (100.0,), (np.nan, np.nan)).prediction[1])
     assert predictions[0] == predictions[1]
     assert predictions[2] == pytest.approx(predictions[0] + 5.0, abs=1e-9)
+
+
+def test_it_begins_where_outputs_grow_without_bound_with_a_state_all_the_same() -> None:
+    # Half a minute later than a state amid its bounds, the reaction has run away by more than a number can hold.
+    model = EFFECTS[-1].extend(cstr()).with_values({"sample_timing.size": 0.45})
+    run = Filter(model, SENSORS).run(np.array([0.0, 0.1]), np.full((2, 1), 90.0), np.array([[0.1, 438.0]] * 2))
+    assert np.all(np.isfinite(run.x))
 
 
 @pytest.mark.parametrize(
