@@ -7,13 +7,16 @@ import numpy as np
 
 from diagnosis.adequacy import WHITE, minus_log10_p
 from diagnosis.difference import Difference, difference
+from diagnosis.experiment import proposed
 from diagnosis.extended import extended_model
 from diagnosis.held_out import Errors, free_run, gained
 from diagnosis.integration import looks_like_integration
+from diagnosis.limits import checked_limits
 from diagnosis.pairs import with_pairs
 from diagnosis.record_checks import run_of
 from diagnosis.result import (
     AMBIGUOUS,
+    LISTED,
     NAMED,
     NOMINAL,
     UNKNOWN,
@@ -40,9 +43,6 @@ from reactorwatch.records.record import Record
 LEAST_GAIN = 10.0
 """In BIC: less does not refute the nominal model (Kass & Raftery 1995, J. American Statistical Association 90)."""
 
-LISTED = 10.0
-"""In BIC: explanations that are worse by less are listed."""
-
 SURE = 6.0
 """In BIC, odds of twenty to one: where a rival is worse by less, the record does not rank them."""
 
@@ -62,6 +62,7 @@ def diagnose(
     effects: Sequence[Effect] | None = None,
     tolerance: Mapping[str, float] | None = None,
     uncertain: Mapping[str, float] | None = None,
+    limits: Mapping[str, tuple[float, float]] | None = None,
 ) -> Diagnosis:
     """What a simulation by the model gets wrong of a record.
 
@@ -73,12 +74,16 @@ def diagnose(
             nothing is said, a fiftieth of the output's range.
         uncertain: by parameter of the model, the standard deviation to which its value is known, in its unit; the
             others are known exactly. See `diagnosis.uncertain`.
+        limits: by input and output, the lowest and the highest value that an experiment may lead to; where nothing is
+            said, somewhat wider than the record.
 
     Raises:
-        InputError: the record cannot be diagnosed, a tolerance is of no output or not positive, or what is uncertain is
-            no parameter, or its standard deviation not positive.
+        InputError: the record cannot be diagnosed, a tolerance is of no output or not positive, what is uncertain is no
+            parameter or its standard deviation not positive, or limits are of no signal, do not rise or are beyond what
+            an input can be.
     """
     effects = effects_of(model) if effects is None else effects
+    checked_limits(model, limits or {})
     run = run_of(record, model)
     bands = _bands(run, model, tolerance or {})
     plant = with_uncertain(model, uncertain or {})
@@ -112,19 +117,24 @@ def diagnose(
     causes = tuple(_causes(best, covariances))
     parameters = _parameters(run, model, uncertain or {}, best)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
+    rivals = _rivals(found, best)
+    experiment = proposed([best, *rivals], run, model, found.noise, limits or {}) if rivals else None
+    if isinstance(experiment, str):
+        remarks.append(experiment)
+        experiment = None
     return Diagnosis(
         samples=run.time_min.size,
         span_min=run.span_min,
         verdict=verdict,
         causes=causes,
-        alternatives=tuple(_alternatives(found, best)),
+        alternatives=tuple(Alternative(item.key, item.bic - best.bic) for item in rivals),
         location=location,
         significant=verdict != NOMINAL,
         practical=matters or _matters(curves, bands),
         differences=_differences(model, found, curves),
         gain=_gain(model, found, best, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
-        experiment=None,
+        experiment=experiment,
         extended_model=extended_model(adjusted, effects, causes, record.zero_ns),
         remarks=tuple(remarks),
         parameters=parameters,
@@ -145,9 +155,9 @@ def _verdict(found: Found, best: Explained) -> str:
     return AMBIGUOUS if rivals and min(rivals) < SURE else NAMED
 
 
-def _alternatives(found: Found, best: Explained) -> list[Alternative]:
-    """The best of every other set of causes."""
-    listed: list[Alternative] = []
+def _rivals(found: Found, best: Explained) -> list[Explained]:
+    """The best of every other set of causes that comes near."""
+    listed: list[Explained] = []
     seen = {frozenset(best.hypothesis.causes)}
     if best is found.nominal:
         return []
@@ -155,7 +165,7 @@ def _alternatives(found: Found, best: Explained) -> list[Alternative]:
         causes = frozenset(item.hypothesis.causes)
         if item.bic < best.bic + LISTED and causes not in seen:
             seen.add(causes)
-            listed.append(Alternative(item.key, item.bic - best.bic))
+            listed.append(item)
     return listed
 
 

@@ -221,6 +221,12 @@ class Hypothesis:
             columns.append((clipped(fit.w[2:]) - clipped(w[2:])).ravel() / step)
         return np.stack(columns, axis=1)
 
+    def unexplained(self, run: Run, fit: Fit) -> float:
+        """What no change of its numbers would take away of the innovations' sum of squares, linearised."""
+        g, w = self._slope(run, fit, self._least_differences()), np.nan_to_num(fit.w[2:]).ravel()
+        sought = g.T @ w
+        return max(float(w @ w - sought @ self._inverse(g) @ sought), 0.0)
+
     def without(self, run: Run, fit: Fit, place: int) -> Array:
         """The whitened innovations of a filter that does not know one of the deviations, shape (rows, n_y)."""
         signals = self._signals(fit.theta)

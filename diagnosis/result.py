@@ -11,6 +11,9 @@ NOMINAL, NAMED, AMBIGUOUS, UNKNOWN = "nominal", "named", "ambiguous", "unknown"
 SD_95 = 1.959964
 """Standard deviations to either side that hold 95 % of a normal distribution."""
 
+LISTED = 10.0
+"""In BIC: explanations that are worse by less are listed."""
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -108,20 +111,64 @@ class Gain:
 
 
 @dataclass(frozen=True)
+class Apart:
+    """How well an experiment tells two explanations apart.
+
+    Attributes:
+        between: their names, each its causes joined by a plus.
+        expected_delta_bic: by how much the wrong one is expected to be worse.
+        probability: the probability that it is worse by more than `LISTED`.
+    """
+
+    between: tuple[str, str]
+    expected_delta_bic: float
+    probability: float
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentCurves:
+    """What the pictures of an experiment are drawn from; all over its rows.
+
+    Attributes:
+        time_min: from its start, shape (rows,).
+        level: of the input that is moved.
+        outputs: that each explanation predicts without noise, by its name and the output's.
+    """
+
+    time_min: Array
+    level: Array
+    outputs: dict[str, dict[str, Array]]
+
+
+@dataclass(frozen=True)
 class Experiment:
     """An input that would tell rivals apart.
 
     Attributes:
         why: in a sentence.
         input: (minute, value) of each change.
-        separates: the causes.
+        separates: the explanations that it tells apart, each its causes joined by a plus.
         expected_delta_bic: what it is expected to bring between the two nearest of them.
+        probability: the probability that it brings more than `LISTED`.
+        signal: the input that is moved; the others stay as they were.
+        span_min: how long it takes.
+        limits: that it keeps under every explanation, by signal.
+        apart: of every pair of explanations.
+        predicted: the lowest and highest value of each output without noise, by explanation and output.
+        curves: for pictures.
     """
 
     why: str
     input: tuple[tuple[float, float], ...]
     separates: tuple[str, ...]
     expected_delta_bic: float
+    probability: float
+    signal: str
+    span_min: float
+    limits: dict[str, tuple[float, float]]
+    apart: tuple[Apart, ...]
+    predicted: dict[str, dict[str, tuple[float, float]]]
+    curves: ExperimentCurves | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ from math import isfinite
 from typing import Any
 
 from diagnosis.difference import Difference
-from diagnosis.result import Diagnosis, Estimate, HeldOut
+from diagnosis.result import Diagnosis, Estimate, Experiment, HeldOut
 
 
 def as_object(diagnosis: Diagnosis, file: str, seconds: float) -> dict[str, Any]:
@@ -47,13 +47,7 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float) -> dict[str, Any]
             "held_out": {name: _held_out(item) for name, item in diagnosis.gain.held_out.items()},
         },
         "adequacy": {name: {"minus_log10_p": _number(value)} for name, value in diagnosis.adequacy.items()},
-        "experiment": None
-        if experiment is None
-        else {
-            "why": experiment.why,
-            "input": [[_number(minute), _number(value)] for minute, value in experiment.input],
-            "separates": list(experiment.separates),
-        },
+        "experiment": None if experiment is None else _experiment(experiment),
         "extended_model": diagnosis.extended_model,
         **({"parameters": _parameters(diagnosis)} if diagnosis.parameters else {}),
     }
@@ -71,6 +65,30 @@ def with_differences(diagnosis: Diagnosis, file: str, seconds: float) -> dict[st
     """The same, and where the simulation differs from the record: what report.json holds."""
     differences = {name: _difference(item) for name, item in diagnosis.differences.items()}
     return as_object(diagnosis, file, seconds) | {"differences": differences}
+
+
+def _experiment(experiment: Experiment) -> dict[str, Any]:
+    return {
+        "why": experiment.why,
+        "input": [[_number(minute), _number(value)] for minute, value in experiment.input],
+        "separates": list(experiment.separates),
+        "signal": experiment.signal,
+        "span_min": _number(experiment.span_min),
+        "expected_delta_bic": _number(experiment.expected_delta_bic),
+        "probability": _number(experiment.probability),
+        "limits": {name: list(ends) for name, ends in experiment.limits.items()},
+        "expected": [
+            {
+                "between": list(item.between),
+                "delta_bic": _number(item.expected_delta_bic),
+                "probability": _number(item.probability),
+            }
+            for item in experiment.apart
+        ],
+        "predicted": {
+            rival: {name: list(ends) for name, ends in ranges.items()} for rival, ranges in experiment.predicted.items()
+        },
+    }
 
 
 def _estimate(estimate: Estimate) -> dict[str, Any]:

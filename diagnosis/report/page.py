@@ -7,13 +7,11 @@ from pathlib import PurePath
 from shlex import quote
 
 import jinja2
-import numpy as np
 
 from diagnosis.adequacy import WHITE
 from diagnosis.difference import Difference
 from diagnosis.report import pictures
 from diagnosis.report.equations import balances, meanings
-from diagnosis.report.svg import Line, plot
 from diagnosis.report.words import (
     adjusted_said,
     causes_said,
@@ -58,6 +56,7 @@ def as_page(
     effects: Sequence[Effect],
     file: str,
     model_file: str,
+    experiment_file: str = "experiment.csv",
     *,
     on_the_bus: bool = True,
 ) -> str:
@@ -69,6 +68,7 @@ def as_page(
         effects: the catalogue.
         file: of the record, as it was named.
         model_file: of the extended model.
+        experiment_file: of the proposed input.
         on_the_bus: whether there are nodes that could take it.
 
     Raises:
@@ -93,7 +93,10 @@ def as_page(
         differences=[(difference_said(name, item), _strips(item)) for name, item in diagnosis.differences.items()],
         white=WHITE,
         evidence=_evidence(diagnosis, effects),
-        experiment=None if diagnosis.experiment is None else _input(diagnosis.experiment, model),
+        experiment=[] if diagnosis.experiment is None else pictures.experiment(diagnosis.experiment, model),
+        apart=[] if diagnosis.experiment is None else _apart(diagnosis.experiment),
+        experiment_file=experiment_file,
+        experiment_command=_experiment_command(diagnosis.experiment, experiment_file),
         model_file=model_file,
         commands=_commands(file, model_file, on_the_bus=on_the_bus),
         error=lambda value: f"{value:.3g}" if isfinite(value) else "ran away",
@@ -148,11 +151,21 @@ def _evidence(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[str
     return [*rows, ("the simulation as it was", f"{diagnosis.gain.delta_bic:,.1f}")]
 
 
-def _input(experiment: Experiment, model: ProcessModel) -> pictures.Picture:
-    times, values = np.array(experiment.input).T
-    item = model.inputs[0]
-    drawing = plot(f"proposed {item.name}", times, [Line(values, "input", held=True)])
-    return pictures.Picture(f"{item.name}, {item.unit}, over minutes", ((item.meaning, "input"),), drawing)
+def _apart(experiment: Experiment) -> list[tuple[str, str, str]]:
+    return [
+        (" or ".join(item.between), f"{item.expected_delta_bic:.1f}", _percent(item.probability))
+        for item in experiment.apart
+    ]
+
+
+def _percent(share: float) -> str:
+    return "over 99 %" if share > 0.99 else f"{100.0 * share:.0f} %"
+
+
+def _experiment_command(experiment: Experiment | None, experiment_file: str) -> str:
+    if experiment is None:
+        return ""
+    return f"reactorwatch plant --scenario {quote(experiment_file)} --duration {experiment.span_min:g}"
 
 
 def _commands(file: str, model_file: str, *, on_the_bus: bool) -> list[str]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from diagnosis.report.svg import Band, Line, plot
-from diagnosis.result import NOMINAL, SD_95, Cause, Curves, Diagnosis
+from diagnosis.result import NOMINAL, SD_95, Cause, Curves, Diagnosis, Experiment
 from reactorwatch.process.model import Array, ProcessModel
 
 BEFORE_ROWS, AFTER_ROWS = 100, 200
@@ -19,6 +19,7 @@ MEASURED = ("measured", "measured")
 BEFORE = ("simulation as it was", "before")
 AFTER = ("extended simulation", "after")
 RIGHT = ("simulation", "after")
+LIMITS = ("limits", "limit")
 
 
 @dataclass(frozen=True)
@@ -115,6 +116,38 @@ def courses(diagnosis: Diagnosis) -> list[Picture]:
         title = f"Size m of: {cause.label}{'' if unit == '1' else f', {unit}'}"
         found.append(Picture(title, (("most likely", "after"), ("95 % interval", "certain")), drawing))
     return found
+
+
+def experiment(proposed: Experiment, model: ProcessModel) -> list[Picture]:
+    """The proposed input, each output as every explanation predicts it, and what they differ by."""
+    curves = proposed.curves
+    if curves is None:
+        raise ValueError("an experiment without its curves cannot be drawn")
+    names = list(curves.outputs)
+    kinds = [f"rival{place}" for place in range(len(names))]
+    item = model.inputs[0]
+    lines = [Line(curves.level, "input", held=True), *_limits(proposed, item.name, curves.time_min.size)]
+    drawing = plot(f"proposed {item.name}", curves.time_min, lines)
+    found = [Picture(f"{item.name}, {item.unit}", ((item.meaning, "input"), LIMITS), drawing)]
+    for output in model.outputs:
+        values = [curves.outputs[name][output.name] for name in names]
+        lines = [Line(column, kind) for column, kind in zip(values, kinds, strict=True)]
+        drawing = plot(
+            f"predicted {output.name}",
+            curves.time_min,
+            [*lines, *_limits(proposed, output.name, curves.time_min.size)],
+        )
+        legend = tuple(zip(names, kinds, strict=True))
+        found.append(Picture(f"{output.name}, {output.unit}, as predicted under each", (*legend, LIMITS), drawing))
+        lines = [Line(column - values[0], kind) for column, kind in zip(values[1:], kinds[1:], strict=True)]
+        drawing = plot(f"differences of predicted {output.name}", curves.time_min, lines)
+        title = f"{output.name}, {output.unit}, less what is predicted under {names[0]}"
+        found.append(Picture(title, legend[1:], drawing))
+    return found
+
+
+def _limits(proposed: Experiment, name: str, rows: int) -> list[Line]:
+    return [Line(np.full(rows, end), "limit") for end in proposed.limits[name]]
 
 
 def interval(cause: Cause, curves: Curves) -> tuple[Array, Array]:

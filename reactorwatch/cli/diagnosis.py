@@ -8,15 +8,17 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TypeAlias
 
 import msgspec
+import numpy as np
 
 from diagnosis.diagnose import diagnose
 from diagnosis.record_checks import run_of
 from diagnosis.report.machine import as_object, with_differences
 from diagnosis.report.page import as_page
 from diagnosis.report.plain import as_text
-from diagnosis.result import Diagnosis
+from diagnosis.result import Diagnosis, Experiment
 from diagnosis.uncertain import stated
 from reactorwatch.cli.diagnosis_drawing import write_drawing
 from reactorwatch.cli.progress import bar, task
@@ -25,6 +27,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.csv_file import write_csv
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 
@@ -33,6 +36,11 @@ PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "r
 
 PLANT = "cstr"
 """The process that the plant node simulates and the monitor watches."""
+
+EXPERIMENT = "experiment.csv"
+"""The proposed input, if there is one: it can drive a plant."""
+
+Limits: TypeAlias = dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -88,31 +96,33 @@ def cases(
     return found
 
 
-def results(found: Sequence[Case], tolerance: dict[str, float], *, as_json: bool) -> Iterator[str]:
+def results(found: Sequence[Case], tolerance: dict[str, float], limits: Limits, *, as_json: bool) -> Iterator[str]:
     """Diagnose one after the other, write its report if there is a folder for it, and yield what is to be said.
 
     Raises:
-        InputError: a tolerance that cannot be, or a folder that cannot be written to.
+        InputError: a tolerance or limits that cannot be, or a folder that cannot be written to.
     """
     if len(found) == 1:
         with task(f"diagnosing {found[0].file.name}"):
-            said = _result(found[0], tolerance, as_json=as_json)
+            said = _result(found[0], tolerance, limits, as_json=as_json)
         yield said
         return
     with bar("diagnosing", len(found)) as advance:
         for number, case in enumerate(found):
             advance(number, f"diagnosing {case.file.name}")
-            yield _result(case, tolerance, as_json=as_json)
+            yield _result(case, tolerance, limits, as_json=as_json)
 
 
-def diagnosed(case: Case, tolerance: dict[str, float] | None = None) -> tuple[Diagnosis, float]:
+def diagnosed(
+    case: Case, tolerance: dict[str, float] | None = None, limits: Limits | None = None
+) -> tuple[Diagnosis, float]:
     """The diagnosis of a record and the seconds that it took; its report is written if there is a folder for it.
 
     Raises:
         InputError: as `results`.
     """
     began = time.monotonic()
-    diagnosis = diagnose(case.measured, case.model, tolerance=tolerance, uncertain=case.uncertain)
+    diagnosis = diagnose(case.measured, case.model, None, tolerance, case.uncertain, limits)
     seconds = time.monotonic() - began
     if case.folder is not None:
         write_report(diagnosis, case, seconds)
@@ -120,7 +130,7 @@ def diagnosed(case: Case, tolerance: dict[str, float] | None = None) -> tuple[Di
 
 
 def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
-    """Write the four files of a report; each appears whole or not at all.
+    """Write the files of a report; each appears whole or not at all.
 
     Raises:
         InputError: the folder cannot be made or written to.
@@ -132,21 +142,36 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     except OSError as error:
         raise InputError(f"--out {folder}: the folder cannot be made: {error.strerror}") from error
     catalogue, on_the_bus = effects_of(case.model), case.model.name == PLANT
-    page = as_page(diagnosis, case.model, catalogue, str(case.file), str(folder / MODEL), on_the_bus=on_the_bus)
+    files = (str(case.file), str(folder / MODEL), str(folder / EXPERIMENT))
+    page = as_page(diagnosis, case.model, catalogue, *files, on_the_bus=on_the_bus)
     plain = msgspec.json.format(msgspec.json.encode(with_differences(diagnosis, str(case.file), seconds)), indent=2)
     write_extended_model(folder / MODEL, diagnosis.extended_model)
+    _write_experiment(diagnosis.experiment, folder / EXPERIMENT)
     write_drawing(diagnosis, case.model, case.measured, folder / DRAWING)
     for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):
         with replacing(folder / name) as temporary:
             temporary.write_bytes(content)
 
 
-def _result(case: Case, tolerance: dict[str, float], *, as_json: bool) -> str:
-    diagnosis, seconds = diagnosed(case, tolerance)
+def _write_experiment(experiment: Experiment | None, path: Path) -> None:
+    """The level from each change on, and at the end; one of an earlier report goes."""
+    if experiment is None:
+        path.unlink(missing_ok=True)
+        return
+    time_min, level = np.array([*experiment.input, (experiment.span_min, experiment.input[-1][1])]).T
+    write_csv(path, Record(time_min, {experiment.signal: level}, path.name))
+
+
+def _result(case: Case, tolerance: dict[str, float], limits: Limits, *, as_json: bool) -> str:
+    diagnosis, seconds = diagnosed(case, tolerance, limits)
     if as_json:
         return msgspec.json.encode(as_object(diagnosis, str(case.file), seconds)).decode()
     said = as_text(diagnosis, str(case.file), effects_of(case.model))
-    return said if case.folder is None else f"{said}\n  report      {case.folder / PAGE}"
+    if case.folder is None:
+        return said
+    if diagnosis.experiment is not None:
+        said += f"\n  input       {case.folder / EXPERIMENT}"
+    return f"{said}\n  report      {case.folder / PAGE}"
 
 
 def _folders(files: Sequence[Path], out: Path | None) -> list[Path | None]:

@@ -58,7 +58,8 @@ def plant(
     scenario: Annotated[
         str | None,
         typer.Option(
-            help="The input: random-steps, sines, square, constant or file [random-steps].", show_default=False
+            help="The input: random-steps, sines, square, constant or a .csv record [random-steps].",
+            show_default=False,
         ),
     ] = None,
     fault: Annotated[

@@ -64,6 +64,25 @@ def tolerances(text: str | None) -> dict[str, float]:
     return found
 
 
+def limits(text: str | None) -> dict[str, tuple[float, float]]:
+    """The lowest and highest values that an experiment may lead to, by signal, from `qc=85..115,T=425..455`.
+
+    Raises:
+        InputError: not such a text.
+    """
+    found = {}
+    for part in text.split(",") if text is not None else ():
+        signal, _, ends = (item.strip() for item in part.partition("="))
+        low, _, high = ends.partition("..")
+        try:
+            found[signal] = (float(low), float(high))
+        except ValueError:
+            raise InputError(
+                f"--limits must be signal=lowest..highest, such as qc=85..115,T=425..455, got {part!r}"
+            ) from None
+    return found
+
+
 def pace(text: str | None, option: str) -> float | None:
     """A speed or a rate: a positive number, or `max` for as fast as it goes.
 

@@ -14,6 +14,7 @@ from reactorwatch.cli.options import (
     columns,
     existing,
     existing_recording,
+    limits,
     new_file,
     tolerances,
 )
@@ -104,6 +105,14 @@ def diagnose(
             show_default=False,
         ),
     ] = None,
+    limit: Annotated[
+        str | None,
+        typer.Option(
+            "--limits",
+            help="What a proposed experiment keeps to, such as qc=85..115,T=425..455 [a little beyond the record].",
+            show_default=False,
+        ),
+    ] = None,
     model: Model = None,
     plant: Plant = None,
     column: Columns = None,
@@ -112,7 +121,7 @@ def diagnose(
     """Say what the simulation gets wrong, and why."""
     from reactorwatch.cli.diagnosis import cases, results
 
-    accepted = tolerances(tolerance)
+    accepted, kept = tolerances(tolerance), limits(limit)
     found = cases([existing_recording(file) for file in files], plant, columns(column), model, out, uncertain)
-    for said in results(found, accepted, as_json=as_json):
+    for said in results(found, accepted, kept, as_json=as_json):
         typer.echo(said)

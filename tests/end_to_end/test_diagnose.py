@@ -150,6 +150,51 @@ def test_one_bad_file_among_several_is_told_before_anything_is_said_or_written(f
     assert not (folder / "nothing").exists()
 
 
+def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, command: Command) -> None:
+    narrow = PlantConfig(
+        seed=2,
+        faults=("heat_loss:constant:0.02",),
+        scenario={"kind": "random-steps", "low": 102.41, "high": 104.41},
+    )
+    write_csv(tmp_path / "narrow.csv", simulate_record(narrow, 1200))
+    limits = ["--limits", "qc=97..110,T=425..455"]
+    done = command("diagnose", "narrow.csv", "--json", "-o", "report", *limits, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    listed = [item["causes"] for item in found["alternatives"]]
+    said = found["experiment"]
+    assert len(listed) >= 1
+    assert set(said["separates"]) == {item["cause"] for causes in [found["causes"], *listed] for item in causes}
+    assert said["limits"]["qc"] == [97.0, 110.0]
+    assert all(97.0 <= level <= 110.0 for _, level in said["input"])
+    rows = round(said["span_min"] / 0.1)
+    driven = simulate_record(PlantConfig(scenario=str(tmp_path / "report" / "experiment.csv")), rows)
+    times, levels = np.array(said["input"]).T
+    expected = levels[np.searchsorted(times, driven.time_min + 1e-6, side="right") - 1]
+    np.testing.assert_array_equal(driven.columns["qc"], expected)
+
+    write_csv(tmp_path / "right.csv", simulate_record(PlantConfig(seed=6), 600))
+    again = command("diagnose", "right.csv", "-o", "report", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    assert not (tmp_path / "report" / "experiment.csv").exists()  # that of the earlier report
+
+
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [
+        ("qc=85..x", "--limits must be signal=lowest..highest, such as qc=85..115,T=425..455, got 'qc=85..x'"),
+        ("qc=85", "--limits must be signal=lowest..highest, such as qc=85..115,T=425..455, got 'qc=85'"),
+        ("p=1..2", "limits must be of qc, C, T, got p"),
+        ("T=455..425", "limits of T must be two rising numbers, got 455..425"),
+        ("qc=85..900", "limits of qc must be within 0..500 l/min, got 85..900"),
+    ],
+)
+def test_limits_that_cannot_be_are_told_in_a_line(folder: Path, command: Command, limits: str, said: str) -> None:
+    done = command("diagnose", "leak.csv", "-o", "nothing", "--limits", limits, cwd=folder)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", f"reactorwatch: {said}\n")
+    assert not (folder / "nothing").exists()
+
+
 def test_the_drawing_has_both_models_on_one_timeline(
     said: subprocess.CompletedProcess[str], folder: Path, known: Diagnosis
 ) -> None:

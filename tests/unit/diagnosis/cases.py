@@ -6,7 +6,19 @@ from math import nan
 import numpy as np
 
 from diagnosis.difference import difference
-from diagnosis.result import Adjusted, Alternative, Cause, Curves, Diagnosis, Estimate, Experiment, Gain, HeldOut
+from diagnosis.result import (
+    Adjusted,
+    Alternative,
+    Apart,
+    Cause,
+    Curves,
+    Diagnosis,
+    Estimate,
+    Experiment,
+    ExperimentCurves,
+    Gain,
+    HeldOut,
+)
 from reactorwatch.process.model import Array
 
 ROWS = 2000
@@ -38,7 +50,29 @@ CURVE = Cause(
         "value_2": Estimate(1.0, 0.0, "1"),
     },
 )
-EXPERIMENT = Experiment("Wider steps of qc tell both apart.", ((0.0, 103.4), (10.0, 90.0)), ("coolant_flow",), 42.0)
+EXPERIMENT = Experiment(
+    why="Wider steps of qc tell both apart.",
+    input=((0.0, 103.4), (10.0, 90.0)),
+    separates=("coolant_flow", "feed_temperature"),
+    expected_delta_bic=42.0,
+    probability=0.994,
+    signal="qc",
+    span_min=20.0,
+    limits={"qc": (85.0, 115.0), "C": (0.05, 0.2), "T": (425.0, 455.0)},
+    apart=(Apart(("coolant_flow", "feed_temperature"), 42.0, 0.994),),
+    predicted={
+        "coolant_flow": {"C": (0.06, 0.1), "T": (438.5, 448.7)},
+        "feed_temperature": {"C": (0.06, 0.11), "T": (438.4, 448.8)},
+    },
+    curves=ExperimentCurves(
+        np.linspace(0.0, 19.9, 200),
+        np.repeat([103.4, 90.0], 100),
+        {
+            name: {"C": np.linspace(0.1, 0.06, 200), "T": np.linspace(438.5, 448.7 + off, 200)}
+            for name, off in (("coolant_flow", 0.0), ("feed_temperature", 0.1))
+        },
+    ),
+)
 
 
 def curves(causes: Sequence[Cause], seed: int = 1) -> Curves:

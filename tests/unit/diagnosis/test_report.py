@@ -73,7 +73,13 @@ def test_what_stands_in_the_page_from_outside_is_escaped(case: str) -> None:
             ["coolant leak", "-0.04996 ± 0.00017", "What it gains", "A closer look", "209,025.5", 'class="added"'],
         ),
         ("pair", ["drift of the temperature sensor", "Please note", "<msub><mi>m</mi><mn>2</mn></msub>"]),
-        ("ambiguous", ["The experiment that would decide", "Wider steps", "ran away", "3.2"]),
+        (
+            "ambiguous",
+            [
+                *("The experiment that would decide", "Wider steps", "ran away", "3.2", "42.0", "over 99 %"),
+                *("as predicted under each", "reactorwatch plant --scenario experiment.csv --duration 20"),
+            ],
+        ),
         ("unknown", ["no known cause explains it", "in the energy balance"]),
     ],
 )

@@ -97,7 +97,17 @@ def test_the_object_holds_what_was_found() -> None:
     assert said["experiment"] == {
         "why": "Wider steps of qc tell both apart.",
         "input": [[0.0, 103.4], [10.0, 90.0]],
-        "separates": ["coolant_flow"],
+        "separates": ["coolant_flow", "feed_temperature"],
+        "signal": "qc",
+        "span_min": 20.0,
+        "expected_delta_bic": 42.0,
+        "probability": 0.994,
+        "limits": {"qc": [85.0, 115.0], "C": [0.05, 0.2], "T": [425.0, 455.0]},
+        "expected": [{"between": ["coolant_flow", "feed_temperature"], "delta_bic": 42.0, "probability": 0.994}],
+        "predicted": {
+            "coolant_flow": {"C": [0.06, 0.1], "T": [438.5, 448.7]},
+            "feed_temperature": {"C": [0.06, 0.11], "T": [438.4, 448.8]},
+        },
     }
     assert said["adequacy"]["T"] == {"minus_log10_p": 0.35}
 

@@ -1,0 +1,65 @@
+"""A tank that is linear in everything, so that what an experiment tells is known in closed form."""
+
+from math import exp
+
+import casadi as ca
+import numpy as np
+
+from diagnosis.courses import Constant
+from diagnosis.hypothesis import Hypothesis
+from diagnosis.run import Run
+from diagnosis.search import Explained
+from diagnosis.sized import Sized
+from diagnosis.wandering import Noise
+from reactorwatch.process.effects.base import Effect, ParameterEffect, ParameterShift
+from reactorwatch.process.model import Array, Output, ProcessModel, new_clock, parameter, variable
+
+RATE, PERIOD_MIN, NOISE_SD = 0.5, 0.1, 0.2
+"""1/min, min, and m."""
+
+NOISE = Noise((NOISE_SD,), (0.0,))
+
+
+def tank() -> ProcessModel:
+    """dh/dt = RATE (gain u + shift - h)."""
+    h = variable("h", "m", (-100.0, 100.0), 1.0, "level")
+    u = variable("u", "m", (0.0, 20.0), 1.0, "what the level tends to")
+    gain = parameter("gain", 1.0, "1", (0.0, 10.0), "of the input")
+    shift = parameter("shift", 0.0, "m", (-10.0, 10.0), "of the input")
+    rhs = RATE * (gain.symbol * u.symbol + shift.symbol - h.symbol)
+    return ProcessModel(
+        "tank", (h,), (u,), (gain, shift), (ca.SX(rhs),), (Output("h", "m", h.symbol),), clock=new_clock()
+    )
+
+
+class Gain(ParameterEffect):
+    """Gain (1 + m)."""
+
+    name, label, location, unit, lower, upper, typical = "gain", "wrong gain", "feed", "1", -0.9, 5.0, 0.1
+    parameter = "gain"
+
+
+class Shift(ParameterShift):
+    """Shift + m."""
+
+    name, label, location, unit, lower, upper, typical = "shift", "wrong shift", "feed", "m", -10.0, 10.0, 0.1
+    parameter = "shift"
+
+
+def explained(effect: Effect, size: float, run: Run) -> Explained:
+    """A hypothesis of one effect that is there all the time."""
+    hypothesis = Hypothesis(Sized(tank(), (effect,), NOISE), (Constant(run.time_min),))
+    return Explained(hypothesis, hypothesis.at(run, [np.array([size])]), 0.0)
+
+
+def record(u: Array) -> Run:
+    """What a tank without fault shows, without noise."""
+    return Run(PERIOD_MIN * np.arange(u.size, dtype=np.float64), u[:, None], follows(u, u[0])[:, None])
+
+
+def follows(u: Array, start: float) -> Array:
+    """The level, row by row: an input held for a period is approached exponentially."""
+    kept, h = exp(-RATE * PERIOD_MIN), [start]
+    for held in u[:-1].tolist():
+        h.append(kept * h[-1] + (1.0 - kept) * held)
+    return np.array(h)
