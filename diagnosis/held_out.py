@@ -1,9 +1,9 @@
 """The gain, measured on rows that the fit did not see.
 
-Every `EVERY`-th block of `BLOCK_MIN` is held out: the numbers of the best hypothesis are fitted again without what was
-measured there, and then both models run freely through the whole record, from where the filter has found them after
-`OBSERVED_ROWS`, driven by the inputs alone. Blocks, and not the end of the record, because a deviation that sets in
-late would otherwise never be both learned and tested.
+Every `EVERY`-th block of `BLOCK_MIN` is held out, or of less in a short record: the numbers of the best hypothesis are
+fitted again without what was measured there, and then both models run freely through the whole record, from where the
+filter has found them after `OBSERVED_ROWS`, driven by the inputs alone. Blocks, and not the end of the record, because
+a deviation that sets in late would otherwise never be both learned and tested.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,9 @@ from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
 
-EVERY, BLOCK_MIN = 4, 10.0
+EVERY, BLOCK_MIN, FEWEST_BLOCKS = 4, 10.0, 7.5
+"""Blocks are shorter in a record that has fewer of them; the second one held out is then over before its end."""
+
 OBSERVED_ROWS = 100
 WAKE_ROWS = 30
 """After a break in what is known of the inputs, so many rows are not judged: the plant itself was driven otherwise."""
@@ -40,7 +42,8 @@ class Errors(NamedTuple):
 
 def held_out_rows(run: Run) -> Array:
     """Which rows are held out, shape (rows,)."""
-    block = np.floor((run.time_min - run.time_min[0]) / BLOCK_MIN)
+    block_min = min(BLOCK_MIN, run.span_min / FEWEST_BLOCKS)
+    block = np.floor((run.time_min - run.time_min[0]) / block_min)
     found = block % EVERY == EVERY - 1
     found[:OBSERVED_ROWS] = False
     calm = found.copy()

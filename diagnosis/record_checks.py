@@ -3,6 +3,7 @@
 import numpy as np
 
 from diagnosis.run import Run
+from diagnosis.units import check_units
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
@@ -10,6 +11,9 @@ from reactorwatch.records.record import Record
 FEWEST_ROWS = 200
 FEWEST_VALUES = 100
 """Of an output: with less nothing can be told from noise."""
+
+LEAST_MOVE = 1e-3
+"""Of an input, in its scales: less is no excitation."""
 
 
 _OFF_GRID, _REGULAR = 0.05, 0.95
@@ -39,7 +43,10 @@ def run_of(record: Record, model: ProcessModel) -> Run:
         values = record.columns[output.name]
         known = values[np.isfinite(values)]
         if known.size < FEWEST_VALUES:
-            raise InputError(f"{name}: {output.name} needs at least {FEWEST_VALUES} values, got {known.size}")
+            raise InputError(
+                f"{name}: {output.name} needs at least {FEWEST_VALUES} values, got {known.size}; "
+                "is the column the right one, and is the sensor recorded?"
+            )
         if np.ptp(known) == 0.0:
             raise InputError(
                 f"{name}: {output.name} must vary, it is {known[0]:g} {output.unit} in every row; "
@@ -52,17 +59,21 @@ def run_of(record: Record, model: ProcessModel) -> Run:
     for item in model.inputs:
         values = _held(record.columns[item.name])
         if not np.all(np.isfinite(values)):
-            raise InputError(f"{name}: {item.name} must be there in the first row")
+            raise InputError(
+                f"{name}: {item.name} must be there in the first row; leave out the rows before its first value"
+            )
         _check_bounds(name, item.name, item.unit, values, item.lower, item.upper)
         inputs.append(values)
-    if all(np.ptp(values) == 0.0 for values in inputs):
+    if all(np.ptp(values) <= LEAST_MOVE * item.scale for values, item in zip(inputs, model.inputs, strict=True)):
         raise InputError(
-            f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} in every row; "
+            f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} all the time; "
             "nothing can be told apart without excitation: record a stretch with steps in it"
         )
     known = np.column_stack([np.isfinite(record.columns[item.name]) for item in model.inputs])
     u = np.column_stack(inputs)
-    return Run(record.time_min, u, np.column_stack(outputs), _breaks(record.time_min, u, known))
+    run = Run(record.time_min, u, np.column_stack(outputs), _breaks(record.time_min, u, known))
+    check_units(name, run, model)
+    return run
 
 
 def _check_bounds(name: str, signal: str, unit: str, values: np.ndarray, lower: float, upper: float) -> None:

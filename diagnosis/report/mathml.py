@@ -92,7 +92,9 @@ class _Writer:
         kept = self.text(now.dep(old), now.dep(old), _SUM if old == 0 or sign == "+" else _PRODUCT)
         term = _Writer(ca.SX())._plain(now.dep(1 - old), (None, None), _SUM if sign == "+" else _PRODUCT)
         if old == 0:
-            return _within(f"{kept}{marked(f'<mo>{sign}</mo>{term}')}", _SUM, binds)
+            # at the beginning of its row it would be taken for a sign, and drawn without a space
+            new = marked(f'<mo form="infix">{sign}</mo>{term}')
+            return _within(f"{kept}{new}", _SUM, binds)
         return _within(f"{marked(term)}<mo>{sign}</mo>{kept}", _SUM, binds)
 
     def _plain(self, now: ca.SX, before: tuple[ca.SX | None, ...], binds: int) -> str:

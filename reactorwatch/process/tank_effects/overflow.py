@@ -38,7 +38,7 @@ class Overflow(Effect):
             ValueError: the model lacks a state x1 or x2, or a parameter k1 or k2.
         """
         above = model.states[model.state_index("x1")].symbol - BRIM_V
-        over = size * 0.5 * (above + ca.sqrt(above**2 + SOFT_V**2))
+        twice = above + ca.sqrt(above**2 + SOFT_V**2)
         # k1 and k2 are of one flow over the cross-section of either tank.
         widths = model.parameter("k2").symbol / model.parameter("k1").symbol
-        return model.added_to("x1", -over).added_to("x2", INTO_THE_LOWER * widths * over)
+        return model.added_to("x1", -0.5 * size * twice).added_to("x2", 0.5 * INTO_THE_LOWER * size * widths * twice)

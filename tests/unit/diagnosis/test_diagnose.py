@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from diagnosis.diagnose import diagnose
+from diagnosis.record_checks import run_of
 from diagnosis.result import NAMED, NOMINAL, UNKNOWN
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
@@ -96,3 +97,43 @@ def test_what_cannot_be_diagnosed_is_said_in_a_line(spoil: Callable[[Record], Re
 def test_a_tolerance_has_to_be_of_an_output_and_positive(tolerance: dict[str, float], said: str) -> None:
     with pytest.raises(InputError, match=said):
         diagnose(record_of(rows=400), cstr(), tolerance=tolerance)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lambda r: changed(r, qc=0.06 * r.columns["qc"]), r"qc must be in l/min; .* times 16\.67 it would"),
+        (lambda r: changed(r, qc=r.columns["qc"] / 1000), r"qc must be in l/min; .* times 1000 it would"),
+        (lambda r: changed(r, T=1.8 * r.columns["T"] - 459.67), "T must be in K; .* taken as degrees F it would"),
+        (lambda r: replace(r, time_min=60 * r.time_min), "they are 6 min apart, .*; check the unit of the times"),
+        (lambda r: replace(r, time_min=r.time_min / 60), "it lasts 0.665 min; check the unit of the times"),
+        (lambda r: changed(r, qc=np.where(np.arange(r.rows) == 9, 100.0, 100.0 + 1e-6)), "qc must move"),
+        (lambda r: changed(r, C=-r.columns["C"]), r"C must be in \[0, 2\] mol/l"),
+        (
+            lambda r: changed(r, qc=np.where(r.time_min < 1, np.nan, r.columns["qc"])),
+            "qc must be there in the first row",
+        ),
+    ],
+)
+def test_another_unit_is_said_with_its_cure(spoil: Callable[[Record], Record], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        diagnose(spoil(record_of(rows=400)), cstr())
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        "heat_transfer:constant:-0.4",
+        "feed_concentration:constant:-0.3",
+        "coolant_temperature:constant:25",
+        "temperature_bias:constant:15",
+        "reaction_rate:constant:-0.5",
+    ],
+)
+def test_a_gross_cause_is_not_taken_for_a_wrong_unit(fault: str) -> None:
+    run_of(record_of(fault, rows=400), cstr())
+
+
+def test_a_short_record_has_rows_held_out_too() -> None:
+    found = diagnose(record_of(rows=220), cstr())
+    assert found.gain.held_out["T"].rmse_before == pytest.approx(0.3, rel=0.4)
