@@ -6,6 +6,7 @@
 - `signatures`: what it does to a filter's innovations, linearised, of all causes at once.
 - `hypothesis`: effects with courses, fitted to a run.
 - `screen`: which hypotheses are worth fitting; `search`: the best of them, and its rivals.
+- `unknown`: where something acts that no hypothesis has; `forcing`, `forcing_filter`: what it does there.
 - `held_out`, `adequacy`: what was gained, and whether anything is left.
 - `result`: what is said in the end.
 

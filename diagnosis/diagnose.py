@@ -1,6 +1,7 @@
 """From a record and a model to what is wrong with the simulation."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import sqrt
 
 import numpy as np
@@ -33,7 +34,7 @@ from diagnosis.rough_numbers import settled
 from diagnosis.run import Run
 from diagnosis.search import Explained, Found, Search
 from diagnosis.uncertain import with_uncertain
-from diagnosis.unknown import unknown
+from diagnosis.unknown import MARGIN, Located, bic_of, located
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.effects.base import TIMING, Effect
@@ -45,6 +46,13 @@ LEAST_GAIN = 10.0
 
 SURE = 6.0
 """In BIC, odds of twenty to one: where a rival is worse by less, the record does not rank them."""
+
+DOUBTFUL = 3.0
+"""Minus the decimal logarithm of the p-value that what is left is white, beyond which it is asked whether something
+unknown explains the run better."""
+
+NOISY_SHARE = 0.003
+"""Of a state's scale per square root of a minute: a cause that leaves the process so noisy may not be all there is."""
 
 NEARLY = 1.15
 """Times the noise: a free run that errs no more explains what matters, though something is left."""
@@ -93,16 +101,16 @@ def diagnose(
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict, location = _verdict(found, best), best.hypothesis.sized.effects[0].location if best.key else ""
     remarks: list[str] = []
-    if np.any(adequacy >= WHITE):
-        strange = unknown(search, best, effects)
-        best.hypothesis.sized.noise = found.noise
-        if strange is None and best.key and _nearly_explained(found, gained(run, found.nominal, best)[1]):
+    strange: Located | None = None
+    if np.any(adequacy >= DOUBTFUL) or (best.key and _seems_noisy(found, model)):
+        strange = located(model, effects, run, found.nominal.fit, found.own_noise)
+        if _is_unknown(strange, found, best, run, bool(np.any(adequacy >= WHITE))):
+            verdict, best = UNKNOWN, found.nominal  # what is not explained is not extended
+            location = strange.effect.location if strange is not None else location
+        elif np.any(adequacy >= WHITE):
             remarks.append(
                 "what is left is small, but not white: the course in time may be rougher than what was fitted"
             )
-        else:
-            verdict, best = UNKNOWN, found.nominal  # what is not explained is not extended
-            location = strange.hypothesis.sized.effects[0].location if strange is not None else location
     best.hypothesis.sized.noise, found.nominal.hypothesis.sized.noise = found.noise, found.own_noise
     best, covariances = _with_rough_numbers(search, best)
     before, after = gained(run, found.nominal, best)
@@ -114,6 +122,8 @@ def diagnose(
             "of the record's own making, or timing of its input"
         )
     curves = _curves(run, model, found.nominal, best, covariances)
+    if verdict == UNKNOWN and strange is not None and strange.effect.location == location:
+        curves = replace(curves, unknown=strange.course)
     causes = tuple(_causes(best, covariances))
     parameters = _parameters(run, model, uncertain or {}, best)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
@@ -140,6 +150,20 @@ def diagnose(
         parameters=parameters,
         curves=curves,
     )
+
+
+def _is_unknown(strange: Located | None, found: Found, best: Explained, run: Run, something_left: bool) -> bool:
+    """Whether what is named or nominal does not explain the run, but something else would."""
+    better = strange is not None and strange.bic < bic_of(best, strange.known, run) - MARGIN
+    if something_left:
+        return better or not best.key or not _nearly_explained(found, gained(run, found.nominal, best)[1])
+    return better and bool(best.key)
+
+
+def _seems_noisy(found: Found, model: ProcessModel) -> bool:
+    """Whether with the best hypothesis much still moves the states that is not in the model."""
+    shares = (sd / state.scale for sd, state in zip(found.noise.process_sd, model.states, strict=True))
+    return max(shares) > NOISY_SHARE
 
 
 def _nearly_explained(found: Found, after: Errors) -> bool:

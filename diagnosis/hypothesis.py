@@ -32,7 +32,7 @@ _RUNAWAY = 1e100
 """A filter that lost an unstable plant has signatures without bound, and no step makes sense."""
 
 _SHARE = 0.02
-_SCANS = ((2.0, 24), (1.06, 9), (1.015, 7))  # how far to either side, and how many
+_SCANS = ((4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
 _WIDENINGS, _WIDER = 10, 2.0
 _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 5, 1e-3, 10.0, 0.1
 

@@ -172,6 +172,21 @@ class Experiment:
 
 
 @dataclass(frozen=True, eq=False)
+class UnknownCourse:
+    """How something that has no name goes in time, told as the size of an effect that pushes at the same place.
+
+    Attributes:
+        label: what a person calls that effect.
+        unit: of its size.
+        size: m(t), shape (rows,).
+    """
+
+    label: str
+    unit: str
+    size: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Curves:
     """What the pictures of a diagnosis are drawn from; all over the rows of the record.
 
@@ -185,6 +200,7 @@ class Curves:
         residual_after: those of the extended one's.
         deviation: m(t) of each cause, by its name.
         deviation_sd: its standard deviation.
+        unknown: what acts where nothing has a name; None: no such.
     """
 
     time_min: Array
@@ -196,6 +212,7 @@ class Curves:
     residual_after: dict[str, Array]
     deviation: dict[str, Array]
     deviation_sd: dict[str, Array]
+    unknown: UnknownCourse | None = None
 
 
 @dataclass(frozen=True)

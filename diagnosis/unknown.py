@@ -1,170 +1,188 @@
-"""What no cause of the catalogue explains, but acts somewhere.
+"""What no cause of the catalogue explains, but acts somewhere: where?
 
-An unknown effect at a place is one of the catalogue's effects there whose size is no course in time but any smooth
-function of where the plant is: of a few low powers of states and inputs, and of a free curve. Which of these terms it
-needs is selected forwards, by BIC, on the linear equations of the filter's errors, and what was selected is fitted like
-any other hypothesis. So an unknown is compared with the catalogue by the same likelihood; as it may bend more, it has
-to be better by `MARGIN`. It can be located, and what it does in this record described; it is no model for another day.
+Each place is known by the effects of the catalogue that act there, and a balance by what is lost from it
+(`balance_loss`): how these push states and outputs is how anything else at that place would. So each is let go its own
+way, as a forcing of unknown course (`forcing`), and the place whose forcing explains the run best is where it acts. All
+are compared by the same likelihood, with as many numbers to choose.
+
+First each is tried at a few levels about the path of the nominal filter; of the most promising places the best is then
+given the levels that suit it, and its own path, in rounds.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from dataclasses import dataclass, replace
+from itertools import product
 from math import log
 
 import numpy as np
+from numpy.typing import NDArray
 
-from diagnosis import signatures
-from diagnosis.courses import Course, Free, Signal
-from diagnosis.hypothesis import Hypothesis
+from diagnosis.balance_loss import balance_losses
+from diagnosis.courses import Signal
+from diagnosis.forcing import Fitted, Forcing, Levels, Linearised, Reference
+from diagnosis.hypothesis import Fit
+from diagnosis.result import UnknownCourse
 from diagnosis.run import Run
-from diagnosis.search import Explained, Search
+from diagnosis.search import Explained
+from diagnosis.sized import loss_of
 from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.model import Array
+from reactorwatch.process.filter import LEAST_PROCESS_SD, NoiseLevels
+from reactorwatch.process.model import ProcessModel
 
 MARGIN = 25.0
-"""In BIC, over the best of the catalogue."""
+"""In BIC, over the best of the catalogue: a forcing may bend more."""
 
-MOST_TERMS = 6
-LEAST_TERM_GAIN = 6.0
-"""In BIC, of a further term."""
+FIRST_REDS, FIRST_LASTS_MIN = (0.001, 0.03, 0.3, 3.0), (0.4, 3.0, 20.0)
+"""Levels that are tried first: red noise in typical sizes of the effect, and how long it lasts."""
 
-KNOTS, POWERS = 8, 2
-PLACES = 3
-"""How many of the most promising carriers are fitted."""
+PLACES, FINALISTS = 5, 3
+"""How many places are looked at more closely, and how many of them to the end."""
 
-ROUNDS = 3
+ROUNDS = 2
+"""Of new paths for finalists."""
 
+NUMBERS = 3
+"""That a forcing has to choose beside the sensors' noise: how large its function and its red noise are, how long."""
 
-class Terms(Course):
-    """A sum of given signals.
+LEAST_PROCESS_SHARE = 100.0 * LEAST_PROCESS_SD
+"""Of a state's scale: what a path about which all is linear cannot say better."""
 
-    Args:
-        time_min: of the rows.
-        signals: of the terms, shape (rows, terms).
-        labels: of the terms.
-    """
+FAR_OFF = 6.0
+"""Standard deviations of the nominal filter beyond which a value is an outlier."""
 
-    name = "terms"
-
-    def __init__(self, time_min: Array, signals: Signal, labels: Sequence[str]) -> None:
-        super().__init__(time_min)
-        self._signals, self.labels = signals, tuple(labels)
-        self.coefficients = len(self.labels)
-
-    def functions(self, shape: Array) -> tuple[Array, Array]:
-        """See `Course`."""
-        area = np.cumsum(self._signals.over_row[:-1] * np.diff(self.time_min)[:, None], axis=0)
-        return self._signals.at_row, np.concatenate([np.zeros((1, self.coefficients)), area])
-
-    def parameters(self, theta: Array) -> dict[str, float]:
-        """See `Course`. The size is the root mean square."""
-        signal = self.signal(theta)
-        found = {"size": float(np.sqrt(np.mean(signal.at_row**2)))}
-        return found | dict(zip(self.labels, theta.tolist(), strict=True))
-
-    def _coefficients_limited(self, by: Array, lower: float, upper: float) -> Array:
-        return by
+_REDS, _LASTS_MIN, _MOST_CHANGE = (1e-4, 30.0), (0.15, 300.0), 2.0
+_COARSE, _FINE, _OF_SENSORS = 1.0, 0.5, 0.1  # steps of logarithms
 
 
 @dataclass(frozen=True, eq=False)
-class _Selection:
-    """The terms that an unknown effect at the place of a catalogue's effect needs."""
+class Located:
+    """An effect at a place, that has no name.
+
+    Attributes:
+        effect: of the catalogue, or a loss from a balance, that pushes as it does.
+        bic: as of a hypothesis with these numbers.
+        size: of the effect, along the record.
+        known: which values count in the BIC, shape (rows, n_y).
+    """
 
     effect: Effect
-    course: Terms
-    theta: Array
-    score: float
+    bic: float
+    size: Signal
+    known: NDArray[np.bool_]
+
+    @property
+    def course(self) -> UnknownCourse:
+        """For people."""
+        return UnknownCourse(self.effect.label, self.effect.unit, self.size.at_row)
 
 
-def unknown(search: Search, best: Explained, effects: Sequence[Effect]) -> Explained | None:
-    """The best unknown effect, if it explains the run better than the best of the catalogue by `MARGIN`.
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A forcing as far as it has been fitted."""
+
+    forcing: Forcing
+    reference: Reference
+    fitted: Fitted
+    size: Signal
+
+
+def located(
+    model: ProcessModel, effects: Sequence[Effect], run: Run, nominal: Fit, noise: NoiseLevels
+) -> Located | None:
+    """Where an effect acts that nothing explains; None if the run says nothing of it.
 
     Args:
-        search: of the run.
-        best: of the catalogue, or the nominal one; with the noise that it needs.
+        model: of the plant.
         effects: the catalogue.
+        run: the record.
+        nominal: the filter's run without any effect.
+        noise: that it took.
     """
-    found: Explained | None = None
-    from_here = search.nominal()
+    own = model.state_names
+    carriers = [effect for effect in (*effects, *balance_losses(model)) if effect.extend(model).state_names == own]
+    reference = _reference(model, run, nominal)
+    first = [_first(Forcing(model, effect), reference, run, noise) for effect in carriers]
+    places = _best_of_places(first)[:PLACES]
+    closer = _best_of_places([_closer(model, run, item, _COARSE) for item in places])[:FINALISTS]
     for _ in range(ROUNDS):
-        chosen = _selected(search, from_here, effects)[:PLACES]
-        fits = [search.fit(Hypothesis(search.sized((item.effect,)), (item.course,)), (item.theta,)) for item in chosen]
-        if found is not None:
-            fits.append(search.refitted(found))
-        if not fits:
-            break
-        again, found = found, min(fits, key=lambda item: item.bic)
-        if again is not None and found.hypothesis is again.hypothesis:
-            break
-        search.settle(found)
-        from_here = found = search.refitted(found)
-    return found if found is not None and found.bic < best.bic - MARGIN else None
+        closer = _best_of_places([_closer(model, run, item, _FINE) for item in closer])
+    best = closer[0]
+    if not np.isfinite(best.fitted.loss):
+        return None
+    bic = 2.0 * best.fitted.loss + NUMBERS * log(run.values)
+    return Located(best.forcing.effect, bic, best.size, reference.known)
 
 
-def _selected(search: Search, about: Explained, effects: Sequence[Effect]) -> list[_Selection]:
-    """For each carrier the terms that explain most, the most promising first."""
-    run, screen = search.run, search.screen
-    library, labels = _library(run, about)
-    found = []
-    with np.errstate(over="ignore", invalid="ignore"):
-        ways = screen.ways_of_all(about.hypothesis, about.fit, replaced=range(len(about.hypothesis.courses)))
-        for place, effect in enumerate(screen.direct):
-            if effect not in effects:
-                continue
-            g = signatures.shown(ways, place, library.over_row[1:-1], library.at_row[2:])
-            g = g.reshape(-1, len(labels))
-            picked, theta, gain = _forwards(g.T @ g, g.T @ ways.w.ravel(), log(run.values))
-            if picked:
-                signals = Signal(library.over_row[:, picked], library.at_row[:, picked])
-                course = Terms(run.time_min, signals, [labels[item] for item in picked])
-                found.append(_Selection(effect, course, theta, gain - len(picked) * log(run.values)))
-    return sorted(found, key=lambda item: -item.score)
+def bic_of(explained: Explained, known: NDArray[np.bool_], run: Run) -> float:
+    """Of a hypothesis of the catalogue, by some of the values alone."""
+    w, sd = explained.fit.w, explained.fit.found.conditional_sd
+    counted = known & np.isfinite(w) & np.isfinite(sd)
+    logs = float(np.sum(np.log(np.where(counted, sd, 1.0))))
+    return 2.0 * (loss_of(np.where(counted, w, 0.0)) + logs) + explained.hypothesis.freedom * log(run.values)
 
 
-def _forwards(gram: Array, by: Array, price: float) -> tuple[list[int], Array, float]:
-    """Terms, each of which gains the most that is left; their coefficients; twice the gain in log likelihood."""
-    picked: list[int] = []
-    theta, gain = np.empty(0), 0.0
-    if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(by))):
-        return picked, theta, gain
-    while len(picked) < MOST_TERMS:
-        best, best_gain = -1, gain + price + LEAST_TERM_GAIN
-        for term in range(by.size):
-            if term not in picked:
-                chosen = [*picked, term]
-                a = by[chosen]
-                value = float(a @ np.linalg.lstsq(gram[np.ix_(chosen, chosen)], a, rcond=1e-10)[0])
-                if value > best_gain:
-                    best, best_gain = term, value
-        if best < 0:
-            break
-        picked.append(best)
-        gain = best_gain
-        theta = np.asarray(np.linalg.lstsq(gram[np.ix_(picked, picked)], by[picked], rcond=1e-10)[0])
-    return picked, theta, gain
+def _reference(model: ProcessModel, run: Run, nominal: Fit) -> Reference:
+    """The path of the nominal filter."""
+    x, rows = nominal.found.x, run.time_min.size
+    there = np.flatnonzero(np.all(np.isfinite(x), axis=1))
+    x = np.stack([np.interp(np.arange(rows), there, column[there]) for column in x.T], axis=1)
+    scales = np.array([state.scale for state in model.states])
+    sure = np.all(np.isfinite(nominal.found.P.reshape(rows, -1)), axis=1)
+    P = np.where(sure[:, None, None], nominal.found.P, np.diag(scales**2))
+    began = np.zeros(rows, dtype=np.bool_)
+    began[[0, *run.breaks]] = True
+    known = np.isfinite(run.measured) & (np.abs(np.nan_to_num(nominal.w)) < FAR_OFF) & ~began[:, None]
+    zero = np.zeros(rows)
+    return Reference(x, Signal(zero, zero), LEAST_PROCESS_SHARE * scales, known, began, x, P)
 
 
-def _library(run: Run, about: Explained) -> tuple[Signal, list[str]]:
-    """Powers of states and inputs up to `POWERS`, each about its mean and in its standard deviations, and hats."""
-    states = about.hypothesis.sized.model.state_names[: about.hypothesis.sized.own_states]
-    x = about.fit.found.x[:, : len(states)]
-    x = np.where(np.isfinite(x), x, np.nanmean(x, axis=0))
-    z, labels = _scaled(np.column_stack([x, run.inputs])), [*states, *(f"u{i}" for i in range(run.inputs.shape[1]))]
-    after = np.vstack([z[1:], z[-1:]])
-    after[:, len(states) :] = z[:, len(states) :]  # inputs are held
-    columns, names = [(np.ones(len(z)), np.ones(len(z)))], ["1"]
-    for power in range(1, POWERS + 1):
-        for chosen in combinations_with_replacement(range(z.shape[1]), power):
-            now, then = np.prod(z[:, chosen], axis=1), np.prod(after[:, chosen], axis=1)
-            columns.append((0.5 * (now + then), now))
-            names.append("*".join(labels[item] for item in chosen))
-    hats = Free(run.time_min, KNOTS).basis(np.empty(0))
-    over_row = np.column_stack([*(item[0] for item in columns), hats.over_row[:, 1:]])
-    at_row = np.column_stack([*(item[1] for item in columns), hats.at_row[:, 1:]])
-    return Signal(over_row, at_row), [*names, *(f"knot {number}" for number in range(2, KNOTS + 1))]
+def _first(forcing: Forcing, reference: Reference, run: Run, noise: NoiseLevels) -> _Trial:
+    about = forcing.about(reference, run)
+    tried = product(FIRST_REDS, FIRST_LASTS_MIN, range(len(about.clocks)))
+    fits = [about.fit(Levels(red, lasts_min, noise.measurement_sd, clock)) for red, lasts_min, clock in tried]
+    best = min(fits, key=lambda item: item.loss)
+    return _Trial(forcing, reference, best, reference.size)
 
 
-def _scaled(values: Array) -> Array:
-    spread = np.std(values, axis=0)
-    return np.asarray((values - np.mean(values, axis=0)) / np.where(spread > 0.0, spread, 1.0))
+def _best_of_places(trials: Sequence[_Trial]) -> list[_Trial]:
+    """The best of each place, the best first."""
+    found: dict[str, _Trial] = {}
+    for item in sorted(trials, key=lambda item: item.fitted.loss):
+        found.setdefault(item.forcing.effect.location, item)
+    return list(found.values())
+
+
+def _closer(model: ProcessModel, run: Run, trial: _Trial, step: float) -> _Trial:
+    """About the trial's path, with better levels, and the path that follows."""
+    about = trial.forcing.about(trial.reference, run)
+    fitted = _levelled(about, about.fit(trial.fitted.levels), step)
+    if not np.isfinite(fitted.loss):
+        return trial
+    d, size = about.course(fitted)
+    lower, upper = (np.array([getattr(state, name) for state in model.states]) for name in ("lower", "upper"))
+    reference = replace(trial.reference, x=np.clip(trial.reference.x + d, lower, upper), size=size)
+    return _Trial(trial.forcing, reference, fitted, size)
+
+
+def _levelled(about: Linearised, best: Fitted, step: float) -> Fitted:
+    """With better levels: each in turn goes to the bottom of the parabola through three of its values."""
+    for place in range(2 + len(best.levels.sensor_sd)):
+        h = step if place < 2 else _OF_SENSORS * step
+        up, down = about.fit(_changed(best.levels, place, h)), about.fit(_changed(best.levels, place, -h))
+        curved = up.loss + down.loss - 2.0 * best.loss
+        by = 0.5 * h * (down.loss - up.loss) / curved if curved > 0.0 else float(np.sign(down.loss - up.loss)) * np.inf
+        by = float(np.clip(by, -_MOST_CHANGE * h, _MOST_CHANGE * h))
+        best = min(best, up, down, about.fit(_changed(best.levels, place, by)), key=lambda item: item.loss)
+    return best
+
+
+def _changed(levels: Levels, place: int, by: float) -> Levels:
+    """With the logarithm of one changed, within reason."""
+    factor = float(np.exp(by))
+    if place == 0:
+        return replace(levels, red=float(np.clip(levels.red * factor, *_REDS)))
+    if place == 1:
+        return replace(levels, lasts_min=float(np.clip(levels.lasts_min * factor, *_LASTS_MIN)))
+    sds = list(levels.sensor_sd)
+    sds[place - 2] *= factor
+    return replace(levels, sensor_sd=tuple(sds))

@@ -89,6 +89,7 @@ def as_page(
         outputs=pictures.outputs(diagnosis, model),
         closer=pictures.closer(diagnosis, model) if diagnosis.causes else [],
         courses=pictures.courses(diagnosis),
+        unknown=pictures.unknown_course(diagnosis),
         residuals=pictures.residuals(diagnosis, model),
         differences=[(difference_said(name, item), _strips(item)) for name, item in diagnosis.differences.items()],
         white=WHITE,

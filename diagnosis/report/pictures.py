@@ -150,6 +150,22 @@ def _limits(proposed: Experiment, name: str, rows: int) -> list[Line]:
     return [Line(np.full(rows, end), "limit") for end in proposed.limits[name]]
 
 
+def unknown_course(diagnosis: Diagnosis) -> list[Picture]:
+    """How something goes in time that has no name, if that was found."""
+    curves = _curves(diagnosis)
+    unknown = curves.unknown
+    if unknown is None:
+        return []
+    drawing = plot(
+        "course of what acts there",
+        curves.time_min,
+        [Line(unknown.size, "after")],
+        shown=_with_zero(unknown.size, unknown.size, unknown.size),
+    )
+    unit = "" if unknown.unit == "1" else f", {unknown.unit}"
+    return [Picture(f"Told as the size of: {unknown.label}{unit}", (("most likely", "after"),), drawing)]
+
+
 def interval(cause: Cause, curves: Curves) -> tuple[Array, Array]:
     """The ends of the 95 % interval of a cause's size at each row, each of shape (rows,).
 

@@ -12,6 +12,7 @@ All of it is one compiled map over many rows, so that a thousand rows cost some 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import ceil
 
 import casadi as ca
@@ -50,6 +51,27 @@ class Ways:
     K: Array
     L_inverse: Array
     w: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """The equations along a path through the states; of ways the first axis has one place a way.
+
+    Attributes:
+        there: where the way from each row but the last leads, shape (n_x,).
+        F: d there / d state before, shape (n_x, n_x).
+        G: d there / d sizes, shape (n_x, sizes).
+        shown: the outputs in each row, shape (rows, n_y).
+        H: d outputs / d state, shape (rows, n_y, n_x).
+        D: d outputs / d sizes, shape (rows, n_y, sizes).
+    """
+
+    there: Array
+    F: Array
+    G: Array
+    shown: Array
+    H: Array
+    D: Array
 
 
 class FilterErrors:
@@ -133,6 +155,28 @@ class FilterErrors:
         w = np.einsum("kij,kj->ki", L_inverse, np.where(known, residual[1:], 0.0))
         K = P[1:] @ H.transpose(0, 2, 1) * (used[1:] / R)[:, None, :]
         return Ways(F, G, H, D, K, L_inverse, w)
+
+    def about(self, time_min: Array, inputs: Array, x: Array) -> "Path":
+        """The equations along a path that need not be a filter's.
+
+        Args:
+            time_min: shape (rows,).
+            inputs: shape (rows, n_u).
+            x: the path, shape (rows, n_x).
+        """
+        p = self.model.values()
+        there, F, G = self._walked(x[:-1], inputs[:-1], time_min[:-1], np.diff(time_min), p)
+        H, D = self._over(self._shown, p, x, inputs, time_min[:, None])
+        (y,) = self._over(self._outputs, p, x, inputs, time_min[:, None])
+        return Path(there, F, G, y[:, :, 0], H, D)
+
+    @cached_property
+    def _outputs(self) -> ArrayFunction:
+        x, u, p = self.model.arguments()
+        t = ca.SX.sym("t")
+        y = ca.substitute(ca.vertcat(*(item.expression for item in self.model.outputs)), self.model.clock.now, t)
+        y = ca.substitute(y, self.model.clock.middle, t)
+        return mapped(ca.Function("outputs", [x, u, p, t], [ca.densify(y)]), CHUNK, parameters=2)
 
     def _walked(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
         """Where the ways lead, and their derivatives."""

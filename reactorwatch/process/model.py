@@ -37,6 +37,8 @@ class Variable:
         scale: a typical magnitude of its changes; tolerances are relative to it.
         meaning: a few words for people.
         symbol: stands for it in the expressions.
+        balance: of a state whose equation is the balance of something, the place in the plant that this is (one of
+            `effects.base.LOCATIONS`); else empty.
     """
 
     name: str
@@ -46,6 +48,7 @@ class Variable:
     scale: float
     meaning: str
     symbol: ca.SX
+    balance: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,9 +81,11 @@ class Clock:
     middle: ca.SX
 
 
-def variable(name: str, unit: str, bounds: tuple[float, float], scale: float, meaning: str) -> Variable:
+def variable(
+    name: str, unit: str, bounds: tuple[float, float], scale: float, meaning: str, balance: str = ""
+) -> Variable:
     """A variable with a symbol of its own."""
-    return Variable(name, unit, *bounds, scale, meaning, ca.SX.sym(name))
+    return Variable(name, unit, *bounds, scale, meaning, ca.SX.sym(name), balance)
 
 
 def parameter(name: str, value: float, unit: str, bounds: tuple[float, float], meaning: str) -> Parameter:

@@ -14,6 +14,7 @@ from diagnosis.report import mathml
 from diagnosis.report.equations import balances
 from diagnosis.report.page import as_page
 from diagnosis.report.svg import COLUMNS, decimated
+from diagnosis.result import UnknownCourse
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
@@ -87,6 +88,16 @@ def test_the_page_answers_what_it_is_asked(case: str, parts: list[str]) -> None:
     text = page(case)
     for part in parts:
         assert part in text
+
+
+def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> None:
+    curves = CASES["unknown"].curves
+    assert curves is not None
+    assert "What acts there" not in page("unknown")
+    told = replace(curves, unknown=UnknownCourse("heat loss", "1/min", np.linspace(0.0, 0.01, curves.time_min.size)))
+    text = as_page(replace(CASES["unknown"], curves=told), cstr(), EFFECTS, "a.csv", "extended.json")
+    assert "What acts there, over time" in text
+    assert "Told as the size of: heat loss, 1/min" in text
 
 
 def test_the_page_tells_how_the_extended_model_is_used() -> None:

@@ -1,0 +1,41 @@
+"""Something acts that no catalogue has: it is called unknown, and it is told where it acts; on shorter records."""
+
+from dataclasses import replace
+from functools import cache
+
+import pytest
+
+from diagnosis.diagnose import diagnose
+from diagnosis.result import UNKNOWN
+from reactorwatch.process.cstr import cstr
+from tests.hidden_effect.catalogue import OUTSIDE
+from tests.hidden_effect.draw import draw
+from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES
+from tests.hidden_effect.judge import Judged, judge
+from tests.hidden_effect.test_found import at_least
+
+SPAN_MIN = 150.0
+SEED = 4100
+NAMES = [effect.name for effect in OUTSIDE]
+
+
+@cache
+def found(name: str) -> Judged:
+    """What is said of a record in which an effect is hidden, and how that compares."""
+    place = NAMES.index(name)
+    hidden = draw(SEED + place, (OUTSIDE[place],), replace(NAMED_CIRCUMSTANCES["medium"], span_min=SPAN_MIN))
+    return judge(hidden, diagnose(hidden.record, cstr()), seconds=0.0)
+
+
+@pytest.mark.xdist_group("outside")
+def test_what_is_called_unknown_is_told_in_the_right_place() -> None:
+    unknown = {name: found(name) for name in NAMES if found(name).verdict == UNKNOWN}
+    wrong = {name: judged.location for name, judged in unknown.items() if not judged.right_place}
+    assert len(unknown) >= 5
+    assert not wrong
+
+
+@pytest.mark.xdist_group("outside")
+def test_as_many_are_unknown_in_the_right_place_as_promised() -> None:
+    right = [judged.verdict == UNKNOWN and judged.right_place for judged in map(found, NAMES)]
+    assert sum(right) >= at_least(len(right), 0.85)
