@@ -92,15 +92,19 @@ def diagnose(
     """
     effects = effects_of(model) if effects is None else effects
     checked_limits(model, limits or {})
-    run = run_of(record, model)
-    bands = _bands(run, model, tolerance or {})
+    whole = run_of(record, model)
+    bands = _bands(whole, model, tolerance or {})
     plant = with_uncertain(model, uncertain or {})
-    search = Search(plant, effects, run, _smallest_sd(model))
-    found = with_pairs(search, search.found())
+    search = Search(plant, effects, whole, _smallest_sd(model))
+    run = search.run
+    found = search.found()
+    if search.remembers(found.best):
+        found = search.found()
+    found = with_pairs(search, found)
     best = found.best if found.nominal.bic - found.best.bic >= LEAST_GAIN else found.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict, location = _verdict(found, best), best.hypothesis.sized.effects[0].location if best.key else ""
-    remarks: list[str] = []
+    remarks = _left_out(whole, run)
     strange: Located | None = None
     if np.any(adequacy >= DOUBTFUL) or (best.key and _seems_noisy(found, model)):
         strange = located(model, effects, run, found.nominal.fit, found.own_noise)
@@ -121,7 +125,7 @@ def diagnose(
             "what is left is small and goes with the error of an integrator's steps: it looks like integration "
             "of the record's own making, or timing of its input"
         )
-    curves = _curves(run, model, found.nominal, best, covariances)
+    curves = _curves(whole, run, model, found.nominal, best, covariances)
     if verdict == UNKNOWN and strange is not None and strange.effect.location == location:
         curves = replace(curves, unknown=strange.course)
     causes = tuple(_causes(best, covariances))
@@ -270,7 +274,18 @@ def _gain(model: ProcessModel, found: Found, best: Explained, before: Errors, af
     return Gain(found.nominal.bic - best.bic, held_out)
 
 
-def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained, covariances: Sequence[Array]) -> Curves:
+def _left_out(whole: Run, run: Run) -> list[str]:
+    """What is to be said of outliers."""
+    count = whole.values - run.values
+    if count == 0:
+        return []
+    values = "1 value was" if count == 1 else f"{count} values were"
+    return [f"{values} left out for outliers: far off for a moment, they say nothing of the plant"]
+
+
+def _curves(
+    whole: Run, run: Run, model: ProcessModel, nominal: Explained, best: Explained, covariances: Sequence[Array]
+) -> Curves:
     outputs = model.output_names
     hypothesis, signals = best.hypothesis, best.hypothesis.signals(best.fit)
     known = hypothesis.offsets(best.fit)
@@ -284,7 +299,7 @@ def _curves(run: Run, model: ProcessModel, nominal: Explained, best: Explained, 
     return Curves(
         run.time_min,
         dict(zip(model.input_names, run.inputs.T, strict=True)),
-        dict(zip(outputs, run.measured.T, strict=True)),
+        dict(zip(outputs, whole.measured.T, strict=True)),
         dict(zip(outputs, free_run(run, nominal.hypothesis.sized, (), known).T, strict=True)),
         dict(zip(outputs, free_run(run, hypothesis.sized, signals, known).T, strict=True)),
         dict(zip(outputs, _standardised(nominal).T, strict=True)),

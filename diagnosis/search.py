@@ -17,6 +17,7 @@ import numpy as np
 from diagnosis.courses import Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.memory_screen import MemoryScreen
+from diagnosis.outliers import gross_outliers, outliers, without
 from diagnosis.run import Run
 from diagnosis.screen import Lead, Screen
 from diagnosis.sized import Sized
@@ -36,6 +37,9 @@ LEAST_SCORE = -20.0
 
 IN_QUESTION = 60.0
 """In BIC: a rival that is worse by more is out of question."""
+
+LEAST_SENSOR_GAIN = 10.0
+"""In BIC: less does not make a sensor's noise remember."""
 
 ROUNDS, MOST_KNOTS = 5, 80
 SETTLED_NOISE = 10.0
@@ -100,15 +104,21 @@ class Search:
         effects: the catalogue.
         run: the record.
         smallest_sd: of the sensors, one an output.
+
+    Attributes:
+        run: the record without its outliers.
+        noise: that all hypotheses are compared with.
+        screen: of the run.
     """
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run, smallest_sd: Sequence[float]) -> None:
-        self._model, self.run, self._smallest_sd = model, run, list(smallest_sd)
-        self.screen = Screen(model, effects, run)
-        self.memory = MemoryScreen(self.screen.with_memory, run)
+        self._model, self._smallest_sd = model, list(smallest_sd)
+        self.run = without(run, gross_outliers(run.measured))
         self._sized: dict[tuple[str, ...], Sized] = {}
         self._period_min = float(np.median(np.diff(run.time_min)))
-        self.noise = self._chosen_noise()
+        self.noise = self._first_noise()
+        self.screen = Screen(model, effects, self.run)
+        self.memory = MemoryScreen(self.screen.with_memory, self.run)
 
     def found(self) -> Found:
         """The best explanations by one effect."""
@@ -145,30 +155,41 @@ class Search:
             known[best.key] = best
         return Found(self.noise, own_noise, nominal, sorted(known.values(), key=lambda item: item.bic))
 
-    def _chosen_noise(self) -> Noise:
-        """Under which the nominal model is likeliest; a sensor's noise remembers only if the BIC says so."""
-        nothing = (0.0,) * len(self._model.states)
-        white = self._nominal_with(Noise((1.0,) * len(self._model.outputs), nothing))
-        levels = white.tuned(self.run, (), self._smallest_sd)
-        white.noise = Noise(levels.measurement_sd, nothing)
-        loss, _, found = white.follow(self.run, ())
-        wandering = suspected(levels, self._model.output_names, found.residual, self._period_min)
-        if not wandering:
-            return levels
-        if any(levels.process_sd):
-            white.noise = levels
-            loss = white.follow(self.run, ())[0]
-        beside = self._nominal_with(Noise(levels.measurement_sd, levels.process_sd, wandering))
-        beside.noise = remembering = beside.tuned(self.run, (), self._smallest_sd)
-        if 2.0 * (loss - beside.follow(self.run, ())[0]) > 2 * len(wandering) * log(self.run.values):
-            return remembering
-        self._sized[()] = white
-        return levels
+    def _first_noise(self) -> Noise:
+        """Under which the nominal model is likeliest. Its free run tells which values are outliers."""
+        nominal = self._sized[()] = Sized(self._model, (), self._still((1.0,) * len(self._model.outputs)))
+        noise = nominal.tuned(self.run, (), self._smallest_sd)
+        nominal.noise = self._still(noise.measurement_sd)
+        self.run = without(self.run, outliers(self.run.measured, nominal.follow(self.run, ())[2].residual))
+        return noise
 
-    def _nominal_with(self, noise: Noise) -> Sized:
-        """Without any effect; kept for `sized`."""
-        self._sized[()] = Sized(self._model, (), noise, self._period_min)
-        return self._sized[()]
+    def _still(self, measurement_sd: tuple[float, ...]) -> Noise:
+        """Without any that moves the process: the filter runs freely."""
+        return Noise(measurement_sd, (0.0,) * len(self._model.states))
+
+    def remembers(self, best: Explained) -> bool:
+        """Whether the noise of a sensor remembers, by what the best explanation leaves; from then on it does.
+
+        Only an explanation that is right tells: what a model lacks would be taken for noise that remembers for long.
+        """
+        sized, signals, noise = best.hypothesis.sized, best.hypothesis.signals(best.fit), self.noise
+        sized.noise = self._still(noise.measurement_sd)
+        left = sized.follow(self.run, signals)[2].residual
+        self._use_noise(sized)
+        wandering = suspected(noise, self._model.output_names, left, self._period_min)
+        if not wandering:
+            return False
+        beside = Sized(
+            self._model, sized.effects, Noise(noise.measurement_sd, noise.process_sd, wandering), self._period_min
+        )
+        beside.noise = beside.tuned(self.run, signals, self._smallest_sd)
+        gain = 2.0 * (sized.follow(self.run, signals)[0] - beside.follow(self.run, signals)[0])
+        if gain < LEAST_SENSOR_GAIN + 2 * len(wandering) * log(self.run.values):
+            return False
+        nominal = Sized(self._model, (), beside.noise, self._period_min)
+        self._sized = {(): nominal}
+        self.noise = nominal.noise = nominal.tuned(self.run, (), self._smallest_sd)
+        return True
 
     def nominal(self) -> Explained:
         """Without any effect."""

@@ -113,7 +113,7 @@ class Sized:
         known = np.isfinite(run.measured)
         least = np.array(self.noise.measurement_sd)
         good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0) & (found.conditional_sd < _CLUELESS * least)
-        known[[0, *run.breaks]] = False
+        known[[int(np.argmax(np.any(known, axis=1))), *run.breaks]] = False  # it begins with these rows
         w = np.where(known & ~good, LOST, np.where(known, found.whitened, np.nan))
         spread = np.log(np.where(known & good, found.conditional_sd, 1.0))
         return loss_of(w) + float(np.sum(spread)), w, found
@@ -126,7 +126,9 @@ class Sized:
             inputs = run.inputs
         times = self._noise.times
         # It begins anew with a short memory: a model that lacks something makes it seem long, and there it would stay.
-        first_sd = {f"{item.output}.noise": first_rate_sd(item.sd, self._period_min) for item in self._noise.wandering}
+        first_sd = {
+            f"{item.output}.noise": first_rate_sd(item.scale, self._period_min) for item in self._noise.wandering
+        }
         found, times = tune_with(self.model, run.time_min, inputs, run.measured, smallest_sd, tuple(times), first_sd)
         of_sensors = len(found.process_sd) - len(times)
         wandering = learned(self._noise.wandering, found.process_sd[of_sensors:], times, self._period_min)
@@ -162,6 +164,8 @@ class Sized:
 def ways_between(errors: FilterErrors, run: Run, inputs: Array, found: Innovations, used: NDArray[np.bool_]) -> Ways:
     """The equations of a filter's errors about its run, from the second row on, the first that it predicts."""
     began = np.all(np.isnan(found.prediction), axis=1)
+    # What inputs did before a break nobody knows, but in the row itself they were measured, and outputs may show them.
+    inputs = np.column_stack([run.inputs, inputs[:, run.inputs.shape[1] :]])
     return errors.ways(run.time_min[1:], inputs[1:], found.x[1:], found.P[1:], found.residual[1:], used[1:], began[1:])
 
 

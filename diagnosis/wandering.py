@@ -49,12 +49,14 @@ class Wandering(msgspec.Struct, frozen=True):
         sd: standard deviation, in the output's unit.
         time_min: after which a share of 1/e is left of it.
         rate_sd: that of the white noise that moves it, in the output's unit per square root of a minute.
+        scale: standard deviation of the sensor's whole noise, were it white.
     """
 
     output: str
     sd: float
     time_min: float
     rate_sd: float
+    scale: float
 
 
 class Noise(NoiseLevels, frozen=True):
@@ -89,7 +91,7 @@ def suspected(noise: NoiseLevels, outputs: Sequence[str], residual: Array, perio
     found = []
     for name, sd, column in zip(outputs, noise.measurement_sd, residual.T, strict=True):
         if _power_ratio(column) > SUSPICIOUS:
-            found.append(Wandering(name, sd, _first_min(period_min), first_rate_sd(sd, period_min)))
+            found.append(Wandering(name, sd, _first_min(period_min), first_rate_sd(sd, period_min), sd))
     return tuple(found)
 
 
@@ -103,7 +105,7 @@ def with_wandering(model: ProcessModel, wandering: Sequence[Wandering], period_m
     for item in wandering:
         place = model.output_names.index(item.output)
         output = model.outputs[place]
-        scale = _SCALES * item.sd
+        scale = _SCALES * item.scale
         noise = variable(
             f"{item.output}.noise", output.unit, (-1e3 * scale, 1e3 * scale), scale, "noise that remembers"
         )
@@ -131,7 +133,8 @@ def learned(
     found = []
     for item, rate in zip(wandering, rate_sd, strict=True):
         time_min = times[f"{item.output}.noise_min"]
-        found.append(Wandering(item.output, rate / _rate_sd(1.0, time_min, period_min), time_min, rate))
+        sd = rate / _rate_sd(1.0, time_min, period_min)
+        found.append(Wandering(item.output, sd, time_min, rate, item.scale))
     return tuple(found)
 
 
@@ -146,12 +149,11 @@ def _rate_sd(sd: float, time_min: float, period_min: float) -> float:
 
 def _power_ratio(residual: Array) -> float:
     """Power of a residual at the lower frequencies over that at the higher ones; 1 if it is too short to tell."""
-    differences = np.diff(residual)  # so that the highest frequencies do not drown in the lowest
-    known = np.isfinite(differences)
-    if np.count_nonzero(known) < _FEWEST_ROWS:
+    differences = np.diff(residual[np.isfinite(residual)])  # so that the highest frequencies do not drown in the lowest
+    if differences.size < _FEWEST_ROWS:
         return 1.0
-    limit = CUT * float(np.median(np.abs(differences[known]))) / 0.6745
-    power = np.abs(np.fft.rfft(np.clip(np.where(known, differences, 0.0), -limit, limit))) ** 2
+    limit = CUT * float(np.median(np.abs(differences))) / 0.6745
+    power = np.abs(np.fft.rfft(np.clip(differences, -limit, limit))) ** 2
     share = np.linspace(0.0, 1.0, power.size)
     power[1:] /= 2.0 - 2.0 * np.cos(np.pi * share[1:])
     low, high = (float(np.mean(power[(share >= begin) & (share < end)])) for begin, end in (LOW, HIGH))

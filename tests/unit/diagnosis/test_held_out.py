@@ -41,6 +41,6 @@ def test_where_nobody_knows_when_the_input_changed_no_model_is_blamed_for_it() -
 
 
 def test_where_hardly_a_row_is_free_of_doubt_all_are_judged() -> None:
-    time_min = np.arange(0.0, 100.0, 0.1)
+    time_min = np.linspace(0.0, 99.9, 1000)
     run = Run(time_min, np.zeros((1000, 1)), np.zeros((1000, 2)), tuple(range(20, 1000, 20)))
     assert np.count_nonzero(held_out_rows(run)) == 200

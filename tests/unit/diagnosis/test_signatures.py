@@ -1,5 +1,7 @@
 """What the linear map promises is what filters that know the deviation keep, and its three passes agree."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from diagnosis import signatures
 from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Sine, Step
 from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
+from diagnosis.screen import Screen
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
 from reactorwatch.process.cstr import cstr
@@ -97,3 +100,12 @@ def test_the_signal_over_a_row_is_the_mean_of_what_is_at_every_moment(kind: type
     over_row, at_row = course.signal(theta)
     np.testing.assert_allclose(over_row[:-1], means, atol=6e-3)  # the step lies in one of a hundred pieces
     np.testing.assert_allclose(at_row, at_all[::100], atol=1e-9)
+
+
+def test_a_break_after_a_row_hides_no_cause(run: Run) -> None:
+    broken = replace(run, breaks=(300, 450))
+    hypothesis = Hypothesis(Sized(cstr(), (), NOISY), ())
+    ways = Screen(cstr(), EFFECTS, broken).ways_of_all(hypothesis, hypothesis.at(broken, ()), ())
+    for item in (ways.F, ways.G, ways.H, ways.D, ways.K, ways.w):
+        assert np.all(np.isfinite(item))
+    assert not np.any(ways.G[298])  # from row 299 to row 300, where the filter begins anew

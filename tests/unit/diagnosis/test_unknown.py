@@ -12,6 +12,7 @@ from diagnosis.hypothesis import Hypothesis
 from diagnosis.run import Run
 from diagnosis.sized import Sized
 from diagnosis.unknown import Located, located
+from diagnosis.wandering import Noise
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
@@ -36,7 +37,8 @@ def run_of(plant: ProcessModel, shown: Callable[[Array], Array] = lambda outputs
 
 
 def where(run: Run) -> Located:
-    noise = tune(cstr(), run.time_min, run.inputs, run.measured, [1e-4, 1e-2])
+    tuned = tune(cstr(), run.time_min, run.inputs, run.measured, [1e-4, 1e-2])
+    noise = Noise(tuned.measurement_sd, tuned.process_sd)
     nominal = Hypothesis(Sized(cstr(), (), noise), ()).at(run, ())
     found = located(cstr(), EFFECTS, run, nominal, noise)
     assert found is not None
