@@ -107,7 +107,9 @@ def diagnose(
     remarks = _left_out(whole, run)
     strange: Located | None = None
     if np.any(adequacy >= DOUBTFUL) or (best.key and _seems_noisy(found, model)):
-        strange = located(model, effects, run, found.nominal.fit, found.own_noise)
+        off = found.nominal.hypothesis.offsets(found.nominal.fit)
+        known = model.with_values({name: model.parameter(name).value + value for name, value in off.items()})
+        strange = located(known, effects, run, found.nominal.fit, found.own_noise)
         if _is_unknown(strange, found, best, run, bool(np.any(adequacy >= WHITE))):
             verdict, best = UNKNOWN, found.nominal  # what is not explained is not extended
             location = strange.effect.location if strange is not None else location

@@ -84,17 +84,18 @@ class Hypothesis:
         loss, w, found = self.sized.follow(run, self._signals(theta))
         return Fit(theta, loss, w, found)
 
-    def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS) -> Fit:
+    def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True) -> Fit:
         """The best numbers that are found from a start.
 
         Args:
             run: the record.
             start: where it begins, theta of each effect.
-            steps: at most; fewer than `MOST_STEPS` are for a rough fit, in which sizes that act in jumps stay.
+            steps: at most; fewer than `MOST_STEPS` are for a rough fit.
+            scan: whether sizes that act in jumps are looked for; else they stay.
         """
         best = self._climbed(run, self.at(run, start), steps)
         jumping = [place for place, effect in enumerate(self.sized.effects) if effect.jumps]
-        for place in jumping if steps >= MOST_STEPS else ():
+        for place in jumping if scan else ():
             best = self._scanned(run, best, place)
             if len(self.courses) > 1:
                 best = self._climbed(run, best, steps)

@@ -36,6 +36,9 @@ SHORTLIST, AGAIN, REFINED = 6, 3, 2
 COURSES, EXCHANGED = 2, 4
 """How many courses of one cause are fitted, and how many leads in an exchange."""
 
+NEAR_BEST = 20.0
+"""In BIC: what is exchanged and fits worse, roughly, is not fitted to the end."""
+
 ROUNDS, EXCHANGES = 3, 3
 ROUGH_STEPS, EXCHANGE_STEPS = 3, 6
 _NEAR = 0.05  # of what a pair gains: what a rough fit may fall short
@@ -120,7 +123,7 @@ class PairSearch:
             if best is before:
                 break
             search.settle(best)
-            best = search.refitted(best)
+            best = self._fitted(_parts(best))
             if self.gain(best) < LEAST_PAIR_GAIN:
                 return None, {}
             if not np.any(minus_log10_p(best.fit.w, self._run.inputs) > DOUBTFUL):
@@ -153,7 +156,7 @@ class PairSearch:
         for turn in range(EXCHANGES):
             if turn:
                 search.settle(best)
-                best = search.refitted(best)
+                best = self._fitted(_parts(best))
             best = self._finer(best)
             known, again = {best.key: best}, best
             for place in (0, 1):
@@ -162,8 +165,8 @@ class PairSearch:
                 for lead in search.chosen(leads, EXCHANGED, least):
                     knots = best.hypothesis.courses[place].coefficients
                     item = self._fitted(_with(best, place, lead, knots), EXCHANGE_STEPS)
-                    if item.bic < best.bic + IN_QUESTION:
-                        keep(known, self._fitted(_parts(item)))
+                    if item.bic < best.bic + NEAR_BEST:
+                        keep(known, self._fitted(_parts(item), scan=lead.effect.jumps))
             best = min(known.values(), key=_bic)
             if best.key == again.key:
                 break
@@ -175,9 +178,10 @@ class PairSearch:
         for place in (0, 1):
             about, jumps = best, best.hypothesis.sized.effects[place].jumps
             provisional = jumps and isinstance(about.hypothesis.courses[place], Free)
-            leads = self._new(self._leads(about, place, own=True), about)
+            leads = self._leads(about, place, own=True)
+            leads = leads if jumps else self._new(leads, about)  # its size has not been looked for yet
             items = [
-                self._fitted(_with(about, place, lead), MOST_STEPS if jumps else EXCHANGE_STEPS)
+                self._fitted(_with(about, place, lead), EXCHANGE_STEPS, scan=jumps)
                 for lead in self._search.chosen(leads, COURSES, -inf, of_a_cause=COURSES)
             ]
             best = min(items if provisional and items else [*items, about], key=_bic)
@@ -254,11 +258,11 @@ class PairSearch:
                 found.append(Remembered(effect, start, clipped(before) - clipped(w)))
         return found
 
-    def _fitted(self, parts: Sequence[Part], steps: int = MOST_STEPS) -> Explained:
+    def _fitted(self, parts: Sequence[Part], steps: int = MOST_STEPS, scan: bool = False) -> Explained:
         search = self._search
         parts = sorted(parts, key=lambda part: self._order[part.effect.name])
         hypothesis = Hypothesis(search.sized(tuple(part.effect for part in parts)), [part.course for part in parts])
-        return search.fit(hypothesis, [part.theta for part in parts], steps)
+        return search.fit(hypothesis, [part.theta for part in parts], steps, scan)
 
     def _sorted(self, effects: Sequence[Effect]) -> tuple[Effect, ...]:
         return tuple(sorted(effects, key=lambda effect: self._order[effect.name]))

@@ -252,9 +252,11 @@ class Search:
         """A lead as a hypothesis."""
         return self.fit(Hypothesis(self.sized((lead.effect,)), (lead.course,)), (lead.theta,))
 
-    def fit(self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS) -> Explained:
-        """A hypothesis, fitted from a start in at most so many steps."""
-        return self._with_bic(hypothesis, hypothesis.fit(self.run, start, steps))
+    def fit(
+        self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True
+    ) -> Explained:
+        """A hypothesis, fitted from a start; see there."""
+        return self._with_bic(hypothesis, hypothesis.fit(self.run, start, steps, scan))
 
     def _elsewhere(self, lead: Lead, best: Explained) -> bool:
         """Whether a lead of the best's own cause and course begins where its fit is not."""

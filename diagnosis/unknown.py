@@ -92,7 +92,7 @@ def located(
     """Where an effect acts that nothing explains; None if the run says nothing of it.
 
     Args:
-        model: of the plant.
+        model: of the plant; uncertain parameters as the record has them.
         effects: the catalogue.
         run: the record.
         nominal: the filter's run without any effect.
@@ -122,13 +122,14 @@ def bic_of(explained: Explained, known: NDArray[np.bool_], run: Run) -> float:
 
 
 def _reference(model: ProcessModel, run: Run, nominal: Fit) -> Reference:
-    """The path of the nominal filter."""
-    x, rows = nominal.found.x, run.time_min.size
+    """The path of the nominal filter, which may know more states: of sensors, and of uncertain parameters."""
+    own, rows = len(model.states), run.time_min.size
+    x, P = nominal.found.x[:, :own], nominal.found.P[:, :own, :own]
     there = np.flatnonzero(np.all(np.isfinite(x), axis=1))
     x = np.stack([np.interp(np.arange(rows), there, column[there]) for column in x.T], axis=1)
     scales = np.array([state.scale for state in model.states])
-    sure = np.all(np.isfinite(nominal.found.P.reshape(rows, -1)), axis=1)
-    P = np.where(sure[:, None, None], nominal.found.P, np.diag(scales**2))
+    sure = np.all(np.isfinite(P.reshape(rows, -1)), axis=1)
+    P = np.where(sure[:, None, None], P, np.diag(scales**2))
     began = np.zeros(rows, dtype=np.bool_)
     began[[0, *run.breaks]] = True
     known = np.isfinite(run.measured) & (np.abs(np.nan_to_num(nominal.w)) < FAR_OFF) & ~began[:, None]
