@@ -16,7 +16,7 @@ import numpy as np
 from diagnosis import signatures
 from diagnosis.courses import Course, Signal
 from diagnosis.run import Run
-from diagnosis.sized import HUBER, Sized, clipped
+from diagnosis.sized import HUBER, Sized, clipped, loss_of
 from diagnosis.uncertain import last_state, offsets
 from reactorwatch.process.filter import Innovations
 from reactorwatch.process.filter_errors import Ways
@@ -32,7 +32,7 @@ _RUNAWAY = 1e100
 """A filter that lost an unstable plant has signatures without bound, and no step makes sense."""
 
 _SHARE = 0.02
-_SCANS = ((4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
+_SCANS = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
 _WIDENINGS, _WIDER = 10, 2.0
 _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 5, 1e-3, 10.0, 0.1
 
@@ -129,7 +129,11 @@ class Hypothesis:
         return best
 
     def _scanned(self, run: Run, best: Fit, place: int) -> Fit:
-        """Of a size that the innovations depend on in jumps: the best of many, then of nearer ones."""
+        """Of a size that the innovations depend on in jumps: the best of many, then of nearer ones.
+
+        Where none of the first few is better than nothing, there is none.
+        """
+        nothing = loss_of(self.without(run, best, place))
         for reach, count in _SCANS:
             numbers, course = best.theta[place], self.courses[place]
             scaled = np.arange(numbers.size) < course.coefficients
@@ -139,6 +143,8 @@ class Hypothesis:
                 theta[place] = np.where(scaled, share * numbers, numbers)
                 tried.append(self.at(run, theta))
             best = min(best, *tried, key=lambda item: item.loss)
+            if loss_of(best.w) > nothing:
+                break
         return best
 
     def covariance(self, run: Run, fit: Fit) -> Array:

@@ -35,8 +35,11 @@ that acts in jumps, whose fit is a scan, and costs as much as ten others."""
 LEAST_SCORE = -20.0
 """A rival that promises less in BIC is not fitted."""
 
-IN_QUESTION = 60.0
-"""In BIC: a rival that is worse by more is out of question."""
+IN_QUESTION, FAR_OUT = 60.0, 600.0
+"""In BIC: a rival that is worse by more is out of question; and with any other noise too."""
+
+ROUGH = 1e-3
+"""Share of what a lead promises by which it is out, at least: the equations are not linear."""
 
 LEAST_SENSOR_GAIN = 10.0
 """In BIC: less does not make a sensor's noise remember."""
@@ -46,6 +49,7 @@ SETTLED_NOISE = 10.0
 """In BIC: a noise that gains less is not worth another round."""
 
 _NEAR = 4.0
+_SMALLER = 0.3  # of what the linear size is
 _SHARE = 0.3  # of what the best lead promises: linear promises of memory are rough
 
 
@@ -115,6 +119,7 @@ class Search:
         self._model, self._smallest_sd = model, list(smallest_sd)
         self.run = without(run, gross_outliers(run.measured))
         self._sized: dict[tuple[str, ...], Sized] = {}
+        self._nothing: tuple[Noise, float] | None = None
         self._period_min = float(np.median(np.diff(run.time_min)))
         self.noise = self._first_noise()
         self.screen = Screen(model, effects, self.run)
@@ -135,20 +140,23 @@ class Search:
             best = min(best, item, key=lambda item: item.bic)
         least = max([LEAST_SCORE, *(_SHARE * item.score(self.run.values) for item in leads[:1])])
         remembering = self.chosen(remembering, LEADS, least, of_a_cause=1)
-        searched = nominal
+        searched, out = nominal, set[Key]()
         for _ in range(ROUNDS):
             if best is nominal or (best is searched and not self._settled_anew(best)):
                 break
             if best is not searched:
                 self.settle(best)
-            known = {best.key: self.refitted(best)}
+            known = {item.key: self.refitted(item) for item in known.values() if item.bic < best.bic + IN_QUESTION}
             best = searched = known[best.key]
             leads = self.screen.leads(best.hypothesis, best.fit, replaced=(0,))
-            least = max([LEAST_SCORE, *(item.score(self.run.values) - IN_QUESTION for item in leads[:1])])
-            for lead in [*self.chosen(leads, LEADS, least), *self._simpler(leads, best), *remembering]:
+            least = max([LEAST_SCORE, *(self._still_in_question(item) for item in leads[:1])])
+            beside = [lead for lead in [*self._simpler(leads, best), *remembering] if _key(lead) not in out]
+            for lead in [*self.chosen(leads, LEADS, least), *beside]:
                 fresh = _key(lead) not in known or (_key(lead) == best.key and self._elsewhere(lead, best))
                 if fresh:
-                    keep(known, self.fitted(lead))
+                    item = self.fitted(lead)
+                    keep(known, item)
+                    out |= {item.key} if item.bic > best.bic + FAR_OUT else set()
             best = min(known.values(), key=lambda item: item.bic)
         if best is not nominal:
             best = self._finer(best)
@@ -249,8 +257,24 @@ class Search:
         return [next(item for item in of_cause if item.course.name == name) for name in names]
 
     def fitted(self, lead: Lead) -> Explained:
-        """A lead as a hypothesis."""
-        return self.fit(Hypothesis(self.sized((lead.effect,)), (lead.course,)), (lead.theta,))
+        """A lead as a hypothesis. Where the linear size leads astray, it is fitted from a smaller one."""
+        hypothesis = Hypothesis(self.sized((lead.effect,)), (lead.course,))
+        found = self.fit(hypothesis, (lead.theta,))
+        if lead.effect.jumps or found.fit.loss < self._loss_of_nothing():
+            return found
+        shares = np.where(np.arange(lead.theta.size) < lead.course.coefficients, _SMALLER, 1.0)
+        return min(found, self.fit(hypothesis, (shares * lead.theta,)), key=lambda item: item.bic)
+
+    def _still_in_question(self, first: Lead) -> float:
+        """What a lead has to promise beside the first; the more is promised, the rougher it is."""
+        score = first.score(self.run.values)
+        return score - max(IN_QUESTION, ROUGH * score)
+
+    def _loss_of_nothing(self) -> float:
+        """Of the nominal model with the noise that holds now."""
+        if self._nothing is None or self._nothing[0] is not self.noise:
+            self._nothing = (self.noise, self.nominal().fit.loss)
+        return self._nothing[1]
 
     def fit(
         self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True
@@ -265,9 +289,9 @@ class Search:
         return bool(np.any(apart > _NEAR * lead.course.least_differences))
 
     def refitted(self, explained: Explained) -> Explained:
-        """With the noise that holds now."""
+        """With the noise that holds now; sizes that act in jumps stay."""
         self._use_noise(explained.hypothesis.sized)
-        return self.fit(explained.hypothesis, explained.fit.theta)
+        return self.fit(explained.hypothesis, explained.fit.theta, scan=False)
 
     def explained(self, hypothesis: Hypothesis, theta: Sequence[Array]) -> Explained:
         """A hypothesis at some numbers."""
