@@ -2,18 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import sqrt
 
 import numpy as np
 
 from diagnosis.adequacy import WHITE, minus_log10_p
-from diagnosis.difference import Difference, difference
+from diagnosis.drawn import curves_of, differences_of
+from diagnosis.estimates import adjusted_parameters, causes_of, with_rough_numbers
 from diagnosis.experiment import proposed
 from diagnosis.extended import extended_model
-from diagnosis.held_out import Errors, free_run, gained
+from diagnosis.held_out import Errors, gained
 from diagnosis.integration import looks_like_integration
 from diagnosis.limits import checked_limits
 from diagnosis.pairs import with_pairs
+from diagnosis.practice import bands_of, left_matters, matters
 from diagnosis.record_checks import run_of
 from diagnosis.result import (
     AMBIGUOUS,
@@ -21,24 +22,18 @@ from diagnosis.result import (
     NAMED,
     NOMINAL,
     UNKNOWN,
-    Adjusted,
     Alternative,
-    Cause,
-    Curves,
     Diagnosis,
-    Estimate,
     Gain,
     HeldOut,
 )
-from diagnosis.rough_numbers import settled
 from diagnosis.run import Run
 from diagnosis.search import Explained, Found, Search
 from diagnosis.uncertain import with_uncertain
 from diagnosis.unknown import MARGIN, Located, bic_of, located
-from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.effects.base import TIMING, Effect
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 
 LEAST_GAIN = 10.0
@@ -56,9 +51,6 @@ NOISY_SHARE = 0.003
 
 NEARLY = 1.15
 """Times the noise: a free run that errs no more explains what matters, though something is left."""
-
-PRACTICAL_SHARE = 0.02
-"""Of an output's range in the record: a difference in it that matters, where the user does not say."""
 
 SMALLEST_NOISE = 1e-3
 """Of a state's scale: no sensor is taken for better, and files have so many digits."""
@@ -93,7 +85,7 @@ def diagnose(
     effects = effects_of(model) if effects is None else effects
     checked_limits(model, limits or {})
     whole = run_of(record, model)
-    bands = _bands(whole, model, tolerance or {})
+    bands = bands_of(whole, model, tolerance or {})
     plant = with_uncertain(model, uncertain or {})
     search = Search(plant, effects, whole, _smallest_sd(model))
     run = search.run
@@ -118,20 +110,20 @@ def diagnose(
                 "what is left is small, but not white: the course in time may be rougher than what was fitted"
             )
     best.hypothesis.sized.noise, found.nominal.hypothesis.sized.noise = found.noise, found.own_noise
-    best, covariances = _with_rough_numbers(search, best)
+    best, covariances = with_rough_numbers(search, best)
     before, after = gained(run, found.nominal, best)
-    matters = verdict == UNKNOWN and _left_matters(before, found, model, bands)
-    if verdict == UNKNOWN and not matters and looks_like_integration(plant, run, found.nominal.fit.found):
+    unexplained = verdict == UNKNOWN and left_matters(before, found, model, bands)
+    if verdict == UNKNOWN and not unexplained and looks_like_integration(plant, run, found.nominal.fit.found):
         location = TIMING
         remarks.append(
             "what is left is small and goes with the error of an integrator's steps: it looks like integration "
             "of the record's own making, or timing of its input"
         )
-    curves = _curves(whole, run, model, found.nominal, best, covariances)
+    curves = curves_of(whole, run, model, found.nominal, best, covariances)
     if verdict == UNKNOWN and strange is not None and strange.effect.location == location:
         curves = replace(curves, unknown=strange.course)
-    causes = tuple(_causes(best, covariances))
-    parameters = _parameters(run, model, uncertain or {}, best)
+    causes = tuple(causes_of(best, covariances))
+    parameters = adjusted_parameters(run, model, uncertain or {}, best)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
     rivals = _rivals(found, best)
     experiment = proposed([best, *rivals], run, model, found.noise, limits or {}) if rivals else None
@@ -146,8 +138,8 @@ def diagnose(
         alternatives=tuple(Alternative(item.key, item.bic - best.bic) for item in rivals),
         location=location,
         significant=verdict != NOMINAL,
-        practical=matters or _matters(curves, bands),
-        differences=_differences(model, found, curves),
+        practical=unexplained or matters(curves, bands),
+        differences=differences_of(model, found, curves),
         gain=_gain(model, found, best, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=experiment,
@@ -199,67 +191,6 @@ def _rivals(found: Found, best: Explained) -> list[Explained]:
     return listed
 
 
-def _covariances(run: Run, best: Explained) -> list[Array]:
-    """Of the numbers of each effect, whatever those of the others."""
-    if not best.key:
-        return []
-    whole, parts, begin = best.hypothesis.covariance(run, best.fit), [], 0
-    for theta in best.fit.theta:
-        parts.append(whole[begin : begin + theta.size, begin : begin + theta.size])
-        begin += theta.size
-    return parts
-
-
-def _with_rough_numbers(search: Search, best: Explained) -> tuple[Explained, list[Array]]:
-    """With the numbers in which the likelihood is rough where it is largest; and the covariances with their spread."""
-    sds = [np.sqrt(np.maximum(np.diag(item), 0.0)) for item in _covariances(search.run, best)]
-    best, rough = settled(search, best, sds)
-    covariances = _covariances(search.run, best)
-    for effect, whole, numbers in zip(best.hypothesis.sized.effects, covariances, rough, strict=True):
-        for number, sd in numbers.items():
-            share = sd / max(float(np.sqrt(whole[number, number])), 1e-300)
-            share = share if effect.jumps else max(share, 1.0)  # by derivatives, all other numbers may move as well
-            whole[number] *= share
-            whole[:, number] *= share
-    return best, covariances
-
-
-def _parameters(run: Run, model: ProcessModel, uncertain: Mapping[str, float], best: Explained) -> dict[str, Adjusted]:
-    """The uncertain parameters under the best explanation, whatever its numbers may be."""
-    sds = best.hypothesis.offset_sds(run, best.fit) if uncertain else {}
-    off = best.hypothesis.offsets(best.fit)
-    found = {}
-    for name, stated_sd in uncertain.items():
-        item = model.parameter(name)
-        found[name] = Adjusted(item.value, stated_sd, Estimate(item.value + off[name], sds[name], item.unit))
-    return found
-
-
-def _causes(best: Explained, covariances: Sequence[Array]) -> list[Cause]:
-    hypothesis, causes = best.hypothesis, []
-    for effect, course, theta, part in zip(
-        hypothesis.sized.effects, hypothesis.courses, best.fit.theta, covariances, strict=True
-    ):
-        value = course.parameters(theta)
-        slope = {name: np.zeros(theta.size) for name in value}
-        for place in range(theta.size):
-            step = 0.01 * sqrt(max(float(part[place, place]), 1e-300))
-            near = theta.copy()
-            near[place] += step
-            for name, number in course.parameters(near).items():
-                slope[name][place] = (number - value[name]) / step
-        parameters = {
-            name: Estimate(
-                number, sqrt(max(float(slope[name] @ part @ slope[name]), 0.0)), course.unit(name, effect.unit)
-            )
-            for name, number in value.items()
-        }
-        causes.append(
-            Cause(effect.name, course.name, effect.labels.get(course.name, effect.label), effect.location, parameters)
-        )
-    return causes
-
-
 def _gain(model: ProcessModel, found: Found, best: Explained, before: Errors, after: Errors) -> Gain:
     noise_sd = found.noise.sensor_sd(model.output_names)
     held_out = {
@@ -283,85 +214,6 @@ def _left_out(whole: Run, run: Run) -> list[str]:
         return []
     values = "1 value was" if count == 1 else f"{count} values were"
     return [f"{values} left out for outliers: far off for a moment, they say nothing of the plant"]
-
-
-def _curves(
-    whole: Run, run: Run, model: ProcessModel, nominal: Explained, best: Explained, covariances: Sequence[Array]
-) -> Curves:
-    outputs = model.output_names
-    hypothesis, signals = best.hypothesis, best.hypothesis.signals(best.fit)
-    known = hypothesis.offsets(best.fit)
-    deviation, deviation_sd = {}, {}
-    for effect, course, theta, signal, part in zip(
-        hypothesis.sized.effects, hypothesis.courses, best.fit.theta, signals, covariances, strict=True
-    ):
-        slope = course.derivatives(theta, course.least_differences).at_row
-        deviation[effect.name] = signal.at_row
-        deviation_sd[effect.name] = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, part, slope), 0.0))
-    return Curves(
-        run.time_min,
-        dict(zip(model.input_names, run.inputs.T, strict=True)),
-        dict(zip(outputs, whole.measured.T, strict=True)),
-        dict(zip(outputs, free_run(run, nominal.hypothesis.sized, (), known).T, strict=True)),
-        dict(zip(outputs, free_run(run, hypothesis.sized, signals, known).T, strict=True)),
-        dict(zip(outputs, _standardised(nominal).T, strict=True)),
-        dict(zip(outputs, _standardised(best).T, strict=True)),
-        deviation,
-        deviation_sd,
-    )
-
-
-def _differences(model: ProcessModel, found: Found, curves: Curves) -> dict[str, Difference]:
-    columns = curves.inputs | curves.free_before
-    units = {item.name: item.unit for item in model.inputs} | {item.name: item.unit for item in model.outputs}
-    signals = {name: (columns[name], unit) for name, unit in units.items()}
-    noise_sd = found.noise.sensor_sd(model.output_names)
-    return {
-        output.name: difference(
-            curves.measured[output.name] - curves.free_before[output.name],
-            curves.residual_before[output.name],
-            float(noise_sd[place]),
-            output.unit,
-            curves.time_min,
-            signals,
-        )
-        for place, output in enumerate(model.outputs)
-    }
-
-
-def _standardised(item: Explained) -> Array:
-    return np.asarray(item.fit.found.residual / item.fit.found.sd)
-
-
-def _matters(curves: Curves, bands: Mapping[str, float]) -> bool:
-    """Whether the free runs of both models differ by more than the tolerance in an output."""
-    for output, band in bands.items():
-        # The filter says nothing of the first row.
-        difference = (curves.free_after[output] - curves.free_before[output])[1:]
-        known = difference[np.isfinite(difference)]
-        if known.size < difference.size or float(np.sqrt(np.mean(known**2))) > band:
-            return True
-    return False
-
-
-def _left_matters(before: Errors, found: Found, model: ProcessModel, bands: Mapping[str, float]) -> bool:
-    """Whether the nominal free run errs by more than noise and tolerance in an output."""
-    noise = found.own_noise.sensor_sd(model.output_names)
-    left = np.sqrt(np.maximum(before.free**2 - noise**2, 0.0))
-    return any(not value <= bands[name] for name, value in zip(model.output_names, left.tolist(), strict=True))
-
-
-def _bands(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> dict[str, float]:
-    for name, value in tolerance.items():
-        if name not in model.output_names:
-            raise InputError(f"tolerance must be of {', '.join(model.output_names)}, got {name}")
-        if not 0.0 < value < np.inf:
-            raise InputError(f"tolerance of {name} must be a positive number, got {value:g}")
-    ranges = np.nanquantile(run.measured, 0.99, axis=0) - np.nanquantile(run.measured, 0.01, axis=0)
-    return {
-        name: tolerance.get(name, PRACTICAL_SHARE * float(size))
-        for name, size in zip(model.output_names, ranges, strict=True)
-    }
 
 
 def _smallest_sd(model: ProcessModel) -> list[float]:

@@ -1,0 +1,71 @@
+"""What the pictures of a diagnosis are drawn from, and where a simulation differs from its record."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from diagnosis.difference import Difference, difference
+from diagnosis.held_out import free_run
+from diagnosis.result import Curves
+from diagnosis.run import Run
+from diagnosis.search import Explained, Found
+from reactorwatch.process.model import Array, ProcessModel
+
+
+def curves_of(
+    whole: Run, run: Run, model: ProcessModel, nominal: Explained, best: Explained, covariances: Sequence[Array]
+) -> Curves:
+    """Both simulations over the record, and the courses of the causes.
+
+    Args:
+        whole: the record.
+        run: the same without outliers.
+        model: of the plant.
+        nominal: without any cause.
+        best: explanation.
+        covariances: of the numbers of each of its effects.
+    """
+    outputs = model.output_names
+    hypothesis, signals = best.hypothesis, best.hypothesis.signals(best.fit)
+    known = hypothesis.offsets(best.fit)
+    deviation, deviation_sd = {}, {}
+    for effect, course, theta, signal, part in zip(
+        hypothesis.sized.effects, hypothesis.courses, best.fit.theta, signals, covariances, strict=True
+    ):
+        slope = course.derivatives(theta, course.least_differences).at_row
+        deviation[effect.name] = signal.at_row
+        deviation_sd[effect.name] = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, part, slope), 0.0))
+    return Curves(
+        run.time_min,
+        dict(zip(model.input_names, run.inputs.T, strict=True)),
+        dict(zip(outputs, whole.measured.T, strict=True)),
+        dict(zip(outputs, free_run(run, nominal.hypothesis.sized, (), known).T, strict=True)),
+        dict(zip(outputs, free_run(run, hypothesis.sized, signals, known).T, strict=True)),
+        dict(zip(outputs, _standardised(nominal).T, strict=True)),
+        dict(zip(outputs, _standardised(best).T, strict=True)),
+        deviation,
+        deviation_sd,
+    )
+
+
+def differences_of(model: ProcessModel, found: Found, curves: Curves) -> dict[str, Difference]:
+    """Of each output: where, when and at which operating points the simulation errs."""
+    columns = curves.inputs | curves.free_before
+    units = {item.name: item.unit for item in model.inputs} | {item.name: item.unit for item in model.outputs}
+    signals = {name: (columns[name], unit) for name, unit in units.items()}
+    noise_sd = found.noise.sensor_sd(model.output_names)
+    return {
+        output.name: difference(
+            curves.measured[output.name] - curves.free_before[output.name],
+            curves.residual_before[output.name],
+            float(noise_sd[place]),
+            output.unit,
+            curves.time_min,
+            signals,
+        )
+        for place, output in enumerate(model.outputs)
+    }
+
+
+def _standardised(item: Explained) -> Array:
+    return np.asarray(item.fit.found.residual / item.fit.found.sd)

@@ -1,0 +1,81 @@
+"""The numbers of an explanation, with their intervals."""
+
+from collections.abc import Mapping, Sequence
+from math import sqrt
+
+import numpy as np
+
+from diagnosis.result import Adjusted, Cause, Estimate
+from diagnosis.rough_numbers import settled
+from diagnosis.run import Run
+from diagnosis.search import Explained, Search
+from reactorwatch.process.model import Array, ProcessModel
+
+
+def covariances_of(run: Run, best: Explained) -> list[Array]:
+    """Of the numbers of each effect, whatever those of the others."""
+    if not best.key:
+        return []
+    whole, parts, begin = best.hypothesis.covariance(run, best.fit), [], 0
+    for theta in best.fit.theta:
+        parts.append(whole[begin : begin + theta.size, begin : begin + theta.size])
+        begin += theta.size
+    return parts
+
+
+def with_rough_numbers(search: Search, best: Explained) -> tuple[Explained, list[Array]]:
+    """With the numbers in which the likelihood is rough where it is largest; and the covariances with their spread."""
+    sds = [np.sqrt(np.maximum(np.diag(item), 0.0)) for item in covariances_of(search.run, best)]
+    best, rough = settled(search, best, sds)
+    covariances = covariances_of(search.run, best)
+    for effect, whole, numbers in zip(best.hypothesis.sized.effects, covariances, rough, strict=True):
+        for number, sd in numbers.items():
+            share = sd / max(float(np.sqrt(whole[number, number])), 1e-300)
+            share = share if effect.jumps else max(share, 1.0)  # by derivatives, all other numbers may move as well
+            whole[number] *= share
+            whole[:, number] *= share
+    return best, covariances
+
+
+def adjusted_parameters(
+    run: Run, model: ProcessModel, uncertain: Mapping[str, float], best: Explained
+) -> dict[str, Adjusted]:
+    """The uncertain parameters under the best explanation, whatever its numbers may be."""
+    sds = best.hypothesis.offset_sds(run, best.fit) if uncertain else {}
+    off = best.hypothesis.offsets(best.fit)
+    found = {}
+    for name, stated_sd in uncertain.items():
+        item = model.parameter(name)
+        found[name] = Adjusted(item.value, stated_sd, Estimate(item.value + off[name], sds[name], item.unit))
+    return found
+
+
+def causes_of(best: Explained, covariances: Sequence[Array]) -> list[Cause]:
+    """The causes of an explanation, with its numbers.
+
+    Args:
+        best: of the record.
+        covariances: of the numbers of each of its effects.
+    """
+    hypothesis, causes = best.hypothesis, []
+    for effect, course, theta, part in zip(
+        hypothesis.sized.effects, hypothesis.courses, best.fit.theta, covariances, strict=True
+    ):
+        value = course.parameters(theta)
+        slope = {name: np.zeros(theta.size) for name in value}
+        for place in range(theta.size):
+            step = 0.01 * sqrt(max(float(part[place, place]), 1e-300))
+            near = theta.copy()
+            near[place] += step
+            for name, number in course.parameters(near).items():
+                slope[name][place] = (number - value[name]) / step
+        parameters = {
+            name: Estimate(
+                number, sqrt(max(float(slope[name] @ part @ slope[name]), 0.0)), course.unit(name, effect.unit)
+            )
+            for name, number in value.items()
+        }
+        causes.append(
+            Cause(effect.name, course.name, effect.labels.get(course.name, effect.label), effect.location, parameters)
+        )
+    return causes

@@ -1,0 +1,56 @@
+"""Whether a difference matters in practice: that is for the user to say."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from diagnosis.held_out import Errors
+from diagnosis.result import Curves
+from diagnosis.run import Run
+from diagnosis.search import Found
+from reactorwatch.errors import InputError
+from reactorwatch.process.model import ProcessModel
+
+PRACTICAL_SHARE = 0.02
+"""Of an output's range in the record: a difference in it that matters, where the user does not say."""
+
+
+def bands_of(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> dict[str, float]:
+    """The root mean square difference in each output that does not matter, in its unit.
+
+    Args:
+        run: the record.
+        model: of the plant.
+        tolerance: as the user has it, by output.
+
+    Raises:
+        InputError: a tolerance is of no output, or not positive.
+    """
+    for name, value in tolerance.items():
+        if name not in model.output_names:
+            raise InputError(f"tolerance must be of {', '.join(model.output_names)}, got {name}")
+        if not 0.0 < value < np.inf:
+            raise InputError(f"tolerance of {name} must be a positive number, got {value:g}")
+    ranges = np.nanquantile(run.measured, 0.99, axis=0) - np.nanquantile(run.measured, 0.01, axis=0)
+    return {
+        name: tolerance.get(name, PRACTICAL_SHARE * float(size))
+        for name, size in zip(model.output_names, ranges, strict=True)
+    }
+
+
+def matters(curves: Curves, bands: Mapping[str, float]) -> bool:
+    """Whether the free runs of both models differ by more than the tolerance in an output."""
+    for output, band in bands.items():
+        # The filter says nothing of the first row.
+        difference = (curves.free_after[output] - curves.free_before[output])[1:]
+        known = difference[np.isfinite(difference)]
+        if known.size < difference.size or float(np.sqrt(np.mean(known**2))) > band:
+            return True
+    return False
+
+
+def left_matters(before: Errors, found: Found, model: ProcessModel, bands: Mapping[str, float]) -> bool:
+    """Whether the nominal free run errs by more than noise and tolerance in an output."""
+    noise = found.own_noise.sensor_sd(model.output_names)
+    left = np.sqrt(np.maximum(before.free**2 - noise**2, 0.0))
+    return any(not value <= bands[name] for name, value in zip(model.output_names, left.tolist(), strict=True))
