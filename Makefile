@@ -1,11 +1,11 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study kills pictures protobuf clean
+.PHONY: help setup demo test lint bench faults study kills cuts pictures protobuf clean
 
 PYTHON ?= python3
 BIN := .venv/bin
 # each has a target of its own
-LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py)
+LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py)
 READY := .venv/.ready
 
 help: ## what there is to make
@@ -48,6 +48,9 @@ study: $(READY) ## the diagnosis on records with something hidden in them; write
 
 kills: $(READY) ## kill a recorder fifty times under load, and count what is missing: three minutes
 	@$(BIN)/python benchmarks/recorder_kills.py
+
+cuts: $(READY) ## cut links and kill routers under load for up to 30 seconds, and count what is missing: five minutes
+	@$(BIN)/python benchmarks/link_cuts.py
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py

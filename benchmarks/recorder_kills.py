@@ -37,6 +37,7 @@ SIGNALS = 5
 BATCHES_PER_S = 100
 SOONEST_S, LATEST_S = 0.5, 4.0
 PATIENCE_S = 60.0
+FLUSHED_BYTES = 20_000
 
 
 @dataclass(frozen=True)
@@ -63,10 +64,18 @@ class Publisher:
         self._bus = bus
         self._rows = rate_per_s // SIGNALS // BATCHES_PER_S
         self._ended = threading.Event()
+        self._changed = threading.Condition()
         self.sequence = 0
         """Of the samples that are published next."""
+        self.slowest_s = 0.0
+        """The longest that publishing a batch took."""
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
+
+    def wait(self, rows: int) -> None:
+        """Wait until so many rows were published."""
+        with self._changed:
+            assert self._changed.wait_for(lambda: self.sequence >= rows, PATIENCE_S), "nothing is published"
 
     def close(self) -> None:
         """Publish no more."""
@@ -77,6 +86,7 @@ class Publisher:
         due = time.monotonic()
         while not self._ended.wait(max(0.0, due - time.monotonic())):
             due += 1.0 / BATCHES_PER_S
+            began = time.monotonic()
             for _ in range(self._rows):
                 for number in range(SIGNALS):
                     sample = messages.Sample(
@@ -84,15 +94,18 @@ class Publisher:
                     )
                     self._bus.publish(encode(Publication(keys.key("cstr", keys.SAMPLE, f"x{number}"), sample)))
                 self.sequence += 1
+            self.slowest_s = max(self.slowest_s, time.monotonic() - began)
+            with self._changed:
+                self._changed.notify_all()
 
 
 class Tokens:
     """Whether a recorder shows that it is alive."""
 
-    def __init__(self, bus: ZenohBus) -> None:
+    def __init__(self, bus: ZenohBus, plant: str = "cstr") -> None:
         self._changed = threading.Condition()
         self._alive = False
-        bus.watch_alive(keys.key("cstr", keys.ALIVE, "recorder"), self._on_token)
+        bus.watch_alive(keys.key(plant, keys.ALIVE, "recorder"), self._on_token)
 
     def wait(self, *, alive: bool) -> None:
         """Wait until it does, or does not."""
@@ -134,6 +147,7 @@ def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Kil
         for _ in range(kills):
             with recorder(folder, config.endpoint, tokens) as process:
                 alive_at.append(publisher.sequence + 1)  # the row that is being published may be half heard
+                wait_for_a_flush(folder, publisher)  # it has been told what was before, and writes
                 time.sleep(random.uniform(SOONEST_S, LATEST_S))
                 killed_ns.append(time.time_ns())
                 process.send_signal(signal.SIGKILL)
@@ -148,6 +162,12 @@ def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Kil
     assert not left, f"not recovered: {left}"
     files = recordings_in(folder)[:kills]
     return [_look(path, at, alive) for path, at, alive in zip(files, killed_ns, alive_at, strict=True)]
+
+
+def wait_for_a_flush(folder: Path, publisher: Publisher) -> None:
+    """Wait until a file that is being written holds more than its beginning."""
+    while max((part.stat().st_size for part in folder.glob("*.part")), default=0) < FLUSHED_BYTES:
+        publisher.wait(publisher.sequence + BATCHES_PER_S // 10)
 
 
 def _look(path: Path, killed_ns: int, alive: int) -> Killed:

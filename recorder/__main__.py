@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from datetime import datetime
 from pathlib import Path
 
@@ -25,6 +25,9 @@ from recorder.node import Decisions, RecorderNode
 from recorder.part_file import PartFile
 from recorder.retention import DAY_NS, Limits
 from recorder.series import Series
+
+HISTORY_MARGIN_NS = 10_000_000_000
+"""Between a message's publication, by which the bus knows how old it is, and its receipt, by which a file does."""
 
 _MB = 1_000_000
 
@@ -55,13 +58,18 @@ def record(config: RecorderConfig, bus_config: BusConfig, stop: StopSignal) -> P
     try:
         start_ns = time.time_ns()
         with files:
+            history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
+            known = files.received_since(start_ns - history_ns)
             files.begin((), start_ns)
             files.recover_left_behind()
+            node = node_for(config, files, start_ns, known, known_until_ns=start_ns + history_ns)
             serve(
-                node_for(config, files, start_ns),
+                node,
                 bus,
                 stop,
                 subscriptions=(config.key_expression,),
+                history=True,
+                on_gap=node.on_gap,
                 on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
                 linger_s=config.linger_s,
             )
@@ -90,8 +98,14 @@ def files_for(config: RecorderConfig, open_part: Callable[[Path], PartFile] = Pa
     return RecordingFiles(series_for(config), about, limits, synced=config.fsync != "never", open_part=open_part)
 
 
-def node_for(config: RecorderConfig, files: RecordingFiles, start_ns: int) -> RecorderNode:
-    """The node that writes to them."""
+def node_for(
+    config: RecorderConfig,
+    files: RecordingFiles,
+    start_ns: int,
+    known: Collection[int] = (),
+    known_until_ns: int = 0,
+) -> RecorderNode:
+    """The node that writes to them; see `Recorder` for what is known."""
     filing = Filing(
         round(config.flush_period_s * 1e9),
         config.fsync,
@@ -101,7 +115,7 @@ def node_for(config: RecorderConfig, files: RecordingFiles, start_ns: int) -> Re
     )
     black_box = BlackBox(round(config.black_box_min * MINUTE_NS), own=DISK_ALARM)
     return RecorderNode(
-        Recorder(config.plant, start_ns),
+        Recorder(config.plant, start_ns, known, known_until_ns),
         Decisions(filing, Head(), black_box),
         files,
         health_period_ns=round(config.health_period_s * 1e9),

@@ -5,6 +5,7 @@ kept without a schema, so that it spoils no reader's day, and is counted as refu
 """
 
 from collections import Counter
+from collections.abc import Collection
 from typing import Any, NamedTuple
 
 from google.protobuf.message import Message
@@ -13,6 +14,7 @@ from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.runtime.in_order import Gap
 from recorder.entry import Entry
 from recorder.sequences import SequenceCheck
 
@@ -40,15 +42,25 @@ class Kept(NamedTuple):
         return self.message is not None
 
 
+def fingerprint(key: str, payload: bytes) -> int:
+    """What a message is known by, within this process."""
+    return hash((key, payload))
+
+
 class Recorder:
     """Turns messages into entries and counts what it sees.
 
     Args:
         plant: the plant that health is reported under.
         start_ns: the clock reading at which it begins.
+        known: fingerprints of what the files before hold, and the bus may tell once more.
+        known_until_ns: when they are forgotten.
     """
 
-    def __init__(self, plant: str, start_ns: int) -> None:
+    def __init__(self, plant: str, start_ns: int, known: Collection[int] = (), known_until_ns: int = 0) -> None:
+        self._known = set(known)
+        self._known_until_ns = known_until_ns
+        self._unrecovered = 0
         self._plant = plant
         self._start_ns = start_ns
         self._last_ns = start_ns
@@ -61,13 +73,15 @@ class Recorder:
         self._checks: dict[str, SequenceCheck | None] = {}  # by key; None for a key that is not one of ours
 
     def on_message(self, message: Encoded, now_ns: int) -> Kept | None:
-        """The entry for a message; None if it is on one key too many.
+        """The entry for a message; None if it is on one key too many, or in a file already.
 
         The time of receipt never runs backwards, though a clock that is set may: the order in the file is the order
         in which things came.
         """
         key, payload, encoding, received_ns = message
         self._received += 1
+        if self._known and self._is_known(key, payload, now_ns):
+            return None
         received_ns = received_ns or now_ns
         self._longest_lag_ns = max(self._longest_lag_ns, now_ns - received_ns)
         self._last_ns = received_ns = max(received_ns, self._last_ns)
@@ -94,6 +108,21 @@ class Recorder:
             elif check is not None:
                 check.update(decoded.sequence, time_ns)
         return Kept(Entry(key, payload, encoding, received_ns, time_ns), decoded)
+
+    def _is_known(self, key: str, payload: bytes, now_ns: int) -> bool:
+        """Whether it is in a file already; it is passed over once."""
+        if now_ns > self._known_until_ns:
+            self._known.clear()
+        name = fingerprint(key, payload)
+        if name not in self._known:
+            return False
+        self._known.remove(name)
+        return True
+
+    def on_gap(self, gap: Gap) -> None:
+        """Count what was lost on the way. Samples count themselves, by the numbers that they carry."""
+        if keys.parse(f"{gap.stream}/x") is None or gap.stream.split("/")[2] != keys.SAMPLE:
+            self._unrecovered += gap.messages
 
     def moment(self, now_ns: int) -> int:
         """A time of receipt for what the recorder itself adds: nothing that comes later is recorded before it."""
@@ -156,7 +185,7 @@ class Recorder:
             phase=phase,
             uptime_s=(now_ns - self._start_ns) / 1e9,
             received=self._received,
-            lost=min(sum(check.lost for check in checks), _LARGEST_COUNT),
+            lost=min(sum(check.lost for check in checks) + self._unrecovered, _LARGEST_COUNT),
             duplicated=sum(check.duplicated for check in checks),
             out_of_order=sum(check.out_of_order for check in checks),
             refused=self._refused.total(),

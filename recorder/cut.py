@@ -5,6 +5,7 @@ at the beginning of any file of ours; see `head`.
 """
 
 import heapq
+from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from recorder.entry import Entry
+from recorder.gaps import GAP, from_metadata
 from recorder.head import Head
 from recorder.mcap_chunks import damaged, read_summary, span_ns
 from recorder.mcap_scan import FOREVER_NS, Scan, Stored, Wanted
@@ -101,6 +103,7 @@ def cut(
             count += 1
         if not count:
             raise InputError(f"{sources[0]}: holds no message of that time")
+        _copy_gaps(found, writer, window.received_ns)
     return count
 
 
@@ -125,6 +128,7 @@ def merge(sources: Sequence[Path], out: Path, metadata: Mapping[str, str]) -> in
         for stored in _in_order(found):
             writer.copy(stored)
             count += 1
+        _copy_gaps(found, writer)
     return count
 
 
@@ -200,6 +204,19 @@ def _standing(sources: Sequence[_Source], window: Window, begun_ns: int) -> list
             except DecodeError:
                 continue
     return head.entries(begun_ns)
+
+
+def _copy_gaps(
+    sources: Sequence[_Source], writer: RecordingWriter, received_ns: tuple[int, int] = (0, FOREVER_NS)
+) -> None:
+    """Write what the sources say was lost on the way."""
+    for source in sources:
+        scan = Scan(source.path, wanted=lambda _: False)
+        deque(scan, maxlen=0)
+        for record in scan.metadata:
+            gap = from_metadata(record.metadata) if record.name == GAP else None
+            if gap is not None and received_ns[0] <= gap.noticed_ns <= received_ns[1]:
+                writer.add_metadata(GAP, record.metadata)
 
 
 def _check_new(out: Path, sources: Sequence[Path]) -> None:

@@ -15,11 +15,14 @@ from typing import Self
 import structlog
 
 from reactorwatch.errors import InputError
+from reactorwatch.runtime.in_order import Gap
 from recorder.black_box import Stretch
 from recorder.chores import Chores
-from recorder.core import Kept
+from recorder.core import Kept, fingerprint
 from recorder.cut import cut, received_between
 from recorder.entry import Entry
+from recorder.gaps import GAP, to_metadata
+from recorder.mcap_scan import Scan
 from recorder.mcap_writer import RecordingWriter, check_free, part_of
 from recorder.part_file import PART, PartFile, is_held, left_behind
 from recorder.recover import recover
@@ -126,6 +129,33 @@ class RecordingFiles:
         self._writer.write(kept.entry, readable=kept.readable)
         self._last_ns = kept.entry.log_time_ns
 
+    def write_gap(self, gap: Gap) -> None:
+        """Write that something was lost on the way.
+
+        Raises:
+            WriteError: the file cannot be written; see `abandon`.
+        """
+        assert self._writer is not None, "a file was begun"
+        self._writer.add_metadata(GAP, to_metadata(gap))
+        log.warning("lost on the way", stream=gap.stream, messages=gap.messages)
+
+    def received_since(self, from_ns: int) -> set[int]:
+        """Fingerprints of what the files that are there received since a moment, complete or left behind."""
+        known: set[int] = set()
+        for path in (*self._finished(), *self._left):
+            if path.stat().st_mtime_ns < from_ns:
+                continue
+            try:
+                scan = Scan(path, from_ns=from_ns)
+            except InputError:
+                continue  # nothing is in it
+            known.update(
+                fingerprint(stored.channel.topic, stored.payload)
+                for stored in scan
+                if stored.log_time_ns >= from_ns and not stored.repeated
+            )
+        return known
+
     def flush(self) -> None:
         """Hand over what was written; see `RecordingWriter.flush`."""
         if self._writer is not None:
@@ -188,6 +218,8 @@ class RecordingFiles:
             self._chores.finish()
 
     def _finished(self) -> list[Path]:
+        if not self._series.folder.is_dir():
+            return []
         return [path for path in self._series.folder.iterdir() if self._series.owns(path.name) and path.is_file()]
 
     def _recover(self, part: Path) -> None:
@@ -196,6 +228,10 @@ class RecordingFiles:
             path = part.with_name(part.name.removesuffix(PART))
             if path.exists():
                 path = path.with_name(f"{path.stem}-recovered{path.suffix}")
+            if _is_empty(part):
+                part.unlink()
+                log.info("nothing was in it yet", file=str(part))
+                return
             try:
                 saved = recover(part, path)
             except InputError as error:
@@ -240,6 +276,15 @@ class RecordingFiles:
         for path in to_delete(finished, self.size_bytes, self._limits, now_ns, needed_since_ns):
             path.unlink()
             log.info("deleted", file=str(path), why="the limits of what is kept")
+
+
+def _is_empty(part: Path) -> bool:
+    """Whether a file was left behind before anything that it received was handed over."""
+    try:
+        scan = Scan(part)
+        return not any(True for _ in scan) and not scan.orphans and all(damage.cut_off for damage in scan.damages)
+    except InputError:
+        return part.stat().st_size == 0
 
 
 def _left_behind(series: Series) -> list[Path]:

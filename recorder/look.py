@@ -1,14 +1,20 @@
 """A recording looked over: a file in whatever state, or the files in a folder."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from mcap.records import Metadata
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.errors import InputError
-from recorder.mcap_file import METADATA, ZERO_NS, read_messages, read_metadata
+from reactorwatch.runtime.in_order import Gap
+from recorder.gaps import GAP, from_metadata
+from recorder.mcap_chunks import metadata_records
+from recorder.mcap_file import METADATA, ZERO_NS, read_messages, read_metadata, recordings_in
 from recorder.mcap_scan import Scan
 from recorder.overview import Overview, overview
 
@@ -22,12 +28,14 @@ class Look:
         metadata: what it says about its origin, or the first file of a folder does.
         zero_ns: the time that its minutes count from.
         damages: what of it cannot be read; empty if it is whole.
+        gaps: what was lost on the way to the recorder, as it says itself.
     """
 
     overview: Overview
     metadata: dict[str, str]
     zero_ns: int
     damages: tuple[str, ...]
+    gaps: tuple[Gap, ...] = ()
 
 
 def look_over(path: Path) -> Look:
@@ -38,14 +46,16 @@ def look_over(path: Path) -> Look:
     """
     if path.is_dir():
         found, metadata = overview(read_messages(path)), read_metadata(path)
-        return Look(found, metadata, _zero_ns(metadata, found.first_sample_ns), ())
+        records = [record for file in recordings_in(path) for record in metadata_records(file)]
+        return Look(found, metadata, _zero_ns(metadata, found.first_sample_ns), (), _gaps(records))
     scan = Scan(path)
     found = overview(stored.entry for stored in scan)
     metadata = next((record.metadata for record in scan.metadata if record.name == METADATA), {})
     damages = [str(damage) for damage in scan.damages]
     if scan.orphans:
         damages.append(f"{scan.orphans} messages of channels that are described nowhere")
-    return Look(found, metadata, _zero_ns(metadata, found.first_sample_ns), tuple(damages))
+    zero_ns = _zero_ns(metadata, found.first_sample_ns)
+    return Look(found, metadata, zero_ns, tuple(damages), _gaps(scan.metadata))
 
 
 def zero_ns_of(path: Path) -> int:
@@ -65,6 +75,11 @@ def zero_ns_of(path: Path) -> int:
     if first_ns is None:
         raise InputError(f"{path}: holds no sample")
     return _zero_ns(read_metadata(path), first_ns)
+
+
+def _gaps(records: Iterable[Metadata]) -> tuple[Gap, ...]:
+    found = (from_metadata(record.metadata) for record in records if record.name == GAP)
+    return tuple(gap for gap in found if gap is not None)
 
 
 def _zero_ns(metadata: dict[str, str], first_sample_ns: int) -> int:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
+from reactorwatch.runtime.in_order import Gap
 from recorder.black_box import BlackBox
 from recorder.core import Kept, Recorder
 from recorder.files import RecordingFiles
@@ -70,6 +71,17 @@ class RecorderNode:
             if over is not None:
                 self._files.keep_for_good(over)
         return told
+
+    def on_gap(self, gap: Gap, now_ns: int) -> list[Publication]:
+        """Write that something was lost on the way."""
+        self._core.on_gap(gap)
+        if self._core.is_stopped:
+            return []
+        try:
+            self._files.write_gap(gap)
+        except InputError as error:
+            return self._stop(error, now_ns)
+        return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """It takes none."""

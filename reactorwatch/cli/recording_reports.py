@@ -73,6 +73,16 @@ def info_object(seen: Look, file: Path) -> dict[str, Any]:
             {"topic": gap.key, "first": gap.first, "last": gap.last, "after_min": minutes(gap.after_ns)}
             for gap in found.gaps
         ],
+        "lost_on_the_way": [
+            {
+                "stream": gap.stream,
+                "messages": gap.messages,
+                "first": gap.first,
+                "last": gap.last,
+                "noticed_ns": gap.noticed_ns,
+            }
+            for gap in seen.gaps
+        ],
         "alarms": [
             {
                 "alarm": alarm.alarm,
@@ -112,6 +122,12 @@ def info_text(seen: Look, file: Path) -> str:
     ]
     if len(said["gaps"]) > MOST_LINES:
         lines.append(f"  and {len(said['gaps']) - MOST_LINES} more gaps (--json names them)")
+    lines += [
+        f"lost on the way: {gap['messages']} messages of {gap['stream']}, noticed {moment(gap['noticed_ns'])}"
+        for gap in said["lost_on_the_way"][:MOST_LINES]
+    ]
+    if len(said["lost_on_the_way"]) > MOST_LINES:
+        lines.append(f"  and {len(said['lost_on_the_way']) - MOST_LINES} times more (--json names them)")
     if not said["lost"]:
         lines.append("no sample is missing, by their sequence numbers")
     lines += [

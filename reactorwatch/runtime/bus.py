@@ -13,6 +13,7 @@ from typing import Protocol
 from google.protobuf.message import Message
 
 from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.runtime.in_order import Gap
 
 
 class Request(Protocol):
@@ -32,8 +33,25 @@ class Bus(Protocol):
     def publish(self, message: Encoded) -> None:
         """Send bytes out on their key."""
 
-    def subscribe(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
-        """Call the handler, from a thread of the bus, with everything published on matching keys."""
+    def subscribe(
+        self,
+        key_expression: str,
+        handler: Callable[[Encoded], None],
+        *,
+        on_gap: Callable[[Gap], None] | None = None,
+        history: bool = False,
+    ) -> None:
+        """Call the handler, from a thread of the bus, with everything published on matching keys.
+
+        What one bus publishes of one kind of one plant comes in the order of its publication, if the expression is of
+        whole kinds (it ends in `/**`); on each key it always does.
+
+        Args:
+            key_expression: the keys.
+            handler: gets the messages.
+            on_gap: gets told, from a thread of the bus, what was published and never came.
+            history: whether what was published before, and is still remembered, comes first.
+        """
 
     def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
         """Call the handler, from a thread of the bus, with every question on matching keys."""
@@ -103,8 +121,15 @@ class MemoryBus:
             if matches(expression, message.key):
                 handler(message)
 
-    def subscribe(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
-        """See `Bus`."""
+    def subscribe(
+        self,
+        key_expression: str,
+        handler: Callable[[Encoded], None],
+        *,
+        on_gap: Callable[[Gap], None] | None = None,
+        history: bool = False,
+    ) -> None:
+        """See `Bus`; nothing is lost here, and nothing remembered."""
         with self._exchange.lock:
             self._exchange.subscriptions.append((self, key_expression, handler))
 

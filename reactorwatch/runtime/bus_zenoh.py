@@ -2,24 +2,39 @@
 
 Nodes are clients of a router, because a router does not relay between two peers that don't listen, and because
 one address is all that a node then has to know. The router may be this process (`router`), or Zenoh's own.
+
+Nothing that was published is lost on the way as long as its publisher lives and remembers it. Each publisher keeps its
+last messages on each key (`cache_messages`) and tells twice a second which was its last; a subscriber that finds one
+missing asks for it, and one that comes late may ask for what was published before (`history_s`). This is Zenoh's
+advanced publisher and subscriber. What it cannot do is keep the order across keys: see `in_order`.
+
+So publishers need not wait for a network that takes no more: they throw away (`drop`), and what a subscriber thereby
+misses it gets later. A subscriber that is stuck then holds nobody up. Only what somebody asked for again is sent
+with waiting, for else a long recovery would be thrown away in part; and a link that takes nothing for `STUCK_S` is
+closed.
 """
 
 import json
 import re
+import secrets
+import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import structlog
 import zenoh
+import zenoh.ext
 from google.protobuf.message import Message
 
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus import Request
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.delivery import Delivery, Numbered
+from reactorwatch.runtime.in_order import Gap
 from reactorwatch.runtime.serve import StopSignal
 
 log = structlog.get_logger()
@@ -29,6 +44,15 @@ LONGEST_RETRY_S = 2.0
 SAY_AGAIN_S = 30.0
 FLUSH_WITHIN_S = 10.0
 NOBODY = "reactorwatch/nobody"  # a key that no queryable answers
+HEARTBEAT_S = 0.5
+LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that who missed it can ask for it
+STUCK_S = 1.0
+STREAM_PARTS = 3  # of a key: root, plant and kind
+
+CACHES = "@adv/**"  # below a key, where Zenoh's publishers answer for what they remember of it
+HISTORY_WITHIN_S = 10.0
+
+_NUMBERED = struct.Struct("<QQ")  # who published it, and its number in the stream
 
 
 def _configured(settings: dict[str, Any]) -> zenoh.Config:
@@ -38,6 +62,7 @@ def _configured(settings: dict[str, Any]) -> zenoh.Config:
     return config
 
 
+_STUCK = {"transport/link/tx/queue/congestion_control/block/wait_before_close": round(STUCK_S * 1e6)}
 _RETRY = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
 
 
@@ -55,31 +80,100 @@ class ZenohRequest:
         self.query.drop()
 
 
+@dataclass
+class _Key:
+    """What is published on a key."""
+
+    publisher: zenoh.ext.AdvancedPublisher
+    stream: str
+
+
 class ZenohBus:
     """See `reactorwatch.runtime.bus.Bus`."""
 
-    def __init__(self, session: zenoh.Session, congestion: str) -> None:
+    def __init__(self, session: zenoh.Session, config: BusConfig) -> None:
         self._session = session
-        self._congestion = zenoh.CongestionControl.BLOCK if congestion == "block" else zenoh.CongestionControl.DROP
-        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._config = config
+        self._name = secrets.randbits(64)
+        self._keys: dict[str, _Key] = {}
+        self._numbers: dict[str, int] = {}  # the next one of each stream
+        self._publishing = threading.Lock()  # what is numbered first goes out first
+        self._published_at: float | None = None
         self._declared: list[Any] = []  # Zenoh undeclares what nobody holds
+        self._deliveries: list[Delivery] = []
 
     def publish(self, message: Encoded) -> None:
         """See `Bus`."""
-        publisher = self._publishers.get(message.key)
-        if publisher is None:
-            publisher = self._session.declare_publisher(message.key, congestion_control=self._congestion)
-            self._publishers[message.key] = publisher
-        publisher.put(message.payload, encoding=message.encoding)
+        with self._publishing:
+            key = self._keys.get(message.key)
+            if key is None:
+                key = self._keys[message.key] = self._declare(message.key)
+            number = self._numbers[key.stream]
+            self._numbers[key.stream] = number + 1
+            attachment = _NUMBERED.pack(self._name, number)
+            key.publisher.put(message.payload, encoding=message.encoding, attachment=attachment)
+            self._published_at = time.monotonic()
 
-    def subscribe(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
+    def subscribe(
+        self,
+        key_expression: str,
+        handler: Callable[[Encoded], None],
+        *,
+        on_gap: Callable[[Gap], None] | None = None,
+        history: bool = False,
+    ) -> None:
         """See `Bus`."""
+        delivery = Delivery(handler, on_gap or _say_gap) if _is_of_whole_streams(key_expression) else None
 
         def on_sample(sample: zenoh.Sample) -> None:
-            now_ns = time.time_ns()
-            handler(Encoded(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), now_ns))
+            came = _numbered(sample)
+            if delivery is None or came is None:  # or it is of no publisher of ours
+                handler(_encoded(sample))
+            else:
+                delivery.receive(came)
 
-        self._declared.append(self._session.declare_subscriber(key_expression, on_sample))
+        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+        self._declared.append(
+            zenoh.ext.declare_advanced_subscriber(self._session, key_expression, on_sample, recovery=recovery)
+        )
+        if delivery is not None:
+            self._deliveries.append(delivery)
+            # The subscriber's own question for what was before left out keys that were being published on meanwhile.
+            for last in self._remembered(key_expression, "_max=1"):
+                delivery.tell_last(last)
+            if history:
+                for came in self._remembered(key_expression, f"_time=[now(-{self._config.history_s}s)..]"):
+                    delivery.tell(came)
+            threading.Thread(target=delivery.begin, daemon=True).start()  # the handler may wait for who called us
+
+    def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
+        """What publishers remember of what they have published."""
+        replies = self._session.get(
+            f"{key_expression}/{CACHES}?{which}",
+            consolidation=zenoh.ConsolidationMode.NONE,
+            accept_replies=zenoh.ReplyKeyExpr.ANY,
+            timeout=HISTORY_WITHIN_S,
+        )
+        for reply in replies:
+            came = _numbered(reply.ok) if reply.ok is not None else None
+            if came is not None:
+                yield came
+
+    def _declare(self, key: str) -> _Key:
+        stream = _stream(key)
+        self._numbers.setdefault(stream, 0)
+        # Of the same priority as all else: of a lower one, the word that this was all would overtake the replies.
+        again = zenoh.ext.RepliesConfig(congestion_control=zenoh.CongestionControl.BLOCK)
+        drop = self._config.congestion == "drop"
+        publisher = zenoh.ext.declare_advanced_publisher(
+            self._session,
+            key,
+            congestion_control=zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,
+            cache=zenoh.ext.CacheConfig(self._config.cache_messages, replies_config=again),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
+            publisher_detection=True,
+        )
+        return _Key(publisher, stream)
 
     def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
         """See `Bus`."""
@@ -122,11 +216,16 @@ class ZenohBus:
 
         A question to nobody goes the way of the messages before it, and its end comes back from the router: then they
         are all there. Zenoh's own close was never seen to drop what is queued (neither with the router stopped for a
-        second nor under load), but it promises nothing; this does, for one round trip.
+        second nor under load), but it promises nothing; this does, for one round trip. What was thrown away on a full
+        network is told once more by then, and can be asked for as long as this bus is open.
         """
+        if self._published_at is not None:
+            time.sleep(max(0.0, self._published_at + LAST_RECOVERY_S - time.monotonic()))
         for _ in self._session.get(NOBODY, timeout=FLUSH_WITHIN_S):
             pass
         self._session.close()
+        for delivery in self._deliveries:
+            delivery.close()
 
 
 def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
@@ -149,6 +248,8 @@ def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
         "connect/retry": _RETRY,
         "connect/timeout_ms": 0,
         "scouting/multicast/enabled": False,
+        "timestamping/enabled": True,  # by which the age of what was published is known
+        **_STUCK,
     }
     client = _checked(settings, config.endpoint)
     woken = threading.Event()
@@ -166,7 +267,7 @@ def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
             retry_s = min(2 * retry_s, LONGEST_RETRY_S)
             continue
         log.info("connected", node=node, endpoint=config.endpoint)
-        return ZenohBus(session, config.congestion)
+        return ZenohBus(session, config)
     return None
 
 
@@ -182,6 +283,7 @@ def router(config: BusConfig) -> ZenohBus:
         "listen/timeout_ms": 0,
         "listen/exit_on_failure": True,
         "scouting/multicast/enabled": False,
+        **_STUCK,
     }
     try:
         session = zenoh.open(_checked(settings, config.endpoint))
@@ -190,7 +292,38 @@ def router(config: BusConfig) -> ZenohBus:
             f"no router can listen at {config.endpoint!r}: {_first_line(error)}; "
             f"is another router running there? Choose another with --endpoint"
         ) from error
-    return ZenohBus(session, config.congestion)
+    return ZenohBus(session, config)
+
+
+def _stream(key: str) -> str:
+    """The stream that a key is in."""
+    return "/".join(key.split("/", STREAM_PARTS)[:STREAM_PARTS])
+
+
+def _encoded(sample: zenoh.Sample) -> Encoded:
+    """A message that has just come."""
+    now_ns = time.time_ns()
+    return Encoded(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), now_ns)
+
+
+def _numbered(sample: zenoh.Sample) -> Numbered | None:
+    """A message that has just come, as its publisher numbered it; None if it did not."""
+    numbered = sample.attachment.to_bytes() if sample.attachment is not None else b""
+    if len(numbered) != _NUMBERED.size:
+        return None
+    publisher, number = _NUMBERED.unpack(numbered)
+    message = _encoded(sample)
+    return Numbered(publisher, _stream(message.key), number, message)
+
+
+def _is_of_whole_streams(key_expression: str) -> bool:
+    """Whether who listens to it hears all of any stream that it hears anything of."""
+    *parts, last = key_expression.split("/")
+    return last == "**" and len(parts) <= STREAM_PARTS
+
+
+def _say_gap(gap: Gap) -> None:
+    log.warning("messages lost on the way", stream=gap.stream, messages=gap.messages)
 
 
 def _checked(settings: dict[str, Any], endpoint: str) -> zenoh.Config:

@@ -27,16 +27,25 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         endpoint: the router's address. Loopback unless asked otherwise.
-        congestion: what a publisher does when the network cannot take more: wait (`block`), or throw away (`drop`).
-            With `block` nothing is lost on the way, but one stuck subscriber slows the others.
+        congestion: what a publisher does when the network cannot take more: throw away (`drop`), and send again what is
+            asked for; or wait (`block`), so that one stuck subscriber slows the others.
+        cache_messages: how many messages on each key a publisher keeps for those that have not heard them: what a
+            link may lose and get back. A message takes half a kilobyte.
+        history_s: how old what was published before may be to be told to a recorder that begins to listen, in seconds.
     """
 
     endpoint: str = "tcp/127.0.0.1:7447"
-    congestion: Literal["block", "drop"] = "block"
+    congestion: Literal["block", "drop"] = "drop"
+    cache_messages: int = 10_000
+    history_s: float = 60.0
 
     def __post_init__(self) -> None:
         if self.endpoint.count("/") != 1 or ":" not in self.endpoint:
             raise ValueError(f"endpoint must be like 'tcp/127.0.0.1:7447', got {self.endpoint!r}")
+        if not 1 <= self.cache_messages <= 10_000_000:
+            raise ValueError(f"cache_messages must be in [1, 10000000], got {self.cache_messages}")
+        if not 0.0 < self.history_s <= 86_400.0:
+            raise ValueError(f"history_s must be in (0, 86400], got {self.history_s:g}")
 
 
 Section = TypeVar("Section", bound=msgspec.Struct)

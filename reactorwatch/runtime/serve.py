@@ -16,6 +16,7 @@ from typing import Protocol
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.bus import Bus, Request
+from reactorwatch.runtime.in_order import Gap
 
 LONGEST_WAIT_S = 3600.0
 LONGEST_LINGER = 10  # times linger_s: a bus that never falls silent does not keep a node from ending
@@ -108,6 +109,8 @@ def serve(
     stop: StopSignal,
     *,
     subscriptions: tuple[str, ...] = (),
+    history: bool = False,
+    on_gap: Callable[[Gap, int], list[Publication]] | None = None,
     commands: tuple[str, ...] = (),
     on_ready: Callable[[], None] | None = None,
     linger_s: float = 0.0,
@@ -119,23 +122,25 @@ def serve(
         bus: an open bus; it stays open.
         stop: ends the loop; what is in the inbox by then is still handled.
         subscriptions: key expressions whose publications go to `node.on_message`.
+        history: whether those from before do, too, as far as they are remembered.
+        on_gap: told, in its turn between the messages, what was published on them and never came, and what time it is.
         commands: key expressions of queryables whose questions go to `node.on_command`.
         on_ready: called once the node listens.
         linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
     """
-    inbox: SimpleQueue[Encoded | Request | None] = SimpleQueue()
+    inbox: SimpleQueue[Encoded | Gap | Request | None] = SimpleQueue()
     room = threading.Event()
     stop.wakes(lambda: inbox.put(None))
     stop.wakes(room.set)
 
-    def receive(item: Encoded | Request) -> None:
+    def receive(item: Encoded | Gap | Request) -> None:
         while inbox.qsize() >= LARGEST_INBOX and not stop.is_set:
             room.clear()
             room.wait(LOOK_AGAIN_S)
         inbox.put(item)
 
     for expression in subscriptions:
-        bus.subscribe(expression, receive)
+        bus.subscribe(expression, receive, on_gap=receive if on_gap is not None else None, history=history)
     for expression in commands:
         bus.answer(expression, receive)
     if on_ready is not None:
@@ -145,9 +150,11 @@ def serve(
         for publication in publications:
             bus.publish(encode(publication))
 
-    def handle(item: Encoded | Request) -> None:
+    def handle(item: Encoded | Gap | Request) -> None:
         if isinstance(item, Encoded):
             publish(node.on_message(item, time.time_ns()))
+        elif isinstance(item, Gap):
+            publish(on_gap(item, time.time_ns()) if on_gap is not None else [])
         else:
             reply, publications = node.on_command(item.question, time.time_ns())
             item.reply(reply)

@@ -1,6 +1,6 @@
 """A recorder without a bus, fed by hand with messages and a clock."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -70,6 +70,9 @@ def recorder(
     out: Path,
     start_ns: int,
     open_part: Callable[[Path], PartFile] = PartFile,
+    *,
+    known: Collection[int] = (),
+    known_until_ns: int = 0,
     **settings: object,
 ) -> Fed:
     """A recorder that has just begun."""
@@ -77,4 +80,4 @@ def recorder(
     files = files_for(config, open_part)
     files.begin((), start_ns)
     files.recover_left_behind()
-    return Fed(node_for(config, files, start_ns), files, start_ns)
+    return Fed(node_for(config, files, start_ns, known, known_until_ns), files, start_ns)

@@ -201,6 +201,14 @@ def test_what_cannot_be_recovered_is_kept_and_not_looked_at_again(tmp_path: Path
     assert not list(tmp_path.glob("*.part"))
 
 
+def test_a_file_left_behind_before_anything_was_in_it_is_deleted(tmp_path: Path) -> None:
+    recorder(tmp_path / "run.mcap", START).kill()
+    assert (tmp_path / "run.mcap.part").exists()
+    fed = recorder(tmp_path / "run.mcap", START + MINUTE)
+    fed.stop()
+    assert not list(tmp_path.glob("*.part*"))
+
+
 def test_of_a_file_left_behind_with_a_damaged_chunk_the_original_is_kept(tmp_path: Path) -> None:
     killed(tmp_path / "run.mcap", 100)
     part = tmp_path / "run.mcap.part"

@@ -93,7 +93,7 @@ def test_it_takes_no_commands(tmp_path: Path) -> None:
 
 def test_the_file_is_closed_when_the_loop_ends_by_an_exception(tmp_path: Path) -> None:
     class Broken(MemoryBus):
-        def subscribe(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
+        def subscribe(self, key_expression: str, handler: Callable[[Encoded], None], **_: object) -> None:
             handler(message)
             stop.set()
 

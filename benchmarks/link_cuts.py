@@ -1,0 +1,368 @@
+"""What is missing in a recording after a link was cut, or the router was killed, under load?
+
+A publisher sends 5,000 samples a second through a router to a recorder. The link of one of them goes through a proxy,
+which cuts it for a while: either it is closed and refused, as when a machine is switched off, or nothing passes any
+more, as when a cable is pulled. Or the router, a process of its own, is killed and another one started. Afterwards the
+file is read: by the sequence numbers, is anything missing, and is every stream in its order?
+
+    python benchmarks/link_cuts.py [seconds of the longest cut]
+"""
+
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from benchmarks.recorder_kills import PATIENCE_S, RATE_PER_S, SIGNALS, Publisher, Tokens
+from reactorwatch.cli.processes import write_settings
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, decode
+from reactorwatch.contract.messages_pb2 import Health, Sample
+from reactorwatch.runtime import logs
+from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_endpoint, free_port
+from reactorwatch.runtime.serve import StopSignal
+from recorder.__main__ import record
+from recorder.config import RecorderConfig
+from recorder.mcap_file import read_messages, recordings_in
+
+CUTS_S = (1.0, 5.0, 30.0)
+Manner = Literal["closed", "stalled"]
+Whose = Literal["recorder", "publisher"]
+
+CASES: tuple[tuple[Whose, Manner], ...] = (
+    ("recorder", "closed"),
+    ("recorder", "stalled"),
+    ("publisher", "closed"),
+    ("publisher", "stalled"),
+)
+ROWS_PER_S = RATE_PER_S // SIGNALS
+WARM_UP_S = 0.2
+STUCK_S = 7.0  # a publisher that waits for the network waits less
+
+_BLOCK = 65_536
+
+
+class Proxy:
+    """A relay of TCP between this machine's loopback and a router, which can be interrupted."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._target = ("127.0.0.1", int(endpoint.rsplit(":", 1)[1]))
+        self._port = free_port()
+        self.endpoint = f"tcp/127.0.0.1:{self._port}"
+        self._open = threading.Event()
+        self._open.set()
+        self._closed = False
+        self._links: list[socket.socket] = []
+        self._lock = threading.Lock()
+        self._listener = self._listen()
+
+    @contextlib.contextmanager
+    def cut(self, manner: Manner) -> Iterator[None]:
+        """Interrupt it, while the context lasts."""
+        if manner == "stalled":
+            self._open.clear()
+            yield
+            self._open.set()
+            return
+        self._refuse()
+        yield
+        self._listener = self._listen()
+
+    def close(self) -> None:
+        """End it."""
+        self._closed = True
+        self._open.set()
+        self._refuse()
+
+    def _refuse(self) -> None:
+        """Listen no more, and end what is connected."""
+        self._listener.shutdown(socket.SHUT_RDWR)  # a thread that waits for a link holds it open otherwise
+        self._listener.close()
+        self._drop_links()
+
+    def _listen(self) -> socket.socket:
+        listener = socket.create_server(("127.0.0.1", self._port))
+        threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
+        return listener
+
+    def _accept(self, listener: socket.socket) -> None:
+        while True:
+            try:
+                near, _ = listener.accept()
+            except OSError:
+                return  # it is closed
+            try:
+                far = socket.create_connection(self._target)
+            except OSError:
+                near.close()  # the router is gone
+                continue
+            with self._lock:
+                self._links += [near, far]
+            for source, sink in ((near, far), (far, near)):
+                threading.Thread(target=self._relay, args=(source, sink), daemon=True).start()
+
+    def _relay(self, source: socket.socket, sink: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            while block := source.recv(_BLOCK):
+                self._open.wait()
+                sink.sendall(block)
+        for end in (source, sink):
+            with contextlib.suppress(OSError):
+                end.shutdown(socket.SHUT_RDWR)
+
+    def _drop_links(self) -> None:
+        with self._lock:
+            links, self._links = self._links, []
+        for link in links:
+            with contextlib.suppress(OSError):
+                link.shutdown(socket.SHUT_RDWR)
+            link.close()
+
+
+class Router:
+    """A router in a process of its own, which can be killed."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.config = BusConfig(endpoint=endpoint)
+        self._code = (
+            "from reactorwatch.runtime import bus_zenoh, config; import sys; "
+            f"bus = bus_zenoh.router(config.BusConfig(endpoint={endpoint!r})); sys.stdin.read()"
+        )
+        self._process = self._start()
+
+    def kill(self) -> None:
+        """End it as a crash does."""
+        self._process.kill()
+        self._process.communicate()
+
+    def restart(self) -> None:
+        """Start another one at the same address."""
+        self._process = self._start()
+
+    def close(self) -> None:
+        """End it."""
+        self.kill()
+
+    def _start(self) -> "subprocess.Popen[bytes]":
+        return subprocess.Popen([sys.executable, "-c", self._code], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)
+
+
+class Heard:
+    """How many messages of others the recorder says that it has received, or that they are lost."""
+
+    def __init__(self, bus: ZenohBus, plant: str = "cstr") -> None:
+        self._changed = threading.Condition()
+        self._count = 0
+        bus.subscribe(keys.key(plant, keys.HEALTH, "recorder"), self._on_health)
+
+    def wait(self, count: int) -> None:
+        """Wait until it is so many; give up after a while."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._count >= count, PATIENCE_S)
+
+    def _on_health(self, message: Encoded) -> None:
+        health = decode(message.payload, message.encoding)
+        assert isinstance(health, Health)
+        with self._changed:
+            own = health.published - 1  # its reports come back to it, but for this one
+            self._count = health.received + health.lost - own
+            self._changed.notify_all()
+
+
+@dataclass(frozen=True)
+class Found:
+    """What is in the file.
+
+    Attributes:
+        published: samples.
+        recorded: of them.
+        missing: by their sequence numbers.
+        twice: that are there more than once.
+        out_of_order: samples that stand behind one that was published after them.
+        slowest_put_s: the longest that publishing a batch of samples took.
+    """
+
+    published: int
+    recorded: int
+    missing: int
+    twice: int
+    out_of_order: int
+    slowest_put_s: float
+
+
+@dataclass(frozen=True)
+class Load:
+    """What runs.
+
+    Attributes:
+        proxy: on the link of one of them.
+        publisher: of the samples.
+        bus: the publisher's.
+        found: what is in the recording, one for each, when all has ended.
+    """
+
+    proxy: Proxy
+    publisher: Publisher
+    bus: ZenohBus
+    found: list[Found]
+
+    def go_on(self, span_s: float) -> None:
+        """Wait until as much more was published as is in so many seconds."""
+        self.publisher.wait(self.publisher.sequence + round(span_s * ROWS_PER_S))
+
+
+@contextlib.contextmanager
+def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: int) -> Iterator[Load]:
+    """A publisher and a recorder at a router.
+
+    Args:
+        folder: where the file is written.
+        router: its address.
+        whose: the link that goes through the proxy.
+        cache_messages: that the publisher keeps.
+    """
+    proxy = Proxy(router)
+    direct = BusConfig(endpoint=router, cache_messages=cache_messages)
+    via = BusConfig(endpoint=proxy.endpoint, cache_messages=cache_messages)
+    path, stop = folder / "run.mcap", StopSignal()
+    config = RecorderConfig(out=str(path), health_period_s=0.2, black_box_min=0.0)
+    recording = threading.Thread(target=record, args=(config, via if whose == "recorder" else direct, stop))
+    observer = connected(direct)
+    heard, tokens = Heard(observer), Tokens(observer)
+    recording.start()
+    bus = connected(via if whose == "publisher" else direct)
+    try:
+        tokens.wait(alive=True)
+        publisher = Publisher(bus, RATE_PER_S)
+        load = Load(proxy, publisher, bus, [])
+        load.go_on(WARM_UP_S)
+        yield load
+        publisher.close()
+        heard.wait(publisher.sequence * SIGNALS)
+    finally:
+        stop.set()
+        recording.join(PATIENCE_S)
+        bus.close()
+        observer.close()
+        proxy.close()
+    load.found.append(look([path], publisher))
+
+
+def connected(config: BusConfig) -> ZenohBus:
+    """A client of the router."""
+    bus = connect(config, "cuts", StopSignal())
+    assert bus is not None
+    return bus
+
+
+def cut(folder: Path, whose: Whose, manner: Manner, span_s: float, cache_messages: int = 10_000) -> Found:
+    """Cut a link for a time."""
+    with (
+        contextlib.closing(Router(endpoint := free_endpoint())),
+        under_load(folder, endpoint, whose, cache_messages) as load,
+        load.proxy.cut(manner),
+    ):
+        load.go_on(span_s)
+    return load.found[0]
+
+
+def kill_router(folder: Path, span_s: float, cache_messages: int = 10_000) -> Found:
+    """Kill the router, and start another one after a time."""
+    with (
+        contextlib.closing(Router(endpoint := free_endpoint())) as router,
+        under_load(folder, endpoint, None, cache_messages) as load,
+    ):
+        router.kill()
+        load.go_on(span_s)
+        router.restart()
+    return load.found[0]
+
+
+def look(files: Sequence[Path], publisher: Publisher) -> Found:
+    """What is in recordings that follow each other."""
+    numbers: dict[str, list[int]] = {}
+    behind, newest = 0, 0
+    for entry in (entry for path in files for entry in read_messages(path, {keys.SAMPLE})):
+        sample = decode(entry.payload, entry.encoding)
+        assert isinstance(sample, Sample)
+        numbers.setdefault(entry.key, []).append(sample.sequence)
+        behind += sample.sequence < newest
+        newest = max(newest, sample.sequence)
+    recorded = sum(map(len, numbers.values()))
+    different = sum(len(set(found)) for found in numbers.values())
+    published = publisher.sequence * SIGNALS
+    return Found(published, recorded, published - different, recorded - different, behind, publisher.slowest_s)
+
+
+def main() -> None:
+    """Print what was found."""
+    logs.configure()
+    longest_s = float(sys.argv[1]) if len(sys.argv) > 1 else CUTS_S[-1]
+    print(f"{RATE_PER_S:,} samples/s              published   missing  twice  out of order  slowest batch, ms")
+    for span_s in (span for span in CUTS_S if span <= longest_s):
+        cache = round(2 * (span_s + 10.0) * ROWS_PER_S)
+        for whose, manner in CASES:
+            with tempfile.TemporaryDirectory() as folder:
+                _tell(f"{whose}, {manner} {span_s:g} s", cut(Path(folder), whose, manner, span_s, cache))
+        with tempfile.TemporaryDirectory() as folder:
+            _tell(f"router killed {span_s:g} s", kill_router(Path(folder), span_s, cache))
+    with tempfile.TemporaryDirectory() as folder:
+        other, stuck = stick(Path(folder), STUCK_S)
+        _tell(f"beside one stuck {STUCK_S:g} s", other)
+        _tell(f"stuck {STUCK_S:g} s", stuck)
+
+
+def stick(folder: Path, span_s: float, cache_messages: int = 20_000) -> tuple[Found, Found]:
+    """Have one of two recorders stand still for a time, as one that waits for a broken disk; what the two then have."""
+    stuck = folder / "stuck"
+    stuck.mkdir()
+    with (
+        contextlib.closing(Router(endpoint := free_endpoint())),
+        under_load(folder, endpoint, None, cache_messages) as load,
+    ):
+        heard = Heard(load.bus, "stuck")
+        with recorder_process(stuck, endpoint, Tokens(load.bus, "stuck"), plant="stuck") as process:
+            process.send_signal(signal.SIGSTOP)
+            load.go_on(span_s)
+            process.send_signal(signal.SIGCONT)
+            load.publisher.close()
+            heard.wait(load.publisher.sequence * SIGNALS)
+    return load.found[0], look(recordings_in(stuck), load.publisher)
+
+
+@contextlib.contextmanager
+def recorder_process(
+    folder: Path, endpoint: str, tokens: Tokens, plant: str = "cstr"
+) -> Iterator["subprocess.Popen[bytes]"]:
+    """A recorder in a process of its own, which ends by being asked to."""
+    config = RecorderConfig(plant=plant, out=str(folder), health_period_s=0.2, black_box_min=0.0)
+    write_settings(folder / "settings.toml", {"bus": BusConfig(endpoint=endpoint), "recorder": config})
+    tokens.wait(alive=False)
+    command = [sys.executable, "-m", "recorder", str(folder / "settings.toml")]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    try:
+        tokens.wait(alive=True)
+        yield process
+    finally:
+        process.terminate()
+        process.wait(PATIENCE_S)
+
+
+def _tell(name: str, found: Found) -> None:
+    print(
+        f"{name:30s} {found.published:9,d} {found.missing:9d} {found.twice:6d} {found.out_of_order:13d} "
+        f"{1000 * found.slowest_put_s:18.1f}"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""Handing on what comes from a bus in the order of its publication; what waits too long is given up by a thread."""
+
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.runtime.in_order import Gap, InOrder
+
+
+class Numbered(NamedTuple):
+    """A message as its publisher numbered it.
+
+    Attributes:
+        publisher: who.
+        stream: what was counted.
+        number: in the stream.
+        message: what; `received_ns` is when it came.
+    """
+
+    publisher: int
+    stream: str
+    number: int
+    message: Encoded
+
+
+class Delivery:
+    """Between a subscription and its handler; may be called from any thread.
+
+    Nothing is handed on until `begin`.
+
+    Args:
+        handler: gets the messages, one at a time.
+        on_gap: gets told what never came.
+    """
+
+    def __init__(self, handler: Callable[[Encoded], None], on_gap: Callable[[Gap], None]) -> None:
+        self._handler = handler
+        self._on_gap = on_gap
+        self._order: InOrder[Encoded] = InOrder(gathering=True)
+        self._changed = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._give_up_when_due, name="delivery", daemon=True)
+        self._thread.start()
+
+    def receive(self, came: Numbered) -> None:
+        """Take a message in, and hand on what may go on."""
+        with self._changed:
+            waited = self._order.due_ns()
+            now_ns = time.monotonic_ns()
+            self._hand_on(self._order.arrive(came.publisher, came.stream, came.number, came.message, now_ns))
+            if self._order.due_ns() != waited:
+                self._changed.notify()
+
+    def tell_last(self, last: Numbered) -> None:
+        """Before the beginning: what a publisher has published last on a key."""
+        with self._changed:
+            self._order.tell_last(last.publisher, last.stream, last.number)
+
+    def tell(self, came: Numbered) -> None:
+        """Before the beginning: what was published before and is wanted."""
+        with self._changed:
+            self._order.tell(came.publisher, came.stream, came.number, came.message)
+
+    def begin(self) -> None:
+        """Hand on what has come until now, and from now on what comes."""
+        with self._changed:
+            self._hand_on(self._order.gathered(time.monotonic_ns()))
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Hand on what waits, whatever is missing, and end."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+        while (due_ns := self._order.due_ns()) is not None:
+            self._hand_on(self._order.overdue(due_ns))
+
+    def _hand_on(self, items: Iterable[Encoded | Gap]) -> None:
+        for item in items:
+            if isinstance(item, Gap):
+                self._on_gap(item._replace(noticed_ns=time.time_ns()))
+            else:
+                self._handler(item)
+
+    def _give_up_when_due(self) -> None:
+        with self._changed:
+            while not self._closed:
+                due_ns, now_ns = self._order.due_ns(), time.monotonic_ns()
+                if due_ns is None or due_ns > now_ns:
+                    self._changed.wait(None if due_ns is None else (due_ns - now_ns) / 1e9)
+                else:
+                    self._hand_on(self._order.overdue(now_ns))

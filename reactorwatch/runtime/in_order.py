@@ -1,0 +1,177 @@
+"""The order in which a node published, for whoever listens. Pure: it is told what time it is.
+
+Zenoh keeps the order on each key. Across keys it does so as long as nothing is lost; but what is recovered after a cut,
+or told to a late listener, comes key by key: first all that is missing of one signal, then of the next. A row of
+samples would be taken apart by that, so a publisher numbers what it publishes. It does so in each *stream* by itself,
+which is all of one kind of one plant (`reactor/cstr/sample`), so that a listener to one kind knows whether a number is
+missing or was none of its business.
+
+A message goes on when all before it in its stream have. While a number is missing those after it wait, as long as the
+recovery may take (`PATIENCE_NS`); then what has not come is lost, and told as a gap. A number that comes again is
+passed over, and so is what was published before the first that went on.
+
+Who begins to listen asks every publisher for its last number, and perhaps for what was before; until he has been
+told, everything waits (`gathering`). So he knows what is of before his time, which a publisher may send him again,
+and what not. A stream of which he was told nothing begins with 0, or, if he hears another number first, when for a
+moment (`GATHER_NS`) nothing came that was older than what he had heard already.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import accumulate
+from typing import Generic, NamedTuple, TypeVar
+
+Item = TypeVar("Item")
+
+PATIENCE_NS = 5_000_000_000
+GATHER_NS = 500_000_000
+MOST_LOST = 1000
+"""Runs of lost numbers of a stream that are remembered: what comes of them after all goes on."""
+MOST_HELD = 1_000_000
+"""Messages of a stream that may wait; with more, what is missing is given up."""
+
+
+class Gap(NamedTuple):
+    """Messages that never came: what was given up at one time.
+
+    Attributes:
+        stream: plant and kind, as the beginning of their keys.
+        publisher: who published them, a number that a node draws when it starts.
+        first: number of the first of them in the stream.
+        last: number of the last; between them others may have come, of another key for instance.
+        messages: how many.
+        noticed_ns: when they were given up, by the clock of receipt.
+    """
+
+    stream: str
+    publisher: int
+    first: int
+    last: int
+    messages: int
+    noticed_ns: int
+
+
+@dataclass
+class _Stream(Generic[Item]):
+    expected: int | None = None
+    newest: int = 0
+    before: int = -1  # the last number when the listening began
+    told: dict[int, Item] = field(default_factory=dict)  # of what was before
+    held: dict[int, tuple[int, Item]] = field(default_factory=dict)  # with when it came
+    due_ns: int | None = None  # when no longer to wait; None: nothing waits
+    lost: list[tuple[int, int]] = field(default_factory=list)  # (first, last)
+
+
+class InOrder(Generic[Item]):
+    """Lets messages through in the order of their numbers.
+
+    Args:
+        gathering: whether everything waits, at first, until `gathered`.
+    """
+
+    def __init__(self, *, gathering: bool = False) -> None:
+        self._streams: dict[tuple[int, str], _Stream[Item]] = {}
+        self._gathering = gathering
+
+    def arrive(self, publisher: int, stream: str, number: int, item: Item, now_ns: int) -> Iterator[Item | Gap]:
+        """Take a message in; yields what goes on because of it, and the gaps between."""
+        name = publisher, stream
+        state = self._streams.get(name)
+        if state is None:
+            state = self._streams[name] = _Stream()
+            if not number and not self._gathering:
+                state.expected = 0
+        if state.expected is None and not self._gathering and number <= state.before:
+            return
+        if number == state.expected and not state.held:  # as nearly always
+            state.expected = number + 1
+            yield item
+            return
+        if state.expected is not None and number < state.expected:
+            if _take_out(state.lost, number):
+                yield item  # it was given up, and has come after all
+            return
+        state.held.setdefault(number, (now_ns, item))
+        if self._gathering:
+            return
+        patience_ns = GATHER_NS if state.expected is None else PATIENCE_NS
+        if state.due_ns is None or number < state.newest:  # something begins to be waited for, or is being recovered
+            state.due_ns = now_ns + patience_ns
+        state.newest = max(state.newest, number)
+        yield from self._contiguous(state)
+        if len(state.held) > MOST_HELD:
+            yield from self._give_up(name, state, now_ns, now_ns)
+
+    def overdue(self, now_ns: int) -> Iterator[Item | Gap]:
+        """Yields what has waited for long enough."""
+        for name, state in self._streams.items():
+            if state.due_ns is not None and now_ns >= state.due_ns:
+                since_ns = now_ns if state.expected is None else now_ns - PATIENCE_NS
+                yield from self._give_up(name, state, since_ns, now_ns)
+
+    def tell_last(self, publisher: int, stream: str, number: int) -> None:
+        """While gathering: the number that a publisher has come to on one of its keys."""
+        state = self._streams.setdefault((publisher, stream), _Stream())
+        state.before = max(state.before, number)
+
+    def tell(self, publisher: int, stream: str, number: int, item: Item) -> None:
+        """While gathering: a message of before."""
+        self._streams.setdefault((publisher, stream), _Stream()).told[number] = item
+
+    def gathered(self, now_ns: int) -> Iterator[Item | Gap]:
+        """What was before has all been told; yields what goes on."""
+        self._gathering = False
+        for name, state in self._streams.items():
+            live = {number: came for number, came in state.held.items() if number > state.before}
+            state.held = {number: (now_ns, item) for number, item in state.told.items()} | live
+            state.told = {}
+            state.newest = max(state.held, default=state.before)
+            if state.held:
+                yield from self._give_up(name, state, now_ns, now_ns)
+            elif state.before >= 0:
+                state.expected = state.before + 1
+
+    def due_ns(self) -> int | None:
+        """When to ask for what is overdue; None: nothing waits."""
+        return min((state.due_ns for state in self._streams.values() if state.due_ns is not None), default=None)
+
+    def _contiguous(self, state: _Stream[Item]) -> Iterator[Item]:
+        while state.expected is not None and state.expected in state.held:
+            yield state.held.pop(state.expected)[1]
+            state.expected += 1
+        if not state.held:
+            state.due_ns = None
+
+    def _give_up(self, name: tuple[int, str], state: _Stream[Item], since_ns: int, now_ns: int) -> Iterator[Item | Gap]:
+        """Do not wait for what is missing before what came until a moment: all of that was lost at once."""
+        items: list[Item] = []
+        lost: list[tuple[int, int]] = []
+        gathered = state.expected is None
+        numbers = sorted(state.held)
+        came_ns = [state.held[number][0] for number in numbers]
+        noticed_ns = list(accumulate(reversed(came_ns), min))[::-1]  # when the first came that is behind it, or it did
+        for number, known_ns in zip(numbers, noticed_ns, strict=True):
+            item = state.held[number][1]
+            if state.expected is not None and number > state.expected:
+                if gathered or known_ns > since_ns:
+                    break  # what is missing here may still come
+                lost.append((state.expected, number - 1))
+            del state.held[number]
+            state.expected = number + 1
+            items.append(item)
+        state.due_ns = None if not state.held else PATIENCE_NS + min(came for came, _ in state.held.values())
+        if lost:
+            state.lost = [*state.lost, *lost][-MOST_LOST:]
+            count = sum(last - first + 1 for first, last in lost)
+            yield Gap(name[1], name[0], lost[0][0], lost[-1][1], count, now_ns)
+        yield from items
+
+
+def _take_out(runs: list[tuple[int, int]], number: int) -> bool:
+    """Whether a number is in one of the runs; it is no longer, then."""
+    for place, (first, last) in enumerate(runs):
+        if first <= number <= last:
+            rest = [(first, number - 1), (number + 1, last)]
+            runs[place : place + 1] = [run for run in rest if run[0] <= run[1]]
+            return True
+    return False

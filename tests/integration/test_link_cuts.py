@@ -1,0 +1,125 @@
+"""Nothing that was published is lost on the way: links are cut, routers killed, listeners late, stuck or started anew.
+
+Thirty seconds and every pair of link and manner: `make cuts`.
+"""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.link_cuts import (
+    Heard,
+    Manner,
+    Router,
+    Whose,
+    connected,
+    cut,
+    kill_router,
+    look,
+    recorder_process,
+    stick,
+)
+from benchmarks.recorder_kills import PATIENCE_S, RATE_PER_S, SIGNALS, Publisher, Tokens, wait_for_a_flush
+from reactorwatch.cli.recording_reports import info_text
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, decode
+from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_endpoint
+from recorder.look import look_over
+from recorder.mcap_file import recordings_in
+
+
+@pytest.fixture
+def router() -> Iterator[Router]:
+    with contextlib.closing(Router(free_endpoint())) as running:
+        yield running
+
+
+@pytest.mark.parametrize(
+    ("whose", "manner", "span_s"),
+    [
+        ("recorder", "closed", 1.0),
+        ("publisher", "stalled", 1.0),
+        ("publisher", "closed", 5.0),
+        ("recorder", "stalled", 5.0),
+    ],
+)
+def test_a_cut_link_costs_no_sample_and_none_its_place(
+    tmp_path: Path, whose: Whose, manner: Manner, span_s: float
+) -> None:
+    found = cut(tmp_path, whose, manner, span_s)
+    assert found.published > RATE_PER_S * span_s
+    assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
+
+
+def test_a_router_that_is_killed_and_started_again_costs_no_sample(tmp_path: Path) -> None:
+    found = kill_router(tmp_path, 2.0)
+    assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
+
+
+def test_what_could_not_be_recovered_is_counted_and_named_in_the_file_and_by_info(tmp_path: Path) -> None:
+    """The publisher remembers a tenth of what was published while the link was down."""
+    found = cut(tmp_path, "recorder", "closed", 1.0, cache_messages=RATE_PER_S // SIGNALS // 10)
+    seen = look_over(tmp_path / "run.mcap")
+    assert found.missing > 0
+    assert {gap.stream for gap in seen.gaps} == {"reactor/cstr/sample"}
+    assert sum(gap.messages for gap in seen.gaps) == seen.overview.lost == found.missing
+    assert found.out_of_order == 0
+    assert f"lost on the way: {found.missing} messages of reactor/cstr/sample" in info_text(seen, tmp_path / "run.mcap")
+
+
+def test_who_begins_to_listen_late_hears_what_was_before(tmp_path: Path, router: Router) -> None:
+    bus, heard, enough = connected(router.config), list[int](), threading.Event()
+    publisher = Publisher(bus, RATE_PER_S)
+    publisher.wait(1000)
+    late = connected(router.config)
+
+    def hear(message: Encoded) -> None:
+        sample = decode(message.payload, message.encoding)
+        assert isinstance(sample, Sample)
+        heard.append(sample.sequence)
+        if len(heard) >= 2000 * SIGNALS:
+            enough.set()
+
+    late.subscribe(keys.all_of("cstr", keys.SAMPLE), hear, history=True)
+    assert enough.wait(PATIENCE_S)
+    publisher.close()
+    late.close()
+    bus.close()
+    assert heard == [number // SIGNALS for number in range(len(heard))]
+
+
+@pytest.mark.parametrize("killed", [False, True], ids=["stopped", "killed"])
+def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
+    tmp_path: Path, router: Router, killed: bool
+) -> None:
+    bus = connected(BusConfig(endpoint=router.config.endpoint, cache_messages=60_000))  # all that is published here
+    tokens, heard = Tokens(bus), Heard(bus)
+    publisher = Publisher(bus, RATE_PER_S)
+    try:
+        with recorder_process(tmp_path, router.config.endpoint, tokens) as first:
+            wait_for_a_flush(tmp_path, publisher)
+            if killed:
+                first.kill()
+        publisher.wait(publisher.sequence + 500)
+        with recorder_process(tmp_path, router.config.endpoint, tokens):
+            publisher.wait(publisher.sequence + 500)
+            publisher.close()
+            heard.wait(publisher.sequence * SIGNALS)
+    finally:
+        publisher.close()
+        bus.close()
+    files = recordings_in(tmp_path)
+    assert len(files) == 2
+    found = look(files, publisher)
+    assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
+
+
+def test_a_stuck_recorder_costs_another_nothing_and_gets_it_all_later(tmp_path: Path) -> None:
+    """It stands still for longer than it takes until a link that takes nothing is closed."""
+    for found in stick(tmp_path, 3.0):
+        assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)

@@ -1,0 +1,62 @@
+"""Between a bus and who listens: one order, whichever thread it comes from, and nothing older than asked for."""
+
+import time
+from queue import SimpleQueue
+
+import pytest
+
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.runtime import in_order
+from reactorwatch.runtime.delivery import Delivery, Numbered
+from reactorwatch.runtime.in_order import Gap
+
+WITHIN_S = 20.0
+SECOND = 10**9
+
+
+def message(number: int) -> Numbered:
+    return Numbered(1, "reactor/x/sample", number, Encoded(str(number), b"", "", time.time_ns()))
+
+
+def taken(heard: "SimpleQueue[Encoded | Gap]") -> list[str]:
+    """The numbers that were handed on, so far."""
+    items = [heard.get_nowait() for _ in range(heard.qsize())]
+    return [item.key for item in items if isinstance(item, Encoded)]
+
+
+def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(in_order, "PATIENCE_NS", 1_000_000)
+    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    delivery = Delivery(heard.put, heard.put)
+    delivery.begin()
+    for number in (0, 3):
+        delivery.receive(message(number))
+    items = [heard.get(timeout=WITHIN_S) for _ in range(3)]
+    delivery.close()
+    gap = items[1]
+    assert isinstance(gap, Gap)
+    assert (gap.first, gap.last, gap.messages) == (1, 2, 2)
+    assert abs(gap.noticed_ns - time.time_ns()) < 3600 * SECOND
+
+
+def test_what_waits_is_handed_on_when_the_bus_is_closed() -> None:
+    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    delivery = Delivery(heard.put, heard.put)
+    delivery.begin()
+    for number in (0, 3):
+        delivery.receive(message(number))
+    delivery.close()
+    assert taken(heard) == ["0", "3"]
+
+
+def test_nothing_goes_on_before_it_is_known_what_was_before() -> None:
+    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    delivery = Delivery(heard.put, heard.put)
+    delivery.receive(message(9))
+    delivery.tell_last(message(8))
+    delivery.tell(message(7))
+    delivery.tell(message(8))
+    assert taken(heard) == []
+    delivery.begin()
+    assert taken(heard) == ["7", "8", "9"]
+    delivery.close()

@@ -1,0 +1,159 @@
+"""What a node published goes on in that order, whatever comes late; and what never comes is told."""
+
+import random
+
+import pytest
+
+from reactorwatch.runtime import in_order
+from reactorwatch.runtime.in_order import GATHER_NS, PATIENCE_NS, Gap, InOrder
+
+STREAM = "reactor/x/sample"
+
+
+def fed(order: InOrder[int], numbers: list[int], now_ns: int = 0, publisher: int = 1) -> list[int | Gap]:
+    return [item for number in numbers for item in order.arrive(publisher, STREAM, number, number, now_ns)]
+
+
+def test_what_comes_in_order_goes_on_at_once() -> None:
+    order = InOrder[int]()
+    assert fed(order, [0, 1, 2]) == [0, 1, 2]
+    assert order.due_ns() is None
+
+
+def test_what_is_recovered_key_by_key_goes_on_row_by_row() -> None:
+    """Three signals; after row 1 a link was down for four rows."""
+    order = InOrder[int]()
+    assert fed(order, [0, 1, 2]) == [0, 1, 2]
+    blocks = [*range(3, 15, 3), *range(5, 15, 3), *range(4, 15, 3)]
+    assert fed(order, blocks) == list(range(3, 15))
+    assert order.due_ns() is None
+
+
+def test_any_order_of_a_stream_that_was_heard_from_its_beginning_is_put_right() -> None:
+    for seed in range(50):
+        numbers = list(range(1, 40))
+        random.Random(seed).shuffle(numbers)
+        assert fed(InOrder[int](), [0, *numbers]) == list(range(40))
+
+
+def test_a_late_listener_gathers_what_he_is_told_and_then_goes_on_at_once() -> None:
+    order = InOrder[int]()
+    assert fed(order, [30, 33, 31, 34, 32]) == []
+    assert order.due_ns() == GATHER_NS
+    assert list(order.overdue(GATHER_NS - 1)) == []
+    assert list(order.overdue(GATHER_NS)) == [30, 31, 32, 33, 34]
+    assert fed(order, [35]) == [35]
+    assert order.due_ns() is None
+
+
+def test_what_never_comes_is_told_when_it_is_given_up_and_the_rest_goes_on() -> None:
+    order = InOrder[int]()
+    assert fed(order, [0, 3, 4, 7], now_ns=10) == [0]
+    assert order.due_ns() == 10 + PATIENCE_NS
+    now_ns = 10 + PATIENCE_NS
+    assert list(order.overdue(now_ns)) == [Gap(STREAM, 1, 1, 6, 4, now_ns), 3, 4, 7]
+    assert fed(order, [8]) == [8]
+
+
+def test_what_is_missing_before_later_ones_is_waited_for_as_long_again() -> None:
+    order = InOrder[int]()
+    fed(order, [0, 2])
+    assert fed(order, [4], now_ns=PATIENCE_NS - 1) == []
+    assert list(order.overdue(PATIENCE_NS)) == [Gap(STREAM, 1, 1, 1, 1, PATIENCE_NS), 2]
+    assert order.due_ns() == 2 * PATIENCE_NS - 1
+    assert fed(order, [3], now_ns=PATIENCE_NS + 1) == [3, 4]
+
+
+def test_whatever_the_order_of_arrival_nothing_is_waited_for_that_is_over() -> None:
+    """What waits first may have come last; then it is known for longer that something is missing before it."""
+    order = InOrder[int]()
+    fed(order, [0, 9])
+    fed(order, [5, 3], now_ns=1000)
+    due_ns = order.due_ns()
+    assert due_ns == 1000 + PATIENCE_NS
+    assert list(order.overdue(due_ns)) == [Gap(STREAM, 1, 1, 8, 6, due_ns), 3, 5, 9]
+    for seed in range(50):
+        order, now_ns = InOrder[int](), 0
+        numbers = random.Random(seed).sample(range(1, 60), 30)
+        for number in [0, *numbers]:
+            now_ns += PATIENCE_NS // 10
+            list(order.arrive(1, STREAM, number, number, now_ns))
+        while (due_ns := order.due_ns()) is not None:
+            assert list(order.overdue(due_ns)), "it is due, and nothing happens"
+
+
+def test_what_comes_after_it_was_given_up_goes_on_at_once() -> None:
+    order = InOrder[int]()
+    fed(order, [0, 2])
+    list(order.overdue(PATIENCE_NS))
+    assert fed(order, [1, 1, 3]) == [1, 3]
+
+
+def test_what_comes_again_and_what_was_before_the_first_is_passed_over() -> None:
+    order = InOrder[int]()
+    fed(order, [5, 6])
+    assert list(order.overdue(GATHER_NS)) == [5, 6]
+    assert fed(order, [3, 5, 6, 7]) == [7]
+
+
+def test_who_begins_to_listen_hears_what_is_after_his_time_only() -> None:
+    """Number 7 came live before the publisher said that it had come to 8; 9 after."""
+    order = InOrder[int](gathering=True)
+    assert fed(order, [7, 9]) == []
+    order.tell_last(1, STREAM, 6)
+    order.tell_last(1, STREAM, 8)
+    assert order.due_ns() is None
+    assert list(order.gathered(1)) == [9]
+    assert fed(order, [3, 8, 10]) == [10]
+
+
+def test_a_publisher_that_says_nothing_more_is_known_by_its_last_number() -> None:
+    order = InOrder[int](gathering=True)
+    order.tell_last(1, STREAM, 8)
+    assert list(order.gathered(1)) == []
+    assert fed(order, [0, 3, 8, 9]) == [9]
+
+
+def test_who_asks_for_what_was_before_hears_it_first_once_and_in_order() -> None:
+    order = InOrder[int](gathering=True)
+    assert fed(order, [1, 9, 10, 11]) == []
+    order.tell_last(1, STREAM, 9)
+    for number in (3, 6, 9, 4, 7, 10, 5, 8):
+        order.tell(1, STREAM, number, number)
+    assert list(order.gathered(1)) == list(range(3, 12))
+    assert fed(order, [2, 10, 12]) == [12]
+
+
+def test_a_publisher_that_comes_while_others_are_asked_is_heard_from_its_beginning() -> None:
+    order = InOrder[int](gathering=True)
+    assert fed(order, [0, 1]) == []
+    assert list(order.gathered(1)) == [0, 1]
+
+
+def test_as_long_as_a_recovery_goes_on_it_is_waited_for() -> None:
+    order = InOrder[int]()
+    fed(order, [0, 10, 12])
+    assert fed(order, [1], now_ns=4 * 10**9) == [1]
+    assert order.due_ns() == 4 * 10**9 + PATIENCE_NS
+
+
+def test_publishers_and_streams_do_not_wait_for_each_other() -> None:
+    order = InOrder[int]()
+    fed(order, [0, 2])
+    assert fed(order, [0, 1], publisher=2) == [0, 1]
+    assert list(order.arrive(1, "reactor/x/alarm", 0, 5, 0)) == [5]
+
+
+def test_a_late_listener_gathers_as_long_as_older_ones_come_and_not_as_long_as_newer_ones_do() -> None:
+    order = InOrder[int]()
+    assert fed(order, [30, 40], now_ns=0) == []
+    assert fed(order, [31], now_ns=GATHER_NS // 2) == []
+    assert fed(order, [41], now_ns=GATHER_NS) == []
+    assert order.due_ns() == GATHER_NS // 2 + GATHER_NS
+
+
+def test_no_more_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(in_order, "MOST_HELD", 100)
+    order = InOrder[int]()
+    fed(order, [0])
+    assert fed(order, list(range(2, 103))) == [Gap(STREAM, 1, 1, 1, 1, 0), *range(2, 103)]
