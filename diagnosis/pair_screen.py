@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnosis import signatures
+from diagnosis.bounded_fit import within
 from diagnosis.courses import Constant, Course, Free, Sine
 from diagnosis.run import Run
 from diagnosis.screen import KNOTS, Screen, usable
@@ -27,7 +28,7 @@ from reactorwatch.process.model import Array
 TAKEN_AWAY, SINES_SHARE = 2, 0.3
 """How many causes are taken away in turn to see sines below, and what share of the best one's gain a sine must have."""
 
-_RIDGE, _TURNS = 1e-9, 4
+_RIDGE = 1e-9
 _MOST_SIZES = 3.0
 
 
@@ -229,26 +230,6 @@ def _range(block: Block) -> tuple[Array, Array]:
 def _gain(columns: Array, w: Array) -> tuple[float, Array]:
     unbounded = np.full(columns.shape[1], inf)
     return within(columns.T @ columns, columns.T @ w, -unbounded, unbounded)
-
-
-def within(gram: Array, by: Array, lowest: Array, highest: Array) -> tuple[float, Array]:
-    """Twice the gain in log likelihood, and the coefficients; those that leave their range are put to its end."""
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    free, theta = np.ones(by.size, dtype=bool), np.zeros(by.size)
-    for _ in range(_TURNS):
-        if not free.any():
-            break
-        inner = gram[np.ix_(free, free)] / np.outer(scale[free], scale[free])
-        inner[np.diag_indices_from(inner)] += _RIDGE
-        rest = by[free] - gram[np.ix_(free, ~free)] @ theta[~free]
-        theta[free] = np.linalg.solve(inner, rest / scale[free]) / scale[free]
-        inside = np.clip(theta, lowest, highest)
-        beyond = free & (inside != theta)
-        theta = inside
-        if not beyond.any():
-            break
-        free &= ~beyond
-    return float(theta @ (2.0 * by - gram @ theta)), theta
 
 
 def _of_different_causes(blocks: Sequence[Block]) -> list[Block]:

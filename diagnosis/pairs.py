@@ -118,7 +118,7 @@ class PairSearch:
                 rough = sorted((self._fitted(_parts(item), ROUGH_STEPS) for item in rough[:AGAIN]), key=_bic)
             before, near = best, min(item.bic for item in (*rough, best) if item is not None)
             near += _NEAR * max(nominal.bic - near, 0.0)
-            refined = [self._refined(item) for item in rough[:REFINED] if item.bic < near]
+            refined = [self._refined(item) for item in rough[:REFINED] if item.bic <= near]
             best = min((item for item in (best, *refined) if item is not None), key=_bic)
             if best is before:
                 break

@@ -10,11 +10,12 @@ Effects that bring states of their own, such as a lag, have no infinitesimal dev
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log
+from math import inf, log
 
 import numpy as np
 
 from diagnosis import signatures
+from diagnosis.bounded_fit import within
 from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Signal, Sine, Step
 from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
@@ -193,6 +194,8 @@ class Screen:
         courses = [self._sine.basis(np.array([period])) for period in known]
         both = [np.concatenate([getattr(item, name) for item in courses], axis=1) for name in Signal._fields]
         for cause, effect in enumerate(effects):
+            if 0.0 in (effect.lower, effect.upper):
+                continue  # what is there to one side alone does not swing about nothing
             sums = np.zeros((2, count))
             np.add.at(sums[0], place[:-1], over_row[:, cause])
             np.add.at(sums[1], place[1:], at_row[:, cause])
@@ -219,8 +222,13 @@ class Screen:
             a, b = g.T @ ways.w.ravel(), g.T @ g
             if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
                 continue
-            by = np.asarray(np.linalg.lstsq(b, a, rcond=1e-12)[0], dtype=np.float64)
-            gain = float(by @ (2.0 * a - b @ by))
+            # What is there to one side alone stays there. Of the rest see `_possible`.
+            lowest, highest = (0.0 if end == 0.0 else inf for end in (effect.lower, effect.upper))
+            if course.name == self._free.name and 0.0 in (lowest, highest):
+                gain, by = within(b, a, np.full(a.size, -lowest), np.full(a.size, highest))
+            else:
+                by = np.asarray(np.linalg.lstsq(b, a, rcond=1e-12)[0], dtype=np.float64)
+                gain = float(by @ (2.0 * a - b @ by))
             if course.coefficients == 1:
                 by, gains = _possible(by, a, b[0], effect)
                 gain = float(gains[0])

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
+from diagnosis.bounded_fit import within
 from diagnosis.diagnose import diagnose
 from diagnosis.hypothesis import Hypothesis
-from diagnosis.pair_screen import PairScreen, within
+from diagnosis.pair_screen import PairScreen
 from diagnosis.result import NAMED
 from diagnosis.screen import Screen
 from diagnosis.sized import Sized
