@@ -33,6 +33,7 @@ _RUNAWAY = 1e100
 
 _SHARE = 0.02
 _SCANS = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
+_LEAST_SCANNED = 5.0  # in log likelihood
 _WIDENINGS, _WIDER = 10, 2.0
 _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 5, 1e-3, 10.0, 0.1
 
@@ -131,7 +132,7 @@ class Hypothesis:
     def _scanned(self, run: Run, best: Fit, place: int) -> Fit:
         """Of a size that the innovations depend on in jumps: the best of many, then of nearer ones.
 
-        Where none of the first few is better than nothing, there is none.
+        Where none of the first few gains anything, none will.
         """
         nothing = loss_of(self.without(run, best, place))
         for reach, count in _SCANS:
@@ -143,7 +144,7 @@ class Hypothesis:
                 theta[place] = np.where(scaled, share * numbers, numbers)
                 tried.append(self.at(run, theta))
             best = min(best, *tried, key=lambda item: item.loss)
-            if loss_of(best.w) > nothing:
+            if loss_of(best.w) > nothing - _LEAST_SCANNED:
                 break
         return best
 
