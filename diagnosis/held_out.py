@@ -40,12 +40,19 @@ class Errors(NamedTuple):
     one_step: Array
 
 
-def held_out_rows(run: Run) -> Array:
-    """Which rows are held out, shape (rows,)."""
+def held_out_rows(run: Run, onsets_min: Sequence[float] = ()) -> Array:
+    """Which rows are held out, shape (rows,).
+
+    Args:
+        run: the record.
+        onsets_min: when something set in: the blocks in which it did are seen, for no other tells when.
+    """
     block_min = min(BLOCK_MIN, run.span_min / FEWEST_BLOCKS)
     block = np.floor((run.time_min - run.time_min[0]) / block_min)
     found = block % EVERY == EVERY - 1
     found[:OBSERVED_ROWS] = False
+    told = found & ~np.isin(block, [np.floor((onset - run.time_min[0]) / block_min) for onset in onsets_min])
+    found = told if np.count_nonzero(told) >= FEWEST_ROWS else found
     calm = found.copy()
     for row in run.breaks:
         calm[row : row + WAKE_ROWS] = False
@@ -57,7 +64,7 @@ def gained(run: Run, nominal: Explained, best: Explained) -> tuple[Errors, Error
 
     So the difference is that of the causes alone.
     """
-    hidden = held_out_rows(run)
+    hidden = held_out_rows(run, _onsets(best))
     seen = replace(run, measured=np.where(hidden[:, None], np.nan, run.measured))
     fit = best.fit
     if best is not nominal:
@@ -69,6 +76,14 @@ def gained(run: Run, nominal: Explained, best: Explained) -> tuple[Errors, Error
     if best is nominal:
         return before, before
     return before, _errors(run, hidden, best.hypothesis.sized, best.hypothesis.signals(fit), known)
+
+
+def _onsets(explained: Explained) -> list[float]:
+    parameters = (
+        course.parameters(theta)
+        for course, theta in zip(explained.hypothesis.courses, explained.fit.theta, strict=True)
+    )
+    return [item["onset"] for item in parameters if "onset" in item]
 
 
 def free_run(run: Run, sized: Sized, signals: Sequence[Signal], known: Mapping[str, float]) -> Array:
