@@ -160,7 +160,8 @@ def _is_unknown(strange: Located | None, found: Found, best: Explained, run: Run
 
 def _seems_noisy(found: Found, model: ProcessModel) -> bool:
     """Whether with the best hypothesis much still moves the states that is not in the model."""
-    shares = (sd / state.scale for sd, state in zip(found.noise.process_sd, model.states, strict=True))
+    own = found.noise.process_sd[: len(model.states)]  # behind them uncertain parameters, which never move
+    shares = (sd / state.scale for sd, state in zip(own, model.states, strict=True))
     return max(shares) > NOISY_SHARE
 
 

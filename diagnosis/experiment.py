@@ -33,6 +33,9 @@ SURE, LIKELY = 0.99, 0.9
 SMALLER = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1)
 """Shares of the range that are tried until the outputs keep their limits."""
 
+FEW = 2
+"""So many pairs that it leaves open are named."""
+
 STEPS, ROWS_A_STEP = 8, 60
 EXCHANGES = 24
 SEED = 11
@@ -124,6 +127,8 @@ class ExperimentSearch:
         span_min = self._rivals.period_min * levels.size
         left = [self._said(item.between) for item in apart if item not in told]
         but = f" (but not between {', nor between '.join(left)})" if left else ""
+        if len(left) > FEW:
+            but = f" ({len(left)} of the {len(apart)} pairs among all of them stay open)"
         would = "would" if hardest.probability >= LIKELY else "might"
         why = (
             f"{span_min:.4g} min with {item.name} stepping between {levels.min():g} and {levels.max():g} {item.unit} "
