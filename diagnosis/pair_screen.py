@@ -133,7 +133,7 @@ class PairScreen:
         for rest in [w, *(w - block.columns @ _gain(block.columns, w)[1] for block in strongest)]:
             about = Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, rest.reshape(ways.w.shape))
             leads = [item for item in self._screen.swinging(about, self._screen.direct) if np.isfinite(item.gain)]
-            least = max(0.0, *(SINES_SHARE * item.score(self._run.values) for item in leads))
+            least = max([0.0, *(SINES_SHARE * item.score(self._run.values) for item in leads)])
             for lead in leads:
                 period = lead.theta[2:]
                 key = (lead.effect.name, round(log(float(period[0])), 2))
