@@ -35,12 +35,14 @@ def curves_of(
         slope = course.derivatives(theta, course.least_differences).at_row
         deviation[effect.name] = signal.at_row
         deviation_sd[effect.name] = np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", slope, part, slope), 0.0))
+    before = free_run(run, nominal.hypothesis.sized, (), known)
+    after = before if best is nominal else free_run(run, hypothesis.sized, signals, known)
     return Curves(
         run.time_min,
         dict(zip(model.input_names, run.inputs.T, strict=True)),
         dict(zip(outputs, whole.measured.T, strict=True)),
-        dict(zip(outputs, free_run(run, nominal.hypothesis.sized, (), known).T, strict=True)),
-        dict(zip(outputs, free_run(run, hypothesis.sized, signals, known).T, strict=True)),
+        dict(zip(outputs, before.T, strict=True)),
+        dict(zip(outputs, after.T, strict=True)),
         dict(zip(outputs, _standardised(nominal).T, strict=True)),
         dict(zip(outputs, _standardised(best).T, strict=True)),
         deviation,

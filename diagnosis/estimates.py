@@ -25,9 +25,11 @@ def covariances_of(run: Run, best: Explained) -> list[Array]:
 
 def with_rough_numbers(search: Search, best: Explained) -> tuple[Explained, list[Array]]:
     """With the numbers in which the likelihood is rough where it is largest; and the covariances with their spread."""
-    sds = [np.sqrt(np.maximum(np.diag(item), 0.0)) for item in covariances_of(search.run, best)]
-    best, rough = settled(search, best, sds)
     covariances = covariances_of(search.run, best)
+    sds = [np.sqrt(np.maximum(np.diag(item), 0.0)) for item in covariances]
+    moved, rough = settled(search, best, sds)
+    if moved is not best:
+        best, covariances = moved, covariances_of(search.run, moved)
     for effect, whole, numbers in zip(best.hypothesis.sized.effects, covariances, rough, strict=True):
         for number, sd in numbers.items():
             share = sd / max(float(np.sqrt(whole[number, number])), 1e-300)

@@ -63,7 +63,7 @@ def whitened(about: Linear, r: Array, kept: Array, variance: float, offset: Arra
     Returns:
         Shape (rows, n_y, columns), 0 where nothing is known; and the sum of the logarithms of the deviations.
     """
-    found, logs = _whitened(*about, r, kept, variance, offset, seen)
+    found, logs = _whitened(about, r, kept, variance, offset, seen)
     return np.asarray(found), float(logs)
 
 
@@ -78,27 +78,13 @@ def smoothed(about: Linear, r: Array, kept: Array, variance: float, offset: Arra
         offset: shape (rows, n_x).
         seen: shape (rows, n_y).
     """
-    found = np.asarray(_smoothed(*about, r, kept, variance, offset, seen))
+    found = np.asarray(_smoothed(about, r, kept, variance, offset, seen))
     return found[:, :-1], found[:, -1]
 
 
 @compiled
-def _whitened(
-    F: Array,
-    G: Array,
-    H: Array,
-    D: Array,
-    q: Array,
-    known: NDArray[np.bool_],
-    began: NDArray[np.bool_],
-    start: Array,
-    start_covariance: Array,
-    r: Array,
-    kept: Array,
-    variance: float,
-    offset: Array,
-    seen: Array,
-) -> tuple[Array, float]:
+def _whitened(about: Linear, r: Array, kept: Array, variance: float, offset: Array, seen: Array) -> tuple[Array, float]:
+    F, G, H, D, q, known, began, start, start_covariance = about
     rows, n, n_y, columns = F.shape[0], F.shape[1], H.shape[1], offset.shape[2]
     found, logs = np.zeros((rows, n_y, columns)), 0.0
     x, before = np.zeros((n + 1, columns)), np.zeros((n, columns))
@@ -199,22 +185,8 @@ def _correct(P: Array, Pc: Array, s: float) -> None:
 
 
 @compiled
-def _smoothed(
-    F: Array,
-    G: Array,
-    H: Array,
-    D: Array,
-    q: Array,
-    known: NDArray[np.bool_],
-    began: NDArray[np.bool_],
-    start: Array,
-    start_covariance: Array,
-    r: Array,
-    kept: Array,
-    variance: float,
-    offset: Array,
-    seen: Array,
-) -> Array:
+def _smoothed(about: Linear, r: Array, kept: Array, variance: float, offset: Array, seen: Array) -> Array:
+    F, G, H, D, q, known, began, start, start_covariance = about
     rows, n, n_y = F.shape[0], F.shape[1], H.shape[1]
     x_all, P_all = np.zeros((rows, n + 1)), np.zeros((rows, n + 1, n + 1))  # before a row is seen
     gains, offs, sizes = np.zeros((rows, n_y, n + 1)), np.zeros((rows, n_y)), np.ones((rows, n_y))

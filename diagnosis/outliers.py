@@ -10,7 +10,7 @@ begins at it is lost.
 """
 
 from dataclasses import replace
-from math import inf, sqrt
+from math import inf
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from diagnosis.run import Run
 from reactorwatch.process.model import Array
+from reactorwatch.process.noise import rough_sensor_sd
 
 FAR = 5.0
 """Standard deviations of the sensor's noise ..."""
@@ -31,8 +32,6 @@ RANGES = 2.0
 SHOWN = 0.5
 """So much of it has to show in what was measured, against a line through what is around; of whose moves it has to be
 such a share, too."""
-
-_OF_THIRD_DIFFERENCES = 0.6745 * sqrt(20.0)  # their median size, for white noise of unit variance
 
 
 def without(run: Run, outliers: NDArray[np.bool_]) -> Run:
@@ -114,8 +113,7 @@ def _noise_sd(column: Array) -> float:
     known = column[np.isfinite(column)]
     if known.size < 2 * SIDE_ROWS:
         return inf
-    third = float(np.median(np.abs(np.diff(known, n=3)))) / _OF_THIRD_DIFFERENCES
-    return max(third, _step_of(known))
+    return max(rough_sensor_sd(known), _step_of(known))
 
 
 def _step_of(values: Array) -> float:

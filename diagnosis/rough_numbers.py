@@ -125,7 +125,7 @@ class _Scan:
         mean, _ = _moments(known, here)
         trial = _at(self._search, best, self._place, self._number, mean)
         if trial.loss < best.fit.loss + AS_LIKELY:
-            best, here = self._search.explained(best.hypothesis, trial.theta), mean
+            best, here = self._search.judged(best.hypothesis, trial), mean
         return best, _moments(known, here)[1]
 
     def _find_the_edges(self, best: Explained, known: dict[float, Fit]) -> None:

@@ -201,7 +201,9 @@ class Search:
 
     def nominal(self) -> Explained:
         """Without any effect."""
-        return self.explained(Hypothesis(self.sized(()), ()), ())
+        found = self.explained(Hypothesis(self.sized(()), ()), ())
+        self._nothing = (self.noise, found.fit.loss)
+        return found
 
     def settle(self, best: Explained) -> None:
         """Take the noise that a hypothesis needs for that of all."""
@@ -273,14 +275,14 @@ class Search:
     def _loss_of_nothing(self) -> float:
         """Of the nominal model with the noise that holds now."""
         if self._nothing is None or self._nothing[0] is not self.noise:
-            self._nothing = (self.noise, self.nominal().fit.loss)
+            return self.nominal().fit.loss
         return self._nothing[1]
 
     def fit(
         self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True
     ) -> Explained:
         """A hypothesis, fitted from a start; see there."""
-        return self._with_bic(hypothesis, hypothesis.fit(self.run, start, steps, scan))
+        return self.judged(hypothesis, hypothesis.fit(self.run, start, steps, scan))
 
     def _elsewhere(self, lead: Lead, best: Explained) -> bool:
         """Whether a lead of the best's own cause and course begins where its fit is not."""
@@ -295,7 +297,7 @@ class Search:
 
     def explained(self, hypothesis: Hypothesis, theta: Sequence[Array]) -> Explained:
         """A hypothesis at some numbers."""
-        return self._with_bic(hypothesis, hypothesis.at(self.run, theta))
+        return self.judged(hypothesis, hypothesis.at(self.run, theta))
 
     def sized(self, effects: tuple[Effect, ...]) -> Sized:
         """The model with these effects, made once."""
@@ -308,7 +310,8 @@ class Search:
     def _use_noise(self, sized: Sized) -> None:
         sized.noise = self.noise
 
-    def _with_bic(self, hypothesis: Hypothesis, fit: Fit) -> Explained:
+    def judged(self, hypothesis: Hypothesis, fit: Fit) -> Explained:
+        """A hypothesis at a fit of it that is there already."""
         return Explained(hypothesis, fit, 2.0 * fit.loss + hypothesis.freedom * log(self.run.values))
 
 

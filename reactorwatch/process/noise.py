@@ -145,7 +145,7 @@ class _Tuning:
         limits = np.log([[item.lower, item.upper] for item in self._learned]).reshape(-1, 2).T
         self._lowest = np.concatenate([np.log(smallest_sd), np.log(LEAST_SHARE * self._scales), limits[0]])
         self._highest = np.concatenate([np.full(self._of_states.stop, inf), limits[1]])
-        self._first = np.maximum(_rough(measured), smallest_sd)
+        self._first = np.maximum([rough_sensor_sd(column) for column in measured.T], smallest_sd)
         self._filter = Filter(model, NoiseLevels(tuple(self._first.tolist()), (0.0,) * len(model.states)))
 
     def found(self) -> tuple[NoiseLevels, dict[str, float]]:
@@ -252,10 +252,13 @@ class _Tuning:
         return _Trial(theta, loss if np.isfinite(loss) else inf, w, d)
 
 
-def _rough(measured: Array) -> Array:
-    """A first guess of the sensors' noise: third differences leave little of what the process does."""
-    found = []
-    for column in measured.T:
-        third = np.abs(np.diff(column[np.isfinite(column)], n=3))
-        found.append(float(np.median(third)) if third.size else 0.0)
-    return np.array(found) / _OF_THIRD_DIFFERENCES
+def rough_sensor_sd(column: Array) -> float:
+    """A first guess of a sensor's noise; 0 where there are too few values.
+
+    Third differences leave little of what the process does, and their median little of outliers.
+
+    Args:
+        column: what it measured, shape (rows,); NaN where missing.
+    """
+    third = np.abs(np.diff(column[np.isfinite(column)], n=3))
+    return float(np.median(third)) / _OF_THIRD_DIFFERENCES if third.size else 0.0

@@ -14,13 +14,11 @@ from scipy.stats import chi2, multivariate_normal
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, OPERATING_STATE, cstr
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.filter import Filter, FilterState, Innovation, NoiseLevels
 from reactorwatch.process.filter_record import FilterRecord
 from reactorwatch.process.model import Array, Output, ProcessModel, new_clock, variable
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.process.steady_state import steady_states
 
 A = np.array([[-0.7, 0.4], [-0.9, -0.3]])
 B = np.array([0.5, 1.0])
@@ -298,19 +296,6 @@ def test_a_sensor_that_is_all_but_exact_leaves_the_covariance_positive() -> None
     assert np.all(np.diag(P) < 1e-17)
 
 
-def test_it_begins_anew_after_a_row_whose_input_nobody_knows() -> None:
-    time_min, inputs, measured = record_of(PlantConfig(seed=3), 60)
-    inputs = inputs.copy()
-    inputs[30] = np.nan
-    found = Filter(cstr(), SENSORS).run(time_min, inputs, measured)
-    assert np.flatnonzero(np.all(np.isnan(found.prediction), axis=1)).tolist() == [0, 31]
-    kalman = Filter(cstr(), SENSORS)
-    told = [
-        kalman.update(*row) for row in zip(time_min.tolist(), inputs[:, None].tolist(), measured.tolist(), strict=True)
-    ]
-    np.testing.assert_array_equal([item.prediction for item in told], found.prediction)
-
-
 def test_over_rows_without_any_measurement_it_predicts_alone() -> None:
     start = FilterState(0.0, (OPERATING_COOLANT_FLOW,), (0.08, 440.0), (1e-6, 0.0, 0.0, 0.1))
     time_min = np.arange(1, 31, dtype=np.float64) * 0.1
@@ -370,42 +355,6 @@ def test_without_process_noise_the_covariance_stays_positive_for_a_week() -> Non
     assert np.max(np.abs(correlation)) < 1.0
 
 
-def test_it_waits_while_nothing_is_measured_and_says_nothing_of_its_first_row() -> None:
-    kalman = Filter(cstr(), SENSORS)
-    for t in (0.0, 0.1):
-        assert np.all(np.isnan(kalman.update(t, (100.0,), (np.nan, np.nan))))
-        assert kalman.state.time_min is None
-    assert np.all(np.isnan(kalman.update(0.2, (100.0,), (0.09, 441.0))))
-    assert kalman.state.x == pytest.approx((0.09, 441.0), rel=1e-3)
-
-
-@pytest.mark.parametrize("branch", [0, 2])
-def test_what_is_not_measured_begins_at_the_nearest_steady_state(branch: int) -> None:
-    point = steady_states(cstr(), np.array([100.0]))[branch]
-    kalman = Filter(cstr(), SENSORS)
-    kalman.update(0.0, (100.0,), (np.nan, float(point.state[1])))
-    np.testing.assert_allclose(kalman.state.x, point.state, rtol=1e-3)
-
-
-def test_from_the_temperature_alone_it_finds_the_concentration() -> None:
-    """Within 4 of the standard deviations that it claims, from an hour on."""
-    truth = Simulator(cstr())
-    time_min, inputs, measured = record_of(PlantConfig(seed=10), 1500)
-    clean = truth.run(time_min, inputs, np.array([0.11, 436.0])).states[:, 0]
-    measured[:, 0] = np.nan
-    found = Filter(cstr(), SENSORS).run(time_min, inputs, measured)
-    error = found.x[600:, 0] - clean[600:]
-    assert np.all(np.abs(error) < 4 * np.sqrt(found.P[600:, 0, 0]) + 1e-5)
-    assert np.max(np.abs(error)) < 0.002
-
-
-def test_it_begins_right_with_a_sensor_that_the_model_knows_to_be_off() -> None:
-    model = parse_fault("concentration_gain:constant:0.5").extend(cstr())
-    kalman = Filter(model, SENSORS)
-    kalman.update(0.0, (100.0,), (0.15, 441.0))
-    assert kalman.state.x == pytest.approx((0.1, 441.0), rel=1e-3)
-
-
 def test_parameters_may_change_under_way() -> None:
     model = parse_fault("temperature_bias:step:2@1000min").extend(cstr())
     kalman = Filter(model, SENSORS)
@@ -417,13 +366,6 @@ def test_parameters_may_change_under_way() -> None:
         predictions.append(kalman.update(0.1, (100.0,), (np.nan, np.nan)).prediction[1])
     assert predictions[0] == predictions[1]
     assert predictions[2] == pytest.approx(predictions[0] + 5.0, abs=1e-9)
-
-
-def test_it_begins_where_outputs_grow_without_bound_with_a_state_all_the_same() -> None:
-    # Half a minute later than a state amid its bounds, the reaction has run away by more than a number can hold.
-    model = EFFECTS[-1].extend(cstr()).with_values({"sample_timing.size": 0.45})
-    run = Filter(model, SENSORS).run(np.array([0.0, 0.1]), np.full((2, 1), 90.0), np.array([[0.1, 438.0]] * 2))
-    assert np.all(np.isfinite(run.x))
 
 
 @pytest.mark.parametrize(
