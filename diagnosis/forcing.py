@@ -117,7 +117,7 @@ class Forcing:
         self._sized = with_size_inputs(model, (effect,))
         self.sees = tuple(_sees(self._sized))
         noise = NoiseLevels((1.0,) * len(model.outputs), (1.0,) * len(model.states))  # a path has none
-        self._errors = FilterErrors.of(self._sized.model, noise, self._sized.of_rates, self._sized.of_outputs)
+        self._errors = FilterErrors(self._sized.model, noise, self._sized.of_rates, self._sized.of_outputs)
 
     def about(self, reference: Reference, run: Run) -> "Linearised":
         """The forcing about a path."""

@@ -11,14 +11,12 @@ import casadi as ca
 import numpy as np
 
 from diagnosis.run import Run
-from reactorwatch.process.array_function import mapped, over_rows
 from reactorwatch.process.filter import Innovations
+from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array, ProcessModel
 
 LEAST_CORRELATION = 0.15
 """Of the residuals with that error, in every output; by chance, in a thousand rows, it is some hundredths."""
-
-CHUNK = 64
 
 
 def looks_like_integration(model: ProcessModel, run: Run, found: Innovations) -> bool:
@@ -48,6 +46,6 @@ def _shown_error(model: ProcessModel, run: Run, x: Array) -> Array:
     after = state + h * slope
     curved = after + 0.5 * h * (f(after, u, p, t, t)[0] - slope)
     error = f(curved, u, p, t, t)[1] - f(after, u, p, t, t)[1]
-    function = mapped(ca.Function("error", [state, u, p, t, h], [error]), CHUNK, parameters=2)
-    values = (x[:-1], run.inputs[:-1], run.time_min[:-1, None], np.diff(run.time_min)[:, None])
-    return over_rows(function, CHUNK, model.values(), values)[0][:, :, 0]
+    function = RowCode(ca.Function("error", [state, u, p, t, h], [error]), shared=[2])
+    found = function.over(x[:-1], run.inputs[:-1], model.values(), run.time_min[:-1], np.diff(run.time_min))
+    return found[0][:, :, 0]

@@ -148,7 +148,7 @@ class Screen:
                 own = (extended.parameters[-1].symbol,) * 2
             of_rates.append(own[0])
             of_outputs.append(own[1])
-        errors = FilterErrors.of(extended, sized.levels, of_rates, of_outputs)
+        errors = FilterErrors(extended, sized.levels, of_rates, of_outputs)
         errors.changes = sized.noise.times
         return ways_between(errors, self._run, sized.inputs(self._run, signals), fit.found, sized.used(self._run))
 

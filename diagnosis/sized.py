@@ -53,7 +53,7 @@ class Sized:
         sized = with_size_inputs(model, [item for item in self.effects if item.late_output is None])
         self._filtered = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
         self._filter = Filter(self.model, self._levels_of(noise))
-        self._errors = FilterErrors.of(self.model, self.levels, self._filtered.of_rates, self._filtered.of_outputs)
+        self._errors = FilterErrors(self.model, self.levels, self._filtered.of_rates, self._filtered.of_outputs)
         self.noise = noise
 
     @property

@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-import casadi as ca
 import numpy as np
 
 from monitor_node.isolation_window import Window
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import NoiseLevels
-from reactorwatch.process.filter_errors import FilterErrors, piece_function, shown_function
+from reactorwatch.process.filter_errors import FilterErrors
 from reactorwatch.process.filter_step import COMPILED
 from reactorwatch.process.model import Array, ProcessModel
 
@@ -47,8 +46,7 @@ class Linearisation:
     """
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
-        extended, piece, shown = _compiled(model, tuple(effects))
-        self._errors = FilterErrors(extended, noise, piece, shown)
+        self._errors = _compiled(model, tuple(effects)).with_noise(noise)
 
     def ways(self, window: Window) -> Ways:
         """Those between the rows of a window."""
@@ -61,10 +59,10 @@ class Linearisation:
 
 
 @lru_cache(maxsize=COMPILED)
-def _compiled(model: ProcessModel, effects: tuple[Effect, ...]) -> tuple[ProcessModel, ca.Function, ca.Function]:
-    """The model with all effects, and what is compiled for the equations of its filter's errors."""
+def _compiled(model: ProcessModel, effects: tuple[Effect, ...]) -> FilterErrors:
+    """With all effects in the model, and some noise."""
     symbols = []
     for effect in effects:
         model = effect.extend(model)
         symbols.append(model.parameters[-1].symbol)
-    return model, piece_function(model, symbols), shown_function(model, symbols)
+    return FilterErrors(model, NoiseLevels((1.0,) * len(model.outputs), (0.0,) * len(model.states)), symbols, symbols)

@@ -42,16 +42,14 @@ from numpy.typing import NDArray
 from reactorwatch.process.array_function import ArrayFunction
 from reactorwatch.process.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.process.filter_start import Beginning
-from reactorwatch.process.filter_step import chain_function, row_function, walk_function
+from reactorwatch.process.filter_step import row_code, row_function, walk_function
+from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array, ProcessModel
 
 LONGEST_GAP_MIN = 30.0
 
 LEAST_PROCESS_SD = 1e-6
 """Of the scale of a state. Without any process noise its covariance would shrink below what a number can hold."""
-
-CHUNKS, UNROLLED = (64, 8), 8
-"""Rows in one compiled chain, a long one or a short one, and how many of them are one expression."""
 
 
 class NoiseLevels(msgspec.Struct, frozen=True):
@@ -278,10 +276,8 @@ class Filter:
         while row < count:
             done = 0
             if self._time_min is not None and near[row]:
-                end = ends[bisect_left(ends, row)]
-                chunk = self._chunks[0 if end - row >= CHUNKS[0] else 1]
-                part = slice(row, min(end, row + len(chunk.arguments[1])))
-                done = self._run_chunk(chunk, rows[part], told[part], memory[part])
+                part = slice(row, ends[bisect_left(ends, row)])
+                done = self._run_near(rows[part], told[part], memory[part])
             if done:
                 row += done
                 self._remember(float(record.time_min[row - 1]), record.inputs[row - 1].tolist())
@@ -303,23 +299,19 @@ class Filter:
         elif self._time_min is not None:
             memory[row] = self._memory
 
-    def _run_chunk(self, chunk: ArrayFunction, new: Array, told: Array, memory: Array) -> int:
-        """Take a chunk of rows in at once; returns how many of them, up to the first that did not go well."""
+    def _run_near(self, new: Array, told: Array, memory: Array) -> int:
+        """Take rows in at once; returns how many of them, up to the first that did not go well."""
         rows = len(new)
-        chunk.arguments[0][0], chunk.arguments[2][0] = self._memory, self._constants
-        chunk.arguments[1][:rows] = new
-        chunk()
-        after, found = chunk.results
-        good = found[:rows, -1] > 0.0
-        done = rows if good.all() else int(np.argmin(good))
+        done = self._rows.fill(rows, [self._memory, new, self._constants], [memory, told])
         if done:
-            told[:done], memory[:done] = found[:done], after[:done]
-            self._memory[:] = after[done - 1]
+            self._memory[:] = memory[done - 1]
+        if done < rows:
+            told[done], memory[done] = nan, nan
         return done
 
     @cached_property
-    def _chunks(self) -> list[ArrayFunction]:
-        return [ArrayFunction(chain_function(self.model, count, UNROLLED)) for count in CHUNKS]
+    def _rows(self) -> RowCode:
+        return row_code(self.model)
 
     @cached_property
     def _walk(self) -> ArrayFunction:

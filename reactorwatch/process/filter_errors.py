@@ -7,10 +7,11 @@ state and m the size of the deviation, between two rows and at a row
 
 with F and G the derivatives of the way between the rows, H and D those of the outputs, and K the filter's gain. Where
 the filter was, about which all this is linearised, is known from its run; rows that are far apart are walked in pieces.
-All of it is one compiled map over many rows, so that a thousand rows cost some milliseconds.
+All of it is machine code that takes row after row, so that a thousand rows cost a millisecond.
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
@@ -19,13 +20,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.process.array_function import ArrayFunction, mapped, over_rows
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_step import exponential
 from reactorwatch.process.integrate import LONGEST_STEP_MIN, symbolic_step
+from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array, ProcessModel
 
-CHUNK = 32
 _LEAST_PIVOT = 1e-12
 _LONGEST_PIECE_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a piece is two steps; times are rounded
 
@@ -80,32 +80,26 @@ class FilterErrors:
     Args:
         model: that the filter ran with.
         noise: of the plant and its sensors.
-        piece: see `piece_function`.
-        shown: see `shown_function`.
+        of_rates: symbols of the model, the sizes as they act in the balances.
+        of_outputs: the same sizes as they act in the outputs; may be the same symbols.
 
     Attributes:
         noise: as given.
         changes: parameters that differ from the model's values.
     """
 
-    def __init__(self, model: ProcessModel, noise: NoiseLevels, piece: ca.Function, shown: ca.Function) -> None:
+    def __init__(
+        self, model: ProcessModel, noise: NoiseLevels, of_rates: Sequence[ca.SX], of_outputs: Sequence[ca.SX]
+    ) -> None:
         self.model, self.noise = model, noise
         self.changes: Mapping[str, float] = {}
-        self._piece, self._shown = (mapped(function, CHUNK, parameters=2) for function in (piece, shown))
+        self._code = _Code(model, tuple(of_rates), tuple(of_outputs))
 
-    @classmethod
-    def of(
-        cls, model: ProcessModel, noise: NoiseLevels, of_rates: Sequence[ca.SX], of_outputs: Sequence[ca.SX]
-    ) -> "FilterErrors":
-        """With respect to some sizes.
-
-        Args:
-            model: see the class.
-            noise: likewise.
-            of_rates: symbols of the model, the sizes as they act in the balances.
-            of_outputs: the same sizes as they act in the outputs; may be the same symbols.
-        """
-        return cls(model, noise, piece_function(model, of_rates), shown_function(model, of_outputs))
+    def with_noise(self, noise: NoiseLevels) -> "FilterErrors":
+        """The same with another noise; what was compiled is."""
+        other = copy(self)
+        other.noise = noise
+        return other
 
     def ways(
         self,
@@ -145,7 +139,7 @@ class FilterErrors:
         R, q = np.square(self.noise.measurement_sd), np.square(self.noise.process_sd)
         p, step = self.model.values(self.changes), np.diff(time_min)
         there, F, G = self._walked(x[:-1], inputs[:-1], time_min[:-1], step, p)
-        H, D = self._over(self._shown, p, there, inputs[1:], time_min[1:, None])
+        H, D = self._code.shown.over(there, inputs[1:], p, time_min[1:])
         prior = F @ P[:-1] @ F.transpose(0, 2, 1) + np.eye(there.shape[1]) * q * step[:, None, None]
         covariance = H @ prior @ H.transpose(0, 2, 1) + np.diag(R)
         known = np.isfinite(residual[1:]) & np.all(np.isfinite(covariance), axis=2)
@@ -166,35 +160,43 @@ class FilterErrors:
         """
         p = self.model.values()
         there, F, G = self._walked(x[:-1], inputs[:-1], time_min[:-1], np.diff(time_min), p)
-        H, D = self._over(self._shown, p, x, inputs, time_min[:, None])
-        (y,) = self._over(self._outputs, p, x, inputs, time_min[:, None])
+        H, D = self._code.shown.over(x, inputs, p, time_min)
+        (y,) = self._code.outputs.over(x, inputs, p, time_min)
         return Path(there, F, G, y[:, :, 0], H, D)
-
-    @cached_property
-    def _outputs(self) -> ArrayFunction:
-        x, u, p = self.model.arguments()
-        t = ca.SX.sym("t")
-        y = ca.substitute(ca.vertcat(*(item.expression for item in self.model.outputs)), self.model.clock.now, t)
-        y = ca.substitute(y, self.model.clock.middle, t)
-        return mapped(ca.Function("outputs", [x, u, p, t], [ca.densify(y)]), CHUNK, parameters=2)
 
     def _walked(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
         """Where the ways lead, and their derivatives."""
         pieces = np.maximum(np.ceil(step / _LONGEST_PIECE_MIN), 1.0)
-        there, F, G = self._over(self._piece, p, x, u, t[:, None], (step / pieces)[:, None])
+        there, F, G = self._code.piece.over(x, u, p, t, step / pieces)
         there = there[:, :, 0]
         for number in range(1, ceil(pieces.max())):
             rows = np.flatnonzero(pieces > number)
             length = step[rows] / pieces[rows]
-            after, of_x, of_size = self._over(
-                self._piece, p, there[rows], u[rows], (t[rows] + number * length)[:, None], length[:, None]
-            )
+            after, of_x, of_size = self._code.piece.over(there[rows], u[rows], p, t[rows] + number * length, length)
             there[rows], F[rows], G[rows] = after[:, :, 0], of_x @ F[rows], of_x @ G[rows] + of_size
         return there, F, G
 
-    def _over(self, function: ArrayFunction, p: Array, *values: Array) -> list[Array]:
-        """A function of (x, u, p, ...) for many rows; each result has the rows as its first axis."""
-        return over_rows(function, CHUNK, p, values)
+
+@dataclass(frozen=True, eq=False)
+class _Code:
+    """What is compiled, when it is first used."""
+
+    model: ProcessModel
+    of_rates: tuple[ca.SX, ...]
+    of_outputs: tuple[ca.SX, ...]
+
+    @cached_property
+    def piece(self) -> RowCode:
+        return RowCode(piece_function(self.model, self.of_rates), shared=[2])
+
+    @cached_property
+    def shown(self) -> RowCode:
+        return RowCode(shown_function(self.model, self.of_outputs), shared=[2])
+
+    @cached_property
+    def outputs(self) -> RowCode:
+        x, u, p, t, y = self.model.shown()
+        return RowCode(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
 
 
 def _cholesky(A: Array) -> Array:
@@ -233,9 +235,6 @@ def piece_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
 
 def shown_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
     """(x, u, p, t) -> derivatives of the outputs by x and by the sizes."""
-    x, u, p = model.arguments()
-    t = ca.SX.sym("t")
-    y = ca.vertcat(*(output.expression for output in model.outputs))
-    y = ca.substitute(ca.substitute(y, model.clock.now, t), model.clock.middle, t)
+    x, u, p, t, y = model.shown()
     by = [ca.densify(ca.jacobian(y, item)) for item in (x, ca.vertcat(*sizes))]
     return ca.Function("shown", [x, u, p, t], by)

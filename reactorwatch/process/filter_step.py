@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.process.integrate import symbolic_step
+from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import ProcessModel
 
@@ -72,20 +73,9 @@ def output_function(model: ProcessModel) -> ca.Function:
 
 
 @lru_cache(maxsize=COMPILED)
-def _unrolled(model: ProcessModel, count: int) -> ca.Function:
-    """As many rows after each other, as one expression."""
-    return row_function(model).mapaccum("few", count).expand()
-
-
-@lru_cache(maxsize=COMPILED)
-def chain_function(model: ProcessModel, count: int, unrolled: int) -> ca.Function:
-    """As many rows after each other; `unrolled` of them, which divide `count`, are one expression."""
-    row, few = row_function(model), _unrolled(model, unrolled)
-    memory = ca.MX.sym("memory", row.size1_in(0))
-    new = ca.MX.sym("new", row.size1_in(1), count)
-    constants = ca.MX.sym("constants", row.size1_in(2))
-    results = few.mapaccum("many", count // unrolled)(memory, new, ca.repmat(constants, 1, count))
-    return ca.Function("rows", [memory, new, constants], list(results))
+def row_code(model: ProcessModel) -> RowCode:
+    """`row_function` for row after row, up to the first that does not go well."""
+    return RowCode(row_function(model), shared=[2], chained=1, stops=True)
 
 
 def _symbols(model: ProcessModel, new: int) -> tuple[ca.SX, ca.SX, ca.SX]:

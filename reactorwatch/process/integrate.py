@@ -3,7 +3,7 @@
 The method is the pair of Cash & Karp (1990), A variable order Runge-Kutta method for initial value problems with
 rapidly varying right-hand sides, ACM Trans. Math. Softw. 16(3), orders 5 and 4: six evaluations a step, the error
 estimate included. On the operating branch a fixed step of 0.05 min is inside the tolerance, and a record of
-thousands of rows runs as one compiled chain of steps. (The pair of Dormand & Prince takes seven evaluations, the
+thousands of rows runs as one piece of machine code. (The pair of Dormand & Prince takes seven evaluations, the
 last of which would only save one if the input did not jump, and at this step has twice the error.)
 Where the estimate breaks the tolerance (an upset, an ignition: the reaction then has time constants below a
 second) that stretch is walked with steps of its own size, as many as it takes.

@@ -322,6 +322,12 @@ class ProcessModel:
             ca.vertcat(*(item.symbol for item in self.parameters)),
         )
 
+    def shown(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
+        """The symbols x, u, p and of the time, and the outputs in terms of them."""
+        x, u, p = self.arguments()
+        t, y = ca.SX.sym("t"), ca.vertcat(*(output.expression for output in self.outputs))
+        return x, u, p, t, ca.substitute(ca.substitute(y, self.clock.now, t), self.clock.middle, t)
+
 
 def _check_bounds(name: str, value: float, lower: float, upper: float) -> None:
     if not lower <= value <= upper:

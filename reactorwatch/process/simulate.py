@@ -14,20 +14,16 @@ shows of a row is the state after it has begun.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import inf
 
 import casadi as ca
 import numpy as np
 
-from reactorwatch.process.array_function import ArrayFunction, mapped, over_rows
+from reactorwatch.process.array_function import ArrayFunction
 from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
+from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.memory import reset_function, rest_function
 from reactorwatch.process.model import Array, ProcessModel
-
-CHUNK = 256
-"""Steps in one compiled chain. All that comes after a step that breaks the tolerance is computed again."""
-
-UNROLLED = 8
-"""Steps that are one expression in the chain, for a call costs a third of a step. Divides `CHUNK`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +67,7 @@ class Simulator:
         self.model = model
         self._own = sum(state.name not in model.at_rest for state in model.states)
         self._stepper = Stepper(model)
-        self._sensitivity_chains: dict[tuple[int, ...], ArrayFunction] = {}
+        self._sensitivity_codes: dict[tuple[int, ...], RowCode] = {}
 
     def run(
         self,
@@ -136,29 +132,27 @@ class Simulator:
         grid = grid.refined(cuts)
         of_states = self._run_sensitivities(grid, inputs, start, p, wanted, initial)
         of_states = np.concatenate([initial[None], of_states[grid.end_of_row]])
-        by_x, by_p = self._over_rows(self._output_derivatives, time_min, inputs, p, trajectory.states)
+        by_x, by_p = self._output_derivatives.over(trajectory.states, inputs, p, time_min)
         of_outputs: Array = by_x @ of_states + by_p[:, :, wanted]
         return trajectory, Sensitivities(tuple(names), of_states, of_outputs)
 
     # --- what is compiled once a model -----------------------------------------------------------------------
 
     @cached_property
-    def _chain(self) -> ArrayFunction:
-        """(x, U, p, t, t_middle, h) -> (states after each step, error of each)."""
+    def _code(self) -> RowCode:
+        """(x, u, p, t, t_middle, h) -> (state after the step, 1 if it keeps the tolerance), step after step."""
         step = _row_step(self.model)
-        few = step.mapaccum("few", UNROLLED).expand()
-        symbols = self._chain_symbols()
-        x, u, p, t, middle, h = symbols
-        results = few.mapaccum("many", CHUNK // UNROLLED)(x, u, ca.repmat(p, 1, CHUNK), t, middle, h)
-        return ArrayFunction(ca.Function("chain", symbols, list(results)))
+        after, error = step(*step.sx_in())
+        good = ca.logic_and(error <= TOLERANCE, ca.fabs(ca.sum1(after)) < inf)
+        return RowCode(ca.Function("step", step.sx_in(), [after, good]), shared=[2], chained=1, stops=True)
 
-    def _sensitivity_chain(self, wanted: tuple[int, ...]) -> ArrayFunction:
-        """(x, U, p, t, t_middle, h, S, dt, dh) -> (states, sensitivities), for the parameters of these numbers."""
-        if wanted not in self._sensitivity_chains:
-            self._sensitivity_chains[wanted] = self._new_sensitivity_chain(wanted)
-        return self._sensitivity_chains[wanted]
+    def _sensitivity_code(self, wanted: tuple[int, ...]) -> RowCode:
+        """(x, S, u, p, t, t_middle, h, dt, dh) -> (x, S) after the step, for the parameters of these numbers."""
+        if wanted not in self._sensitivity_codes:
+            self._sensitivity_codes[wanted] = self._new_sensitivity_code(wanted)
+        return self._sensitivity_codes[wanted]
 
-    def _new_sensitivity_chain(self, wanted: tuple[int, ...]) -> ArrayFunction:
+    def _new_sensitivity_code(self, wanted: tuple[int, ...]) -> RowCode:
         step = _row_step(self.model)
         n_x, n = len(self.model.states), len(wanted)
         x, u, p, t, middle, h = step.sx_in()
@@ -170,48 +164,21 @@ class Simulator:
             + ca.mtimes(ca.jacobian(after, t), of_t)
             + ca.mtimes(ca.jacobian(after, h), of_h)
         )
-        one = ca.Function("one", [x, S, u, p, t, middle, h, of_t, of_h], [after, ca.densify(S_after)])
-        symbols = [
-            *self._chain_symbols(),
-            ca.MX.sym("S", n_x, n),
-            ca.MX.sym("of_t", 1, CHUNK * n),
-            ca.MX.sym("of_h", 1, CHUNK * n),
-        ]
-        X, U, P, T, M, H, SS, of_T, of_H = symbols
-        results = one.mapaccum("steps", CHUNK, 2)(X, SS, U, ca.repmat(P, 1, CHUNK), T, M, H, of_T, of_H)
-        return ArrayFunction(ca.Function("sensitivity_chain", symbols, list(results)))
-
-    def _chain_symbols(self) -> list[ca.MX]:
-        model = self.model
-        sizes = (
-            ("x", len(model.states), 1),
-            ("u", len(model.inputs) * (2 if model.resets else 1) + bool(model.resets), CHUNK),
-            ("p", len(model.parameters), 1),
-            ("t", 1, CHUNK),
-            ("t_middle", 1, CHUNK),
-            ("h", 1, CHUNK),
-        )
-        return [ca.MX.sym(*size) for size in sizes]
+        one = ca.Function("sensitivities", [x, S, u, p, t, middle, h, of_t, of_h], [after, S_after])
+        return RowCode(one, shared=[3], chained=2)
 
     @cached_property
-    def _outputs(self) -> ArrayFunction:
-        """Rows of (x, u, p, t) -> y."""
-        x, u, p, t, y = self._output_expressions()
-        return mapped(ca.Function("outputs", [x, u, p, t], [y]), CHUNK, parameters=2)
+    def _outputs(self) -> RowCode:
+        """(x, u, p, t) -> y."""
+        x, u, p, t, y = self.model.shown()
+        return RowCode(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
 
     @cached_property
-    def _output_derivatives(self) -> ArrayFunction:
-        """Rows of (x, u, p, t) -> dy/dx, dy/dp."""
-        x, u, p, t, y = self._output_expressions()
+    def _output_derivatives(self) -> RowCode:
+        """(x, u, p, t) -> dy/dx, dy/dp."""
+        x, u, p, t, y = self.model.shown()
         by = ca.Function("outputs_by", [x, u, p, t], [ca.jacobian(y, x), ca.jacobian(y, p)])
-        return mapped(by, CHUNK, parameters=2)
-
-    def _output_expressions(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
-        """The symbols x, u, p, t and y in terms of them."""
-        model, t = self.model, ca.SX.sym("t")
-        x, u, p = model.arguments()
-        y = ca.vertcat(*(output.expression for output in model.outputs))
-        return x, u, p, t, ca.substitute(ca.substitute(y, model.clock.now, t), model.clock.middle, t)
+        return RowCode(by, shared=[2])
 
     @cached_property
     def _complete(self) -> ArrayFunction:
@@ -244,24 +211,20 @@ class Simulator:
     def _run_steps(self, grid: StepGrid, inputs: Array, start: Array, p: Array) -> tuple[Array, dict[int, Array]]:
         """The state after each step, and which steps had to be cut into what to keep the tolerance.
 
-        The chain runs until a step breaks the tolerance; from there on the stepper walks until one step needs no
-        cutting, and the chain goes on after it.
+        The compiled steps go on until one breaks the tolerance; from there on the stepper walks until one step needs no
+        cutting, and they go on after it.
         """
         steps = grid.length_min.size
-        states = np.empty((steps, start.size))
+        states, good = np.empty((steps, start.size)), np.empty(steps)
+        columns = self._columns(grid, inputs)
         cuts: dict[int, Array] = {}
         x, first, ends = start, 0, set(grid.end_of_row.tolist())
         while first < steps:
-            part = slice(first, min(first + CHUNK, steps))
-            count = self._fill(self._chain, grid, inputs, p, x, part)
-            self._chain()
-            after, error = (result[:count] for result in self._chain.results)
-            bad = ~((error[:, 0] <= TOLERANCE) & np.isfinite(after).all(axis=1))
-            good = int(np.argmax(bad)) if bad.any() else count
-            states[first : first + good] = after[:good]
-            first += good
+            u, *times = (column[first:] for column in columns)
+            done = self._code.fill(steps - first, [x, u, p, *times], [states[first:], good[first:]])
+            first += done
             x = states[first - 1] if first else start
-            walking = good < count
+            walking = True
             while walking and first < steps:
                 t, h, middle = grid.start_min[first], grid.length_min[first], grid.middle_min[first]
                 x, lengths = self._stepper.walk(x, inputs[grid.row[first]], p, float(t), float(h), float(middle))
@@ -279,40 +242,20 @@ class Simulator:
         self, grid: StepGrid, inputs: Array, start: Array, p: Array, wanted: list[int], initial: Array
     ) -> Array:
         """d(state after each step)/dp, shape (steps, n_x, n), on a grid that keeps the tolerance."""
-        n_x, n = initial.shape
-        of_time, of_length = self._edge_derivatives(grid, wanted)
-        chain = self._sensitivity_chain(tuple(wanted))
-        *_, sensitivity, chain_of_time, chain_of_length = chain.arguments
-        sensitivity[:] = initial.T
-        steps = grid.length_min.size
-        result = np.empty((steps, n_x, n))
-        x = start
-        for first in range(0, steps, CHUNK):
-            part = slice(first, min(first + CHUNK, steps))
-            count = self._fill(chain, grid, inputs, p, x, part)
-            chain_of_time.reshape(CHUNK, n)[:count] = of_time[part]
-            chain_of_length.reshape(CHUNK, n)[:count] = of_length[part]
-            chain()
-            states, sensitivities = chain.results
-            after = sensitivities.reshape(CHUNK, n, n_x)
-            result[part] = after[:count].transpose(0, 2, 1)
-            x, sensitivity[:] = states[count - 1], after[count - 1]
-        return result
+        u, *times = self._columns(grid, inputs)
+        code = self._sensitivity_code(tuple(wanted))
+        results = code.results(grid.length_min.size)
+        edges = self._edge_derivatives(grid, wanted)
+        code.fill(grid.length_min.size, [start, np.ascontiguousarray(initial.T), u, p, *times, *edges], results)
+        return results[1].transpose(0, 2, 1)
 
-    def _fill(self, chain: ArrayFunction, grid: StepGrid, inputs: Array, p: Array, x: Array, part: slice) -> int:
-        """Put some steps into the arguments that both chains begin with; returns how many they are."""
-        count = int(part.stop - part.start)
-        state, u, parameters, time, middle, length = chain.arguments[:6]
-        state[0], parameters[0] = x, p
-        n_u = inputs.shape[1]
-        u[:count, :n_u] = inputs[grid.row[part]]
+    def _columns(self, grid: StepGrid, inputs: Array) -> tuple[Array, Array, Array, Array]:
+        """Of every step: u as in `_row_step`, the start, the middle of its row and the length."""
+        u = inputs[grid.row]
         if self.model.resets:
-            last = np.isin(np.arange(part.start, part.stop), grid.end_of_row)
-            u[:count, n_u:-1], u[:count, -1] = inputs[grid.row[part] + last], last
-        time[:count, 0] = grid.start_min[part]
-        middle[:count, 0] = grid.middle_min[part]
-        length[:count, 0] = grid.length_min[part]
-        return count
+            last = np.isin(np.arange(grid.row.size), grid.end_of_row)
+            u = np.column_stack([u, inputs[grid.row + last], last])
+        return np.ascontiguousarray(u, dtype=np.float64), grid.start_min, grid.middle_min, grid.length_min
 
     def _edge_derivatives(self, grid: StepGrid, wanted: list[int]) -> tuple[Array, Array]:
         """d(start of step)/dp and d(length of step)/dp, each of shape (steps, n)."""
@@ -331,14 +274,8 @@ class Simulator:
         return of_time, of_length
 
     def _trajectory(self, time_min: Array, inputs: Array, p: Array, states: Array) -> Trajectory:
-        (y,) = self._over_rows(self._outputs, time_min, inputs, p, states)
+        (y,) = self._outputs.over(states, inputs, p, time_min)
         return Trajectory(time_min, states, y[:, :, 0])
-
-    def _over_rows(
-        self, function: ArrayFunction, time_min: Array, inputs: Array, p: Array, states: Array
-    ) -> list[Array]:
-        """Results of a function of (x, u, p, t) for every row, each of shape (rows, its rows, its columns)."""
-        return over_rows(function, CHUNK, p, (states, inputs, time_min[:, None]))
 
     def _checked(
         self, time_min: Array, inputs: Array, start: Array, changes: Mapping[str, float] | None

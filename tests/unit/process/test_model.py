@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from reactorwatch.process.array_function import ArrayFunction, mapped
+from reactorwatch.process.array_function import ArrayFunction
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.model import parameter
 
@@ -50,12 +50,3 @@ def test_array_function_equals_the_function_it_is_made_of() -> None:
     on_arrays()
     np.testing.assert_allclose(on_arrays.results[0][0], matrix @ vector, rtol=1e-14)
     np.testing.assert_array_equal(on_arrays.results[1][0], [0.0, vector[0]])
-
-
-def test_mapped_function_shares_the_parameters_between_rows() -> None:
-    x, p = ca.SX.sym("x", 2), ca.SX.sym("p")
-    rows = mapped(ca.Function("f", [x, p], [p * x]), 4, parameters=1)
-    values = np.arange(8.0).reshape(4, 2)
-    rows.arguments[0][:], rows.arguments[1][0] = values, 3.0
-    rows()
-    np.testing.assert_array_equal(rows.results[0], 3.0 * values)

@@ -1,0 +1,90 @@
+"""Machine code of a function says what CasADi itself says of it, to the last bit."""
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from reactorwatch.process.machine_code import RowCode
+from reactorwatch.process.model import Array
+
+VALUES = np.array([0.5, -1.2, 0.0, -0.0, 3.0, 1e-300, 1e300, 0.9999, -7.25, np.nan, np.inf, -np.inf])
+
+
+def operations() -> ca.Function:
+    """(x, [a, b]) -> everything that may stand in a model."""
+    x, p = ca.SX.sym("x"), ca.SX.sym("p", 2)
+    a, b = p[0], p[1]
+    one = [ca.exp, ca.log, ca.sqrt, ca.sin, ca.cos, ca.tan, ca.asin, ca.acos, ca.atan, ca.sinh, ca.cosh, ca.tanh]
+    one += [ca.asinh, ca.acosh, ca.atanh, ca.erf, ca.log1p, ca.expm1, ca.floor, ca.ceil, ca.fabs, ca.sign]
+    two = [ca.fmin, ca.fmax, ca.fmod, ca.atan2, ca.copysign, ca.hypot, ca.logic_and, ca.logic_or]
+    told = [f(x) for f in one] + [f(x, a) for f in two] + [f(b, x) for f in two]
+    told += [x + a, x - b, x * a, x / b, x**a, x**1.7, x**2, 2 * x, 1 / x, -x, ca.logic_not(x), ca.if_else(x, a, b)]
+    told += [x < a, x <= a, x == a, x != a, ca.if_else(x > b, x, a)]
+    return ca.Function("operations", [x, p], [ca.vertcat(*told)])
+
+
+def same(found: Array, expected: ca.DM) -> bool:
+    return np.array_equal(found, np.array(expected), equal_nan=True)
+
+
+@pytest.mark.parametrize("p", [(0.5, -2.0), (0.0, 3.0), (np.nan, np.inf)])
+def test_every_operation_is_casadi_s(p: tuple[float, float]) -> None:
+    function = operations()
+    (found,) = RowCode(function, shared=[1]).over(VALUES, np.array(p))
+    for value, row in zip(VALUES, found, strict=True):
+        assert same(row, function(value, p)), value
+
+
+def test_matrices_keep_their_shape_and_structural_zeros_are_there() -> None:
+    x, A = ca.SX.sym("x", 3), ca.SX.sym("A", 2, 3)
+    function = ca.Function("f", [x, A], [ca.mtimes(x, x.T), ca.mtimes(A, x), ca.vertcat(ca.SX(1, 1), x[0])])
+    rng = np.random.default_rng(7)
+    xs, a = rng.normal(size=(5, 3)), rng.normal(size=(2, 3))
+    found = RowCode(function, shared=[1]).over(xs, a.T)
+    for number, results in enumerate(zip(*found, strict=True)):
+        assert all(same(*pair) for pair in zip(results, function(xs[number], a), strict=True))
+
+
+def test_a_chain_goes_from_row_to_row() -> None:
+    """X <- x + u, of which the sums are known."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    code = RowCode(ca.Function("f", [x, u], [x + u]), chained=1)
+    (sums,) = code.over(np.array([10.0]), np.arange(1.0, 6.0))
+    np.testing.assert_array_equal(sums.ravel(), [11.0, 13.0, 16.0, 20.0, 25.0])
+
+
+def test_a_chain_stops_with_the_row_that_does_not_go_well() -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    code = RowCode(ca.Function("f", [x, u], [x + u, x + u < 15]), chained=1, stops=True)
+    after, good = np.zeros(5), np.zeros(5)
+    assert code.fill(5, [np.array([10.0]), np.arange(1.0, 6.0)], [after, good]) == 2
+    np.testing.assert_array_equal(after, [11.0, 13.0, 16.0, 0.0, 0.0])  # the third is worked out, and no more
+
+
+def test_what_is_no_number_does_not_go_well() -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    code = RowCode(ca.Function("f", [x, u], [x + u, x + u]), chained=1, stops=True)
+    assert code.fill(2, [np.array([1.0]), np.array([1.0, np.nan])], [np.zeros(2), np.zeros(2)]) == 1
+
+
+def test_no_rows_have_no_results() -> None:
+    x = ca.SX.sym("x")
+    (found,) = RowCode(ca.Function("f", [x], [x])).over(np.empty((0, 1)))
+    assert found.shape == (0, 1, 1)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros(4), np.zeros(10)[::2], np.zeros(5, dtype=np.float32)])
+def test_arrays_that_do_not_fit_are_refused(wrong: Array) -> None:
+    """It would read or write what is not its own."""
+    x = ca.SX.sym("x")
+    code = RowCode(ca.Function("f", [x], [2 * x]))
+    with pytest.raises(ValueError, match="an array of 5 float64 without gaps is needed"):
+        code.fill(5, [wrong], [np.zeros(5)])
+    with pytest.raises(ValueError, match="an array of 5 float64 without gaps is needed"):
+        code.fill(5, [np.zeros(5)], [wrong])
+
+
+def test_an_operation_without_machine_code_is_named() -> None:
+    x = ca.SX.sym("x")
+    with pytest.raises(ValueError, match="no machine code for CasADi's operation OP_ERFINV"):
+        RowCode(ca.Function("f", [x], [ca.erfinv(x)]))
