@@ -12,7 +12,7 @@ import numpy as np
 from diagnosis.run import Run
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.process.steady_state import SteadyState, steady_states
+from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
 FACTORS = (60.0, 1000.0, 3600.0, 1000.0 / 60.0, 3.6, 1e6, 100.0)
 """Between units of time, of amounts, of flows (m3/h and l/min), and of shares; either way."""
@@ -38,7 +38,8 @@ def check_units(name: str, run: Run, model: ProcessModel) -> None:
     own, u = model.without_memory(), np.median(run.inputs, axis=0)
     y = np.nanmedian(run.measured, axis=0)
     when = float(np.median(run.time_min))
-    points = steady_states(own, u, when)
+    rests = SteadyStates(own)
+    points = rests.at(u, when)
     scales = _scales(own)
     if points:
         nearest = min(points, key=lambda point: _distance(point, y, scales))
@@ -51,7 +52,7 @@ def check_units(name: str, run: Run, model: ProcessModel) -> None:
             if item.lower <= value <= item.upper:
                 changed = u.copy()
                 changed[place] = value
-                if any(_distance(point, y, scales) < NEAR for point in steady_states(own, changed, when)):
+                if any(_distance(point, y, scales) < NEAR for point in rests.at(changed, when)):
                     raise InputError(_said(name, item.name, item.unit, float(u[place]), f"times {factor:.4g}"))
     for place, output in enumerate(own.outputs):
         for value, hint in _in_other_units(float(y[place]), output.unit):

@@ -9,15 +9,17 @@ The memory that effects bring along (`ProcessModel.at_rest`) is at rest to begin
 """
 
 from collections.abc import Mapping, Sequence
+from functools import cached_property, lru_cache
+from math import inf
 
 import casadi as ca
 import numpy as np
 
 from reactorwatch.process.array_function import ArrayFunction
-from reactorwatch.process.filter_step import output_function
+from reactorwatch.process.filter_step import COMPILED, output_function
 from reactorwatch.process.memory import reset_function, rest_function
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.process.steady_state import SteadyState, steady_states
+from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
 START_SD = 3.0
 """Standard deviation at the start of a state that no sensor shows, in its scales."""
@@ -39,9 +41,10 @@ class Beginning:
         own = model.without_memory()
         self._model = own
         self._outputs = ArrayFunction(output_function(own))
+        self._corrected = ArrayFunction(corrected_function(own))
         self._lower = np.array([state.lower for state in own.states])
         self._upper = np.array([state.upper for state in own.states])
-        self._where: tuple[float, ...] = ()
+        self._where: tuple[object, ...] = ()
         self._points: list[SteadyState] = []
         self._wide = np.diag(np.square([START_SD * state.scale for state in own.states]))
         self._memory = np.array([state.scale * (state.name in model.at_rest) for state in model.states])
@@ -69,48 +72,71 @@ class Beginning:
         known = np.isfinite(y)
         if not known.any() or not np.all(np.isfinite(u)):
             return None
-        model = self._model.with_values(changes) if changes else self._model
-        p, wide = model.values(), self._wide
-        R = np.diag(np.square(measurement_sd))[np.ix_(known, known)]
+        p = self._model.values(changes)
         x = 0.5 * (self._lower + self._upper)
-        for argument, value in zip(self._outputs.arguments[1:], (u, p, np.array([time_min])), strict=True):
-            argument[0] = value
-        if np.linalg.matrix_rank(self._shown(x)[1][known]) < x.size:
-            points = self._steady_states(model, u, time_min)
+        if np.linalg.matrix_rank(self._slope(x, u, p, time_min)[known]) < x.size:
+            points = self._steady_states(u, time_min, changes)
             distances = [float(np.nansum(((point.outputs - y) / measurement_sd) ** 2)) for point in points]
             x = points[int(np.argmin(distances))].state if points else x
+        noise, wide = np.square(measurement_sd), self._wide
         for _ in range(CORRECTIONS):
-            expected, H = self._shown(x)
-            K = _gain(wide, H[known], R)
-            x = np.clip(x + K @ (y - expected)[known], self._lower, self._upper)
-        H = self._shown(x)[1][known]
-        K = _gain(wide, H, START_SDS**2 * R)
-        rest = np.eye(x.size) - K @ H
-        return self._with_memory(x, u, p, time_min, rest @ wide @ rest.T + START_SDS**2 * K @ R @ K.T)
+            x = _called(self._corrected, x, u, p, time_min, y, noise, wide)[0][0]
+        P = _called(self._corrected, x, u, p, time_min, y, START_SDS**2 * noise, wide)[1]
+        return self._with_memory(x, u, p, time_min, P)
 
     def _with_memory(self, x: Array, u: Array, p: Array, time_min: float, P: Array) -> tuple[Array, Array]:
         """The same with the states that nobody measures at rest, give or take their scales."""
         for function, further in ((self._completed, np.diag(np.square(self._memory))), (self._begun, 0.0)):
-            for argument, value in zip(function.arguments, (x, u, p, np.array([time_min])), strict=True):
-                argument[0] = value
-            function()
-            J = function.results[1].T
-            x, P = function.results[0][0].copy(), J @ P @ J.T + further
+            after, J = _called(function, x, u, p, time_min)
+            x, P = after[0], J.T @ P @ J + further
         return x, P
 
-    def _steady_states(self, model: ProcessModel, u: Array, time_min: float) -> list[SteadyState]:
+    def _steady_states(self, u: Array, time_min: float, changes: Mapping[str, float]) -> list[SteadyState]:
         """As they are now. Kept until they are asked for elsewhere: one record is often begun many times."""
-        where = (time_min, *u, *model.values())
+        where = (time_min, *u, *changes.items())
         if where != self._where:
-            self._where, self._points = where, steady_states(model, u, time_min)
+            self._where, self._points = where, self._rests.at(u, time_min, changes)
         return self._points
 
-    def _shown(self, x: Array) -> tuple[Array, Array]:
-        """The outputs of a state, and their derivatives with respect to it, with the other arguments as they are."""
-        outputs = self._outputs
-        outputs.arguments[0][0] = x
-        outputs()
-        return outputs.results[0][0].copy(), outputs.results[1].T.copy()
+    @cached_property
+    def _rests(self) -> SteadyStates:
+        return SteadyStates(self._model)
+
+    def _slope(self, x: Array, u: Array, p: Array, time_min: float) -> Array:
+        """The outputs' derivatives with respect to the state."""
+        return _called(self._outputs, x, u, p, time_min)[1].T
+
+
+def _called(function: ArrayFunction, *values: Array | float) -> list[Array]:
+    for argument, value in zip(function.arguments, values, strict=True):
+        argument[:] = value
+    function()
+    return [item.copy() for item in function.results]
+
+
+@lru_cache(maxsize=COMPILED)
+def corrected_function(model: ProcessModel) -> ca.Function:
+    """(x, u, p, t, y, r, P) -> a state that shows y better than x does, and its covariance.
+
+    With NaN in y for what is missing, r the variances of the sensors, and P the covariance of a state that nothing is
+    known of. Far from where it runs, a model may have outputs that grow without bound: they tell nothing.
+    """
+    x, u, p = model.arguments()
+    t, n_x, n_y = ca.SX.sym("t"), x.numel(), len(model.outputs)
+    y, r, wide = ca.SX.sym("y", n_y), ca.SX.sym("r", n_y), ca.SX.sym("P", n_x, n_x)
+    lower, upper = (ca.DM([getattr(state, name) for state in model.states]) for name in ("lower", "upper"))
+    expected, H = output_function(model)(x, u, p, t)
+    change, P = ca.SX.zeros(n_x), wide
+    for place in range(n_y):
+        h = H[place, :]
+        variance = h @ P @ h.T + r[place]
+        tells = ca.logic_and(ca.fabs(y[place]) < inf, ca.fabs(variance) < inf)
+        K = ca.if_else(tells, P @ h.T / variance, 0)
+        change += ca.if_else(tells, K * (y[place] - expected[place] - h @ change), 0)
+        rest = ca.SX.eye(n_x) - K @ ca.if_else(tells, h, 0)
+        P = rest @ P @ rest.T + K @ K.T * r[place]
+    after = ca.fmin(ca.fmax(x + change, lower), upper)
+    return ca.Function("corrected", [x, u, p, t, y, r, wide], [after, ca.densify(P)])
 
 
 def _with_derivative(function: ca.Function) -> ca.Function:
@@ -118,15 +144,3 @@ def _with_derivative(function: ca.Function) -> ca.Function:
     symbols = function.sx_in()
     result = function(*symbols)
     return ca.Function(function.name(), symbols, [result, ca.densify(ca.jacobian(result, symbols[0]))])
-
-
-def _gain(P: Array, H: Array, R: Array) -> Array:
-    """Of a correction. Far from where it runs, a model may have outputs that grow without bound: they tell little."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        S, shown = H @ P @ H.T + R, H @ P
-    if not np.all(np.isfinite(S)):
-        return np.zeros((P.shape[0], H.shape[0]))
-    try:
-        return np.asarray(np.linalg.solve(S, shown).T, dtype=np.float64)
-    except np.linalg.LinAlgError:  # beside the largest of them the noise of the sensors is lost
-        return np.asarray((np.linalg.pinv(S, hermitian=True) @ shown).T, dtype=np.float64)

@@ -1,12 +1,17 @@
 """The linear model at a point: first-order Taylor expansion, with derivatives taken symbolically."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.model import Array, ProcessModel
+
+COMPILED = 64
+"""Models whose derivatives are kept."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,7 +41,13 @@ class LinearModel:
         return values[np.lexsort((values.imag, values.real))]
 
 
-def linearise(model: ProcessModel, state: Array, inputs: Array, time_min: float = 0.0) -> LinearModel:
+def linearise(
+    model: ProcessModel,
+    state: Array,
+    inputs: Array,
+    time_min: float = 0.0,
+    changes: Mapping[str, float] | None = None,
+) -> LinearModel:
     """The linear model at a point, which need not be a steady state.
 
     Args:
@@ -44,16 +55,22 @@ def linearise(model: ProcessModel, state: Array, inputs: Array, time_min: float 
         state: shape (n_x,).
         inputs: shape (n_u,).
         time_min: when, for models with an effect that depends on time.
+        changes: parameters that differ from the model's values.
     """
+    matrices = _derivatives(model)(state, inputs, model.values(changes), time_min, time_min)
+    A, B, C, D = (np.array(matrix) for matrix in matrices)
+    return LinearModel(A, B, C, D, np.array(state, dtype=float), np.array(inputs, dtype=float))
+
+
+@lru_cache(maxsize=COMPILED)
+def _derivatives(model: ProcessModel) -> ca.Function:
+    """(x, u, p, t, t_middle) -> A, B, C, D."""
     x, u, p = model.arguments()
     clock = model.clock
     rhs = ca.vertcat(*model.rhs)
     y = ca.vertcat(*(output.expression for output in model.outputs))
-    function = ca.Function(
+    return ca.Function(
         "linear",
         [x, u, p, clock.now, clock.middle],
         [ca.jacobian(rhs, x), ca.jacobian(rhs, u), ca.jacobian(y, x), ca.jacobian(y, u)],
     )
-    matrices = function(state, inputs, model.values(), time_min, time_min)
-    A, B, C, D = (np.array(matrix) for matrix in matrices)
-    return LinearModel(A, B, C, D, np.array(state, dtype=float), np.array(inputs, dtype=float))

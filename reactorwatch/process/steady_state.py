@@ -1,17 +1,20 @@
 """All steady states of a model at a constant input, and their stability.
 
-Newton's method, damped, from a lattice of starts over the physical range of the states, each start a column of one
-compiled map; what they reach is put together. A fixed lattice, not random starts: the answer is the same every
+Newton's method, damped, from a lattice of starts over the physical range of the states, all in machine code; what they
+reach is put together. A fixed lattice, not random starts: the answer is the same every
 time. For the reactor the result is held in a test against an exhaustive one-dimensional scan.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.linearise import linearise
+from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.memory import rest_function
 from reactorwatch.process.model import Array, ProcessModel
 
@@ -50,60 +53,95 @@ class SteadyState:
 
 
 def steady_states(model: ProcessModel, inputs: Array, time_min: float = 0.0) -> list[SteadyState]:
-    """All steady states within the bounds of the states.
+    """All steady states within the bounds of the states; see `SteadyStates.at`.
 
     Args:
         model: the process.
         inputs: shape (n_u,), constant.
         time_min: when, for models with an effect that depends on time.
 
-    Returns:
-        By rising value of the last state that is not in `at_rest` (for the reactor: from extinguished to operating).
-
     Raises:
         ValueError: inputs that do not fit the model.
     """
-    inputs = np.atleast_1d(np.asarray(inputs, dtype=float))
-    if inputs.shape != (len(model.inputs),) or not np.all(np.isfinite(inputs)):
-        raise ValueError(f"inputs must be {len(model.inputs)} finite numbers ({model.input_names}), got {inputs}")
-    own = model.without_memory()
-    scales = np.array([state.scale for state in own.states])
-    lower = np.array([state.lower for state in own.states])
-    upper = np.array([state.upper for state in own.states])
-    x = lower[:, None] + _lattice(len(own.states)) * (upper - lower)[:, None]
-    rhs, newton = _newton(own)
-    fixed = (inputs, model.values(), time_min)
-    for _ in range(ITERATIONS):
-        step = np.nan_to_num(np.array(newton(x, *fixed)))
-        # No step longer than a tenth of the range: far from a root Newton's direction is good, its length is not.
-        length = np.max(np.abs(step) / (upper - lower)[:, None], axis=0)
-        x = np.clip(x - step * np.minimum(1.0, 0.1 / np.maximum(length, 1e-300)), lower[:, None], upper[:, None])
-    residual = np.max(np.abs(np.array(rhs(x, *fixed))) / scales[:, None], axis=0)
-    found: list[Array] = []
-    for point in x[:, residual < RESIDUAL].T:
-        if all(np.max(np.abs(point - other) / scales) > SAME for other in found):
-            found.append(point)
-    function, completed = model.function(), rest_function(model)
-    found = [np.array(completed(point, *fixed)).ravel() for point in sorted(found, key=lambda point: float(point[-1]))]
-    return [
-        SteadyState(
-            point,
-            np.array(function(point, *fixed, time_min)[1]).ravel(),
-            linearise(model, point, inputs, time_min).eigenvalues,
-        )
-        for point in found
-    ]
+    return SteadyStates(model).at(inputs, time_min)
 
 
-def _newton(model: ProcessModel) -> tuple[ca.Function, ca.Function]:
-    """(x, u, p, t) -> dx/dt and -> Newton's step, each for all starts at once."""
+class SteadyStates:
+    """Finds the steady states of one model; what is compiled for it is kept.
+
+    Args:
+        model: the process.
+    """
+
+    def __init__(self, model: ProcessModel) -> None:
+        own = model.without_memory()
+        self._model = model
+        self._scales = np.array([state.scale for state in own.states])
+        lower, upper = (np.array([getattr(state, name) for state in own.states]) for name in ("lower", "upper"))
+        self._starts = lower + _lattice(len(own.states)).T * (upper - lower)
+        self._search = RowCode(_search_step(own), shared=[1, 2, 3])
+        self._outputs = model.function()
+        self._completed = rest_function(model)
+
+    def at(self, inputs: Array, time_min: float = 0.0, changes: Mapping[str, float] | None = None) -> list[SteadyState]:
+        """All steady states within the bounds of the states.
+
+        Args:
+            inputs: shape (n_u,), constant.
+            time_min: when, for models with an effect that depends on time.
+            changes: parameters that differ from the model's values.
+
+        Returns:
+            By rising value of the last output (for the reactor: from extinguished to operating).
+
+        Raises:
+            ValueError: inputs that do not fit the model.
+        """
+        model, inputs = self._model, np.atleast_1d(np.asarray(inputs, dtype=float))
+        if inputs.shape != (len(model.inputs),) or not np.all(np.isfinite(inputs)):
+            raise ValueError(f"inputs must be {len(model.inputs)} finite numbers ({model.input_names}), got {inputs}")
+        fixed = (inputs, model.values(changes), time_min)
+        found = []
+        for point in self._reached(*fixed):
+            state = np.array(self._completed(point, *fixed)).ravel()
+            outputs = np.array(self._outputs(state, *fixed, time_min)[1]).ravel()
+            found.append(SteadyState(state, outputs, linearise(model, state, inputs, time_min, changes).eigenvalues))
+        return sorted(found, key=lambda point: float(point.outputs[-1]))
+
+    def _reached(self, inputs: Array, p: Array, time_min: float) -> list[Array]:
+        """The states, without those at rest, in which nothing changes, each once."""
+        fixed = (inputs, p, np.array([time_min]))
+        x = self._starts.copy()
+        searching = np.arange(len(x))
+        for _ in range(ITERATIONS):
+            after = self._search.over(x[searching], *fixed)[0][:, :, 0]
+            moved = np.any(after != x[searching], axis=1)
+            x[searching] = after
+            searching = searching[moved]
+            if not searching.size:
+                break
+        rate = self._search.over(x, *fixed)[1][:, :, 0]
+        there = x[np.max(np.abs(rate) / self._scales, axis=1) < RESIDUAL]
+        found = []
+        while len(there):
+            found.append(there[0])
+            there = there[np.max(np.abs(there - there[0]) / self._scales, axis=1) > SAME]
+        return found
+
+
+def _search_step(model: ProcessModel) -> ca.Function:
+    """(x, u, p, t) -> x after a damped step of Newton's method, and dx/dt before it."""
     x, u, p = model.arguments()
     t = ca.SX.sym("t")
     rhs = ca.substitute(ca.vertcat(*model.rhs), model.clock.now, t)
     rhs = ca.substitute(rhs, model.clock.middle, t)
-    balance = ca.Function("balance", [x, u, p, t], [rhs])
-    newton = ca.Function("newton", [x, u, p, t], [ca.solve(ca.jacobian(rhs, x), rhs)])
-    return balance.map(STARTS), newton.map(STARTS)
+    lower, upper = (ca.DM([getattr(state, name) for state in model.states]) for name in ("lower", "upper"))
+    step = ca.solve(ca.jacobian(rhs, x), rhs)
+    step = ca.if_else(ca.fabs(step) < inf, step, 0)
+    # No step longer than a tenth of the range: far from a root Newton's direction is good, its length is not.
+    length = ca.mmax(ca.fabs(step) / (upper - lower))
+    after = ca.fmin(ca.fmax(x - step * ca.fmin(1, 0.1 / ca.fmax(length, 1e-300)), lower), upper)
+    return ca.Function("search", [x, u, p, t], [after, rhs])
 
 
 def _lattice(dimensions: int) -> Array:
