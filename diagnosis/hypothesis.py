@@ -214,7 +214,7 @@ class Hypothesis:
                 columns.append(self._slope_by_differences(run, fit, place, moved))
                 continue
             over_row, at_row = course.derivatives(numbers, moved)
-            column = place - (late is not None and late < place)  # ways know nothing of the late output
+            column = self._column(place)
             g = signatures.shown(ways, column, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
             columns.append(g.reshape(-1, course.freedom))
         return np.concatenate(columns, axis=1)
@@ -228,6 +228,28 @@ class Hypothesis:
             _, w, _ = self.sized.follow(run, self._signals(theta))
             columns.append((clipped(fit.w[2:]) - clipped(w[2:])).ravel() / step)
         return np.stack(columns, axis=1)
+
+    def signatures(self, run: Run, fit: Fit, place: int, course: Course) -> Array:
+        """What the whitened innovations lose as the coefficients of another course of one of its effects grow.
+
+        Args:
+            run: the record.
+            fit: where all is linearised.
+            place: of the effect; not one that makes an output late.
+            course: without numbers besides its coefficients.
+
+        Returns:
+            Shape (values from the third row on, coefficients).
+        """
+        ways = self.sized.ways(run, self._signals(fit.theta), fit.found)
+        over_row, at_row = (np.ascontiguousarray(item) for item in course.basis(np.empty(0)))
+        g = signatures.shown(ways, self._column(place), over_row[1:-1], at_row[2:])
+        return g.reshape(-1, course.coefficients)
+
+    def _column(self, place: int) -> int:
+        """Of an effect among the ways, which know nothing of the late output."""
+        late = self.sized.late
+        return place - (late is not None and late < place)
 
     def unexplained(self, run: Run, fit: Fit) -> float:
         """What no change of its numbers would take away of the innovations' sum of squares, linearised."""

@@ -19,7 +19,7 @@ from diagnosis.courses import Constant, Course, Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Hypothesis
 from diagnosis.pair_screen import PairLead, PairScreen, Remembered
 from diagnosis.screen import KNOTS, Lead
-from diagnosis.search import IN_QUESTION, MOST_KNOTS, Explained, Found, Key, Search, keep
+from diagnosis.search import IN_QUESTION, Explained, Found, Key, Search, keep
 from diagnosis.sized import clipped
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array
@@ -157,7 +157,7 @@ class PairSearch:
             if turn:
                 search.settle(best)
                 best = self._fitted(_parts(best))
-            best = self._finer(best)
+            best = search.resolved(best, EXCHANGE_STEPS)
             known, again = {best.key: best}, best
             for place in (0, 1):
                 leads = self._new(self._leads(best, place), best)
@@ -186,19 +186,6 @@ class PairSearch:
             ]
             best = min(items if provisional and items else [*items, about], key=_bic)
         return self._fitted(_parts(best))
-
-    def _finer(self, best: Explained) -> Explained:
-        """Curves with as many knots as they need."""
-        for place in (0, 1):
-            while isinstance(best.hypothesis.courses[place], Free):
-                parts = _parts(best)
-                knots = 2 * parts[place].course.coefficients - 1
-                parts[place] = _with_knots(parts[place], knots)
-                item = self._fitted(parts, EXCHANGE_STEPS) if knots <= MOST_KNOTS else best
-                if item.bic >= best.bic:
-                    break
-                best = item
-        return best
 
     def _new(self, leads: Sequence[Lead], pair: Explained) -> list[Lead]:
         """Those that are no part of a pair with the same course already, unless there may be another optimum."""

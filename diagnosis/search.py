@@ -16,6 +16,7 @@ import numpy as np
 
 from diagnosis.courses import Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
+from diagnosis.knots import best_resolved
 from diagnosis.memory_screen import MemoryScreen
 from diagnosis.outliers import gross_outliers, outliers, without
 from diagnosis.run import Run
@@ -35,8 +36,9 @@ that acts in jumps, whose fit is a scan, and costs as much as ten others."""
 LEAST_SCORE = -20.0
 """A rival that promises less in BIC is not fitted."""
 
-IN_QUESTION, FAR_OUT = 60.0, 600.0
-"""In BIC: a rival that is worse by more is out of question; and with any other noise too."""
+IN_QUESTION, FAR_OUT = 100.0, 600.0
+"""In BIC: a rival that is worse by more is out of question; and with any other noise too. A free curve with twelve
+knots that needs but three costs ninety too much."""
 
 ROUGH = 1e-3
 """Share of what a lead promises by which it is out, at least: the equations are not linear."""
@@ -44,7 +46,7 @@ ROUGH = 1e-3
 LEAST_SENSOR_GAIN = 10.0
 """In BIC: less does not make a sensor's noise remember."""
 
-ROUNDS, MOST_KNOTS = 5, 80
+ROUNDS = 5
 SETTLED_NOISE = 10.0
 """In BIC: a noise that gains less is not worth another round."""
 
@@ -147,6 +149,7 @@ class Search:
             if best is not searched:
                 self.settle(best)
             known = {item.key: self.refitted(item) for item in known.values() if item.bic < best.bic + IN_QUESTION}
+            known = {key: self.resolved(item) for key, item in known.items()}
             best = searched = known[best.key]
             leads = self.screen.leads(best.hypothesis, best.fit, replaced=(0,))
             least = max([LEAST_SCORE, *(self._still_in_question(item) for item in leads[:1])])
@@ -155,12 +158,9 @@ class Search:
                 fresh = _key(lead) not in known or (_key(lead) == best.key and self._elsewhere(lead, best))
                 if fresh:
                     item = self.fitted(lead)
-                    keep(known, item)
+                    keep(known, self.resolved(item) if item.bic < best.bic + IN_QUESTION else item)
                     out |= {item.key} if item.bic > best.bic + FAR_OUT else set()
             best = min(known.values(), key=lambda item: item.bic)
-        if best is not nominal:
-            best = self._finer(best)
-            known[best.key] = best
         return Found(self.noise, own_noise, nominal, sorted(known.values(), key=lambda item: item.bic))
 
     def _first_noise(self) -> Noise:
@@ -236,17 +236,18 @@ class Search:
     def _followed(self, effect: Effect, signal: Signal) -> tuple[float, Array]:
         return self.sized((effect,)).follow(self.run, [signal])[:2]
 
-    def _finer(self, best: Explained) -> Explained:
-        """A free curve with as many knots as it needs."""
-        course, (theta,) = best.hypothesis.courses[0], best.fit.theta
-        while isinstance(course, Free) and course.coefficients < MOST_KNOTS:
-            finer = Free(self.run.time_min, 2 * course.coefficients - 1)
-            start = np.interp(finer.knots_min, course.knots_min, theta)
-            item = self.fit(Hypothesis(best.hypothesis.sized, (finer,)), (start,))
-            if item.bic >= best.bic:
-                break
-            best, course, (theta,) = item, finer, item.fit.theta
-        return best
+    def resolved(self, item: Explained, steps: int = MOST_STEPS) -> Explained:
+        """With as many knots as its free curves need."""
+        hypothesis = item.hypothesis
+        for place, course in enumerate(hypothesis.courses):
+            if not isinstance(course, Free) or place == hypothesis.sized.late:
+                continue
+            courses, theta = list(item.hypothesis.courses), list(item.fit.theta)
+            courses[place], theta[place] = best_resolved(self.run, item.hypothesis, item.fit, place)
+            if courses[place].coefficients != course.coefficients:
+                other = self.fit(Hypothesis(hypothesis.sized, courses), theta, steps, scan=False)
+                item = min(item, other, key=lambda item: item.bic)
+        return item
 
     def _sorted(self, leads: Sequence[Lead]) -> list[Lead]:
         return sorted(leads, key=lambda item: -item.score(self.run.values))
@@ -286,6 +287,8 @@ class Search:
 
     def _elsewhere(self, lead: Lead, best: Explained) -> bool:
         """Whether a lead of the best's own cause and course begins where its fit is not."""
+        if not lead.course.numbers:
+            return False
         theta = best.fit.theta[0]
         apart = np.abs(lead.theta - theta)[lead.course.coefficients :]
         return bool(np.any(apart > _NEAR * lead.course.least_differences))

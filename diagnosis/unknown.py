@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 from math import log
 
+import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -49,6 +50,9 @@ LEAST_PROCESS_SHARE = 100.0 * LEAST_PROCESS_SD
 
 FAR_OFF = 6.0
 """Standard deviations of the nominal filter beyond which a value is an outlier."""
+
+ANSWERED = 8.0
+"""Standard deviations, of a correlation by chance."""
 
 _REDS, _LASTS_MIN, _MOST_CHANGE = (1e-4, 30.0), (0.15, 300.0), 2.0
 _COARSE, _FINE, _OF_SENSORS = 1.0, 0.5, 0.1  # steps of logarithms
@@ -100,6 +104,8 @@ def located(
     """
     own = model.state_names
     carriers = [effect for effect in (*effects, *balance_losses(model)) if effect.extend(model).state_names == own]
+    if input_answers(run, nominal):
+        carriers = [effect for effect in carriers if not _shows_input(effect.extend(model))]
     reference = _reference(model, run, nominal)
     first = [_first(Forcing(model, effect), reference, run, noise) for effect in carriers]
     places = _best_of_places(first)[:PLACES]
@@ -111,6 +117,24 @@ def located(
         return None
     bic = 2.0 * best.fitted.loss + NUMBERS * log(run.values)
     return Located(best.forcing.effect, bic, best.size, reference.known)
+
+
+def input_answers(run: Run, nominal: Fit) -> bool:
+    """Whether an input moves with what is measured in the same row, as that of a controller does.
+
+    Then it tells of the sensors' noise in that row, and what shows an input in the outputs explains noise.
+    """
+    w = np.clip(np.nan_to_num(nominal.w[1:]), -FAR_OFF, FAR_OFF)
+    changes = np.diff(run.inputs, axis=0)
+    changes = changes - changes.mean(axis=0)
+    both = np.abs(changes.T @ w)
+    chance = np.sqrt(np.outer(np.sum(changes**2, axis=0), np.sum(w**2, axis=0)) / len(w))
+    return bool(np.any(both > ANSWERED * chance))
+
+
+def _shows_input(model: ProcessModel) -> bool:
+    """Whether the outputs of a row depend on the input that holds from then on."""
+    return any(ca.depends_on(output.expression, model.arguments()[1]) for output in model.outputs)
 
 
 def bic_of(explained: Explained, known: NDArray[np.bool_], run: Run) -> float:
