@@ -46,6 +46,9 @@ DOUBTFUL = 3.0
 """Minus the decimal logarithm of the p-value that what is left is white, beyond which it is asked whether something
 unknown explains the run better."""
 
+MUCH_LEFT, MUCH_LEFT_BY_TWO = 30.0, 10.0
+"""Likewise; so much is left by no cause that is right, nor by two of them, which can imitate a third."""
+
 NOISY_SHARE = 0.003
 """Of a state's scale per square root of a minute: a cause that leaves the process so noisy may not be all there is."""
 
@@ -102,7 +105,7 @@ def diagnose(
         off = found.nominal.hypothesis.offsets(found.nominal.fit)
         known = model.with_values({name: model.parameter(name).value + value for name, value in off.items()})
         strange = located(known, effects, run, found.nominal.fit, found.own_noise)
-        if _is_unknown(strange, found, best, run, bool(np.any(adequacy >= WHITE))):
+        if _is_unknown(strange, found, best, run, float(np.max(adequacy))):
             verdict, best = UNKNOWN, found.nominal  # what is not explained is not extended
             location = strange.effect.location if strange is not None else location
         elif np.any(adequacy >= WHITE):
@@ -150,12 +153,22 @@ def diagnose(
     )
 
 
-def _is_unknown(strange: Located | None, found: Found, best: Explained, run: Run, something_left: bool) -> bool:
-    """Whether what is named or nominal does not explain the run, but something else would."""
+def _is_unknown(strange: Located | None, found: Found, best: Explained, run: Run, left: float) -> bool:
+    """Whether what is named or nominal does not explain the run, but something else would.
+
+    Args:
+        strange: what would.
+        found: of the catalogue.
+        best: of it.
+        run: the record.
+        left: minus the decimal logarithm of the p-value that what it leaves is white.
+    """
     better = strange is not None and strange.bic < bic_of(best, strange.known, run) - MARGIN
-    if something_left:
-        return better or not best.key or not _nearly_explained(found, gained(run, found.nominal, best)[1])
-    return better and bool(best.key)
+    if left < WHITE:
+        return better and bool(best.key)
+    if not best.key or left >= (MUCH_LEFT if len(best.key) == 1 else MUCH_LEFT_BY_TWO):
+        return True
+    return better or not _nearly_explained(found, gained(run, found.nominal, best)[1])
 
 
 def _seems_noisy(found: Found, model: ProcessModel) -> bool:

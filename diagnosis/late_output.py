@@ -22,11 +22,13 @@ class Moved(NamedTuple):
         run: with more rows; its inputs are those of the run and what else was given for every row.
         prompt: where the run's rows are in it, shape (rows,).
         late: where the values of the late output are, shape (rows,).
+        before: whether such a value was true before the filter began, so that nothing tells what it is, shape (rows,).
     """
 
     run: Run
     prompt: NDArray[np.int64]
     late: NDArray[np.int64]
+    before: NDArray[np.bool_]
 
 
 def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_min: Array) -> Moved:
@@ -42,7 +44,9 @@ def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_m
     rows = run.time_min.size
     begins = np.array([0, *run.breaks])
     begun_min = run.time_min[begins[np.searchsorted(begins, np.arange(rows), side="right") - 1]]
-    true_min = np.maximum(run.time_min - np.maximum(delay_min, 0.0), begun_min)
+    true_min = run.time_min - np.maximum(delay_min, 0.0)
+    before = true_min < begun_min
+    true_min = np.maximum(true_min, begun_min)
     times, where = np.unique(np.concatenate([run.time_min, true_min]), return_inverse=True)
     prompt, late = where[:rows], where[rows:]
     source = np.clip(np.searchsorted(run.time_min, times, side="right") - 1, 0, rows - 1)
@@ -51,7 +55,7 @@ def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_m
     for place in range(measured.shape[1]):
         measured[late if place == output else prompt, place] = run.measured[:, place]
     spread[late[:, None], np.flatnonzero(~held)] = inputs[:, ~held]
-    return Moved(Run(times, spread, measured), prompt, late)
+    return Moved(Run(times, spread, measured), prompt, late, before)
 
 
 def gathered(found: Innovations, by: Moved, output: int) -> Innovations:

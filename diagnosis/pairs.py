@@ -106,6 +106,16 @@ class PairSearch:
 
     def found(self) -> tuple[Explained | None, dict[Key, Explained]]:
         """The best pair, and all that were fitted well under the same noise."""
+        best = self._curved()
+        if best is None or _curves(best):
+            best = min((item for item in (best, self._grown()) if item is not None), key=_bic, default=None)
+        if best is None:
+            return None, {}
+        self._search.settle(best)
+        return self._exchanged(self._fitted(_parts(best)))
+
+    def _curved(self) -> Explained | None:
+        """The best that is found with curves, of which each then takes the simplest course that does."""
         search, nominal = self._search, self._found.nominal
         best: Explained | None = None
         leads = self._screened(self._found.best)
@@ -125,11 +135,45 @@ class PairSearch:
             search.settle(best)
             best = self._fitted(_parts(best))
             if self.gain(best) < LEAST_PAIR_GAIN:
-                return None, {}
+                return None
             if not np.any(minus_log10_p(best.fit.w, self._run.inputs) > DOUBTFUL):
                 break
             leads = self._screened(best)
-        return (None, {}) if best is None else self._exchanged(best)
+        return best
+
+    def _grown(self) -> Explained | None:
+        """From the best single cause whose course has few numbers: a curve takes what belongs to a second one."""
+        search = self._search
+        simple = [item for item in self._found.explained if not _curves(item)]
+        if not simple:
+            search.noise = self._found.own_noise
+            nominal = self._found.nominal
+            leads = self._simple(search.screen.leads(nominal.hypothesis, nominal.fit))
+            simple = [self._fitted([_part_of(lead)], EXCHANGE_STEPS) for lead in leads]
+        if not simple:
+            return None
+        first = min(simple, key=_bic)
+        search.settle(first)
+        first = search.refitted(first)
+        (part,) = _parts(first)
+        leads = search.screen.leads(first.hypothesis, first.fit)
+        others = [effect for effect in search.screen.with_memory if effect is not part.effect]
+        leads += search.memory.leads(first.fit, lambda item, signal: self._followed([part], item, signal), others)
+        leads = self._simple([lead for lead in leads if lead.effect is not part.effect])
+        pairs = [self._fitted([part, _part_of(lead)], EXCHANGE_STEPS) for lead in leads]
+        if not pairs:
+            return None
+        best = min(pairs, key=_bic)
+        search.settle(best)
+        best = self._exchanged(self._fitted(_parts(best)), curves=False)[0]
+        search.settle(best)
+        return self._fitted(_parts(best))
+
+    def _simple(self, leads: Sequence[Lead]) -> list[Lead]:
+        """The most promising of different causes that are no curves."""
+        leads = [lead for lead in leads if not isinstance(lead.course, Free)]
+        leads.sort(key=lambda item: -item.score(self._run.values))
+        return self._search.chosen(leads, EXCHANGED, -inf, of_a_cause=1)
 
     def gain(self, pair: Explained) -> float:
         """In BIC, of a pair over the best single cause, with the noise that holds now; either of the two, too."""
@@ -149,8 +193,8 @@ class PairSearch:
                 found.append(lead)
         return found
 
-    def _exchanged(self, best: Explained) -> tuple[Explained, dict[Key, Explained]]:
-        """Each of the two exchanged for whatever is better, until nothing is."""
+    def _exchanged(self, best: Explained, curves: bool = True) -> tuple[Explained, dict[Key, Explained]]:
+        """Each of the two exchanged for whatever is better, with curves or without them, until nothing is."""
         search = self._search
         known: dict[Key, Explained] = {best.key: best}
         for turn in range(EXCHANGES):
@@ -161,6 +205,7 @@ class PairSearch:
             known, again = {best.key: best}, best
             for place in (0, 1):
                 leads = self._new(self._leads(best, place), best)
+                leads = [lead for lead in leads if curves or not isinstance(lead.course, Free)]
                 least = max((item.score(self._run.values) for item in leads), default=0.0) - IN_QUESTION
                 for lead in search.chosen(leads, EXCHANGED, least):
                     knots = best.hypothesis.courses[place].coefficients
@@ -265,9 +310,13 @@ def _parts(explained: Explained) -> list[Part]:
     return [Part(*item) for item in whole]
 
 
+def _part_of(lead: Lead) -> Part:
+    return Part(lead.effect, lead.course, lead.theta)
+
+
 def _with(explained: Explained, place: int, lead: Lead, knots: int = KNOTS) -> list[Part]:
     """One of the two exchanged; a curve with at least so many knots."""
-    parts, part = _parts(explained), Part(lead.effect, lead.course, lead.theta)
+    parts, part = _parts(explained), _part_of(lead)
     parts[place] = _with_knots(part, knots) if isinstance(lead.course, Free) and knots > KNOTS else part
     return parts
 
@@ -277,6 +326,11 @@ def _with_knots(part: Part, knots: int) -> Part:
     finer = Free(part.course.time_min, knots)
     values = part.course.functions(np.empty(0))[0] @ part.theta
     return Part(part.effect, finer, np.interp(finer.knots_min, part.course.time_min, values))
+
+
+def _curves(explained: Explained) -> bool:
+    """Whether one of its courses is a curve."""
+    return any(isinstance(course, Free) for course in explained.hypothesis.courses)
 
 
 def _bic(explained: Explained) -> float:

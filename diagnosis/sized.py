@@ -103,19 +103,23 @@ class Sized:
 
     def follow(self, run: Run, signals: Sequence[Signal]) -> tuple[float, Array, Innovations]:
         """Loss, whitened innovations and the filter's run."""
+        known, least = np.isfinite(run.measured), np.array(self.noise.measurement_sd)
+        unseen = np.zeros_like(known)
         if self.late is None:
             found = self._filter.run(run.time_min, self.inputs(run, signals), run.measured)
         else:
-            by = self._moved(run, signals, self.late)
+            by, output = self._moved(run, signals, self.late), self._output(self.late)
             found = self._filter.run(by.run.time_min, by.run.inputs, by.run.measured)
-            found = gathered(found, by, self._output(self.late))
+            found = gathered(found, by, output)
+            unseen[:, output] = by.before & known[:, output]
+            known[by.before, output] = False
         # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
-        known = np.isfinite(run.measured)
-        least = np.array(self.noise.measurement_sd)
         good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0) & (found.conditional_sd < _CLUELESS * least)
-        known[[int(np.argmax(np.any(known, axis=1))), *run.breaks]] = False  # it begins with these rows
+        begins = [int(np.argmax(np.any(known, axis=1))), *run.breaks]
+        known[begins] = unseen[begins] = False
         w = np.where(known & ~good, LOST, np.where(known, found.whitened, np.nan))
-        spread = np.log(np.where(known & good, found.conditional_sd, 1.0))
+        # What was true before the beginning counts as expected: a longer delay must neither gain nor lose by it.
+        spread = np.log(np.where(known & good, found.conditional_sd, np.where(unseen, least, 1.0)))
         return loss_of(w) + float(np.sum(spread)), w, found
 
     def tuned(self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float]) -> Noise:
