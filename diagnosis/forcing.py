@@ -28,8 +28,6 @@ from diagnosis.forcing_filter import Linear, smoothed, whitened
 from diagnosis.run import Run
 from diagnosis.size_inputs import SizedModel, with_size_inputs
 from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.filter import NoiseLevels
-from reactorwatch.process.filter_errors import FilterErrors
 from reactorwatch.process.model import Array, ProcessModel
 
 KNOTS = 10
@@ -116,8 +114,7 @@ class Forcing:
         self.effect = effect
         self._sized = with_size_inputs(model, (effect,))
         self.sees = tuple(_sees(self._sized))
-        noise = NoiseLevels((1.0,) * len(model.outputs), (1.0,) * len(model.states))  # a path has none
-        self._errors = FilterErrors(self._sized.model, noise, self._sized.of_rates, self._sized.of_outputs)
+        self._errors = self._sized.errors  # a path has no noise
 
     def about(self, reference: Reference, run: Run) -> "Linearised":
         """The forcing about a path."""

@@ -2,12 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import casadi as ca
 import numpy as np
 
 from diagnosis.courses import Signal
 from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.filter import NoiseLevels
+from reactorwatch.process.filter_errors import FilterErrors
+from reactorwatch.process.filter_step import COMPILED
 from reactorwatch.process.model import Array, ProcessModel, variable
 
 
@@ -25,14 +29,21 @@ class SizedModel:
     of_rates: tuple[ca.SX, ...]
     of_outputs: tuple[ca.SX, ...]
 
+    @cached_property
+    def errors(self) -> FilterErrors:
+        """The equations of its filter's errors with respect to the sizes; its noise is to be given."""
+        unknown = NoiseLevels((1.0,) * len(self.model.outputs), (0.0,) * len(self.model.states))
+        return FilterErrors(self.model, unknown, self.of_rates, self.of_outputs)
+
     def inputs(self, inputs: Array, signals: Sequence[Signal]) -> Array:
         """The inputs of a record with the sizes beside them, shape (rows, n_u + 2 effects)."""
         columns = [item for signal in signals for item in (signal.over_row, signal.at_row)]
         return np.column_stack([inputs, *columns])
 
 
-def with_size_inputs(model: ProcessModel, effects: Sequence[Effect]) -> SizedModel:
-    """The model with the effects in it, their sizes as inputs.
+@lru_cache(maxsize=COMPILED)
+def with_size_inputs(model: ProcessModel, effects: tuple[Effect, ...]) -> SizedModel:
+    """The model with the effects in it, their sizes as inputs; kept, with what is compiled from it.
 
     Args:
         model: any that has what the effects act on.

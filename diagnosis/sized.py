@@ -50,10 +50,11 @@ class Sized:
         places = [place for place, effect in enumerate(self.effects) if effect.late_output is not None]
         self.late = places[0] if places else None
         self._plant, self._noise, self._period_min = model, noise, period_min
-        sized = with_size_inputs(model, [item for item in self.effects if item.late_output is None])
-        self._filtered = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
+        sized = with_size_inputs(model, tuple(item for item in self.effects if item.late_output is None))
+        wandering = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
+        self._filtered = wandering if noise.wandering else sized
         self._filter = Filter(self.model, self._levels_of(noise))
-        self._errors = FilterErrors(self.model, self.levels, self._filtered.of_rates, self._filtered.of_outputs)
+        self._errors = self._filtered.errors.with_noise(self.levels)
         self.noise = noise
 
     @property

@@ -19,7 +19,7 @@ from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import ProcessModel
 
-COMPILED = 64
+COMPILED = 128
 """Models whose functions are kept: to make one takes some ten milliseconds."""
 
 

@@ -208,6 +208,8 @@ class ProcessModel:
         Raises:
             ValueError: as `values`.
         """
+        if not changes:
+            return self
         values = self.values(changes)
         return replace(
             self,
