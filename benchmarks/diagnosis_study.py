@@ -4,20 +4,23 @@ Records of every class (`benchmarks/hidden/classes.py`) are drawn from fresh see
 diagnosis does not use (`tests/hidden_effect/`), diagnosed in parallel, and held against the truth.
 
     python benchmarks/diagnosis_study.py [--quick] [--records N] [--jobs N] [--classes NAME ...] [--seed N]
-                                         [--json FILE] [--write]
+                                         [--json FILE] [--from FILE ...] [--write]
 
-`--write` puts the tables into docs/diagnosis_study.md.
+`--write` puts the tables into docs/diagnosis.md. All classes take hours; one after the other, each with `--json`, they
+can be put together by `--from`.
 """
 
 import argparse
 import json
 import os
 import time
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
 
+import msgspec
 from rich.console import Console
 from rich.progress import Progress
 
@@ -30,9 +33,10 @@ from tests.hidden_effect.judge import Judged, failed, judge
 
 RECORDS, NOMINAL_RECORDS, QUICK_RECORDS = 96, 330, 13
 FIRST_SEED = 10_000_000
-PAGE = Path(__file__).parents[1] / "docs" / "diagnosis_study.md"
+PAGE = Path(__file__).parents[1] / "docs" / "diagnosis.md"
+BEGIN, END = "<!-- made by make study: begin -->", "<!-- made by make study: end -->"
 
-TEMPLATE = """# How well the diagnosis finds what is hidden
+TEMPLATE = """## How well it finds what is hidden
 
 Made by `make study`, from seeds of {seed} on. Every record is drawn from a seed, made by equations and a solver that
 the diagnosis does not use, and held against the truth. The classes are in `benchmarks/hidden/classes.py`; how large
@@ -44,7 +48,7 @@ what is hidden is, in `tests/hidden_effect/catalogue.py`.
 explanations are on it. *wrong*: something is claimed that is not there. *place*: the location is right. *curve*: of the
 whole course, whatever its profile is called.
 
-## What each cause was called
+### What each cause was called
 
 Over all classes in which one cause is hidden, or none.
 
@@ -59,6 +63,9 @@ def main() -> None:
     chosen = arguments()
     # The matrices are small: threads of the linear algebra would only wait for each other.
     os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    if chosen.earlier:
+        report(earlier(chosen.earlier), chosen, 0.0)
+        return
     classes = [class_named(name) for name in chosen.classes] if chosen.classes else list(CLASSES)
     tasks = [(study, number) for study in classes for number in range(_records(study, chosen))]
     began = time.perf_counter()
@@ -92,7 +99,16 @@ def report(found: dict[str, list[Judged]], chosen: argparse.Namespace, seconds: 
         numbers = {name: [asdict(item) for item in items] for name, items in found.items()}
         chosen.json.write_text(json.dumps(numbers, indent=1) + "\n")
     if chosen.write:
-        PAGE.write_text(page(found, chosen.seed))
+        PAGE.write_text(with_section(PAGE.read_text(), section(found, chosen.seed)))
+
+
+def earlier(files: Sequence[Path]) -> dict[str, list[Judged]]:
+    """What was found before and written by `--json`, in the order of the classes."""
+    found: dict[str, list[Judged]] = {}
+    for file in files:
+        for name, items in json.loads(file.read_text()).items():
+            found[name] = msgspec.convert(items, list[Judged])
+    return {study.name: found[study.name] for study in CLASSES if study.name in found}
 
 
 def judged(name: str, number: int, first_seed: int) -> Judged:
@@ -115,13 +131,26 @@ def warm_up() -> None:
         _warm = True
 
 
-def page(found: dict[str, list[Judged]], seed: int) -> str:
-    """The page of the study."""
+def section(found: dict[str, list[Judged]], seed: int) -> str:
+    """What is told of the study."""
     text = TEMPLATE.format(seed=seed, main=main_table(found), confusion=confusion_table(found))
     missed = failures(found)
-    return text + (
-        "\n## Where it was not named\n\n" + "\n".join(f"- {line}" for line in missed) + "\n" if missed else ""
-    )
+    if missed:
+        lines = "\n".join(f"- {line}" for line in missed)
+        text += f"\n<details><summary>Where it was not named ({len(missed)})</summary>\n\n{lines}\n\n</details>\n"
+    return text
+
+
+def with_section(page: str, text: str) -> str:
+    """A page with what stands between the marks exchanged.
+
+    Raises:
+        ValueError: the page lacks a mark.
+    """
+    if BEGIN not in page or END not in page:
+        raise ValueError(f"{PAGE.name} must hold the marks {BEGIN} and {END}")
+    before, after = page.split(BEGIN)[0], page.split(END)[1]
+    return f"{before}{BEGIN}\n{text}{END}{after}"
 
 
 def _records(study: StudyClass, chosen: argparse.Namespace) -> int:
@@ -141,7 +170,8 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--classes", nargs="+", metavar="NAME", help=", ".join(item.name for item in CLASSES))
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="the first")
     parser.add_argument("--json", type=Path, help="where the numbers are written, record by record")
-    parser.add_argument("--write", action="store_true", help=f"write {PAGE.name}")
+    parser.add_argument("--from", dest="earlier", nargs="+", type=Path, metavar="FILE", help="what --json has written")
+    parser.add_argument("--write", action="store_true", help=f"write the tables into {PAGE.name}")
     return parser.parse_args()
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.diagnosis_study import earlier, section, with_section
 from benchmarks.diagnosis_study import judged as run_one
-from benchmarks.diagnosis_study import page
 from benchmarks.hidden.classes import CLASSES, class_named, drawn, seed_of
 from benchmarks.hidden.score import Score, confusion
 from benchmarks.hidden.tables import failures, main_table
@@ -69,13 +69,27 @@ def test_no_two_records_of_a_study_share_a_seed() -> None:
     assert len(set(seeds)) == len(seeds)
 
 
-def test_a_record_goes_through_and_comes_out_as_a_page(tmp_path: Path) -> None:
+def test_a_record_goes_through_and_comes_out_as_tables_that_can_be_put_together_later(tmp_path: Path) -> None:
     found = {"150 min": [run_one("150 min", 0, 60_000_000)]}
     assert found["150 min"][0].remark == ""
-    text = page(found, 60_000_000)
+    text = section(found, 60_000_000)
     assert main_table(found) in text
     assert "60000000" in text
-    assert json.loads(json.dumps(found["150 min"][0].__dict__))["seconds"] > 0.0
+    file = tmp_path / "numbers.json"
+    file.write_text(json.dumps({"150 min": [found["150 min"][0].__dict__]}))
+    assert section(earlier([file]), 60_000_000) == text
+
+
+def test_the_tables_take_the_place_of_those_before() -> None:
+    page = "before\n<!-- made by make study: begin -->\nold\n<!-- made by make study: end -->\nafter\n"
+    once = with_section(page, "new\n")
+    assert once == page.replace("old", "new")
+    assert with_section(once, "new\n") == once
+
+
+def test_a_page_without_the_marks_is_left_alone() -> None:
+    with pytest.raises(ValueError, match="must hold the marks"):
+        with_section("no marks", "new")
 
 
 def test_nothing_is_hidden_in_a_nominal_record() -> None:
