@@ -164,10 +164,10 @@ class Heard:
         self._count = 0
         bus.subscribe(keys.key(plant, keys.HEALTH, "recorder"), self._on_health)
 
-    def wait(self, count: int) -> None:
-        """Wait until it is so many; give up after a while."""
+    def wait(self, count: int) -> bool:
+        """Wait until it is so many; False: they did not come in a while."""
         with self._changed:
-            self._changed.wait_for(lambda: self._count >= count, PATIENCE_S)
+            return self._changed.wait_for(lambda: self._count >= count, PATIENCE_S)
 
     def _on_health(self, message: Encoded) -> None:
         health = decode(message.payload, message.encoding)
@@ -207,12 +207,14 @@ class Load:
         proxy: on the link of one of them.
         publisher: of the samples.
         bus: the publisher's.
+        heard: what the recorder has received.
         found: what is in the recording, one for each, when all has ended.
     """
 
     proxy: Proxy
     publisher: Publisher
     bus: ZenohBus
+    heard: Heard
     found: list[Found]
 
     def go_on(self, span_s: float) -> None:
@@ -243,7 +245,7 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
     try:
         tokens.wait(alive=True)
         publisher = Publisher(bus, RATE_PER_S)
-        load = Load(proxy, publisher, bus, [])
+        load = Load(proxy, publisher, bus, heard, [])
         load.go_on(WARM_UP_S)
         yield load
         publisher.close()
@@ -333,6 +335,7 @@ def stick(folder: Path, span_s: float, cache_messages: int = 20_000) -> tuple[Fo
         with recorder_process(stuck, endpoint, Tokens(load.bus, "stuck"), plant="stuck") as process:
             process.send_signal(signal.SIGSTOP)
             load.go_on(span_s)
+            assert load.heard.wait(load.publisher.sequence * SIGNALS), "one that is stuck holds the other up"
             process.send_signal(signal.SIGCONT)
             load.publisher.close()
             heard.wait(load.publisher.sequence * SIGNALS)

@@ -32,7 +32,7 @@ from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal
-from recorder.__main__ import files_for, node_for
+from recorder.__main__ import begin, files_for
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
 from recorder.entry import Entry
@@ -198,8 +198,7 @@ def fsync(folder: Path) -> None:
         Timed.waits_s.clear()
         start = time.perf_counter()
         with files_for(config, Timed) as recorded:
-            recorded.begin((), 0)
-            node = node_for(config, recorded, 0)
+            node = begin(config, recorded, 0)
             for number, message in enumerate(sent):
                 node.on_message(message, number * step_ns)
         took_ms = (time.perf_counter() - start) * 1e3 / FSYNC_SECONDS

@@ -77,13 +77,18 @@ def lives_in(messages: Iterable[Encoded], plant: str) -> list[Life]:
             continue
         if isinstance(body, Health):
             _report(lives, body, number)
-        elif isinstance(body, Alarm) and (body.event in PEOPLE or is_silence(body)):
+        elif isinstance(body, Alarm) and _is_of_monitor(body) and (body.event in PEOPLE or is_silence(body)):
             (lives[-1].told if lives else before).append(body)
     if not lives:
         raise InputError(f"holds no report of health of a monitor of plant {plant!r}, so there is nothing to verify")
     lives[0].first = 0
     lives[0].told = before + lives[0].told
     return lives
+
+
+def _is_of_monitor(alarm: Alarm) -> bool:
+    """Whether it is the monitor's, and not the recorder's own."""
+    return not alarm.alarm.startswith(f"{keys.RECORDING}/")
 
 
 def is_silence(alarm: Alarm) -> bool:

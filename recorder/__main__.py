@@ -17,7 +17,8 @@ from reactorwatch.runtime.entry import main
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.black_box import BlackBox
 from recorder.config import RecorderConfig
-from recorder.core import DISK_ALARM, NODE, Recorder
+from recorder.core import NODE, Recorder
+from recorder.disk_alarm import COMMANDS, DISK_ALARM
 from recorder.files import RecordingFiles
 from recorder.filing import Filing
 from recorder.head import Head
@@ -60,9 +61,7 @@ def record(config: RecorderConfig, bus_config: BusConfig, stop: StopSignal) -> P
         with files:
             history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
             known = files.received_since(start_ns - history_ns)
-            files.begin((), start_ns)
-            files.recover_left_behind()
-            node = node_for(config, files, start_ns, known, known_until_ns=start_ns + history_ns)
+            node = begin(config, files, start_ns, known, known_until_ns=start_ns + history_ns)
             serve(
                 node,
                 bus,
@@ -70,6 +69,7 @@ def record(config: RecorderConfig, bus_config: BusConfig, stop: StopSignal) -> P
                 subscriptions=(config.key_expression,),
                 history=True,
                 on_gap=node.on_gap,
+                commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
                 on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
                 linger_s=config.linger_s,
             )
@@ -98,10 +98,37 @@ def files_for(config: RecorderConfig, open_part: Callable[[Path], PartFile] = Pa
     return RecordingFiles(series_for(config), about, limits, synced=config.fsync != "never", open_part=open_part)
 
 
+def begin(
+    config: RecorderConfig,
+    files: RecordingFiles,
+    start_ns: int,
+    known: Collection[int] = (),
+    known_until_ns: int = 0,
+) -> RecorderNode:
+    """Begin a file, and have done what a killed recorder left undone.
+
+    Returns:
+        The node that goes on from there; see `Recorder` for what is known.
+    """
+    black_box = black_box_for(config)
+    missed = files.missed_stretches(black_box, start_ns)
+    files.begin((), start_ns)
+    files.recover_left_behind()
+    for stretch in missed:
+        files.keep_for_good(stretch)
+    return node_for(config, files, start_ns, black_box, known, known_until_ns)
+
+
+def black_box_for(config: RecorderConfig) -> BlackBox:
+    """The black box that the settings ask for."""
+    return BlackBox(round(config.black_box_min * MINUTE_NS), own=DISK_ALARM)
+
+
 def node_for(
     config: RecorderConfig,
     files: RecordingFiles,
     start_ns: int,
+    black_box: BlackBox,
     known: Collection[int] = (),
     known_until_ns: int = 0,
 ) -> RecorderNode:
@@ -113,7 +140,6 @@ def node_for(
         config.rotate_mb * _MB,
         start_ns,
     )
-    black_box = BlackBox(round(config.black_box_min * MINUTE_NS), own=DISK_ALARM)
     return RecorderNode(
         Recorder(config.plant, start_ns, known, known_until_ns),
         Decisions(filing, Head(), black_box),

@@ -84,6 +84,11 @@ class BlackBox:
         return min(now_ns - self._around_ns, self._open.from_ns if self._open is not None else now_ns)
 
     @property
+    def reach_ns(self) -> int:
+        """For how long an alarm may matter to the stretch that is under way: that of the longest."""
+        return (LONGEST + 1) * self._around_ns
+
+    @property
     def next_due_ns(self) -> int | None:
         """When a stretch ends, if nothing happens until then."""
         return self._open.to_ns + 1 if self._open is not None else None

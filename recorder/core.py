@@ -14,7 +14,9 @@ from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.in_order import Gap
+from recorder.disk_alarm import DiskAlarm
 from recorder.entry import Entry
 from recorder.sequences import SequenceCheck
 
@@ -24,10 +26,6 @@ MOST_KEYS = 10_000
 
 _NO_SAMPLE = messages.QUALITY_UNSPECIFIED  # which protobuf reads out of bytes that hold something else
 _LARGEST_COUNT = 2**64 - 1  # a sequence number may be any nonsense; the sum of what it skips must still fit its field
-
-
-DISK_ALARM = f"{keys.RECORDING}/disk"
-"""The alarm of a recorder that cannot write."""
 
 
 class Kept(NamedTuple):
@@ -68,8 +66,8 @@ class Recorder:
         self._reports = 0
         self._longest_lag_ns = 0
         self._refused: Counter[str] = Counter()
-        self._stopped: str | None = None
-        self._stopped_ns = 0
+        self._stopped = False
+        self._disk = DiskAlarm(plant)
         self._checks: dict[str, SequenceCheck | None] = {}  # by key; None for a key that is not one of ours
 
     def on_message(self, message: Encoded, now_ns: int) -> Kept | None:
@@ -135,38 +133,22 @@ class Recorder:
 
     def stop_recording(self, why: str, now_ns: int) -> list[Publication]:
         """The file cannot be written: what the plant's people are told."""
-        self._stopped = why
-        self._stopped_ns = now_ns
-        return [self._disk_alarm(now_ns), self.health(now_ns)]
+        self._stopped = True
+        return [self._disk.come_up(why, now_ns), self.health(now_ns)]
 
     def resume_recording(self, now_ns: int) -> list[Publication]:
         """There is a file again: what they are told then."""
-        cleared = self._disk_alarm(now_ns, cleared_ns=now_ns)
-        self._stopped = None
-        return [cleared, self.health(now_ns)]
+        self._stopped = False
+        return [self._disk.go(self._refused["disk"], now_ns), self.health(now_ns)]
 
     @property
     def is_stopped(self) -> bool:
         """Whether what is received cannot be written."""
-        return self._stopped is not None
+        return self._stopped
 
-    def _disk_alarm(self, now_ns: int, cleared_ns: int = 0) -> Publication:
-        missing = self._refused["disk"]
-        if cleared_ns:
-            text = f"recording goes on; {missing} messages are missing so far"
-        else:
-            text = f"recording stopped: {self._stopped}; it goes on when there is room"
-        alarm = messages.Alarm(
-            time_ns=now_ns,
-            alarm=DISK_ALARM,
-            state=messages.ALARM_STATE_NORMAL if cleared_ns else messages.ALARM_STATE_UNACKNOWLEDGED,
-            priority=messages.PRIORITY_CRITICAL,
-            raised_ns=self._stopped_ns,
-            cleared_ns=cleared_ns,
-            text=text,
-            event="cleared" if cleared_ns else "raised",
-        )
-        return Publication(keys.key(self._plant, keys.ALARM, DISK_ALARM), alarm)
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
+        """What people ask of its alarm, or do to it."""
+        return self._disk.obey(question, now_ns)
 
     def health(self, now_ns: int, phase: str = "") -> Publication:
         """How it does; the lag is the longest between receipt and work since the last call.
@@ -175,7 +157,7 @@ class Recorder:
             now_ns: the moment.
             phase: in a word; empty: by whether it can write.
         """
-        phase = phase or ("recording" if self._stopped is None else "not recording")
+        phase = phase or ("not recording" if self._stopped else "recording")
         checks = [check for check in self._checks.values() if check is not None]
         self._reports += 1
         health = messages.Health(

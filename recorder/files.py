@@ -6,7 +6,7 @@ What is written, and when a file is flushed or a new one begun, is decided elsew
 
 import os
 import shutil
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -14,27 +14,28 @@ from typing import Self
 
 import structlog
 
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
-from recorder.black_box import Stretch
+from recorder.black_box import BlackBox, Stretch
+from recorder.black_box_files import BlackBoxFiles
 from recorder.chores import Chores
 from recorder.core import Kept, fingerprint
 from recorder.cut import cut, received_between
 from recorder.entry import Entry
 from recorder.gaps import GAP, to_metadata
-from recorder.mcap_scan import Scan
+from recorder.mcap_scan import Scan, Stored, Wanted
 from recorder.mcap_writer import RecordingWriter, check_free, part_of
 from recorder.part_file import PART, PartFile, is_held, left_behind
-from recorder.recover import recover
+from recorder.recover import origin, recover
 from recorder.retention import Finished, Limits, to_delete
 from recorder.series import Series
 
 log = structlog.get_logger()
 
-BLACK_BOX = "black-box"
-"""The folder, beside the recordings, of the stretches that are kept for good."""
 DAMAGED = ".damaged"
-"""The ending of a file left behind from which not all could be recovered: it is kept, and not looked at again."""
+"""The ending of a file left behind from which not all could be recovered: it is kept as long as a recording is."""
 
 
 class RecordingFiles:
@@ -66,6 +67,7 @@ class RecordingFiles:
         self._synced = synced
         self._open_part = open_part
         self._writer: RecordingWriter | None = None
+        self._black_boxes = BlackBoxFiles(series)
         self._chores = Chores()
         self._begun = 0
         self._before = ""
@@ -73,6 +75,8 @@ class RecordingFiles:
         self._abandoned: list[Path] = []
         first = series.first(datetime.now(UTC))
         self._left = [] if not series.folder.is_dir() else _left_behind(series)
+        for copy in self._black_boxes.half_made():
+            copy.unlink(missing_ok=True)
         if not self._left:
             check_free(first)
 
@@ -141,20 +145,36 @@ class RecordingFiles:
 
     def received_since(self, from_ns: int) -> set[int]:
         """Fingerprints of what the files that are there received since a moment, complete or left behind."""
-        known: set[int] = set()
-        for path in (*self._finished(), *self._left):
-            if path.stat().st_mtime_ns < from_ns:
+        return {fingerprint(stored.channel.topic, stored.payload) for stored in self._stored_since(from_ns)}
+
+    def missed_stretches(self, black_box: BlackBox, now_ns: int) -> list[Stretch]:
+        """Have a black box go on where that of a killed recorder was, before what it left behind is recovered.
+
+        Returns:
+            The stretches that are over and were never kept.
+        """
+        kept = self._black_boxes.spans()
+        over = []
+        for stored in self._stored_since(now_ns - black_box.reach_ns, is_alarm) if black_box.reach_ns else ():
+            at_ns = stored.log_time_ns
+            if any(first_ns <= at_ns <= last_ns for first_ns, last_ns in kept):
                 continue
             try:
-                scan = Scan(path, from_ns=from_ns)
+                over.append(black_box.on_message(decode(stored.payload, stored.entry.encoding), at_ns))
+            except DecodeError:
+                continue
+        over.append(black_box.over(now_ns))
+        return [stretch for stretch in over if stretch is not None]
+
+    def _stored_since(self, from_ns: int, wanted: Wanted | None = None) -> Iterator[Stored]:
+        """What the files that are there received since a moment; one file after the other, the oldest first."""
+        there = [(path.stat().st_mtime_ns, path) for path in (*self._finished(), *self._left)]
+        for _, path in sorted(item for item in there if item[0] >= from_ns):
+            try:
+                scan = Scan(path, from_ns=from_ns, wanted=wanted)
             except InputError:
                 continue  # nothing is in it
-            known.update(
-                fingerprint(stored.channel.topic, stored.payload)
-                for stored in scan
-                if stored.log_time_ns >= from_ns and not stored.repeated
-            )
-        return known
+            yield from (stored for stored in scan if stored.log_time_ns >= from_ns and not stored.repeated)
 
     def flush(self) -> None:
         """Hand over what was written; see `RecordingWriter.flush`."""
@@ -222,11 +242,16 @@ class RecordingFiles:
             return []
         return [path for path in self._series.folder.iterdir() if self._series.owns(path.name) and path.is_file()]
 
+    def _damaged(self) -> list[Path]:
+        ending = PART + DAMAGED
+        there = self._series.folder.glob(f"*{ending}")
+        return [path for path in there if self._series.owns(path.name.removesuffix(ending))]
+
     def _recover(self, part: Path) -> None:
         """Make a file whole that was left behind. It is deleted only if nothing but its end is missing."""
         with left_behind(part):
             path = part.with_name(part.name.removesuffix(PART))
-            if path.exists():
+            if path.exists() and not _is_of(path, part):
                 path = path.with_name(f"{path.stem}-recovered{path.suffix}")
             if _is_empty(part):
                 part.unlink()
@@ -245,14 +270,8 @@ class RecordingFiles:
             log.info("recovered", file=str(path), messages=saved.messages, lost=saved.lost)
 
     def _black_box(self, stretch: Stretch) -> None:
-        folder = self._series.folder / BLACK_BOX
-        folder.mkdir(exist_ok=True)
+        path = self._black_boxes.new(stretch)
         raised = datetime.fromtimestamp(stretch.raised_ns / 1e9, UTC)
-        name = f"{self._series.stem}-{raised:%Y%m%dT%H%M%SZ}-{stretch.alarm.replace('/', '-')}"
-        path, number = folder / f"{name}.mcap", 1
-        while path.exists():
-            number += 1
-            path = folder / f"{name}-{number}.mcap"
         about = {**self._metadata, "alarm": stretch.alarm, "raised": raised.isoformat(timespec="milliseconds")}
         window = received_between(stretch.from_ns, stretch.to_ns)
         while True:
@@ -270,12 +289,18 @@ class RecordingFiles:
 
     def _delete_oldest(self, now_ns: int, needed_since_ns: int | None) -> None:
         finished = []
-        for path in self._finished():
+        for path in (*self._finished(), *self._damaged()):
             told = path.stat()
             finished.append(Finished(path, told.st_size, told.st_mtime_ns))
         for path in to_delete(finished, self.size_bytes, self._limits, now_ns, needed_since_ns):
             path.unlink()
             log.info("deleted", file=str(path), why="the limits of what is kept")
+
+
+def is_alarm(topic: str) -> bool:
+    """Whether a topic is that of an alarm."""
+    parsed = keys.parse(topic)
+    return parsed is not None and parsed.kind == keys.ALARM
 
 
 def _is_empty(part: Path) -> bool:
@@ -285,6 +310,14 @@ def _is_empty(part: Path) -> bool:
         return not any(True for _ in scan) and not scan.orphans and all(damage.cut_off for damage in scan.damages)
     except InputError:
         return part.stat().st_size == 0
+
+
+def _is_of(path: Path, part: Path) -> bool:
+    """Whether a file was recovered from another, by a recorder that was killed before it could delete that one."""
+    try:
+        return origin(path) == origin(part) != {}
+    except InputError:
+        return False
 
 
 def _left_behind(series: Series) -> list[Path]:
@@ -301,7 +334,7 @@ def _left_behind(series: Series) -> list[Path]:
                 found.append(part)
             elif not series.dated:
                 raise InputError(f"recording {part.with_name(name)}: {part} is being written by another recorder")
-    for copy in (*series.folder.glob(f".{series.stem}*.tmp{PART}"), *(series.folder / BLACK_BOX).glob(f".*.tmp{PART}")):
+    for copy in series.folder.glob(f".{series.stem}*.tmp{PART}"):
         if not is_held(copy):
             copy.unlink(missing_ok=True)  # it was being made when its maker was killed
     return found

@@ -46,8 +46,7 @@ def look_over(path: Path) -> Look:
     """
     if path.is_dir():
         found, metadata = overview(read_messages(path)), read_metadata(path)
-        records = [record for file in recordings_in(path) for record in metadata_records(file)]
-        return Look(found, metadata, _zero_ns(metadata, found.first_sample_ns), (), _gaps(records))
+        return Look(found, metadata, _zero_ns(metadata, found.first_sample_ns), (), gaps_in(path))
     scan = Scan(path)
     found = overview(stored.entry for stored in scan)
     metadata = next((record.metadata for record in scan.metadata if record.name == METADATA), {})
@@ -56,6 +55,15 @@ def look_over(path: Path) -> Look:
         damages.append(f"{scan.orphans} messages of channels that are described nowhere")
     zero_ns = _zero_ns(metadata, found.first_sample_ns)
     return Look(found, metadata, zero_ns, tuple(damages), _gaps(scan.metadata))
+
+
+def gaps_in(path: Path) -> tuple[Gap, ...]:
+    """What was lost on the way to a recording, or to those of a folder, as they say themselves.
+
+    Raises:
+        InputError: a file is damaged.
+    """
+    return _gaps(record for file in recordings_in(path) for record in metadata_records(file))
 
 
 def zero_ns_of(path: Path) -> int:

@@ -1,20 +1,15 @@
-"""Writing recordings as MCAP files: https://mcap.dev/spec.
+"""Writing recordings as MCAP files; the bytes are those of `mcap_stream`."""
 
-The library gathers messages into chunks and describes a channel within the chunk of its first message. Ours are also
-described outside of it, so that a damaged chunk does not leave the messages of all later ones without a name.
-"""
-
+import os
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self, cast
+from typing import Self
 
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
-from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, Schema
+from mcap.records import Channel
 from mcap.well_known import MessageEncoding, SchemaEncoding
-from mcap.writer import Writer
 
 from reactorwatch import __version__
 from reactorwatch.contract import messages_pb2 as messages
@@ -23,6 +18,7 @@ from reactorwatch.errors import InputError
 from recorder.entry import Entry
 from recorder.mcap_chunks import REPEATED
 from recorder.mcap_scan import Stored
+from recorder.mcap_stream import McapStream
 from recorder.part_file import PART, PartFile, is_held
 
 METADATA = "reactorwatch"
@@ -62,7 +58,7 @@ class RecordingWriter:
             self._stream = open_part(self._part)
         except OSError as error:
             raise self._failed(error) from error
-        self._writer = Writer(cast(IO[bytes], self._stream))
+        self._writer = McapStream(self._stream)
         try:
             self._writer.start(library=f"reactorwatch {__version__}")
             self._writer.add_metadata(METADATA, {"version": __version__, **metadata})
@@ -124,7 +120,7 @@ class RecordingWriter:
             WriteError: as `write`.
         """
         try:
-            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.flush()
             self._writer.add_metadata(name, metadata)
         except OSError as error:
             raise self._failed(error) from error
@@ -136,7 +132,7 @@ class RecordingWriter:
             WriteError: the file cannot be written.
         """
         try:
-            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._writer.flush()
         except OSError as error:
             raise self._failed(error) from error
 
@@ -160,7 +156,7 @@ class RecordingWriter:
         if self._stream.closed:
             return
         try:
-            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._writer.finish()
             self._stream.finish(self._path)
         except OSError as error:
             raise self._failed(error) from error
@@ -183,36 +179,26 @@ class RecordingWriter:
         metadata = {REPEATED: "true"} if entry.repeated else {}
         kind = message_type(entry.encoding) if readable else None
         if kind is None:
-            return self._new_channel(entry.key, entry.encoding, 0, metadata)
+            return self._writer.add_channel(entry.key, entry.encoding, 0, metadata)
         schema = self._schema(kind.DESCRIPTOR.full_name, SchemaEncoding.Protobuf, _descriptors())
-        return self._new_channel(entry.key, MessageEncoding.Protobuf, schema, metadata)
+        return self._writer.add_channel(entry.key, MessageEncoding.Protobuf, schema, metadata)
 
     def _copied_channel(self, stored: Stored) -> int:
         channel, schema = stored.channel, stored.schema
         number = self._schema(schema.name, schema.encoding, schema.data) if schema else 0
         name = (channel.topic, channel.message_encoding, number, *sorted(channel.metadata.items()))
         if name not in self._copies:
-            self._copies[name] = self._new_channel(channel.topic, channel.message_encoding, number, channel.metadata)
+            self._copies[name] = self._writer.add_channel(
+                channel.topic, channel.message_encoding, number, channel.metadata
+            )
         return self._copies[name]
 
     def _schema(self, name: str, encoding: str, data: bytes) -> int:
         described = (name, encoding, data)
         number = self._schemas.get(described)
         if number is None:
-            number = self._schemas[described] = self._writer.register_schema(name, encoding, data)
-            self._describe(Schema(data=data, encoding=encoding, id=number, name=name))
+            number = self._schemas[described] = self._writer.add_schema(name, encoding, data)
         return number
-
-    def _new_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
-        number = self._writer.register_channel(topic, encoding, schema, metadata)
-        self._describe(Channel(id=number, topic=topic, message_encoding=encoding, metadata=metadata, schema_id=schema))
-        return number
-
-    def _describe(self, record: Channel | Schema) -> None:
-        """Write a description outside of any chunk, too; the library is between two records whenever it returns."""
-        builder = RecordBuilder()
-        record.write(builder)
-        self._stream.write(builder.end())  # type: ignore[no-untyped-call]
 
     def _failed(self, error: OSError) -> WriteError:
         kept = f"; what was written is in {self._part}" if self._part.exists() else ""
@@ -234,6 +220,8 @@ def check_free(path: Path) -> None:
     part = part_of(path)
     if not path.parent.is_dir():
         raise InputError(f"recording {path}: the folder {path.parent} does not exist")
+    if not os.access(path.parent, os.W_OK):
+        raise InputError(f"recording {path}: the folder {path.parent} cannot be written to")
     if path.exists():
         raise InputError(f"recording {path}: exists already and is not overwritten; choose another name")
     if is_held(part):

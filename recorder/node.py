@@ -84,8 +84,8 @@ class RecorderNode:
         return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """It takes none."""
-        return CommandReply(accepted=False, text="the recorder takes no commands"), []
+        """What people ask of its alarm, or do to it."""
+        return self._core.on_command(question, now_ns)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Flush the file, look for room on a full disk, keep a stretch for good, report health: each when it is due."""

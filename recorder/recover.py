@@ -73,7 +73,7 @@ def recover(path: Path, out: Path) -> Saved:
     topics: Counter[str] = Counter()
     first_ns, last_ns = 2**64, 0
     with replacing(out) as temporary:
-        with RecordingWriter(temporary, _metadata(path)) as writer:
+        with RecordingWriter(temporary, origin(path)) as writer:
             for stored in scan:
                 writer.copy(stored)
                 topics[stored.channel.topic] += 1
@@ -91,8 +91,12 @@ def recover(path: Path, out: Path) -> Saved:
     return saved
 
 
-def _metadata(path: Path) -> dict[str, str]:
-    """What our own record in the file says; empty if there is none. It stands at the very beginning."""
+def origin(path: Path) -> dict[str, str]:
+    """What our own record in a file, damaged or not, says; empty if there is none. It stands at the very beginning.
+
+    Raises:
+        InputError: nothing in it looks like a recording.
+    """
     scan = Scan(path)
     next(iter(scan), None)
     return next((record.metadata for record in scan.metadata if record.name == METADATA), {})

@@ -1,11 +1,14 @@
-"""`alarm`: what the operator does with alarms, asked of the running monitor."""
+"""`alarm`: what the operator does with alarms, asked of the running monitor; of the recorder, for its own alarm."""
 
+import contextlib
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.asking import PATIENCE_S, ask
+from reactorwatch.cli.asking import PATIENCE_S, NoAnswerError, ask
 from reactorwatch.cli.options import Endpoint, Json, Plant, Settings
+from reactorwatch.contract.keys import ACKNOWLEDGE_RECORDER, LIST_RECORDER_ALARMS, RECORDING
+from reactorwatch.errors import InputError
 
 if TYPE_CHECKING:
     from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
@@ -15,7 +18,7 @@ By = Annotated[str, typer.Option("--by", help="Who you are.", show_default=False
 Comment = Annotated[str, typer.Option("--comment", help="Why.", show_default=False)]
 Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the monitor.", min=0.1)]
 
-MONITOR = "monitor"
+MONITOR, RECORDER = "monitor", "recorder"
 
 alarms = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -38,6 +41,8 @@ def list_alarms(
 
     reply = ask(MONITOR, config, endpoint, name, timeout, "list_alarms", ListAlarms())
     _show(reply, json=json)
+    with contextlib.suppress(NoAnswerError):  # a plant may be watched and not be recorded
+        _show(ask(RECORDER, config, endpoint, name, timeout, LIST_RECORDER_ALARMS, ListAlarms()), json=json)
 
 
 @alarms.command("shelve")
@@ -53,6 +58,8 @@ def shelve(
     json: Json = False,
 ) -> None:
     """Put an alarm out of sight for a time."""
+    if alarm.startswith(f"{RECORDING}/"):
+        raise InputError(f"alarm {alarm} is the recorder's own, and can be acknowledged and nothing else")
     from reactorwatch.contract.messages_pb2 import ShelveAlarm
 
     command = ShelveAlarm(alarm=alarm, by=by, comment=comment, minutes=minutes)
@@ -75,7 +82,12 @@ def _register(word: str, command: str, description: str) -> None:
         from reactorwatch.contract.messages_pb2 import AlarmCommand
 
         asked = AlarmCommand(alarm=alarm, by=by, comment=comment)
-        _show(ask(MONITOR, config, endpoint, name, timeout, command, asked), json=json)
+        node, told = MONITOR, command
+        if alarm.startswith(f"{RECORDING}/"):
+            if command != "acknowledge":
+                raise InputError(f"alarm {alarm} is the recorder's own, and can be acknowledged and nothing else")
+            node, told = RECORDER, ACKNOWLEDGE_RECORDER
+        _show(ask(node, config, endpoint, name, timeout, told, asked), json=json)
 
     alarms.command(word, help=description)(act)
 

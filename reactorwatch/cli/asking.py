@@ -14,6 +14,10 @@ PATIENCE_S = 5.0
 """For how long, if nobody says."""
 
 
+class NoAnswerError(InputError):
+    """There is no such node."""
+
+
 def ask(
     node: str,
     config: Path | None,
@@ -26,7 +30,7 @@ def ask(
     """A node's answer to a command.
 
     Args:
-        node: `monitor` or `replay`, for what is said if none answers; and whose settings name the plant.
+        node: `monitor`, `recorder` or `replay`, for what is said if none answers; and whose settings name the plant.
         config: settings file, or None.
         endpoint: the router's address, or None.
         plant: its name; None: that of the settings, else `cstr`.
@@ -35,7 +39,8 @@ def ask(
         message: what it carries.
 
     Raises:
-        InputError: no router or no such node within the time, or the node refuses.
+        InputError: no router within the time, or the node refuses.
+        NoAnswerError: no such node within the time.
     """
     import logging
     import threading
@@ -71,7 +76,7 @@ def ask(
     replies = [decode(answer.payload, answer.encoding) for answer in answers]
     reply = next((item for item in replies if isinstance(item, CommandReply)), None)
     if reply is None:
-        raise InputError(f"no {node} of plant {plant!r} answered within {timeout_s:g} s; is it running?")
+        raise NoAnswerError(f"no {node} of plant {plant!r} answered within {timeout_s:g} s; is it running?")
     if not reply.accepted:
         raise InputError(reply.text)
     return reply

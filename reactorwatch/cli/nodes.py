@@ -20,6 +20,7 @@ from reactorwatch.cli.options import (
     pace,
     span_ns,
 )
+from reactorwatch.errors import InputError
 
 
 def add_to(app: typer.Typer) -> None:
@@ -168,11 +169,17 @@ def replay(
     if verify:
         from reactorwatch.cli.verification import run
 
+        given = {"--rate": rate, "--from": begin, "--to": end, "--loop": loop, "--column": column}
+        for option, value in given.items():
+            if value:
+                raise InputError(f"--verify publishes nothing and takes the whole recording; leave out {option}")
         raise typer.Exit(run(existing_recording(file), config, name, as_json=as_json))
     from reactorwatch.records.record import MINUTE_NS
     from reactorwatch.runtime.config import section
     from recorder.replay import ReplayConfig, run_replay
 
+    if column and file.suffix.lower() != ".csv":
+        raise InputError(f"--column is for the columns of a .csv file, got {file}")
     tables, bus = _settings(config, endpoint)
     flags = {
         "file": str(existing_recording(file)),

@@ -150,3 +150,14 @@ def new_file(path: Path) -> Path:
     if path.is_dir():
         raise InputError(f"{path}: is a folder, a file name was expected")
     return path
+
+
+def new_recording(path: Path) -> Path:
+    """The path of a recording that is to be written.
+
+    Raises:
+        InputError: as `new_file`; or it has another ending, by which nothing would find it again as a recording.
+    """
+    if new_file(path).suffix != ".mcap":
+        raise InputError(f"{path}: a recording is written, so its name must end in .mcap")
+    return path

@@ -100,10 +100,10 @@ def info_object(seen: Look, file: Path) -> dict[str, Any]:
 def info_text(seen: Look, file: Path) -> str:
     """The same for people."""
     said = info_object(seen, file)
-    lines = [
-        f"{file}: {said['messages']} messages of {len(said['topics'])} topics, received over {said['span_s']:.1f} s "
-        f"({moment(said['first_ns'])} to {moment(said['last_ns'])})"
-    ]
+    lines = [f"{file}: {said['messages']} messages of {len(said['topics'])} topics"]
+    if said["messages"]:
+        first, last = moment(said["first_ns"]), moment(said["last_ns"])
+        lines[0] += f", received over {said['span_s']:.1f} s ({first} to {last})"
     if said["from_min"] is not None:
         lines.append(f"samples from {said['from_min']:g} to {said['to_min']:g} min")
     told = [

@@ -10,14 +10,15 @@ import typer
 
 from monitor_node.comparison import Difference
 from monitor_node.config import MonitorConfig
-from monitor_node.verification import Verification, verify
+from monitor_node.verification import COMPARED, Verification, verify
 from reactorwatch import __version__
 from reactorwatch.cli.progress import task
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_minutes
 from reactorwatch.runtime.config import read_settings, section
-from recorder.look import zero_ns_of
+from recorder.look import gaps_in, zero_ns_of
 from recorder.mcap_file import one_plant_in, read_messages, read_metadata
 
 SETTINGS = "settings"
@@ -57,6 +58,12 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
     version = metadata.get("version", __version__)
     if version != __version__:
         found.notes.append(f"it was recorded by version {version}, and this is {__version__}")
+    found.notes += [
+        f"{gap.messages} messages of {gap.stream} never reached this recording; what the monitor said of them, "
+        "and what it learned from them, is then not said again"
+        for gap in gaps_in(file)
+        if gap.stream in {keys.all_of(monitor.plant, kind).removesuffix("/**") for kind in (keys.SAMPLE, *COMPARED)}
+    ]
     said = _object(found, file, monitor.plant, zero_ns_of(file))
     typer.echo(msgspec.json.encode(said).decode() if as_json else _text(said))
     return 0 if found.exact else 1

@@ -23,7 +23,10 @@ COMMAND = "command"
 ALIVE = "alive"
 
 RECORDING = "recording"
-"""What the names of a recorder's own alarms begin with: no monitor raises them, and no command acts on them."""
+"""What the names of a recorder's own alarms begin with: no monitor raises them, and the recorder answers for them."""
+LIST_RECORDER_ALARMS = "list_recorder_alarms"
+ACKNOWLEDGE_RECORDER = "acknowledge_recorder"
+"""The recorder's commands; others than the monitor's, so that it is known whether each of the two is there."""
 
 _PLANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 

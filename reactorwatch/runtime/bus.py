@@ -4,10 +4,13 @@ The nodes know only the protocol. The real bus is `bus_zenoh`; the one here deli
 order of publication, so that a whole chain of nodes can be tested without a network.
 """
 
+import contextlib
 import re
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from queue import Empty, SimpleQueue
 from typing import Protocol
 
 from google.protobuf.message import Message
@@ -89,11 +92,11 @@ class MemoryRequest:
     """A question within the process, and where its answers are gathered."""
 
     question: Encoded
-    answers: list[Encoded]
+    answers: SimpleQueue[Encoded]
 
     def reply(self, message: Message) -> None:
         """Answer it."""
-        self.answers.append(Encoded(self.question.key, *encode_message(message)))
+        self.answers.put(Encoded(self.question.key, *encode_message(message)))
 
 
 @dataclass
@@ -139,13 +142,19 @@ class MemoryBus:
             self._exchange.answerers.append((self, key_expression, handler))
 
     def ask(self, question: Encoded, timeout_s: float) -> list[Encoded]:
-        """See `Bus`; answers only come from handlers that reply before they return."""
-        answers: list[Encoded] = []
+        """See `Bus`; returns as soon as all have answered who listen there."""
+        answers: SimpleQueue[Encoded] = SimpleQueue()
         with self._exchange.lock:
-            for _, expression, handler in list(self._exchange.answerers):
-                if matches(expression, question.key):
-                    handler(MemoryRequest(question, answers))
-        return answers
+            answerers = list(self._exchange.answerers)
+        handlers = [handler for _, expression, handler in answerers if matches(expression, question.key)]
+        until = time.monotonic() + timeout_s
+        for handler in handlers:
+            handler(MemoryRequest(question, answers))
+        found: list[Encoded] = []
+        with contextlib.suppress(Empty):
+            while len(found) < len(handlers):
+                found.append(answers.get(timeout=max(0.0, until - time.monotonic())))
+        return found
 
     def announce(self, key: str) -> None:
         """See `Bus`."""

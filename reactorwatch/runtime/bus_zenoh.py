@@ -14,6 +14,7 @@ with waiting, for else a long recovery would be thrown away in part; and a link 
 closed.
 """
 
+import contextlib
 import json
 import re
 import secrets
@@ -51,6 +52,7 @@ STREAM_PARTS = 3  # of a key: root, plant and kind
 
 CACHES = "@adv/**"  # below a key, where Zenoh's publishers answer for what they remember of it
 HISTORY_WITHIN_S = 10.0
+MOST_ASKED = 4  # times for what was before; what was published while the answers came may be missing
 
 _NUMBERED = struct.Struct("<QQ")  # who published it, and its number in the stream
 
@@ -142,8 +144,13 @@ class ZenohBus:
             for last in self._remembered(key_expression, "_max=1"):
                 delivery.tell_last(last)
             if history:
-                for came in self._remembered(key_expression, f"_time=[now(-{self._config.history_s}s)..]"):
-                    delivery.tell(came)
+                began, since_s = time.monotonic(), self._config.history_s
+                for _ in range(MOST_ASKED):
+                    for came in self._remembered(key_expression, f"_time=[now(-{since_s}s)..]"):
+                        delivery.tell(came)
+                    if delivery.is_told():
+                        break
+                    since_s = time.monotonic() - began + HEARTBEAT_S
             threading.Thread(target=delivery.begin, daemon=True).start()  # the handler may wait for who called us
 
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
@@ -223,6 +230,10 @@ class ZenohBus:
             time.sleep(max(0.0, self._published_at + LAST_RECOVERY_S - time.monotonic()))
         for _ in self._session.get(NOBODY, timeout=FLUSH_WITHIN_S):
             pass
+        # Advanced ones may outlive the session otherwise, and hang the process (eclipse-zenoh/zenoh-python#624).
+        for declared in (*self._declared, *(key.publisher for key in self._keys.values())):
+            with contextlib.suppress(zenoh.ZError):
+                declared.undeclare()
         self._session.close()
         for delivery in self._deliveries:
             delivery.close()

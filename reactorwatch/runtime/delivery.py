@@ -49,19 +49,25 @@ class Delivery:
         with self._changed:
             waited = self._order.due_ns()
             now_ns = time.monotonic_ns()
-            self._hand_on(self._order.arrive(came.publisher, came.stream, came.number, came.message, now_ns))
+            key = came.message.key
+            self._hand_on(self._order.arrive(came.publisher, came.stream, key, came.number, came.message, now_ns))
             if self._order.due_ns() != waited:
                 self._changed.notify()
 
     def tell_last(self, last: Numbered) -> None:
         """Before the beginning: what a publisher has published last on a key."""
         with self._changed:
-            self._order.tell_last(last.publisher, last.stream, last.number)
+            self._order.tell_last(last.publisher, last.stream, last.message.key, last.number)
 
     def tell(self, came: Numbered) -> None:
         """Before the beginning: what was published before and is wanted."""
         with self._changed:
-            self._order.tell(came.publisher, came.stream, came.number, came.message)
+            self._order.tell(came.publisher, came.stream, came.message.key, came.number, came.message)
+
+    def is_told(self) -> bool:
+        """Before the beginning: see `InOrder.is_told`."""
+        with self._changed:
+            return self._order.is_told()
 
     def begin(self) -> None:
         """Hand on what has come until now, and from now on what comes."""

@@ -6,26 +6,37 @@ samples would be taken apart by that, so a publisher numbers what it publishes. 
 which is all of one kind of one plant (`reactor/cstr/sample`), so that a listener to one kind knows whether a number is
 missing or was none of its business.
 
-A message goes on when all before it in its stream have. While a number is missing those after it wait, as long as the
-recovery may take (`PATIENCE_NS`); then what has not come is lost, and told as a gap. A number that comes again is
-passed over, and so is what was published before the first that went on.
+A message goes on when all before it in its stream have. While a number is missing those after it wait, until it is
+lost, and told as a gap. It is lost for certain when every key of the stream has come to a later one, because each key
+keeps its order; only a key that was never heard before might still bring it, so that is waited for, too
+(`PATIENCE_NS`). While a key has not come so far, its recovery may still be under way, or it has fallen silent: that is
+waited for longer than Zenoh waits for the answer to a question (`RECOVERY_NS`). A number that comes again is passed
+over, and so is what was published before the first that went on. What comes after it was given up goes on at once,
+out of its place, rather than nowhere.
 
 Who begins to listen asks every publisher for its last number, and perhaps for what was before; until he has been
-told, everything waits (`gathering`). So he knows what is of before his time, which a publisher may send him again,
+told, everything waits (`gathering`). He asks again where something is missing (`is_told`): while much is told, what
+comes live may be thrown away on the way, and Zenoh does not know that it is missing before it has heard the first of a
+key. So he knows what is of before his time, which a publisher may send him again,
 and what not. A stream of which he was told nothing begins with 0, or, if he hears another number first, when for a
 moment (`GATHER_NS`) nothing came that was older than what he had heard already.
 """
 
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import accumulate
+from operator import itemgetter
 from typing import Generic, NamedTuple, TypeVar
 
 Item = TypeVar("Item")
 
 PATIENCE_NS = 5_000_000_000
+RECOVERY_NS = 15_000_000_000
+"""Zenoh gives a question up after 10 s; then it hands on what it has."""
+LOOK_AGAIN_NS = 250_000_000
 GATHER_NS = 500_000_000
-MOST_LOST = 1000
+MOST_LOST = 100_000
 """Runs of lost numbers of a stream that are remembered: what comes of them after all goes on."""
 MOST_HELD = 1_000_000
 """Messages of a stream that may wait; with more, what is missing is given up."""
@@ -57,9 +68,22 @@ class _Stream(Generic[Item]):
     newest: int = 0
     before: int = -1  # the last number when the listening began
     told: dict[int, Item] = field(default_factory=dict)  # of what was before
+    told_from: dict[str, int] = field(default_factory=dict)  # the first of each key
     held: dict[int, tuple[int, Item]] = field(default_factory=dict)  # with when it came
-    due_ns: int | None = None  # when no longer to wait; None: nothing waits
+    due_ns: int | None = None  # when to look whether to wait no longer; None: nothing waits
+    recovered_ns: int = 0  # when something that was missing came last, or it began to be missing
+    keys: dict[str, int] = field(default_factory=dict)  # the newest number that came of each
     lost: list[tuple[int, int]] = field(default_factory=list)  # (first, last)
+
+    @property
+    def passed(self) -> int:
+        """The number that every key has come to."""
+        return min(self.keys.values())
+
+    @property
+    def told_by_all(self) -> int:
+        """From where on what was before was told of every key: of one less is remembered than of another."""
+        return max(self.told_from.values(), default=0)
 
 
 class InOrder(Generic[Item]):
@@ -73,7 +97,9 @@ class InOrder(Generic[Item]):
         self._streams: dict[tuple[int, str], _Stream[Item]] = {}
         self._gathering = gathering
 
-    def arrive(self, publisher: int, stream: str, number: int, item: Item, now_ns: int) -> Iterator[Item | Gap]:
+    def arrive(
+        self, publisher: int, stream: str, key: str, number: int, item: Item, now_ns: int
+    ) -> Iterator[Item | Gap]:
         """Take a message in; yields what goes on because of it, and the gaps between."""
         name = publisher, stream
         state = self._streams.get(name)
@@ -81,6 +107,7 @@ class InOrder(Generic[Item]):
             state = self._streams[name] = _Stream()
             if not number and not self._gathering:
                 state.expected = 0
+        state.keys[key] = max(state.keys.get(key, number), number)
         if state.expected is None and not self._gathering and number <= state.before:
             return
         if number == state.expected and not state.held:  # as nearly always
@@ -97,26 +124,45 @@ class InOrder(Generic[Item]):
         patience_ns = GATHER_NS if state.expected is None else PATIENCE_NS
         if state.due_ns is None or number < state.newest:  # something begins to be waited for, or is being recovered
             state.due_ns = now_ns + patience_ns
+            state.recovered_ns = now_ns
         state.newest = max(state.newest, number)
         yield from self._contiguous(state)
         if len(state.held) > MOST_HELD:
-            yield from self._give_up(name, state, now_ns, now_ns)
+            yield from self._give_up(name, state, now_ns, now_ns, state.newest)
 
     def overdue(self, now_ns: int) -> Iterator[Item | Gap]:
         """Yields what has waited for long enough."""
         for name, state in self._streams.items():
-            if state.due_ns is not None and now_ns >= state.due_ns:
+            if state.due_ns is None or now_ns < state.due_ns:
+                continue
+            silent_until_ns = state.recovered_ns + RECOVERY_NS
+            passed = state.newest if now_ns >= silent_until_ns else state.passed
+            if state.expected is None or state.expected < passed:
                 since_ns = now_ns if state.expected is None else now_ns - PATIENCE_NS
-                yield from self._give_up(name, state, since_ns, now_ns)
+                yield from self._give_up(name, state, since_ns, now_ns, passed)
+            else:
+                state.due_ns = min(now_ns + LOOK_AGAIN_NS, silent_until_ns)
 
-    def tell_last(self, publisher: int, stream: str, number: int) -> None:
+    def tell_last(self, publisher: int, stream: str, key: str, number: int) -> None:
         """While gathering: the number that a publisher has come to on one of its keys."""
         state = self._streams.setdefault((publisher, stream), _Stream())
+        state.keys[key] = max(state.keys.get(key, number), number)
         state.before = max(state.before, number)
 
-    def tell(self, publisher: int, stream: str, number: int, item: Item) -> None:
+    def tell(self, publisher: int, stream: str, key: str, number: int, item: Item) -> None:
         """While gathering: a message of before."""
-        self._streams.setdefault((publisher, stream), _Stream()).told[number] = item
+        state = self._streams.setdefault((publisher, stream), _Stream())
+        state.told[number] = item
+        state.told_from[key] = min(state.told_from.get(key, number), number)
+
+    def is_told(self) -> bool:
+        """While gathering: whether nothing is missing of what was before, nor between it and what has come since."""
+        for state in self._streams.values():
+            first = state.told_by_all
+            numbers = {number for number in (*state.told, *state.held) if number >= first}
+            if state.told and len(numbers) <= max(state.before, *numbers) - first:
+                return False
+        return True
 
     def gathered(self, now_ns: int) -> Iterator[Item | Gap]:
         """What was before has all been told; yields what goes on."""
@@ -125,9 +171,11 @@ class InOrder(Generic[Item]):
             live = {number: came for number, came in state.held.items() if number > state.before}
             state.held = {number: (now_ns, item) for number, item in state.told.items()} | live
             state.told = {}
+            for number in sorted(number for number in state.held if number < state.told_by_all):
+                yield state.held.pop(number)[1]
             state.newest = max(state.held, default=state.before)
             if state.held:
-                yield from self._give_up(name, state, now_ns, now_ns)
+                yield from self._give_up(name, state, now_ns, now_ns, state.newest)
             elif state.before >= 0:
                 state.expected = state.before + 1
 
@@ -142,8 +190,13 @@ class InOrder(Generic[Item]):
         if not state.held:
             state.due_ns = None
 
-    def _give_up(self, name: tuple[int, str], state: _Stream[Item], since_ns: int, now_ns: int) -> Iterator[Item | Gap]:
-        """Do not wait for what is missing before what came until a moment: all of that was lost at once."""
+    def _give_up(
+        self, name: tuple[int, str], state: _Stream[Item], since_ns: int, now_ns: int, passed: int
+    ) -> Iterator[Item | Gap]:
+        """Do not wait for what is missing before what came until a moment: all of that was lost at once.
+
+        What is missing beyond `passed`, the number that every key has come to, is still waited for.
+        """
         items: list[Item] = []
         lost: list[tuple[int, int]] = []
         gathered = state.expected is None
@@ -153,13 +206,17 @@ class InOrder(Generic[Item]):
         for number, known_ns in zip(numbers, noticed_ns, strict=True):
             item = state.held[number][1]
             if state.expected is not None and number > state.expected:
-                if gathered or known_ns > since_ns:
+                if gathered or known_ns > since_ns or number > passed:
                     break  # what is missing here may still come
                 lost.append((state.expected, number - 1))
             del state.held[number]
             state.expected = number + 1
             items.append(item)
-        state.due_ns = None if not state.held else PATIENCE_NS + min(came for came, _ in state.held.values())
+        state.due_ns = None
+        if state.held:
+            first_ns = min(came for came, _ in state.held.values())
+            state.due_ns = first_ns + PATIENCE_NS
+            state.recovered_ns = max(state.recovered_ns, first_ns)
         if lost:
             state.lost = [*state.lost, *lost][-MOST_LOST:]
             count = sum(last - first + 1 for first, last in lost)
@@ -168,10 +225,11 @@ class InOrder(Generic[Item]):
 
 
 def _take_out(runs: list[tuple[int, int]], number: int) -> bool:
-    """Whether a number is in one of the runs; it is no longer, then."""
-    for place, (first, last) in enumerate(runs):
-        if first <= number <= last:
-            rest = [(first, number - 1), (number + 1, last)]
-            runs[place : place + 1] = [run for run in rest if run[0] <= run[1]]
-            return True
-    return False
+    """Whether a number is in one of the runs, which are in order; it is no longer, then."""
+    place = bisect_right(runs, number, key=itemgetter(0)) - 1
+    if place < 0 or number > runs[place][1]:
+        return False
+    first, last = runs[place]
+    rest = [(first, number - 1), (number + 1, last)]
+    runs[place : place + 1] = [run for run in rest if run[0] <= run[1]]
+    return True

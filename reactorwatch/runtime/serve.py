@@ -129,12 +129,12 @@ def serve(
         linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
     """
     inbox: SimpleQueue[Encoded | Gap | Request | None] = SimpleQueue()
-    room = threading.Event()
+    room, ended = threading.Event(), threading.Event()
     stop.wakes(lambda: inbox.put(None))
     stop.wakes(room.set)
 
     def receive(item: Encoded | Gap | Request) -> None:
-        while inbox.qsize() >= LARGEST_INBOX and not stop.is_set:
+        while inbox.qsize() >= LARGEST_INBOX and not (stop.is_set or ended.is_set()):
             room.clear()
             room.wait(LOOK_AGAIN_S)
         inbox.put(item)
@@ -175,6 +175,7 @@ def serve(
             handle(item)
             wait_s = 0.0
         room.set()
+    ended.set()
     deadline = time.monotonic() + LONGEST_LINGER * linger_s
     remaining = 0
     while True:  # what was on its way when the end was asked for is not thrown away

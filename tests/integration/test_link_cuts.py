@@ -61,9 +61,10 @@ def test_a_router_that_is_killed_and_started_again_costs_no_sample(tmp_path: Pat
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
 
 
-def test_what_could_not_be_recovered_is_counted_and_named_in_the_file_and_by_info(tmp_path: Path) -> None:
+@pytest.mark.parametrize("whose", ["recorder", "publisher"])
+def test_what_could_not_be_recovered_is_counted_and_named_in_the_file_and_by_info(tmp_path: Path, whose: Whose) -> None:
     """The publisher remembers a tenth of what was published while the link was down."""
-    found = cut(tmp_path, "recorder", "closed", 1.0, cache_messages=RATE_PER_S // SIGNALS // 10)
+    found = cut(tmp_path, whose, "closed", 1.0, cache_messages=RATE_PER_S // SIGNALS // 10)
     seen = look_over(tmp_path / "run.mcap")
     assert found.missing > 0
     assert {gap.stream for gap in seen.gaps} == {"reactor/cstr/sample"}
@@ -120,6 +121,42 @@ def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
 
 
 def test_a_stuck_recorder_costs_another_nothing_and_gets_it_all_later(tmp_path: Path) -> None:
-    """It stands still for longer than it takes until a link that takes nothing is closed."""
+    """Its process is stopped for longer than it takes until a link that takes nothing is closed; the other hears on."""
     for found in stick(tmp_path, 3.0):
         assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
+
+
+def test_a_handler_that_blocks_holds_up_neither_the_publisher_nor_another_listener(router: Router) -> None:
+    """Until the other has heard all, the handler does not return; then it hears the same."""
+    rows, released = 3000, threading.Event()
+    bus, stuck, quick = (connected(router.config) for _ in range(3))
+    heard: dict[str, list[int]] = {"stuck": [], "quick": []}
+    complete = {name: threading.Event() for name in heard}
+
+    def hear(name: str, message: Encoded) -> None:
+        sample = decode(message.payload, message.encoding)
+        assert isinstance(sample, Sample)
+        heard[name].append(sample.sequence)
+        if len(heard[name]) == rows * SIGNALS:
+            complete[name].set()
+
+    def hear_and_block(message: Encoded) -> None:
+        hear("stuck", message)
+        released.wait(PATIENCE_S)
+
+    everything = keys.all_of("cstr", keys.SAMPLE)
+    stuck.subscribe(everything, hear_and_block)
+    quick.subscribe(everything, lambda message: hear("quick", message))
+    publisher = Publisher(bus, RATE_PER_S)
+    try:
+        publisher.wait(rows)
+        assert complete["quick"].wait(PATIENCE_S)
+        assert len(heard["stuck"]) == 1
+        released.set()
+        assert complete["stuck"].wait(PATIENCE_S)
+    finally:
+        released.set()
+        publisher.close()
+        for each in (stuck, quick, bus):
+            each.close()
+    assert heard["stuck"][: rows * SIGNALS] == heard["quick"][: rows * SIGNALS]

@@ -1,6 +1,7 @@
 """The monitor's core says again what was recorded of it, value for value; and what it does not is found out."""
 
 import json
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,8 +13,10 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import decode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Sample
 from reactorwatch.errors import InputError
+from reactorwatch.runtime.in_order import Gap
 from recorder.cut import cut, sampled_between
 from recorder.entry import Entry
+from recorder.gaps import GAP, to_metadata
 from recorder.mcap_file import RecordingWriter, read_messages, read_metadata, recordings_in
 from recorder.recover import recover
 
@@ -120,6 +123,66 @@ def test_a_recording_that_ends_between_a_sample_and_what_was_said_of_it_is_exact
     code, told = verified(more, capsys)
     assert (code, told["differing"]) == (0, 0)
     assert told["after_the_end"] > 0
+
+
+def as_after_a_cut(hour: Path, out: Path, lost: Callable[[Entry], bool] = lambda _: False) -> Path:
+    """The hour as a recorder has it whose link was down from 25 to 35 minutes, around the leak and its alarms.
+
+    What it missed came afterwards, all of one kind after the other; but for what was lost.
+    """
+    begin_ns, end_ns = (first_after(hour, keys.key("cstr", keys.SAMPLE, "qc"), at).log_time_ns for at in (25.0, 35.0))
+    entries = list(read_messages(hour))
+    missed = [entry for entry in entries if begin_ns <= entry.log_time_ns < end_ns]
+    gaps: Counter[str] = Counter()
+    with RecordingWriter(out, read_metadata(hour)) as writer:
+        for entry in (entry for entry in entries if entry.log_time_ns < begin_ns):
+            writer.write(entry)
+        for entry in sorted(missed, key=lambda entry: entry.key.split("/")[2]):
+            if lost(entry):
+                gaps["/".join(entry.key.split("/")[:3])] += 1
+            else:
+                writer.write(entry._replace(log_time_ns=end_ns))
+        for stream, count in gaps.items():
+            writer.add_metadata(GAP, to_metadata(Gap(stream, 1, 0, 0, count, end_ns)))
+        for entry in (entry for entry in entries if entry.log_time_ns >= end_ns):
+            writer.write(entry)
+    return out
+
+
+def test_what_was_recovered_after_a_cut_link_is_exact_whatever_the_order_of_the_kinds(
+    hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cut_link = as_after_a_cut(hour, tmp_path / "cut.mcap")
+    kinds = [entry.key.split("/")[2] for entry in read_messages(cut_link)]
+    assert kinds != [entry.key.split("/")[2] for entry in read_messages(hour)]
+    code, told = verified(cut_link, capsys)
+    assert (code, told["rows"], told["differing"]) == (0, ROWS, 0)
+
+
+def test_samples_that_only_the_recorder_lost_make_a_difference_and_the_gap_is_told_with_it(
+    hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    key, first = keys.key("cstr", keys.SAMPLE, "T"), START_NS + 26 * 60 * 10**9
+    lost = as_after_a_cut(
+        hour, tmp_path / "x.mcap", lambda e: e.key == key and first <= e.publish_time_ns < first + 10**10
+    )
+    code, told = verified(lost, capsys)
+    assert (code, told["exact"]) == (1, False)
+    assert told["differences"][0]["at_min"] == 26.0
+    assert told["notes"][-1].startswith("2 messages of reactor/cstr/sample never reached this recording")
+
+
+def test_what_the_monitor_said_and_the_recorder_lost_is_as_many_differences(
+    hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    at_ns = START_NS + 26 * 60 * 10**9
+    lost = as_after_a_cut(
+        hour, tmp_path / "x.mcap", lambda e: f"/{keys.ESTIMATE}/" in e.key and e.publish_time_ns == at_ns
+    )
+    code, told = verified(lost, capsys)
+    assert (code, told["differing"]) == (1, 2)
+    assert {item["what"] for item in told["differences"]} == {"not recorded"}
+    assert told["notes"][-1].startswith("2 messages of reactor/cstr/estimate never reached this recording")
 
 
 def test_a_sample_that_was_changed_in_its_last_digit_is_found_out(

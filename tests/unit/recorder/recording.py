@@ -6,7 +6,7 @@ from pathlib import Path
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Health
-from recorder.__main__ import files_for, node_for
+from recorder.__main__ import begin, files_for
 from recorder.config import RecorderConfig
 from recorder.files import RecordingFiles
 from recorder.mcap_writer import part_of
@@ -78,6 +78,4 @@ def recorder(
     """A recorder that has just begun."""
     config = RecorderConfig(out=str(out), **settings)  # type: ignore[arg-type]
     files = files_for(config, open_part)
-    files.begin((), start_ns)
-    files.recover_left_behind()
-    return Fed(node_for(config, files, start_ns, known, known_until_ns), files, start_ns)
+    return Fed(begin(config, files, start_ns, known, known_until_ns), files, start_ns)

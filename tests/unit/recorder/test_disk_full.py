@@ -8,7 +8,7 @@ import pytest
 
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import decode
-from recorder.core import DISK_ALARM
+from recorder.disk_alarm import DISK_ALARM
 from recorder.mcap_file import read_messages, recordings_in
 from recorder.part_file import PartFile
 from tests.unit.recorder import golden
@@ -63,6 +63,7 @@ def test_recording_stops_with_an_alarm_keeps_what_is_there_and_goes_on_when_ther
     disk.room = 10**9
     fed.pass_time(3 * SECOND)
     assert [item.event for item in fed.alarms()] == ["raised", "cleared"]
+    assert fed.alarms()[-1].state == messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED  # nobody has said that he saw it
     fed.hear(samples(1000, first=1000), SECOND // 100)
     fed.stop()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run-2.mcap", "run.mcap"]

@@ -13,7 +13,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode
 from reactorwatch.errors import InputError
 from recorder.entry import Entry
-from recorder.mcap_file import plants_in, read_messages, read_metadata, read_record, recordings_in
+from recorder.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record, recordings_in
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import MINUTE, SECOND, Fed, recorder
 
@@ -192,6 +192,88 @@ def test_kills_one_after_the_other_leave_a_file_each(tmp_path: Path) -> None:
         killed(tmp_path / "run.mcap", 20)
     recorder(tmp_path / "run.mcap", START).stop()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run-2.mcap", "run-3.mcap", "run-4.mcap", "run.mcap"]
+
+
+def test_a_recovery_that_was_killed_before_it_deleted_the_remains_is_done_again_into_the_same_file(
+    tmp_path: Path,
+) -> None:
+    killed(tmp_path / "run.mcap", 100)
+    remains = (tmp_path / "run.mcap.part").read_bytes()
+    recorder(tmp_path / "run.mcap", START).stop()
+    recovered = of_others(tmp_path / "run.mcap")
+    (tmp_path / "run.mcap.part").write_bytes(remains)
+    recorder(tmp_path / "run.mcap", START).stop()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run-2.mcap", "run-3.mcap", "run.mcap"]
+    assert of_others(tmp_path / "run.mcap") == recovered
+
+
+def test_a_file_of_the_same_name_and_another_origin_is_not_written_over_by_a_recovery(tmp_path: Path) -> None:
+    killed(tmp_path / "run.mcap", 100)
+    RecordingWriter(other := tmp_path / "other.mcap", {"started": "yesterday"}).close()
+    other.rename(tmp_path / "run.mcap")
+    recorder(tmp_path / "run.mcap", START).stop()
+    assert not of_others(tmp_path / "run.mcap")
+    assert of_others(tmp_path / "run-recovered.mcap")
+
+
+def test_damaged_remains_count_and_are_deleted_in_their_turn_and_what_people_saved_is_not(tmp_path: Path) -> None:
+    for name in ("run-recovered.mcap", "run-7.mcap.part.damaged", "mine.mcap.part.damaged"):
+        (tmp_path / name).write_bytes(b"of before")
+        os.utime(tmp_path / name, ns=(1, 1))
+    fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, keep_files=3.0, black_box_min=0.0)
+    fed.hear(samples(130), SECOND)
+    fed.stop()
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"mine.mcap.part.damaged", "run-recovered.mcap", "run.mcap", "run-2.mcap", "run-3.mcap"}
+
+
+def raising(folder: Path) -> Fed:
+    """A recorder that has heard an alarm and is killed a while after it."""
+    fed = recorder(folder, START, black_box_min=0.5)
+    fed.hear([*samples(100), alarm("ewma/T"), *samples(10, first=100)], SECOND)
+    fed.pass_time(SECOND)  # the last of it is flushed
+    fed.kill()
+    return fed
+
+
+def boxed(folder: Path) -> list[list[int]]:
+    """The numbers of the samples in each file of the black box."""
+    return [
+        [
+            message.sequence
+            for entry in of_others(path)
+            if isinstance(message := decode(entry.payload, entry.encoding), messages.Sample)
+        ]
+        for path in sorted((folder / "black-box").glob("*.mcap"))
+    ]
+
+
+def test_a_stretch_under_way_when_the_recorder_is_killed_goes_on_with_the_next_start(tmp_path: Path) -> None:
+    before = raising(tmp_path)
+    fed = recorder(tmp_path, before.now_ns + SECOND, black_box_min=0.5)
+    fed.hear(samples(100, first=110), SECOND)
+    fed.stop()
+    (kept,) = boxed(tmp_path)
+    assert kept == list(range(70, 128))  # half a minute around the alarm, two seconds of which passed in between
+
+
+def test_a_stretch_that_was_over_while_no_recorder_ran_is_kept_by_the_next_start(tmp_path: Path) -> None:
+    before = raising(tmp_path)
+    recorder(tmp_path, before.now_ns + 2 * MINUTE, black_box_min=0.5).stop()
+    assert boxed(tmp_path) == [list(range(70, 110))]
+
+
+def test_a_copy_of_a_stretch_that_a_kill_left_half_made_is_made_anew_and_no_stretch_twice(tmp_path: Path) -> None:
+    before = raising(tmp_path)
+    (tmp_path / "black-box").mkdir()
+    (tmp_path / "black-box" / f".{tmp_path.name}.tmp").touch()  # of somebody else
+    half = tmp_path / "black-box" / ".cstr-20260101T000000Z-ewma-T.mcap.1.tmp.part"
+    half.write_bytes(b"x")
+    recorder(tmp_path, before.now_ns + 2 * MINUTE, black_box_min=0.5).stop()
+    assert not half.exists()
+    for _ in range(2):
+        recorder(tmp_path, before.now_ns + 2 * MINUTE, black_box_min=0.5).stop()
+    assert boxed(tmp_path) == [list(range(70, 110))]
 
 
 def test_what_cannot_be_recovered_is_kept_and_not_looked_at_again(tmp_path: Path) -> None:

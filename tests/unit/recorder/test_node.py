@@ -12,7 +12,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, decode, encode
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.serve import StopSignal, serve
-from recorder.__main__ import files_for, node_for
+from recorder.__main__ import begin, files_for
 from recorder.config import RecorderConfig
 from recorder.entry import Entry
 from recorder.files import RecordingFiles
@@ -26,8 +26,7 @@ SECOND = 10**9
 def node_on(path: Path, start_ns: int = 0) -> tuple[RecorderNode, RecordingFiles]:
     config = RecorderConfig(out=str(path), flush_period_s=1.0)
     files = files_for(config)
-    files.begin((), start_ns)
-    return node_for(config, files, start_ns), files
+    return begin(config, files, start_ns), files
 
 
 def of_health(entry: Entry) -> messages.Health:
@@ -83,7 +82,7 @@ def test_it_reports_at_once_and_then_every_period_and_flushes_between(tmp_path: 
     assert grown == [101, 103, 105, 107, 109, 111]
 
 
-def test_it_takes_no_commands(tmp_path: Path) -> None:
+def test_a_command_that_is_not_its_own_is_refused(tmp_path: Path) -> None:
     node, writer = node_on(tmp_path / "run.mcap")
     with writer:
         reply, published = node.on_command(Encoded("reactor/cstr/command/x", b"", ""), 0)

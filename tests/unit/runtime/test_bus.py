@@ -58,6 +58,15 @@ def test_a_question_is_answered_by_who_listens_there() -> None:
     assert client.ask(Encoded("reactor/other/command/set_input", b"", ""), 1.0) == []
 
 
+def test_who_does_not_answer_within_the_time_is_not_waited_for_longer() -> None:
+    exchange = Exchange()
+    server, client = MemoryBus(exchange), MemoryBus(exchange)
+    server.answer("a/*", lambda request: None)
+    server.answer("a/b", lambda request: request.reply(CommandReply(accepted=True, text="here")))
+    (answer,) = client.ask(Encoded("a/b", b"", ""), 0.01)
+    assert CommandReply.FromString(answer.payload).text == "here"
+
+
 def test_a_token_is_seen_by_those_who_come_late_and_goes_with_its_bus() -> None:
     exchange, seen = Exchange(), list[tuple[str, bool]]()
     node, watcher = MemoryBus(exchange), MemoryBus(exchange)

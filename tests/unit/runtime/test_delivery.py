@@ -15,13 +15,14 @@ SECOND = 10**9
 
 
 def message(number: int) -> Numbered:
-    return Numbered(1, "reactor/x/sample", number, Encoded(str(number), b"", "", time.time_ns()))
+    sample = Encoded("reactor/x/sample/T", str(number).encode(), "", time.time_ns())
+    return Numbered(1, "reactor/x/sample", number, sample)
 
 
 def taken(heard: "SimpleQueue[Encoded | Gap]") -> list[str]:
     """The numbers that were handed on, so far."""
     items = [heard.get_nowait() for _ in range(heard.qsize())]
-    return [item.key for item in items if isinstance(item, Encoded)]
+    return [item.payload.decode() for item in items if isinstance(item, Encoded)]
 
 
 def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -55,7 +56,9 @@ def test_nothing_goes_on_before_it_is_known_what_was_before() -> None:
     delivery.receive(message(9))
     delivery.tell_last(message(8))
     delivery.tell(message(7))
+    assert not delivery.is_told()
     delivery.tell(message(8))
+    assert delivery.is_told()
     assert taken(heard) == []
     delivery.begin()
     assert taken(heard) == ["7", "8", "9"]

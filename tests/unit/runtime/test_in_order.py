@@ -1,17 +1,20 @@
 """What a node published goes on in that order, whatever comes late; and what never comes is told."""
 
 import random
+from collections.abc import Iterable
 
 import pytest
 
 from reactorwatch.runtime import in_order
-from reactorwatch.runtime.in_order import GATHER_NS, PATIENCE_NS, Gap, InOrder
+from reactorwatch.runtime.in_order import GATHER_NS, LOOK_AGAIN_NS, PATIENCE_NS, RECOVERY_NS, Gap, InOrder
 
 STREAM = "reactor/x/sample"
 
 
-def fed(order: InOrder[int], numbers: list[int], now_ns: int = 0, publisher: int = 1) -> list[int | Gap]:
-    return [item for number in numbers for item in order.arrive(publisher, STREAM, number, number, now_ns)]
+def fed(
+    order: InOrder[int], numbers: Iterable[int], now_ns: int = 0, publisher: int = 1, key: str = "T"
+) -> list[int | Gap]:
+    return [item for number in numbers for item in order.arrive(publisher, STREAM, key, number, number, now_ns)]
 
 
 def test_what_comes_in_order_goes_on_at_once() -> None:
@@ -77,9 +80,92 @@ def test_whatever_the_order_of_arrival_nothing_is_waited_for_that_is_over() -> N
         numbers = random.Random(seed).sample(range(1, 60), 30)
         for number in [0, *numbers]:
             now_ns += PATIENCE_NS // 10
-            list(order.arrive(1, STREAM, number, number, now_ns))
+            list(order.arrive(1, STREAM, "T", number, number, now_ns))
         while (due_ns := order.due_ns()) is not None:
             assert list(order.overdue(due_ns)), "it is due, and nothing happens"
+
+
+def test_a_key_that_is_recovered_long_after_the_others_still_takes_its_places() -> None:
+    """Three signals; after row 1 a link was down, and each publisher remembers the last 1,000 of 3,000 rows.
+
+    Zenoh hands on a key when its recovery is over, which takes up to ten seconds more for one than for another.
+    """
+    order = InOrder[int]()
+    fed(order, [0], key="qc")
+    fed(order, [1], key="C")
+    fed(order, [2], key="T")
+    assert fed(order, range(6000, 9000, 3), now_ns=0, key="qc") == []
+    assert fed(order, range(6001, 9000, 3), now_ns=1, key="C") == []
+    at_ns = 1
+    while (due_ns := order.due_ns()) is not None and due_ns < 2 * PATIENCE_NS:
+        assert list(order.overdue(due_ns)) == []
+        assert due_ns > at_ns
+        at_ns = due_ns
+    assert fed(order, range(6002, 9000, 3), now_ns=2 * PATIENCE_NS, key="T") == []
+    due_ns = 3 * PATIENCE_NS
+    assert list(order.overdue(due_ns)) == [Gap(STREAM, 1, 3, 5999, 5997, due_ns), *range(6000, 9000)]
+    assert order.due_ns() is None
+
+
+def test_a_key_that_has_fallen_silent_is_not_waited_for_for_ever() -> None:
+    order = InOrder[int]()
+    fed(order, [0], key="C")
+    fed(order, [1, 3], key="T")
+    assert list(order.overdue(PATIENCE_NS)) == []
+    assert order.due_ns() == PATIENCE_NS + LOOK_AGAIN_NS
+    assert list(order.overdue(RECOVERY_NS)) == [Gap(STREAM, 1, 2, 2, 1, RECOVERY_NS), 3]
+
+
+def test_what_every_key_has_passed_is_given_up_while_the_rest_is_waited_for() -> None:
+    order = InOrder[int]()
+    fed(order, [0, 4, 8], key="C")
+    fed(order, [5], key="T")
+    assert list(order.overdue(PATIENCE_NS)) == [Gap(STREAM, 1, 1, 3, 3, PATIENCE_NS), 4, 5]
+    assert fed(order, [7], now_ns=PATIENCE_NS, key="T") == []
+    due_ns = 2 * PATIENCE_NS
+    assert list(order.overdue(due_ns)) == [Gap(STREAM, 1, 6, 6, 1, due_ns), 7, 8]
+
+
+def test_what_is_missing_later_is_waited_for_as_long_by_itself() -> None:
+    order = InOrder[int]()
+    fed(order, [0], key="C")
+    fed(order, [1, 3], key="T")
+    fed(order, [5], now_ns=RECOVERY_NS - 1, key="T")
+    assert list(order.overdue(RECOVERY_NS)) == [Gap(STREAM, 1, 2, 2, 1, RECOVERY_NS), 3]
+    assert list(order.overdue(2 * RECOVERY_NS - 2)) == []
+    assert fed(order, [4], now_ns=2 * RECOVERY_NS - 2, key="C") == [4, 5]
+
+
+def test_a_silent_key_of_which_the_last_number_was_told_is_one_that_may_be_recovered() -> None:
+    order = InOrder[int](gathering=True)
+    order.tell_last(1, STREAM, "C", 3)
+    order.tell_last(1, STREAM, "T", 4)
+    assert list(order.gathered(0)) == []
+    fed(order, [6], key="T")
+    assert list(order.overdue(PATIENCE_NS)) == []
+    assert fed(order, [5], now_ns=PATIENCE_NS, key="C") == [5, 6]
+
+
+def test_keys_that_each_keep_their_order_make_one_order_whatever_is_lost_and_however_late_they_are() -> None:
+    """A fifth of all is lost; each key stands still at times, for less than a recovery takes."""
+    for seed in range(50):
+        draw = random.Random(seed)
+        order, now_ns, heard = InOrder[int](), 0, list[int | Gap]()
+        came = [number for number in range(1, 200) if draw.random() < 0.8]
+        waiting = {key: [number for number in came if number % 3 == key] for key in range(3)}
+        heard += fed(order, [0], key="0")
+        for key in (1, 2):
+            order.tell_last(1, STREAM, str(key), 0)
+        while any(waiting.values()):
+            now_ns += draw.randrange(RECOVERY_NS // 20)
+            key = draw.choice([key for key, rest in waiting.items() if rest])
+            burst, waiting[key] = waiting[key][:9], waiting[key][9:]
+            heard += fed(order, burst, now_ns, key=str(key))
+            heard += order.overdue(now_ns)
+        while (due_ns := order.due_ns()) is not None:
+            heard += order.overdue(due_ns)
+        assert [item for item in heard if isinstance(item, int)] == [0, *came]
+        assert sum(item.messages for item in heard if isinstance(item, Gap)) == came[-1] - len(came)
 
 
 def test_what_comes_after_it_was_given_up_goes_on_at_once() -> None:
@@ -87,6 +173,13 @@ def test_what_comes_after_it_was_given_up_goes_on_at_once() -> None:
     fed(order, [0, 2])
     list(order.overdue(PATIENCE_NS))
     assert fed(order, [1, 1, 3]) == [1, 3]
+    fed(order, range(4, 8004, 2))
+    due_ns = order.due_ns()
+    assert due_ns is not None
+    list(order.overdue(due_ns))
+    late = list(range(5, 8001, 2))
+    random.Random(1).shuffle(late)
+    assert fed(order, late) == late
 
 
 def test_what_comes_again_and_what_was_before_the_first_is_passed_over() -> None:
@@ -100,8 +193,8 @@ def test_who_begins_to_listen_hears_what_is_after_his_time_only() -> None:
     """Number 7 came live before the publisher said that it had come to 8; 9 after."""
     order = InOrder[int](gathering=True)
     assert fed(order, [7, 9]) == []
-    order.tell_last(1, STREAM, 6)
-    order.tell_last(1, STREAM, 8)
+    order.tell_last(1, STREAM, "T", 6)
+    order.tell_last(1, STREAM, "T", 8)
     assert order.due_ns() is None
     assert list(order.gathered(1)) == [9]
     assert fed(order, [3, 8, 10]) == [10]
@@ -109,7 +202,7 @@ def test_who_begins_to_listen_hears_what_is_after_his_time_only() -> None:
 
 def test_a_publisher_that_says_nothing_more_is_known_by_its_last_number() -> None:
     order = InOrder[int](gathering=True)
-    order.tell_last(1, STREAM, 8)
+    order.tell_last(1, STREAM, "T", 8)
     assert list(order.gathered(1)) == []
     assert fed(order, [0, 3, 8, 9]) == [9]
 
@@ -117,11 +210,40 @@ def test_a_publisher_that_says_nothing_more_is_known_by_its_last_number() -> Non
 def test_who_asks_for_what_was_before_hears_it_first_once_and_in_order() -> None:
     order = InOrder[int](gathering=True)
     assert fed(order, [1, 9, 10, 11]) == []
-    order.tell_last(1, STREAM, 9)
+    order.tell_last(1, STREAM, "T", 9)
     for number in (3, 6, 9, 4, 7, 10, 5, 8):
-        order.tell(1, STREAM, number, number)
+        order.tell(1, STREAM, "T", number, number)
     assert list(order.gathered(1)) == list(range(3, 12))
     assert fed(order, [2, 10, 12]) == [12]
+
+
+def test_what_was_before_is_told_when_nothing_is_missing_up_to_what_comes_live() -> None:
+    """Two keys by turns; 7 was published after its key was asked, and thrown away on the way."""
+    order = InOrder[int](gathering=True)
+    assert order.is_told()
+    order.tell_last(1, STREAM, "C", 4)
+    order.tell_last(1, STREAM, "T", 5)
+    for number, key in ((0, "C"), (2, "C"), (4, "C"), (1, "T"), (3, "T")):
+        order.tell(1, STREAM, key, number, number)
+        assert not order.is_told()
+    order.tell(1, STREAM, "T", 5, 5)
+    assert order.is_told()
+    fed(order, [6, 8], key="C")
+    fed(order, [9], key="T")
+    assert not order.is_told()
+    order.tell(1, STREAM, "T", 7, 7)
+    assert order.is_told()
+    assert list(order.gathered(0)) == list(range(10))
+
+
+def test_what_is_still_remembered_of_some_keys_only_goes_first_and_is_no_gap() -> None:
+    order = InOrder[int](gathering=True)
+    for number, key in ((1, "C"), (3, "C"), (5, "C"), (4, "T"), (6, "T")):
+        order.tell(1, STREAM, key, number, number)
+    assert order.is_told()
+    assert list(order.gathered(0)) == [1, 3, 4, 5, 6]
+    assert fed(order, [7]) == [7]
+    assert order.due_ns() is None
 
 
 def test_a_publisher_that_comes_while_others_are_asked_is_heard_from_its_beginning() -> None:
@@ -141,7 +263,7 @@ def test_publishers_and_streams_do_not_wait_for_each_other() -> None:
     order = InOrder[int]()
     fed(order, [0, 2])
     assert fed(order, [0, 1], publisher=2) == [0, 1]
-    assert list(order.arrive(1, "reactor/x/alarm", 0, 5, 0)) == [5]
+    assert list(order.arrive(1, "reactor/x/alarm", "ewma", 0, 5, 0)) == [5]
 
 
 def test_a_late_listener_gathers_as_long_as_older_ones_come_and_not_as_long_as_newer_ones_do() -> None:

@@ -73,6 +73,23 @@ def test_every_message_is_handed_over_in_order() -> None:
     assert [message.key for message in node.heard] == [f"in/{number}" for number in range(5000)]
 
 
+def test_a_question_is_answered_by_the_loop_of_the_node_while_who_asked_waits() -> None:
+    exchange, stop, ready = Exchange(), StopSignal(), threading.Event()
+    thread = threading.Thread(
+        target=serve,
+        args=(Echo(), MemoryBus(exchange), stop),
+        kwargs={"commands": ("command/*",), "on_ready": ready.set},
+    )
+    thread.start()
+    try:
+        assert ready.wait(WITHIN_S)
+        (answer,) = MemoryBus(exchange).ask(Encoded("command/say", b"heard", ""), WITHIN_S)
+    finally:
+        stop.set()
+        thread.join(WITHIN_S)
+    assert CommandReply.FromString(answer.payload).text == "heard"
+
+
 def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     """The inbox stays within its bound, and nothing is lost."""
     monkeypatch.setattr("reactorwatch.runtime.serve.LARGEST_INBOX", 100)
@@ -139,6 +156,29 @@ def test_lingering_hears_what_comes_within_it() -> None:
     serve(node, bus, stop, subscriptions=("in/**",), on_ready=later, linger_s=1.0)
     said[0].join()
     assert [message.key for message in node.heard] == ["in/late"]
+
+
+def test_a_node_that_is_finished_holds_nobody_up_who_still_publishes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("reactorwatch.runtime.serve.LARGEST_INBOX", 10)
+    exchange, ready = Exchange(), threading.Event()
+    node, speaker = Echo(messages=5), MemoryBus(exchange)
+    serving = threading.Thread(
+        target=serve,
+        args=(node, MemoryBus(exchange), StopSignal()),
+        kwargs={"subscriptions": ("in/*",), "on_ready": ready.set},
+    )
+    serving.start()
+    assert ready.wait(WITHIN_S)
+
+    def speak() -> None:
+        for _ in range(1000):
+            speaker.publish(Encoded("in/x", b"", ""))
+
+    speaking = threading.Thread(target=speak, daemon=True)
+    speaking.start()
+    serving.join(WITHIN_S)
+    speaking.join(WITHIN_S)
+    assert not speaking.is_alive()
 
 
 def test_a_bus_that_never_falls_silent_does_not_keep_a_node_from_ending() -> None:

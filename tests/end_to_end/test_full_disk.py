@@ -1,0 +1,71 @@
+"""A recorder that cannot write says so where operators look, and they can say that they have seen it."""
+
+import contextlib
+import json
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
+from reactorwatch.runtime.bus_zenoh import ZenohBus
+
+from .conftest import PATIENCE_S, REACTORWATCH, Command, Start, WaitAlive
+
+LARGEST_FILE = 64  # blocks: as if the disk were full then
+DISK = "recording/disk"
+
+
+@contextlib.contextmanager
+def recording(folder: Path, endpoint: str) -> Iterator[None]:
+    """A recorder that may write no more than so much to a file."""
+    settings = folder / "settings.toml"
+    settings.write_text(f'[recorder]\nout = "{folder}"\nresume_mb = 1e12\n')
+    command = f"ulimit -f {LARGEST_FILE}; exec {REACTORWATCH} record --config {settings} --endpoint {endpoint}"
+    process = subprocess.Popen(["sh", "-c", command], stderr=subprocess.PIPE)
+    try:
+        yield
+    finally:
+        process.terminate()
+        _, said = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, said.decode()
+
+
+def fill(bus: ZenohBus) -> None:
+    """Publish until the recorder's alarm comes."""
+    raised = threading.Event()
+    bus.subscribe(keys.key("cstr", keys.ALARM, DISK), lambda _: raised.set())
+    for number in range(10_000_000):
+        sample = Sample(time_ns=number, sequence=number, value=number / 7, quality=QUALITY_GOOD)
+        encoded: Encoded = encode(Publication(keys.key("cstr", keys.SAMPLE, "x"), sample))
+        bus.publish(encoded)
+        if number % 1000 == 0 and raised.wait(0.01):
+            return
+
+
+def test_a_full_disk_is_listed_with_the_other_alarms_and_can_be_acknowledged(
+    tmp_path: Path, bus: ZenohBus, endpoint: str, command: Command, start: Start, wait_alive: WaitAlive
+) -> None:
+    start("monitor", "--endpoint", endpoint)
+    with recording(tmp_path, endpoint):
+        wait_alive("cstr", "monitor", "recorder")
+        early = command("alarm", "acknowledge", DISK, "--by", "Ada", "--endpoint", endpoint)
+        assert (early.returncode, early.stderr) == (2, f"reactorwatch: alarm {DISK} has not come up\n")
+        fill(bus)
+        listed = [
+            json.loads(line) for line in command("alarm", "list", "--json", "--endpoint", endpoint).stdout.splitlines()
+        ]
+        (disk,) = [alarm for alarm in listed if alarm["alarm"] == DISK]
+        assert (disk["state"], disk["priority"]) == ("unacknowledged", "critical")
+        assert "shewhart/T" in {alarm["alarm"] for alarm in listed}
+        done = command("alarm", "acknowledge", DISK, "--by", "Ada", "--comment", "I make room", "--endpoint", endpoint)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert done.stdout.startswith(f"{DISK} (critical): acknowledged; ")
+        assert done.stdout.rstrip().endswith("Ada: I make room")
+        shelved = command("alarm", "shelve", DISK, "--by", "Ada", "--minutes", "5", "--endpoint", endpoint)
+        assert (shelved.returncode, shelved.stdout) == (2, "")
+        assert "can be acknowledged and nothing else" in shelved.stderr
+    gone = command("alarm", "acknowledge", DISK, "--by", "Ada", "--endpoint", endpoint)
+    assert (gone.returncode, gone.stderr.count("no recorder of plant 'cstr' answered")) == (2, 1)

@@ -1,0 +1,103 @@
+"""Plant, monitor and recorder on a real router; the recorder's link is cut, and its recording still replays."""
+
+import contextlib
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from benchmarks.link_cuts import Proxy, Router, connected
+from monitor_node.alarm_commands import COMMANDS
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from plant_node.__main__ import serve_plant
+from plant_node.config import PlantConfig
+from plant_node.node import PlantNode
+from plant_node.record import plant_from
+from reactorwatch.cli.processes import settings_text
+from reactorwatch.cli.verification import run
+from reactorwatch.contract import keys
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.serve import StopSignal, serve
+from recorder.__main__ import record
+from recorder.config import RecorderConfig
+
+WITHIN_S = 60.0
+PLANT = PlantConfig(
+    seed=5, speed=600.0, duration_min=60.0, faults=("coolant_flow:step:-0.08@30min",), wait_for=("monitor", "recorder")
+)
+MONITOR = MonitorConfig(training_min=15.0)
+
+
+@contextlib.contextmanager
+def running(work: Callable[[], object], stop: StopSignal) -> Iterator[None]:
+    """Something in a thread; it is asked to stop at the end and must then end."""
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join(WITHIN_S)
+    assert not thread.is_alive()
+
+
+def watch(bus_config: BusConfig, stop: StopSignal) -> None:
+    with contextlib.closing(connected(bus_config)) as bus:
+        serve(
+            Monitor(MONITOR, time.time_ns()),
+            bus,
+            stop,
+            subscriptions=(keys.all_of("cstr", keys.SAMPLE),),
+            commands=tuple(keys.key("cstr", keys.COMMAND, name) for name in COMMANDS),
+            on_ready=lambda: bus.announce(keys.key("cstr", keys.ALIVE, "monitor")),
+            linger_s=0.5,
+        )
+
+
+class Rows:
+    """How many rows of the plant were published."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._count = 0
+
+    def hear(self, _: object) -> None:
+        with self._changed:
+            self._count += 1
+            self._changed.notify_all()
+
+    def wait(self, count: int) -> None:
+        with self._changed:
+            assert self._changed.wait_for(lambda: self._count >= count, WITHIN_S), "the plant stands still"
+
+
+def test_a_run_that_was_recorded_over_a_cut_link_is_exact(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, rows = tmp_path / "run.mcap", Rows()
+    about = {"settings": settings_text({"monitor": MONITOR})}
+    config = RecorderConfig(out=str(path), about=about, black_box_min=0.0, linger_s=2.0)
+    endpoint = free_endpoint()
+    direct = BusConfig(endpoint=endpoint)
+    with contextlib.closing(Router(endpoint)), contextlib.closing(connected(direct)) as bus:
+        proxy = Proxy(endpoint)
+        watching, recording = StopSignal(), StopSignal()
+        bus.subscribe(keys.key("cstr", keys.SAMPLE, "T"), rows.hear)
+        with (
+            contextlib.closing(proxy),
+            running(lambda: record(config, BusConfig(endpoint=proxy.endpoint), recording), recording),
+            running(lambda: watch(direct, watching), watching),
+            contextlib.closing(connected(direct)) as plant_bus,
+        ):
+            plant = PlantNode(plant_from(PLANT), PLANT, lambda _: None)
+            with running(lambda: serve_plant(plant, PLANT, plant_bus, StopSignal()), StopSignal()):
+                rows.wait(250)
+                with proxy.cut("closed"):
+                    rows.wait(400)
+                rows.wait(600)
+    assert run(path, None, None, as_json=True) == 0
+    told = json.loads(capsys.readouterr().out.splitlines()[-1])
+    assert (told["exact"], told["rows"], told["notes"]) == (True, 600, [])
