@@ -4,12 +4,17 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 import structlog
 
 ROOT = Path(__file__).parents[1]
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command does: the last bits depend on it
+
+# a test says nothing of speed, and one that fails must fail again
+hypothesis.settings.register_profile("reactorwatch", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("reactorwatch")
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from monitor_node.identification.structure import RowChoice, Structure
 PERIOD_NS = 100
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.data())
 def test_stream_and_record_agree(data: st.DataObject) -> None:
     """Random structures, row choices, missing values and gaps: the same rows, the same numbers."""

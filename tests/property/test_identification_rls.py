@@ -20,7 +20,7 @@ def rows_of(elements: st.SearchStrategy[float]) -> st.SearchStrategy[NDArray[np.
     return st.integers(1, 30).flatmap(lambda rows: arrays(np.float64, (rows, N + 1), elements=elements))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(rows_of(SCALED), FORGETTING, st.sampled_from([1e-2, 1.0, 1e6]))
 def test_scaled_rows_never_take_the_covariance_out_of_its_bounds(
     rows: NDArray[np.float64], forgetting: float, limit: float
@@ -34,7 +34,7 @@ def test_scaled_rows_never_take_the_covariance_out_of_its_bounds(
         assert np.all(np.diag(rls.covariance) > 0.0)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(rows_of(ANY), FORGETTING, st.sampled_from([1e-2, 1e6, None]))
 def test_whatever_is_accepted_leaves_finite_numbers(
     rows: NDArray[np.float64], forgetting: float, limit: float | None
@@ -50,7 +50,7 @@ def test_whatever_is_accepted_leaves_finite_numbers(
     assert np.all(np.diag(rls.covariance) > 0.0)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(rows_of(ANY), FORGETTING, st.data())
 def test_stored_at_any_row_it_goes_on_with_the_same_bits(
     rows: NDArray[np.float64], forgetting: float, data: st.DataObject
@@ -67,7 +67,7 @@ def test_stored_at_any_row_it_goes_on_with_the_same_bits(
     assert resumed.state == straight.state
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(rows_of(ANY), FORGETTING, st.integers(1, 70), st.data())
 def test_in_a_bank_a_plant_has_the_bits_of_its_own(
     rows: NDArray[np.float64], forgetting: float, plants: int, data: st.DataObject

@@ -29,14 +29,14 @@ def faults(draw: st.DrawFn) -> FaultSpecification:
     return FaultSpecification(effect, profile, values)
 
 
-@settings(derandomize=True, max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(faults())
 def test_written_and_read_it_is_the_same(fault: FaultSpecification) -> None:
     assert parse_fault(str(fault)) == fault
     assert str(parse_fault(str(fault))) == str(fault)
 
 
-@settings(derandomize=True, max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.floats(-1e4, 1e4), st.sampled_from([("s", 60.0), ("min", 1.0), ("h", 1 / 60)]))
 def test_units_of_time_are_the_same_time(minutes: float, unit: tuple[str, float]) -> None:
     name, per_minute = unit
@@ -44,7 +44,7 @@ def test_units_of_time_are_the_same_time(minutes: float, unit: tuple[str, float]
     assert math.isclose(found, minutes, rel_tol=1e-12, abs_tol=1e-300)
 
 
-@settings(derandomize=True, max_examples=500, deadline=None)
+@settings(max_examples=500)
 @given(st.text(alphabet="coolant_flow:step=-0.5@3min,eE+ \n\t'\"\u0664\u00b2", max_size=40) | st.text(max_size=20))
 def test_any_text_is_a_fault_or_one_line_that_says_why_not(text: str) -> None:
     for start, end in (

@@ -15,7 +15,7 @@ any_flows = st.lists(st.floats(0.0, 500.0), min_size=2, max_size=30)
 operating_flows = st.lists(st.floats(90.0, 111.0), min_size=2, max_size=30)
 
 
-@settings(derandomize=True, max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(any_flows, st.floats(0.0, 1.5), st.floats(350.0, 560.0))
 def test_any_input_keeps_within_the_bounds_of_mass_and_energy(flows: list[float], C0: float, T0: float) -> None:
     """C: nothing makes A. T: not below feed and coolant; and Z = T + (K1/k0) C is not changed by the reaction.
@@ -32,7 +32,7 @@ def test_any_input_keeps_within_the_bounds_of_mass_and_energy(flows: list[float]
     assert (T + ADIABATIC_RISE * C).max() <= max(T0 + ADIABATIC_RISE * C0, TF + ADIABATIC_RISE * CF) + 1e-3
 
 
-@settings(derandomize=True, max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(operating_flows, st.lists(st.floats(0.0, 1.0), min_size=1, max_size=40))
 def test_more_rows_in_between_change_nothing(flows: list[float], shares: list[float]) -> None:
     """A row put between two others, with the same input, is only another place to look."""

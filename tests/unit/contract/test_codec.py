@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import reactorwatch.contract
@@ -69,7 +69,6 @@ def test_bytes_of_yesterday_still_read(name: str) -> None:
     st.floats(allow_nan=False),
     st.text(max_size=10),
 )
-@settings(derandomize=True)
 def test_a_sample_comes_back_as_it_went(time_ns: int, sequence: int, value: float, unit: str) -> None:
     sample = messages.Sample(time_ns=time_ns, sequence=sequence, value=value, unit=unit, quality=messages.QUALITY_GOOD)
     encoded = encode(Publication("reactor/cstr/sample/T", sample))

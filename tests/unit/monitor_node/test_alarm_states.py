@@ -58,7 +58,7 @@ def test_every_state_has_its_value_on_the_bus() -> None:
 
 
 @given(st.lists(st.sampled_from(Event), max_size=60))
-@settings(derandomize=True, max_examples=300)
+@settings(max_examples=300)
 def test_no_sequence_of_events_leaves_the_table_or_loses_the_condition(events: list[Event]) -> None:
     state, standing = State.NORMAL, False
     for event in events:
