@@ -7,7 +7,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
-from recorder.black_box import BlackBox
+from recorder.black_box import BlackBox, Stretch
 from recorder.core import Kept, Recorder
 from recorder.files import RecordingFiles
 from recorder.filing import Filing
@@ -68,8 +68,7 @@ class RecorderNode:
         if kept.message is not None:
             self._head.remember(kept.entry, kept.message)
             over = self._black_box.on_message(kept.message, kept.entry.log_time_ns)
-            if over is not None:
-                self._files.keep_for_good(over)
+            told += self._keep_for_good(over, now_ns)
         return told
 
     def on_gap(self, gap: Gap, now_ns: int) -> list[Publication]:
@@ -90,9 +89,7 @@ class RecorderNode:
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Flush the file, look for room on a full disk, keep a stretch for good, report health: each when it is due."""
         told = self._try_again(now_ns) if self._core.is_stopped else self._see_to_file(now_ns)
-        over = self._black_box.over(now_ns)
-        if over is not None:
-            self._files.keep_for_good(over)
+        told += self._keep_for_good(self._black_box.over(now_ns), now_ns)
         if now_ns >= self._next_health_ns:
             self._next_health_ns = now_ns + self._health_period_ns
             told.append(self._core.health(now_ns))
@@ -113,14 +110,21 @@ class RecorderNode:
         """Write and send the last report."""
         last = self._core.health(now_ns, phase="stopped")
         told = self.on_message(encode(last), now_ns)
-        over = self._black_box.close()
-        if over is not None:
-            try:
-                self._files.flush()
-            except WriteError as error:
-                told += self._stop(error, now_ns)
-            self._files.keep_for_good(over)
+        told += self._keep_for_good(self._black_box.close(), now_ns)
         return [*told, last]
+
+    def _keep_for_good(self, over: Stretch | None, now_ns: int) -> list[Publication]:
+        """Have a stretch copied that is over, after all of it was handed over."""
+        if over is None:
+            return []
+        told: list[Publication] = []
+        try:
+            self._files.flush()
+            self._filing.flushed()
+        except WriteError as error:
+            told = self._stop(error, now_ns)
+        self._files.keep_for_good(over)
+        return told
 
     def _write(self, kept: Kept, now_ns: int) -> list[Publication]:
         if self._core.is_stopped:

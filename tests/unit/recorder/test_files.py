@@ -14,6 +14,7 @@ from reactorwatch.contract.codec import Publication, decode, encode
 from reactorwatch.errors import InputError
 from recorder.entry import Entry
 from recorder.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record, recordings_in
+from recorder.mcap_scan import Scan
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import MINUTE, SECOND, Fed, recorder
 
@@ -156,6 +157,22 @@ def test_a_stretch_that_is_not_over_when_the_recorder_stops_is_kept_as_far_as_it
     fed.stop()
     (box,) = (tmp_path / "black-box").iterdir()
     assert len(of_others(box)) == 9
+
+
+def test_all_of_a_stretch_is_in_the_file_when_it_is_copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its last sample came a moment before its end, and would be flushed later."""
+    fed = recorder(tmp_path / "run.mcap", START, black_box_min=0.5, flush_period_s=1.0)
+    there: list[int] = []
+    part = tmp_path / "run.mcap.part"
+    monkeypatch.setattr(
+        fed.files, "keep_for_good", lambda _: there.append(sum("/sample/" in x.channel.topic for x in Scan(part)))
+    )
+    fed.hear([alarm("ewma/T")], SECOND)
+    fed.pass_time(29 * SECOND)
+    fed.hear(samples(1), 9 * SECOND // 10)
+    fed.pass_time(SECOND // 5)
+    assert there == [1]
+    fed.stop()
 
 
 def killed(folder: Path, count: int) -> Fed:
