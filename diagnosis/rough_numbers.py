@@ -39,8 +39,8 @@ between two values tried."""
 HOLLOWS, APART_ROWS = 3, 20
 """How many onsets of effects with memory are tried, and by how much they differ."""
 
-WITHIN_ROW = 12.0**-0.5
-"""Of a row, the standard deviation of where in it something sets in: the fit takes its mean over the row."""
+WITHIN_ROW = 0.15
+"""Of a row, the least standard deviation of an onset: the fit takes the mean over the row for what acts in part of it."""
 
 LARGEST_SHARE = 0.05
 """Of the record, for the first look to either side."""
@@ -76,7 +76,7 @@ def settled(search: Search, best: Explained, sds: Sequence[Array]) -> tuple[Expl
             reach = min(float(np.hypot(sd, course.period_min)), LARGEST_SHARE * search.run.span_min)
             bounds = (course.begin_min, course.end_min)
             best, sd = _Scan(search, place, number, reach, bounds).settled(best)
-            rough[number] = float(np.hypot(sd, WITHIN_ROW * course.period_min))
+            rough[number] = max(sd, WITHIN_ROW * course.period_min)
         found.append(rough)
     return best, found
 
