@@ -40,7 +40,7 @@ HOLLOWS, APART_ROWS = 3, 20
 """How many onsets of effects with memory are tried, and by how much they differ."""
 
 WITHIN_ROW = 0.15
-"""Of a row, the least standard deviation of an onset: the fit takes the mean over the row for what acts in part of it."""
+"""Of a row, the least standard deviation of an onset: what acts in part of a row is taken for its mean over the row."""
 
 LARGEST_SHARE = 0.05
 """Of the record, for the first look to either side."""
