@@ -44,3 +44,13 @@ def test_after_a_break_it_begins_with_all_that_is_measured() -> None:
     assert np.all(np.isnan(found.prediction[300]))
     assert np.all(np.isfinite(w[305:]))
     assert np.max(np.abs(w[305:])) < 6.0
+
+
+def test_what_was_true_before_a_break_is_held_against_no_delay() -> None:
+    """In three rows in twenty the analyser shows what nobody can know; the right delay is likeliest nevertheless."""
+    run = run_of("concentration_delay:constant:0.3", rows=1200)
+    broken = Run(run.time_min, run.inputs, run.measured, breaks=tuple(range(20, 1200, 20)))
+    course = Constant(run.time_min)
+    late = Sized(cstr(), (DELAY,), SENSORS)
+    losses = {delay: late.follow(broken, [course.signal(np.array([delay]))])[0] for delay in (0.1, 0.2, 0.3, 0.4, 0.5)}
+    assert min(losses, key=lambda delay: losses[delay]) == 0.3

@@ -11,7 +11,7 @@ from diagnosis.forcing import Forcing
 from diagnosis.hypothesis import Hypothesis
 from diagnosis.run import Run
 from diagnosis.sized import Sized
-from diagnosis.unknown import Located, located
+from diagnosis.unknown import Located, input_answers, located
 from diagnosis.wandering import Noise
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
@@ -125,3 +125,13 @@ def test_a_size_may_depend_on_what_its_own_terms_depend_on(name: str, sees: tupl
     model = cstr()
     names = (*model.state_names, *model.input_names)
     assert tuple(names[place] for place in Forcing(model, effect_of(name)).sees) == sees
+
+
+@pytest.mark.parametrize(("gain", "answers"), [(0.0, False), (5.0, True)])
+def test_a_controller_s_answer_in_the_same_row_is_noticed(gain: float, answers: bool) -> None:
+    """Its input tells of the noise of what it answers, and not of the plant."""
+    run = run_of(cstr())
+    noise = Noise((0.002, 0.3), (0.0, 0.0))
+    answered = Run(run.time_min, run.inputs + gain * (run.measured[:, 1:] - 438.5), run.measured)
+    nominal = Hypothesis(Sized(cstr(), (), noise), ()).at(run, ())
+    assert input_answers(answered, nominal) is answers
