@@ -1,9 +1,9 @@
 """Two causes at once.
 
 Two deviations that are there together can look like a third one, and then the best single cause is neither of them. So
-all pairs are screened together (`pair_screen`), about the run of the best single cause, and the best are fitted roughly,
-with curves that can be anything. Of the best of these each cause takes the simplest course that does, and about its run,
-where linear equations hold, all pairs are screened again.
+all pairs are screened together (`pair_screen`), about the run of the best single cause, and the best are fitted
+roughly, with curves that can be anything. Of the best of these each cause takes the simplest course that does, and
+about its run, where linear equations hold, all pairs are screened again.
 
 A curve can take what belongs to the other cause. So if one is left, a pair is grown without curves too, from the best
 single cause of a simple course, and the likelier of the two goes on. In the end each of the two is exchanged, the other
