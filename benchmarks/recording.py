@@ -1,13 +1,12 @@
 """Does the recorder keep up, and what does it cost over the bare MCAP library?
 
 Printed are ratios measured in one run, because the machine's speed is not ours: recorded over published at 20,000
-messages/s through a real router; writing and reading over the bare library's; drawing in seconds a million samples.
+messages/s through a real router; writing and reading over the bare library's.
 
     python benchmarks/recording.py
 """
 
 import contextlib
-import resource
 import signal
 import subprocess
 import sys
@@ -39,8 +38,6 @@ from recorder.entry import Entry
 from recorder.filing import Fsync
 from recorder.mcap_file import RecordingWriter, read_messages, read_metadata, read_record
 from recorder.part_file import PartFile
-from recorder.rerun_file import write_rrd
-from recorder.run import read_run
 
 RATE_PER_S = 20_000
 SECONDS = 5
@@ -168,12 +165,6 @@ def files(folder: Path) -> None:
     print(f"reading decoded / bare reader, in order  {decoded / ordered:5.2f}   ({decoded:,.0f} messages/s)")
     print(f"reading as a record / bare, in order     {record_rate / ordered:5.2f}   ({record_rate:,.0f} messages/s)")
     assert read_metadata(ours)
-    start = time.perf_counter()
-    write_rrd(read_run(read_messages(ours)), folder / "ours.rrd")
-    seconds = time.perf_counter() - start
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    per_million_s = seconds * 1e6 / MESSAGES
-    print(f"dashboard of a million samples           {per_million_s:5.1f} s (this process peaks at {peak_mb:.0f} MB)")
 
 
 class Timed(PartFile):

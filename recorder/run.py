@@ -1,25 +1,17 @@
-"""A recording as columns, for drawing. Pure.
+"""A run as columns, for drawing: the whole of it, or a stretch. Pure.
 
-One pass over the messages; the numbers go into growing arrays, so that a run of millions of samples costs a few bytes
-a number and not an object each.
+It is drawn stretch by stretch, so that a recording larger than memory can be, and a run that has not ended. A stretch
+therefore says of what was before it what panels need to go on where they were.
 """
 
-from array import array
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
-from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import DecodeError, Encoded, decode
-from reactorwatch.errors import InputError
-from reactorwatch.records.record import UNITS
-from recorder.entry import Entry
-from recorder.measurement import measured
 
 Times = NDArray[np.int64]
 Values = NDArray[np.float64]
@@ -66,6 +58,15 @@ class Charted:
     out: Values
 
 
+@dataclass(frozen=True)
+class Reconstructed:
+    """What a signal would read if its sensor were right, shape (points,), while its sensor is suspected."""
+
+    time_ns: Times
+    value: Values
+    sd: Values
+
+
 class AlarmChange(NamedTuple):
     """A change of an alarm: its state is a `messages.AlarmState`, `event` says what made it."""
 
@@ -88,9 +89,63 @@ class FaultChange(NamedTuple):
     onset_ns: int
 
 
+class Snapshot(NamedTuple):
+    """An identified model of a signal; parameters by name: (value, standard deviation)."""
+
+    time_ns: int
+    parameters: Mapping[str, tuple[float, float]]
+    excitation: float
+    condition: float
+
+
+class Report(NamedTuple):
+    """How a node does.
+
+    Attributes:
+        time_ns: of the newest sample when the report was received: a node speaks by the clock, a run goes by the time
+            of its samples, and at an accelerated plant the two have nothing in common.
+        phase: a word.
+        lag_ms: between receipt and the end of the work on it.
+        counts: what went wrong, by its name.
+    """
+
+    time_ns: int
+    phase: str
+    lag_ms: float
+    counts: Mapping[str, int]
+
+
+class Seen(NamedTuple):
+    """What there has been of a signal so far: how many values, their mean, and between what they were."""
+
+    rows: int
+    mean: float
+    lowest: float
+    highest: float
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """What was before a stretch.
+
+    Attributes:
+        first_ns: time of the first sample; None: there was none.
+        last: the newest two samples of each signal: what is measured together may be cut apart.
+        states: of alarms that have spoken.
+        suspected_ns: when suspects were told last.
+        onset_ns: when the first fault sets in, or has.
+    """
+
+    first_ns: int | None = None
+    last: Mapping[str, Measured] = field(default_factory=dict)
+    states: Mapping[str, int] = field(default_factory=dict)
+    suspected_ns: int | None = None
+    onset_ns: int | None = None
+
+
 @dataclass(frozen=True)
 class Run:
-    """One plant's run.
+    """One plant's run, or a stretch of it.
 
     Attributes:
         plant: its name; empty if there is nothing of it.
@@ -100,6 +155,12 @@ class Run:
         charts: by the name of the chart and the signal, `ewma/T`.
         alarms: in order of time.
         faults: in order of time.
+        reconstructed: by signal.
+        models: snapshots in order of time, by the signal and whether it is the model that alarms are judged by.
+        health: reports in order of time, by node.
+        seen: of each signal, up to the end of the stretch.
+        earlier: what was before it.
+        counted_from_ns: the time that its minutes count from; None: its first sample.
     """
 
     plant: str
@@ -109,6 +170,12 @@ class Run:
     charts: dict[str, Charted]
     alarms: tuple[AlarmChange, ...]
     faults: tuple[FaultChange, ...]
+    reconstructed: dict[str, Reconstructed] = field(default_factory=dict)
+    models: dict[tuple[str, bool], tuple[Snapshot, ...]] = field(default_factory=dict)
+    health: dict[str, tuple[Report, ...]] = field(default_factory=dict)
+    seen: dict[str, Seen] = field(default_factory=dict)
+    earlier: Earlier = Earlier()
+    counted_from_ns: int | None = None
 
     @property
     def span_ns(self) -> tuple[int, int]:
@@ -116,105 +183,12 @@ class Run:
         series = [item.time_ns for item in self.measured.values()]
         return (min(int(t[0]) for t in series), max(int(t[-1]) for t in series)) if series else (0, 0)
 
+    @property
+    def first_ns(self) -> int:
+        """The time of the run's first sample, which may have been in an earlier stretch; 0 if there is none."""
+        return self.span_ns[0] if self.earlier.first_ns is None else self.earlier.first_ns
 
-def read_run(recording: Iterable[Entry | Encoded]) -> Run:
-    """The run that a recording tells of.
-
-    Args:
-        recording: the messages of one plant, in any order; those of other kinds, and what cannot be decoded, are
-            passed over.
-
-    Raises:
-        InputError: the messages are of several plants.
-    """
-    series: dict[str, _Series | None] = {}
-    plants: set[str] = set()
-    alarms: list[AlarmChange] = []
-    faults: list[FaultChange] = []
-    for entry in recording:
-        if entry.key not in series:
-            series[entry.key] = _Series.of(entry.key)
-        into = series[entry.key]
-        if into is None:
-            continue
-        try:
-            message: Any = decode(entry.payload, entry.encoding)
-        except DecodeError:
-            continue
-        if type(message) is not _KINDS[into.topic.kind].message:
-            continue
-        plants.add(into.topic.plant)
-        if into.topic.kind == keys.ALARM:
-            alarms.append(AlarmChange(*(getattr(message, name) for name in AlarmChange._fields)))
-        elif into.topic.kind == keys.FAULT:
-            faults.append(FaultChange(*(getattr(message, name) for name in FaultChange._fields)))
-        else:
-            into.append(message)
-    if len(plants) > 1:
-        raise InputError(f"a run is of one plant; name one of {', '.join(sorted(plants))}")
-    found = [item for item in series.values() if item is not None]
-
-    def of_kind(kind: str) -> Iterator[tuple[str, list[Any]]]:
-        return ((item.topic.name, item.in_order()) for item in found if item.topic.kind == kind and item.times)
-
-    return Run(
-        plant=next(iter(plants), ""),
-        units=UNITS | {item.topic.name: item.unit for item in found if item.unit},
-        measured={name: Measured(*columns) for name, columns in of_kind(keys.SAMPLE)},
-        estimated={name: Estimated(*columns) for name, columns in of_kind(keys.ESTIMATE)},
-        charts={name: Charted(*columns) for name, columns in of_kind(keys.CHART)},
-        alarms=tuple(sorted(alarms, key=lambda change: change.time_ns)),
-        faults=tuple(sorted(faults, key=lambda change: change.time_ns)),
-    )
-
-
-class _Kind(NamedTuple):
-    message: type[Message]
-    numbers: Callable[[Any], tuple[float, ...]] = lambda message: ()  # in the order of the fields above
-
-
-_KINDS = {
-    keys.SAMPLE: _Kind(messages.Sample, lambda m: () if (value := measured(m)) is None else (value,)),
-    keys.ESTIMATE: _Kind(messages.Estimate, lambda m: (m.prediction, m.residual, m.lower_limit, m.upper_limit)),
-    keys.CHART: _Kind(
-        messages.ChartPoint, lambda m: (m.statistic, m.centre, m.lower_limit, m.upper_limit, float(m.out))
-    ),
-    keys.ALARM: _Kind(messages.Alarm),
-    keys.FAULT: _Kind(messages.Fault),
-}
-
-
-class _Series:
-    """The numbers of one key, as they come."""
-
-    def __init__(self, topic: keys.Topic) -> None:
-        self.topic = topic
-        self.unit = ""
-        self.times = array("q")
-        self._numbers = array("d")  # those of a message side by side
-        self._of = _KINDS[topic.kind].numbers
-
-    @classmethod
-    def of(cls, key: str) -> "_Series | None":
-        """The series of a key; None if there is nothing to draw of it."""
-        topic = keys.parse(key)
-        return cls(topic) if topic is not None and topic.kind in _KINDS else None
-
-    def append(self, message: Any) -> None:
-        """Add a message's numbers, if it has any."""
-        numbers = self._of(message)
-        if not numbers:
-            return
-        if not self.times:
-            self.unit = getattr(message, "unit", "")
-        self.times.append(message.time_ns)
-        self._numbers.extend(numbers)
-
-    def in_order(self) -> list[NDArray[Any]]:
-        """The times and the columns, in order of time."""
-        times = np.array(self.times, np.int64)
-        columns = list(np.array(self._numbers).reshape(times.size, -1).T.copy())
-        if (np.diff(times) < 0).any():
-            order = np.argsort(times, kind="stable")
-            return [times[order], *(column[order] for column in columns)]
-        return [times, *columns]
+    @property
+    def zero_ns(self) -> int:
+        """The time that its minutes count from."""
+        return self.first_ns if self.counted_from_ns is None else self.counted_from_ns

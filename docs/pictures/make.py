@@ -8,24 +8,32 @@ import sys
 import tempfile
 from pathlib import Path
 
-from recorder.picture import render_png
+from PIL import Image
 
 FOLDER = Path(__file__).parent
+COLOURS = 255
+"""Of a picture, rare ones kept: a dashboard has few, and the file becomes a third."""
 
 
 def main() -> int:
     """Make the study, run the demonstration and draw it; returns an exit code."""
     command = str(Path(sys.executable).with_name("reactorwatch"))
-    study = subprocess.run([command, "reproduce", "-o", str(FOLDER.parent)], check=False)  # noqa: S603 (our own command)
-    if study.returncode:
-        return study.returncode
     with tempfile.TemporaryDirectory() as temporary:
-        run = Path(temporary) / "run"
-        demo = [command, "demo", "--out", str(run), "--speed", "max"]
-        done = subprocess.run(demo, check=False)  # noqa: S603 (as above)
-        if done.returncode:
-            return done.returncode
-        render_png(run / "demo.rrd", FOLDER / "dashboard.png", width=1600, height=1000)
+        run, tabs = Path(temporary) / "run", Path(temporary) / "tabs"
+        recording, diagnosis = run / "demo.mcap", run / "diagnosis"
+        for arguments in (
+            ("reproduce", "-o", FOLDER.parent),
+            ("demo", "--out", run),
+            ("dashboard", recording, "-o", run / "demo.rrd", "--diagnosis", diagnosis, "--png", tabs),
+        ):
+            done = subprocess.run([command, *map(str, arguments)], check=False)  # noqa: S603 (our own command)
+            if done.returncode:
+                return done.returncode
+        for picture in sorted(tabs.iterdir()):
+            with Image.open(picture) as image:
+                image.convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE).save(
+                    FOLDER / picture.name, optimize=True
+                )
     return 0
 
 

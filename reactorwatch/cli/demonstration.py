@@ -176,21 +176,22 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: Path, folder: Path, pl
 
 
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
-    """Draw the recording, diagnose it, read from it what happened, and write that down."""
+    """Diagnose the recording, draw it, read from it what happened, and write that down."""
     from diagnosis.report.words import verdict
-    from reactorwatch.cli.diagnosis import MODEL, PAGE, cases, diagnosed
+    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, cases, diagnosed
     from reactorwatch.process import effects_of
-    from recorder.rerun_file import write_rrd
-    from recorder.run import read_run
+    from recorder.dashboard.file import write_rrd
+    from recorder.run_reader import stretches
 
     drawing = recording.with_suffix(".rrd")
-    with task("drawing and checking"):
-        write_rrd(read_run(messages(recording, PLANT)), drawing)
+    with task("checking"):
         first_ns, faults, alarms = _events(recording)
         again = backtest.run(messages(recording, PLANT), monitor)
     with task("diagnosing"):
         (case,) = cases([recording], PLANT, {}, None, folder / DIAGNOSIS_FOLDER)
         diagnosis, _ = diagnosed(case)
+    with task("drawing"):
+        write_rrd(stretches(messages(recording, PLANT)), drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)
     same = [alarm.SerializeToString() for alarm in alarms] == [
         alarm.SerializeToString() for alarm in again.alarm_messages
     ]

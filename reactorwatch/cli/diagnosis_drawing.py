@@ -9,8 +9,8 @@ from diagnosis.report.pictures import interval
 from diagnosis.result import SD_95, Curves, Diagnosis
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record, to_time_ns
+from recorder.dashboard.file import DIAGNOSIS, write_views
 from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Series, TimePlot
-from recorder.rerun_file import write_views
 
 
 def write_drawing(diagnosis: Diagnosis, model: ProcessModel, measured: Record, path: Path) -> None:
@@ -41,7 +41,7 @@ def write_drawing(diagnosis: Diagnosis, model: ProcessModel, measured: Record, p
         )
         for item in model.inputs
     ]
-    write_views({"Diagnosis": views}, path, f"diagnosis of {measured.name}", int(time_ns[0]))
+    write_views({DIAGNOSIS: views}, path, int(time_ns[0]))
 
 
 def _outputs(curves: Curves, model: ProcessModel, time_ns: NDArray[np.int64]) -> list[TimePlot]:
@@ -52,7 +52,7 @@ def _outputs(curves: Curves, model: ProcessModel, time_ns: NDArray[np.int64]) ->
             (
                 Series("measured", time_ns, curves.measured[item.name], MEASURED, width=2.5),
                 Series("simulation as it was", time_ns, curves.free_before[item.name], ALARM, width=1.0),
-                Series("extended simulation", time_ns, curves.free_after[item.name], PREDICTED, width=1.0),
+                Series("simulation extended", time_ns, curves.free_after[item.name], PREDICTED, width=1.0),
             ),
         )
         for item in model.outputs
@@ -85,5 +85,6 @@ def _causes(diagnosis: Diagnosis, curves: Curves, time_ns: NDArray[np.int64]) ->
             Series("lower end", time_ns, lower, LIMIT, width=1.0, legend="95 % interval"),
             Series("most likely", time_ns, curves.deviation[cause.cause], PREDICTED),
         )
-        found.append(TimePlot(f"Size of: {cause.label}", cause.parameters["size"].unit, series))
+        unit = cause.parameters["size"].unit
+        found.append(TimePlot(f"Size of: {cause.label}", unit if unit != "1" else "", series))
     return found

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Columns, Plant, columns, existing, existing_recording, new_file
+from reactorwatch.errors import InputError
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
 
@@ -23,17 +24,35 @@ def dashboard(
     ],
     out: Out,
     plant: Plant = None,
+    diagnosis: Annotated[
+        Path | None,
+        typer.Option(help="The report of a diagnosis of it (a folder), drawn into a tab.", show_default=False),
+    ] = None,
+    png: Annotated[
+        Path | None, typer.Option(help="A folder for a picture of each tab, without a screen.", show_default=False)
+    ] = None,
 ) -> None:
     """Draw a recording into a Rerun file, without a screen."""
+    from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.sources import messages
-    from recorder.rerun_file import write_rrd
-    from recorder.run import read_run
+    from reactorwatch.cli.sources import counted_from_ns, messages
+    from recorder.dashboard.file import write_rrd
+    from recorder.dashboard.picture import render_tabs
+    from recorder.run_reader import stretches
 
     out = new_file(out)
+    drawn = existing(diagnosis / DRAWING) if diagnosis is not None else None
+    if png is not None and png.exists() and not png.is_dir():
+        raise InputError(f"--png {png}: is a file, the name of a folder was expected")
     with task(f"drawing {file.name}"):
-        write_rrd(read_run(messages(existing_recording(file), plant)), out)
+        run = stretches(messages(existing_recording(file), plant), counted_from_ns=counted_from_ns(file))
+        write_rrd(run, out, diagnosis=drawn)
     typer.echo(f"wrote {out}")
+    if png is not None:
+        with task("rendering"):
+            pictures = render_tabs(out, png)
+        for picture in pictures:
+            typer.echo(f"wrote {picture}")
 
 
 def import_csv(

@@ -104,6 +104,20 @@ def zero_of(path: Path, first_ns: int) -> int:
     return 0 if kind(path) == "csv" else first_ns
 
 
+def counted_from_ns(path: Path) -> int | None:
+    """The time that a file's minutes count from, where it says so; None: its first sample.
+
+    Raises:
+        InputError: as `messages`.
+    """
+    if kind(path) == "csv":
+        return 0
+    from recorder.mcap_file import ZERO_NS, read_metadata
+
+    said = read_metadata(path).get(ZERO_NS, "")
+    return int(said) if said.isdecimal() else None
+
+
 def kind(path: Path) -> str:
     """`csv` or `mcap`, by the file's ending; a folder is of recordings.
 

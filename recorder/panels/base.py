@@ -1,8 +1,12 @@
-"""What a panel says of a run: plain descriptions, which know nothing of the program that draws them."""
+"""What a panel says of a run: plain descriptions, which know nothing of the program that draws them.
 
-from collections.abc import Callable
+A run is described stretch by stretch. What has a time is added to what there is; a view of the same title is the same
+view.
+"""
+
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +31,12 @@ INPUT = Colour(0, 158, 115)
 LIMIT = Colour(150, 150, 150)
 RESIDUAL = Colour(204, 121, 167)
 ALARM = Colour(213, 94, 0)
-FAULT = Colour(240, 228, 66)
+FAULT = Colour(225, 200, 30)
 QUIET = Colour(150, 150, 150)
+STABLE = Colour(60, 200, 140)
+UNSTABLE = Colour(225, 130, 190)
+SEVERAL = (MEASURED, PREDICTED, INPUT, RESIDUAL, FAULT, ALARM)
+"""For lines that are alike, one after the other."""
 
 
 class Series(NamedTuple):
@@ -85,13 +93,30 @@ class EventLog(NamedTuple):
     events: tuple[Event, ...]
 
 
+class StateLine(NamedTuple):
+    """What state a thing is in: from each time on, a word."""
+
+    name: str
+    time_ns: tuple[int, ...]
+    states: tuple[str, ...]
+
+
+class StateLines(NamedTuple):
+    """Lanes over the time of the run, coloured by the state of each; `colours` are by its word."""
+
+    title: str
+    lines: tuple[StateLine, ...]
+    colours: Mapping[str, Colour]
+
+
 class PlanePath(NamedTuple):
-    """A line in a plane, in order of time; NaN leaves a gap."""
+    """A line in a plane, shape (points,); NaN leaves a gap."""
 
     name: str
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     colour: Colour
+    width: float = 0.8
 
 
 class PlaneMark(NamedTuple):
@@ -103,27 +128,67 @@ class PlaneMark(NamedTuple):
     colour: Colour
 
 
+class Box(NamedTuple):
+    """A rectangle in a plane, in its units."""
+
+    x_lower: float
+    x_upper: float
+    y_lower: float
+    y_upper: float
+
+
 class PlanePlot(NamedTuple):
-    """One measured thing over another."""
+    """One thing over another.
+
+    Attributes:
+        title: as on the screen.
+        x_label: with the unit.
+        y_label: with the unit.
+        box: what sets the scales; that of the first stretch counts.
+        shown: what it opens on.
+        time_ns: that the paths are of.
+        paths: in order of time; those of a stretch are added to those before.
+        curves: as they are now; those of a stretch take the place of those before.
+        marks: likewise.
+        events: marks that stay.
+        note: a line of text above it.
+    """
 
     title: str
     x_label: str
     y_label: str
-    paths: tuple[PlanePath, ...]
-    marks: tuple[PlaneMark, ...]
+    box: Box
+    shown: Box
+    time_ns: int
+    paths: tuple[PlanePath, ...] = ()
+    curves: tuple[PlanePath, ...] = ()
+    marks: tuple[PlaneMark, ...] = ()
+    events: tuple[PlaneMark, ...] = ()
+    note: str = ""
 
 
-View: TypeAlias = TimePlot | EventLog | PlanePlot
+class Again(NamedTuple):
+    """A view of another panel, here too, if there is one."""
+
+    panel: str
+    title: str
+
+
+View: TypeAlias = TimePlot | EventLog | StateLines | PlanePlot | Again
+Arrangement: TypeAlias = Literal["rows", "grid", "beside"]
 
 
 @dataclass(frozen=True)
 class Panel:
-    """A part of the dashboard.
+    """A tab of the dashboard.
 
     Attributes:
         title: as on the screen.
-        draw: the views of a run, from top to bottom; none if the run has nothing for it.
+        draw: the views of a run, or of a stretch of it; none if there is nothing for it.
+        arranged: one view under the other (`rows`), two in a row (`grid`), or what goes over time at the left and the
+            rest at the right (`beside`).
     """
 
     title: str
     draw: Callable[[Run], tuple[View, ...]]
+    arranged: Arrangement = "rows"

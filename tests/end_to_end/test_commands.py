@@ -7,6 +7,7 @@ import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from reactorwatch.contract import keys
@@ -16,12 +17,13 @@ from reactorwatch.records.csv_file import read_csv
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.serve import StopSignal
+from recorder.dashboard.picture import count_coloured
 from recorder.mcap_file import read_messages
 
 from .conftest import PATIENCE_S, Command, Start, WaitAlive
 
 COMMANDS = (
-    *("up", "demo", "alarm"),
+    *("up", "demo", "view", "alarm"),
     *("plant", "monitor", "record", "replay", "alive"),
     *("dashboard", "import", "export", "recover", "info", "cut", "merge"),
     *("simulate", "backtest", "diagnose", "identify", "linearise", "reproduce", "charts"),
@@ -88,6 +90,11 @@ def record_csv(tmp_path: Path) -> Path:
         (["plant", "--endpoint", "nowhere"], "endpoint must be like"),
         (["monitor", "--config", "nowhere.toml"], "nowhere.toml: cannot be read"),
         (["dashboard", "RECORD", "-o", "no/such/a.rrd"], "folder"),
+        (["dashboard", "RECORD", "-o", "OUT", "--diagnosis", "no"], "no/report.rrd: there is no such file"),
+        (["dashboard", "RECORD", "-o", "OUT", "--png", "BAD.txt"], "BAD.txt: is a file"),
+        (["view", "--web", "--bind", "here"], "--bind must be an IP address of this machine"),
+        (["view", "--web", "--bind", "192.0.2.1"], "is it one of this machine?"),
+        (["view", "--config", "nowhere.toml"], "nowhere.toml: cannot be read"),
         (["import", "RECORD", "-o", "no/such/a.mcap"], "folder"),
         (["demo", "--fault", "nothing"], "nothing"),
         (["identify", "RECORD"], "rows"),
@@ -121,6 +128,21 @@ def test_what_is_wrong_is_told_in_one_line_and_nothing_is_written(
     assert len(done.stderr.strip().splitlines()) == 1
     assert done.stderr.startswith("reactorwatch: ")
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_dashboard_comes_with_a_picture_of_each_tab_if_asked(command: Command, tmp_path: Path) -> None:
+    row = np.arange(300)
+    columns = (row / 10, 100 + 5 * np.sign(np.sin(row / 9)), 0.1 + 0.01 * np.cos(row / 9), 440 + np.sin(row / 9))
+    np.savetxt(tmp_path / "record.csv", np.column_stack(columns), header="time_min,qc,C,T", comments="", delimiter=",")
+    done = command("dashboard", "record.csv", "-o", "run.rrd", "--png", "tabs", cwd=tmp_path)
+    assert (tmp_path / "run.rrd").is_file()
+    if "needs a graphics driver" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["wrote run.rrd", "wrote tabs/overview.png", "wrote tabs/phase-plane.png"]
+    pictures = [(tmp_path / "tabs" / f"{tab}.png").read_bytes() for tab in ("overview", "phase-plane")]
+    assert all(count_coloured(picture) > 500 for picture in pictures)
+    assert pictures[0] != pictures[1]
 
 
 def test_a_node_without_a_router_waits_says_so_and_can_be_stopped(endpoint: str, start: Start) -> None:

@@ -97,6 +97,18 @@ def test_the_settings_that_ran_are_written_down_with_the_seed(demo: tuple[Path, 
     assert settings["bus"]["endpoint"].startswith("tcp/127.0.0.1:")
 
 
+def test_the_drawing_has_every_tab_the_diagnosis_among_them(demo: tuple[Path, str]) -> None:
+    from rerun.chunk import RrdReader
+
+    reader, tabs = RrdReader(demo[0] / "demo.rrd"), []
+    for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
+        table = chunk.to_record_batch()
+        if "ContainerBlueprint:display_name" in table.schema.names:
+            tabs += [name[0] for name in table.column("ContainerBlueprint:display_name").to_pylist() if name]
+    panels = {"Overview", "Residuals and charts", "Alarms", "Model", "Phase plane", "Health", "Diagnosis"}
+    assert sorted(tabs) == sorted(panels)
+
+
 def test_rerun_accepts_the_drawing_and_its_series_are_the_samples(
     demo: tuple[Path, str], recorded: list[Encoded]
 ) -> None:

@@ -72,7 +72,7 @@ def publications() -> Iterator[Publication]:
         if row in (round(RAISED_MIN / STEP_MIN), round(CLEARED_MIN / STEP_MIN)):
             yield _named(keys.ALARM, "shewhart/T", _alarm(now))
         if row % 50 == 0:
-            yield _named(keys.HEALTH, "monitor", messages.Health(time_ns=RECEIVED_NS + row, node="monitor"))
+            yield _named(keys.HEALTH, "monitor", _health(row))
 
 
 def _watched(signal: str, row: int) -> Iterator[Publication]:
@@ -95,6 +95,11 @@ def _watched(signal: str, row: int) -> Iterator[Publication]:
             time_ns=now, statistic=statistic, lower_limit=-3.0, upper_limit=3.0, out=abs(statistic) > 3.0
         )
         yield _named(keys.CHART, keys.chart_name("shewhart", signal), point)
+
+
+def _health(row: int) -> messages.Health:
+    phase = "watching" if row * STEP_MIN >= LEARNED_MIN else "training"
+    return messages.Health(time_ns=RECEIVED_NS + row, node="monitor", phase=phase)
 
 
 def _fault(now: int) -> messages.Fault:

@@ -1,17 +1,22 @@
-"""What every panel has to keep, and what each of them shows of the golden run."""
+"""What every panel has to keep, and what each of them shows of the golden run. The phase plane has its own file."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pytest
 
 import recorder.panels
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.panels import PANELS, alarms, phase_plane, residuals, signals
-from recorder.panels.base import EventLog, Panel, PlanePlot, TimePlot
-from recorder.run import Run, read_run
+from recorder.panels import PANELS, alarms, charts, health, model, overview
+from recorder.panels.base import ALARM, Again, EventLog, Panel, PlanePlot, StateLines, TimePlot, View
+from recorder.run import Charted, Reconstructed, Report, Run, Snapshot
+from recorder.run_reader import read_run, stretches
 from tests.unit.recorder import golden
+
+V = TypeVar("V", bound=View)
 
 
 @pytest.fixture(scope="module")
@@ -19,10 +24,19 @@ def run() -> Run:
     return read_run(golden.entries())
 
 
+def of_kind(views: Sequence[View], kind: type[V]) -> Iterator[V]:
+    return (view for view in views if isinstance(view, kind))
+
+
+def log_of(run: Run) -> EventLog:
+    return next(of_kind(alarms.draw(run), EventLog))
+
+
 def only(run: Run, *signals_left: str) -> Run:
     """The run of a plant that had but these signals, and no monitor."""
     measured = {name: run.measured[name] for name in signals_left}
-    return replace(run, measured=measured, estimated={}, charts={}, alarms=(), faults=())
+    seen = {name: run.seen[name] for name in signals_left}
+    return replace(run, measured=measured, seen=seen, estimated={}, charts={}, alarms=(), faults=(), health={})
 
 
 def test_every_file_of_the_folder_is_in_the_catalogue() -> None:
@@ -33,14 +47,22 @@ def test_every_file_of_the_folder_is_in_the_catalogue() -> None:
     assert len(PANELS) == len(files)
 
 
+def some_runs(run: Run) -> Iterator[Run]:
+    yield run
+    yield replace(
+        run, measured={**run.measured, "C": replace(run.measured["C"], value=run.measured["C"].value * np.nan)}
+    )
+    for left in (("T",), ("C", "T"), ("qc", "C", "T"), ()):
+        yield only(run, *left)
+    yield from stretches(golden.entries(), 150)
+
+
 @pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel.title)
 def test_every_panel_describes_any_run(panel: Panel, run: Run) -> None:
     """Names are told apart, times ascend, columns are of one length; also where next to nothing was recorded."""
-    unusable = replace(run.measured["C"], value=run.measured["C"].value * np.nan)
-    blind = replace(run, measured={**run.measured, "C": unusable})
-    for some_run in (run, blind, only(run, "T"), only(run, "C", "T"), only(run)):
+    for some_run in some_runs(run):
         views = panel.draw(some_run)
-        assert len({view.title for view in views}) == len(views)
+        assert len({(type(view), view.title) for view in views}) == len(views)
         for view in views:
             if isinstance(view, TimePlot):
                 assert len({series.name for series in view.series}) == len(view.series)
@@ -50,15 +72,27 @@ def test_every_panel_describes_any_run(panel: Panel, run: Run) -> None:
             elif isinstance(view, EventLog):
                 times = [event.time_ns for event in view.events]
                 assert times == sorted(times)
-            else:
-                assert len({path.name for path in view.paths}) == len(view.paths)
+            elif isinstance(view, StateLines):
+                for line in view.lines:
+                    assert list(line.time_ns) == sorted(set(line.time_ns))
+                    assert len(line.time_ns) == len(line.states)
+                    assert set(line.states) <= view.colours.keys()
+            elif isinstance(view, PlanePlot):
+                assert len({path.name for path in (*view.paths, *view.curves)}) == len(view.paths) + len(view.curves)
                 assert all(path.x.shape == path.y.shape for path in view.paths)
 
 
+def test_what_is_shown_again_is_there(run: Run) -> None:
+    titles = {(panel.title, view.title) for panel in PANELS for view in panel.draw(run) if not isinstance(view, Again)}
+    for panel in PANELS:
+        for view in of_kind(panel.draw(run), Again):
+            assert (view.panel, view.title) in titles
+
+
 def test_signals_show_measured_predicted_and_limits_in_colours_of_their_own(run: Run) -> None:
-    plots = {plot.title: plot for plot in signals.draw(run)}
-    assert list(plots) == ["Concentration C", "Temperature T", "Coolant flow qc"]
-    temperature = plots["Temperature T"]
+    plots = {plot.title: plot for plot in of_kind(overview.draw(run), TimePlot)}
+    assert list(plots) == ["C: concentration of A in the reactor", "T: temperature of the reactor", "qc: coolant flow"]
+    temperature = plots["T: temperature of the reactor"]
     assert temperature.unit == "K"
     lines = {series.name: series for series in temperature.series}
     assert list(lines) == ["upper limit", "lower limit", "measured", "predicted"]
@@ -66,69 +100,165 @@ def test_signals_show_measured_predicted_and_limits_in_colours_of_their_own(run:
     assert lines["predicted"].value is run.estimated["T"].prediction
     assert lines["upper limit"].value is run.estimated["T"].upper_limit
     assert len({lines[name].colour for name in ("upper limit", "measured", "predicted")}) == 3
-    (flow,) = plots["Coolant flow qc"].series
+    (flow,) = plots["qc: coolant flow"].series
     assert flow.held
+
+
+def test_what_a_suspected_sensor_should_read_is_drawn_beside_what_it_reads(run: Run) -> None:
+    rebuilt = Reconstructed(run.measured["T"].time_ns[5:9], np.arange(4.0), np.ones(4))
+    plots = {
+        plot.title[0]: plot for plot in of_kind(overview.draw(replace(run, reconstructed={"T": rebuilt})), TimePlot)
+    }
+    assert next(series for series in plots["T"].series if series.name == "reconstructed").value is rebuilt.value
+    assert "reconstructed" not in {series.name for series in plots["C"].series}
+
+
+def test_signals_of_no_known_process_are_drawn_by_their_names(run: Run) -> None:
+    """A run says names and units; nothing has to be the reactor."""
+    strange = replace(only(run, "T"), measured={"pH": run.measured["T"]}, units={"pH": ""}, seen={"pH": run.seen["T"]})
+    (plot,) = of_kind(overview.draw(strange), TimePlot)
+    assert (plot.title, plot.unit) == ("pH", "")
 
 
 def test_residuals_open_on_what_was_judged(run: Run) -> None:
     """A first prediction that is wild does not set the scale."""
     wild = run.estimated["T"].residual.copy()
     wild[0] = 1e6
-    changed = replace(run, estimated={"T": replace(run.estimated["T"], residual=wild)})
-    (plot,) = residuals.draw(changed)
+    changed = replace(run, estimated={"T": replace(run.estimated["T"], residual=wild)}, charts={})
+    (plot,) = charts.draw(changed)
     watched = np.isfinite(run.estimated["T"].upper_limit)
     assert plot.shown is not None
     lower, upper = plot.shown
     assert lower < wild[watched].min() < wild[watched].max() < upper < 1.0
     learning = replace(run.estimated["T"], lower_limit=wild * np.nan, upper_limit=wild * np.nan)
-    (plot,) = residuals.draw(replace(run, estimated={"T": learning}))
+    (plot,) = charts.draw(replace(run, estimated={"T": learning}, charts={}))
     assert plot.shown is None
 
 
+def chart(*statistic: float) -> Charted:
+    """A chart with limits at +-3 around 1."""
+    ones, value = np.ones(len(statistic)), np.array(statistic)
+    out = np.abs(value - 1.0) > 3.0
+    return Charted(np.arange(len(statistic)) * 10**9, value, ones, ones - 3.0, ones + 3.0, out.astype(float))
+
+
+def test_every_chart_is_drawn_with_its_limits_those_of_all_signals_last(run: Run) -> None:
+    names = ("shewhart/T", "mewma/all", "ewma/C")
+    plots = charts.draw(replace(run, estimated={}, charts=dict.fromkeys(names, chart(0.0, 1.0))))
+    assert [plot.title for plot in plots] == ["Chart ewma/C", "Chart shewhart/T", "Chart mewma/all"]
+    lines = {series.name: series.value.tolist() for series in plots[0].series}
+    assert (lines["upper limit"], lines["centre"], lines["lower limit"]) == ([4.0, 4.0], [1.0, 1.0], [-2.0, -2.0])
+    assert lines["statistic"] == [0.0, 1.0]
+
+
+def test_what_is_out_of_limits_is_drawn_as_an_alarm(run: Run) -> None:
+    (plot,) = charts.draw(replace(run, estimated={}, charts={"ewma/T": chart(1.0, 2.0, 9.0, 8.0, 2.0)}))
+    out = next(series for series in plot.series if series.name == "statistic out")
+    assert out.colour == ALARM
+    # the line comes from where it was, and ends with the last that is out
+    assert np.array_equal(out.value, [np.nan, 2.0, 9.0, 8.0, np.nan], equal_nan=True)
+    assert plot.shown is None
+
+
+def test_a_statistic_that_goes_through_the_roof_leaves_the_limits_visible(run: Run) -> None:
+    (plot,) = charts.draw(replace(run, estimated={}, charts={"mewma/all": chart(1.0, 1e6, -1e6)}))
+    assert plot.shown is not None
+    lower, upper = plot.shown
+    assert 4.0 < upper < 100.0
+    assert -100.0 < lower < -2.0
+    edge = next(series for series in plot.series if series.name == "statistic out of the plot").value
+    assert np.isnan(edge[0])
+    assert lower < edge[2] < edge[1] < upper
+    assert max(series.value.max() for series in plot.series if series.name == "statistic") == 1e6, "nothing is cut off"
+
+
 def test_the_log_tells_alarms_and_faults_in_order(run: Run) -> None:
-    (log,) = alarms.draw(run)
-    assert [(event.kind, event.text) for event in log.events] == [
+    assert [(event.kind, event.text) for event in log_of(run).events] == [
         ("fault", "20.0 min  injected: coolant_flow:step:-0.05@20min"),
         ("raised", "22.0 min  shewhart/T: T is lower than the model expects"),
         ("cleared", "27.0 min  shewhart/T: T is back between its limits"),
     ]
 
 
+def test_the_log_of_a_stretch_counts_from_the_beginning_of_the_run() -> None:
+    texts = [event.text for part in stretches(golden.entries(), 500) for event in log_of(part).events]
+    assert [text.split("  ")[0] for text in texts] == ["20.0 min", "22.0 min", "27.0 min"]
+
+
 def test_the_log_tells_the_suspects_of_one_look_once(run: Run) -> None:
     suspect = messages.Suspect(cause="coolant_flow", probability=0.9, profile="step", size=-0.05, unit="1")
     suspect.onset_ns = run.span_ns[0] + 20 * 60_000_000_000
     look = run.alarms[0]._replace(event="suspected", suspects=[suspect])
-    (log,) = alarms.draw(replace(run, alarms=(run.alarms[0], look, look._replace(alarm="ewma/T"))))
-    assert [(event.kind, event.text) for event in log.events][1:] == [
+    raised = run.alarms[0]._replace(event="raised")
+    twice = replace(run, alarms=(raised, look, look._replace(alarm="ewma/T")))
+    told = ("suspect", "22.0 min  coolant_flow (90 %; step of -0.05 at 20.0 min)")
+    assert [(event.kind, event.text) for event in log_of(twice).events][1:] == [
         ("raised", "22.0 min  shewhart/T: T is lower than the model expects"),
-        ("suspect", "22.0 min  coolant_flow (90 %; step of -0.05 at 20.0 min)"),
+        told,
     ]
+    known = replace(twice, earlier=replace(run.earlier, suspected_ns=look.time_ns))
+    assert told not in [(event.kind, event.text) for event in log_of(known).events], "told by the stretch before"
 
 
-def test_every_state_of_an_alarm_has_a_word(run: Run) -> None:
-    changes = [run.alarms[0]._replace(state=state) for state in messages.AlarmState.values()]
-    (log,) = alarms.draw(replace(run, alarms=tuple(changes)))
-    words = {event.kind for event in log.events if event.kind != "fault"}
-    assert len(words) == len(messages.AlarmState.values())
+def test_every_state_of_an_alarm_has_a_word_and_a_colour(run: Run) -> None:
+    changes = [
+        run.alarms[0]._replace(state=state, time_ns=state + 1) for state in messages.AlarmState.values() if state
+    ]
+    (lanes,) = of_kind(alarms.draw(replace(run, alarms=tuple(changes))), StateLines)
+    (line,) = lanes.lines
+    assert len(set(line.states)) == len(changes)
+    assert set(line.states) <= lanes.colours.keys()
 
 
-def test_the_path_changes_colour_while_the_alarm_stands_without_a_break(run: Run) -> None:
-    (plane,) = phase_plane.draw(run)
-    quiet, alarmed = plane.paths
-    assert (quiet.name, alarmed.name) == ("no alarm", "alarm stands")
-    raised, cleared = (round(minutes / golden.STEP_MIN) for minutes in (golden.RAISED_MIN, golden.CLEARED_MIN))
-    rows = np.arange(golden.ROWS)
-    assert np.array_equal(np.isfinite(alarmed.x), (rows >= raised - 1) & (rows < cleared))
-    assert np.array_equal(np.isfinite(quiet.x), (rows < raised) | (rows >= cleared - 1))
-    steps = [np.isfinite(path.x[:-1]) & np.isfinite(path.x[1:]) for path in plane.paths]
-    assert (steps[0] ^ steps[1]).all()  # every step is drawn, once
+def test_the_life_of_an_alarm_is_a_line_that_begins_with_the_run(run: Run) -> None:
+    first = run.alarms[0]._replace(event="raised")
+    (lanes,) = of_kind(alarms.draw(replace(run, alarms=(first, *run.alarms[1:]))), StateLines)
+    (line,) = lanes.lines
+    assert line.name == "shewhart/T"
+    assert line.states == ("normal", "raised", "cleared")
+    minutes = (0.0, golden.RAISED_MIN, golden.CLEARED_MIN)
+    assert line.time_ns == tuple(golden.time_ns(round(at / golden.STEP_MIN)) for at in minutes)
 
 
-def test_the_plane_marks_the_fault_and_the_first_alarm(run: Run) -> None:
-    (plane,) = phase_plane.draw(run)
-    assert isinstance(plane, PlanePlot)
-    assert (plane.x_label, plane.y_label) == ("C, mol/l", "T, K")
-    places = {mark.name: (mark.x, mark.y) for mark in plane.marks}
-    for name, minutes in (("fault", golden.ONSET_MIN), ("alarm", golden.RAISED_MIN)):
-        row = round(minutes / golden.STEP_MIN)
-        assert places[name] == (golden.value("C", row), golden.value("T", row))
+def test_what_is_known_of_an_alarm_from_before_is_not_said_again(run: Run) -> None:
+    earlier = replace(run.earlier, first_ns=run.span_ns[0], states={"shewhart/T": messages.ALARM_STATE_NORMAL})
+    again = replace(run, alarms=(run.alarms[0]._replace(event="raised"),), earlier=earlier)
+    (lanes,) = of_kind(alarms.draw(again), StateLines)
+    assert lanes.lines[0].states == ("raised",)
+
+
+def test_parameters_of_both_models_are_drawn_with_their_intervals(run: Run) -> None:
+    adapting = tuple(Snapshot(at, {"a1": (0.9 + at, 0.1), "b1": (2.0, 0.5)}, 0.02 * at, 50.0) for at in (1, 2))
+    judged = (Snapshot(2, {"a1": (0.8, 0.1), "b1": (1.9, 0.5)}, 0.03, 33.0),)
+    plots = model.draw(replace(run, models={("T", False): adapting, ("T", True): judged}))
+    assert [plot.title.split(" of ")[0] for plot in plots] == [
+        "Parameters a",
+        "Parameters b",
+        "Excitation that the model",
+    ]
+    lines = {series.name: series.value for series in plots[0].series}
+    assert lines["a1"] == pytest.approx([1.9, 2.9])
+    assert lines["a1 upper end"] - lines["a1"] == pytest.approx(0.196)
+    assert lines["a1 judged by"] == pytest.approx([0.8])
+    excitation = {series.name: series.value.tolist() for series in plots[-1].series}
+    assert excitation == {"of the model judged by": [0.03], "of the model that adapts": [0.02, 0.04]}
+
+
+def test_health_shows_phases_lag_and_troubles_of_each_node(run: Run) -> None:
+    reports = {
+        "monitor": (
+            Report(5, "training", 1.5, {"lost": 0, "late": 0}),
+            Report(9, "watching", 2.5, {"lost": 3, "late": 4}),
+        ),
+        "plant": (Report(5, "running", 0.0, {"lost": 0, "late": 0}),),
+    }
+    phases, lag, troubles = health.draw(replace(run, health=reports))
+    assert isinstance(phases, StateLines)
+    assert [(line.name, line.states) for line in phases.lines] == [
+        ("monitor", ("training", "watching")),
+        ("plant", ("running",)),
+    ]
+    assert isinstance(lag, TimePlot)
+    assert isinstance(troubles, TimePlot)
+    assert [series.value.tolist() for series in lag.series] == [[1.5, 2.5], [0.0]]
+    assert [series.value.tolist() for series in troubles.series] == [[0.0, 7.0], [0.0]]

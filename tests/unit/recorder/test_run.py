@@ -7,7 +7,8 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.errors import InputError
 from recorder.entry import Entry
-from recorder.run import Run, read_run
+from recorder.run import Earlier, Run
+from recorder.run_reader import read_run, stretches
 from tests.unit.recorder import golden
 
 
@@ -89,3 +90,67 @@ def test_a_run_is_of_one_plant() -> None:
     other = [entry._replace(key=entry.key.replace("cstr", "b")) for entry in golden.entries()]
     with pytest.raises(InputError, match="a run is of one plant; name one of b, cstr"):
         read_run([*golden.entries(), *other])
+
+
+def test_stretches_hold_the_run_and_each_message_once(run: Run) -> None:
+    parts = list(stretches(golden.entries(), 111))
+    assert len(parts) > 15
+    for signal, measured in run.measured.items():
+        found = [part.measured[signal] for part in parts if signal in part.measured]
+        assert np.array_equal(np.concatenate([item.time_ns for item in found]), measured.time_ns)
+        assert np.array_equal(np.concatenate([item.value for item in found]), measured.value)
+    assert [change for part in parts for change in part.alarms] == list(run.alarms)
+    assert [change for part in parts for change in part.faults] == list(run.faults)
+    assert [report.phase for part in parts for report in part.health.get("monitor", ())] == [
+        report.phase for report in run.health["monitor"]
+    ]
+
+
+def test_a_stretch_knows_what_was_before_it(run: Run) -> None:
+    parts = list(stretches(golden.entries(), 500))
+    assert parts[0].earlier == Earlier()
+    for number, part in enumerate(parts[1:], start=1):
+        assert part.first_ns == run.first_ns == TIMES[0]
+        before = [item.measured["T"] for item in parts[:number]]
+        newest = np.concatenate([item.value for item in before])[-2:]
+        assert np.array_equal(part.earlier.last["T"].value, newest)
+    states = [part.earlier.states.get("shewhart/T") for part in parts]
+    assert states[0] is None
+    assert states[-1] == messages.ALARM_STATE_UNACKNOWLEDGED, "it clears in the last"
+    onset_ns = golden.time_ns(round(golden.ONSET_MIN / golden.STEP_MIN))
+    assert (parts[0].earlier.onset_ns, parts[-1].earlier.onset_ns) == (None, onset_ns)
+
+
+def test_what_has_been_seen_of_a_signal_does_not_depend_on_the_stretches(run: Run) -> None:
+    (*_, last) = stretches(golden.entries(), 97)
+    for signal, measured in run.measured.items():
+        seen = last.seen[signal]
+        assert seen.rows == golden.ROWS
+        assert seen.mean == pytest.approx(measured.value.mean(), rel=1e-12)
+        assert (seen.lowest, seen.highest) == (measured.value.min(), measured.value.max())
+
+
+def test_a_node_s_report_stands_at_the_newest_sample_of_its_receipt(run: Run) -> None:
+    """A node speaks by the clock; at an accelerated plant that is another time than the run's."""
+    rows = [row for row in range(golden.ROWS) if row % 50 == 0]
+    assert [report.time_ns for report in run.health["monitor"]] == [golden.time_ns(row) for row in rows]
+
+
+def test_models_are_told_apart_by_what_they_are_for() -> None:
+    parameter = messages.Parameter(name="a1", value=0.9, sd=0.1)
+    published = [
+        messages.ModelSnapshot(time_ns=at, parameters=[parameter], excitation=0.1 * at, reference=reference)
+        for at, reference in ((1, False), (2, False), (2, True))
+    ]
+    run = read_run(encode(Publication("reactor/cstr/model/T", item)) for item in published)
+    assert [item.time_ns for item in run.models["T", False]] == [1, 2]
+    (judged,) = run.models["T", True]
+    assert judged.parameters == {"a1": (0.9, 0.1)}
+    assert judged.excitation == pytest.approx(0.2)
+
+
+def test_a_reconstruction_is_a_column_beside_its_signal() -> None:
+    told = [messages.Reconstruction(time_ns=at, value=440.0 + at, sd=0.5, unit="K") for at in (1, 2, 3)]
+    run = read_run(encode(Publication("reactor/cstr/reconstruction/T", item)) for item in told)
+    assert run.reconstructed["T"].value.tolist() == [441.0, 442.0, 443.0]
+    assert run.reconstructed["T"].sd.tolist() == [0.5, 0.5, 0.5]

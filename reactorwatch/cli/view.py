@@ -1,0 +1,51 @@
+"""`view`: the dashboard of a plant that runs, in a window or in the browser."""
+
+from typing import Annotated
+
+import typer
+
+from reactorwatch.cli.options import Endpoint, Plant, Settings
+
+LOOPBACK = "127.0.0.1"
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the command."""
+    app.command("view")(view)
+
+
+def view(
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Plant = None,
+    web: Annotated[bool, typer.Option("--web", help="In the browser, at the address that is printed.")] = False,
+    bind: Annotated[str, typer.Option(help="The address that the viewer listens on.")] = LOOPBACK,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            help="For the browser; the one after it carries the data [two that are free].",
+            min=1024,
+            max=65534,
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Show a running plant live: a window, or with --web a page for the browser.
+
+    Ends when the window is closed or with Ctrl-C. What was published in the last minute is shown, too.
+    """
+    import logging
+    import os
+
+    # before Rerun is imported: that a viewer is gone ends this command, and is no error of its connection's
+    os.environ.setdefault("RUST_LOG", "off")
+    from reactorwatch.runtime.config import BusConfig, read_settings, section
+    from reactorwatch.runtime.logs import configure
+    from recorder.config import RecorderConfig
+    from recorder.dashboard.live import Shown, show
+
+    configure(logging.INFO)
+    tables = read_settings(config)
+    bus = section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    plant = section(RecorderConfig, "recorder", tables, {"plant": name}).plant
+    show(plant, bus, Shown(web=web, bind=bind, port=port), typer.echo)

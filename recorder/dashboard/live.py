@@ -1,0 +1,210 @@
+"""The dashboard of a plant that runs: what goes over the bus, streamed to a viewer.
+
+The viewer is a process of its own and holds what it is sent; here is nothing that grows with the run. Which views there
+are shows in the first seconds of a run, so the layout is sent again whenever one is new.
+"""
+
+import errno
+import socket
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from ipaddress import ip_address
+from pathlib import Path
+from typing import NamedTuple
+
+import rerun as rr
+
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.errors import InputError
+from reactorwatch.runtime import bus_zenoh
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_port
+from reactorwatch.runtime.serve import serve, stop_on_signals
+from recorder.dashboard.drawing import Drawing
+from recorder.dashboard.stream import APPLICATION
+from recorder.dashboard.viewer import viewer
+from recorder.panels import PANELS
+from recorder.run_reader import STRETCH, RunReader
+
+NODE = "view"
+LOOPBACK = ("127.0.0.1", "::1")
+DRAW_EVERY_NS = 500_000_000
+START_WITHIN_S = 30.0
+LOOK_EVERY_S = 0.1
+
+
+class Shown(NamedTuple):
+    """Where a dashboard is shown: a window, or a page for the browser; `port` is the page's, None: one that is free."""
+
+    web: bool
+    bind: str
+    port: int | None
+
+
+def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], None]) -> None:
+    """Show a plant until the viewer is closed, or SIGINT (Ctrl-C) or SIGTERM comes.
+
+    Args:
+        plant: its name.
+        bus_config: where the router is.
+        shown: where the dashboard is.
+        say: told where to look.
+
+    Raises:
+        InputError: the viewer does not run on this machine, its address or port cannot be had, or the endpoint makes
+            no sense.
+    """
+    page, data = (free_port(), free_port()) if shown.port is None else (shown.port, shown.port + 1)
+    for port in (page, data):
+        _check_free(shown.bind, port)
+    arguments = ("--serve-web", "--web-viewer-port", str(page), *_origins(shown, page)) if shown.web else ()
+    with tempfile.TemporaryDirectory() as folder, stop_on_signals() as stop:
+        log = Path(folder) / "viewer.log"
+        with viewer(*arguments, port=data, bind=shown.bind, log=log) as process:
+            _wait_for(process, data, shown, log)
+            if shown.web:
+                host = _in_url(_reached(shown.bind))
+                say(f"open http://{host}:{page}/?url=rerun%2Bhttp://{host}:{data}/proxy")
+            bus = bus_zenoh.connect(bus_config, NODE, stop)
+            if bus is None:
+                return
+            try:
+                recording = stream_to(data, shown.bind, f"{plant}-{time.time_ns()}")
+                dashboard = LiveDashboard(recording, lambda: process.poll() is not None, time.time_ns())
+                serve(dashboard, bus, stop, subscriptions=(f"{keys.ROOT}/{plant}/**",), history=True)
+                recording.disconnect()
+            finally:
+                bus.close()
+
+
+class LiveDashboard:
+    """Draws what it hears; see `reactorwatch.runtime.serve.Node`.
+
+    Args:
+        recording: the stream, connected to a viewer.
+        is_closed: whether the viewer is.
+        now_ns: the clock.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, is_closed: Callable[[], bool], now_ns: int) -> None:
+        self._recording = recording
+        self._is_closed = is_closed
+        self._drawing = Drawing(recording)
+        self._reader = RunReader()
+        self._taken = 0
+        self._next_ns = now_ns + DRAW_EVERY_NS
+
+    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
+        """Keep it until there is something to be drawn."""
+        self._reader.take(message)
+        self._taken += 1
+        if self._taken >= STRETCH or now_ns >= self._next_ns:
+            self._draw(now_ns)
+        return []
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
+        """Nobody asks a dashboard."""
+        raise AssertionError(question.key)
+
+    def on_tick(self, now_ns: int) -> list[Publication]:
+        """Draw what has come."""
+        self._draw(now_ns)
+        return []
+
+    def next_tick_ns(self) -> int:
+        """Every half second."""
+        return self._next_ns
+
+    @property
+    def finished(self) -> bool:
+        """Whether the viewer has been closed."""
+        return self._is_closed()
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        """Draw the last."""
+        self._draw(now_ns)
+        return []
+
+    def _draw(self, now_ns: int) -> None:
+        self._next_ns = now_ns + DRAW_EVERY_NS
+        if not self._taken:
+            return
+        self._taken = 0
+        run = self._reader.cut()
+        if run.earlier.first_ns is None and not run.measured:
+            return  # the time of the run begins with its first sample
+        self._drawing.draw(run, PANELS)
+        if self._drawing.layout.changed:
+            self._recording.send_blueprint(self._drawing.layout.blueprint(live=True))
+
+
+def stream_to(port: int, address: str, name: str) -> rr.RecordingStream:
+    """A stream to a viewer.
+
+    Args:
+        port: that it listens at.
+        address: that it listens on.
+        name: of the recording.
+    """
+    recording = rr.RecordingStream(APPLICATION, recording_id=name)
+    recording.connect_grpc(f"rerun+http://{_in_url(_reached(address))}:{port}/proxy")
+    return recording
+
+
+def _check_free(address: str, port: int) -> None:
+    """What somebody else listens at would look like the viewer.
+
+    Raises:
+        InputError: it is no address of this machine, or the port is taken.
+    """
+    try:
+        version = ip_address(address).version
+        with socket.socket(socket.AF_INET6 if version == 6 else socket.AF_INET) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((address, port))
+    except ValueError:
+        raise InputError(f"--bind must be an IP address of this machine, such as 127.0.0.1, got {address!r}") from None
+    except OSError as error:
+        cure = "choose another --port" if error.errno == errno.EADDRINUSE else "is it one of this machine?"
+        raise InputError(f"nothing can listen at {address} port {port}: {error.strerror}; {cure}") from error
+
+
+def _reached(address: str) -> str:
+    """How this machine reaches what listens on an address."""
+    return {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(address, address)  # noqa: S104 (nothing is bound here)
+
+
+def _in_url(address: str) -> str:
+    return f"[{address}]" if ":" in address else address
+
+
+def _origins(shown: Shown, page: int) -> tuple[str, ...]:
+    """Pages that may ask for the data, beside those of this machine, which may anyway."""
+    return () if shown.bind in LOOPBACK else ("--cors-allow-origin", f"http://*:{page}")
+
+
+def _wait_for(process: subprocess.Popen[bytes], port: int, shown: Shown, log: Path) -> None:
+    """Wait until the viewer listens.
+
+    Raises:
+        InputError: it has ended, or does not within the time.
+    """
+    deadline = time.monotonic() + START_WITHIN_S
+    while time.monotonic() < deadline:
+        try:
+            with socket.create_connection((_reached(shown.bind), port), timeout=1.0):
+                return
+        except OSError:
+            pass
+        try:
+            code = process.wait(LOOK_EVERY_S)
+        except subprocess.TimeoutExpired:
+            continue
+        said = log.read_text(errors="replace").strip().splitlines()
+        cure = "" if shown.web else "; it needs a screen, try --web"
+        raise InputError(f"the viewer ended with code {code}: {said[-1] if said else 'it did not say why'}{cure}")
+    raise InputError(f"the viewer does not listen at {shown.bind}:{port} after {START_WITHIN_S:g} s")

@@ -1,0 +1,112 @@
+"""Pictures of dashboards. They need Rerun's viewer and a graphics driver; without these the tests skip and say so."""
+
+import io
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image
+
+from reactorwatch.errors import InputError
+from recorder.dashboard.file import write_rrd
+from recorder.dashboard.picture import count_coloured, render_png, render_tabs
+from recorder.panels.base import ALARM, INPUT, MEASURED, PREDICTED, RESIDUAL, UNSTABLE, Colour
+from recorder.run_reader import read_run
+from tests.unit.recorder import golden
+
+
+@contextmanager
+def skipping_without_graphics() -> Iterator[None]:
+    try:
+        yield
+    except InputError as error:
+        if "needs a graphics driver" in str(error):
+            pytest.skip(str(error))
+        raise
+
+
+def like(pixels: NDArray[np.int16], colour: Colour) -> NDArray[np.bool_]:
+    """Which pixels are of a colour, smoothed edges left out."""
+    return np.asarray(np.abs(pixels - np.array(colour)).max(axis=2) <= 40)
+
+
+def pixels_of(png: Path) -> NDArray[np.int16]:
+    with Image.open(png) as image:
+        return np.asarray(image.convert("RGB"), np.int16)
+
+
+@pytest.fixture(scope="module")
+def rrd(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("picture") / "run.rrd"
+    write_rrd(read_run(golden.entries()), path)
+    return path
+
+
+def test_a_picture_shows_the_lines_and_leaves_no_viewer_behind(
+    rrd: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(*arguments: Any, **options: Any) -> subprocess.Popen[bytes]:
+        started.append(real(*arguments, **options))
+        return started[-1]
+
+    real = subprocess.Popen
+    monkeypatch.setattr(subprocess, "Popen", start)
+    png = tmp_path / "run.png"
+    with skipping_without_graphics():
+        render_png(rrd, png, 1000, 700)
+    pixels = pixels_of(png)
+    assert pixels.shape == (700, 1000, 3)
+    for colour in (MEASURED, PREDICTED, INPUT):
+        there = like(pixels, colour)
+        assert there.sum() > 150
+        assert np.ptp(np.flatnonzero(there.any(axis=0))) > 450, "the whole run is shown, over the width of the plots"
+    (viewer,) = started
+    assert viewer.returncode is not None
+    assert isinstance(viewer.args, list)
+    assert viewer.args[viewer.args.index("--bind") + 1] == "127.0.0.1"
+
+
+def test_every_tab_gets_a_picture_of_its_own(rrd: Path, tmp_path: Path) -> None:
+    with skipping_without_graphics():
+        pictures = render_tabs(rrd, tmp_path / "tabs", 1000, 700)
+    assert [path.name for path in pictures] == [
+        "overview.png", "residuals-and-charts.png", "alarms.png", "phase-plane.png", "health.png",
+    ]  # fmt: skip
+    shown = {path.stem: pixels_of(path) for path in pictures}
+    # residuals, the alarm's lane and line, the path and the steady states, and a node's lane
+    for tab, colour, least in (
+        ("residuals-and-charts", RESIDUAL, 500),
+        ("alarms", ALARM, 100),
+        ("phase-plane", MEASURED, 500),
+        ("phase-plane", UNSTABLE, 20),
+        ("health", INPUT, 1000),
+    ):
+        assert like(shown[tab], colour).sum() > least, tab
+    for tab, colour in (("residuals-and-charts", MEASURED), ("alarms", MEASURED), ("health", ALARM)):
+        assert like(shown[tab], colour).sum() < 50, tab
+
+
+def test_only_coloured_pixels_count() -> None:
+    image = Image.new("RGB", (10, 10), (120, 120, 120))
+    image.paste(MEASURED, (0, 0, 10, 3))
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG")
+    assert count_coloured(buffer.getvalue()) == 30
+
+
+def test_what_cannot_be_drawn_is_told_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="there is no such file"):
+        render_png(tmp_path / "none.rrd", tmp_path / "run.png")
+    (tmp_path / "run.rrd").write_bytes(b"")
+    with pytest.raises(InputError, match=r"the folder .+ does not exist"):
+        render_png(tmp_path / "run.rrd", tmp_path / "no" / "run.png")
+    with pytest.raises(InputError, match="the viewer did not show the plots in time"):
+        render_png(tmp_path / "run.rrd", tmp_path / "run.png", deadline_s=0.0)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run.rrd"]
