@@ -19,8 +19,8 @@ from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import ProcessModel
 
-COMPILED = 128
-"""Models whose functions are kept: to make one takes some ten milliseconds."""
+COMPILED = 64
+"""Models whose functions are kept: to make one takes some ten milliseconds, and to keep it a megabyte."""
 
 
 @lru_cache(maxsize=COMPILED)

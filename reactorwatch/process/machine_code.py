@@ -249,4 +249,6 @@ def _machine_code(text: str) -> tuple[llvm.ExecutionEngine, int]:
     machine = llvm.Target.from_default_triple().create_target_machine(opt=0)
     engine = llvm.create_mcjit_compiler(module, machine)
     engine.finalize_object()
-    return engine, engine.get_function_address("rows")
+    address = engine.get_function_address("rows")
+    engine.remove_module(module)  # the code stays, without what it was made of
+    return engine, address
