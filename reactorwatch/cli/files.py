@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Plant, columns, existing, existing_recording, new_file
+from reactorwatch.cli.options import Columns, Plant, columns, existing, existing_recording, new_file, new_of_kind
 from reactorwatch.errors import InputError
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
@@ -40,8 +40,10 @@ def dashboard(
     from recorder.dashboard.picture import render_tabs
     from recorder.run_reader import stretches
 
-    out = new_file(out)
-    drawn = existing(diagnosis / DRAWING) if diagnosis is not None else None
+    out = new_of_kind(out, ".rrd")
+    drawn = diagnosis / DRAWING if diagnosis is not None else None
+    if drawn is not None and not drawn.is_file():
+        raise InputError(f"--diagnosis {diagnosis}: holds no {DRAWING}; it must be the folder that diagnose -o wrote")
     if png is not None and png.exists() and not png.is_dir():
         raise InputError(f"--png {png}: is a file, the name of a folder was expected")
     with task(f"drawing {file.name}"):

@@ -152,12 +152,12 @@ def new_file(path: Path) -> Path:
     return path
 
 
-def new_recording(path: Path) -> Path:
-    """The path of a recording that is to be written.
+def new_of_kind(path: Path, ending: str) -> Path:
+    """The path of a file of a kind that is to be written.
 
     Raises:
-        InputError: as `new_file`; or it has another ending, by which nothing would find it again as a recording.
+        InputError: as `new_file`; or it has another ending, by which nothing would open it.
     """
-    if new_file(path).suffix != ".mcap":
-        raise InputError(f"{path}: a recording is written, so its name must end in .mcap")
+    if new_file(path).suffix != ending:
+        raise InputError(f"{path}: the name must end in {ending}, got {path.suffix or 'no ending'}")
     return path

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Json, existing, existing_recording, new_recording, span_ns
+from reactorwatch.cli.options import Json, existing, existing_recording, new_of_kind, span_ns
 from reactorwatch.errors import InputError
 
 
@@ -35,7 +35,7 @@ def recover(
 
     if is_held(existing(file)):
         raise InputError(f"{file}: is still being written; stop its recorder first")
-    out = new_recording(out) if out is not None else _beside(file)
+    out = new_of_kind(out, ".mcap") if out is not None else _beside(file)
     with task(f"recovering {file.name}"):
         saved = save(file, out)
     typer.echo(msgspec.json.encode(saved_object(saved, out)).decode() if as_json else saved_text(saved, file, out))
@@ -78,7 +78,7 @@ def cut(
     to_ns = span_ns(end, "--to") if end is not None else 2**63
     if from_ns >= to_ns:
         raise InputError(f"--from must be before --to, got {begin} and {end}")
-    out = new_recording(out)
+    out = new_of_kind(out, ".mcap")
     with task(f"cutting {file.name}"):
         sources = recordings_in(existing_recording(file))
         zero_ns = zero_ns_of(file)
@@ -97,7 +97,7 @@ def merge(
     from recorder.cut import merge as join
     from recorder.mcap_file import read_metadata, recordings_in
 
-    out = new_recording(out)
+    out = new_of_kind(out, ".mcap")
     with task(f"merging into {out.name}"):
         sources = [source for file in files for source in recordings_in(existing_recording(file))]
         for number, source in enumerate(sources):
