@@ -28,6 +28,9 @@ from reactorwatch.process.model import Array
 TAKEN_AWAY, SINES_SHARE = 2, 0.3
 """How many causes are taken away in turn to see sines below, and what share of the best one's gain a sine must have."""
 
+BLOCK, NEGLIGIBLE = 512, 1e-9
+"""Values whose products are summed at once, and the share of a column's largest that is taken for nothing."""
+
 _RIDGE = 1e-9
 _MOST_SIZES = 3.0
 
@@ -151,7 +154,7 @@ class PairScreen:
         alone, until those that are left promise less.
         """
         columns = np.concatenate([block.columns for block in blocks], axis=1)
-        gram, by = columns.T @ columns, columns.T @ w
+        gram, by = _products(columns), columns.T @ w
         ends = np.cumsum([block.columns.shape[1] for block in blocks])
         places = [np.arange(end - block.columns.shape[1], end) for end, block in zip(ends, blocks, strict=True)]
         price = log(self._run.values)
@@ -225,6 +228,18 @@ def _range(block: Block) -> tuple[Array, Array]:
     if block.size is not None:
         lower, upper = lower / block.size, min(upper / block.size, _MOST_SIZES)
     return np.full(count, lower), np.full(count, upper)
+
+
+def _products(columns: Array) -> Array:
+    """Of all columns with each other. A knot of a curve shows for a while only, and outside of it costs nothing."""
+    sizes, products = np.abs(columns), np.zeros((columns.shape[1],) * 2)
+    least = NEGLIGIBLE * np.max(sizes, axis=0)
+    for begin in range(0, len(columns), BLOCK):
+        part = slice(begin, begin + BLOCK)
+        there = np.flatnonzero(np.max(sizes[part], axis=0) > least)
+        shown = columns[part, there]
+        products[np.ix_(there, there)] += shown.T @ shown
+    return products
 
 
 def _gain(columns: Array, w: Array) -> tuple[float, Array]:
