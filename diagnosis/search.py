@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from diagnosis.adequacy import minus_log10_p
 from diagnosis.courses import Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.knots import best_resolved
@@ -46,7 +47,10 @@ ROUGH = 1e-3
 LEAST_SENSOR_GAIN = 10.0
 """In BIC: less does not make a sensor's noise remember."""
 
-ROUNDS = 5
+ROUNDS, OTHERS = 5, 2
+DOUBTFUL = 3.0
+"""Minus the decimal logarithm of the p-value that what the best leaves is white, beyond which others are asked."""
+
 SETTLED_NOISE = 10.0
 """In BIC: a noise that gains less is not worth another round."""
 
@@ -142,9 +146,18 @@ class Search:
             best = min(best, item, key=lambda item: item.bic)
         least = max([LEAST_SCORE, *(_SHARE * item.score(self.run.values) for item in leads[:1])])
         remembering = self.chosen(remembering, LEADS, least, of_a_cause=1)
-        searched, out = nominal, set[Key]()
+        best, known = self._in_rounds(best, known, remembering)
+        best, known = self._in_their_own_noise(best, known, remembering)
+        return Found(self.noise, own_noise, nominal, sorted(known.values(), key=lambda item: item.bic))
+
+    def _in_rounds(
+        self, best: Explained, known: dict[Key, Explained], remembering: Sequence[Lead]
+    ) -> tuple[Explained, dict[Key, Explained]]:
+        """Noise and hypothesis in turn; the best, and all that were fitted with its noise."""
+        searched: Explained | None = None
+        out = set[Key]()
         for _ in range(ROUNDS):
-            if best is nominal or (best is searched and not self._settled_anew(best)):
+            if not best.key or (best is searched and not self._settled_anew(best)):
                 break
             if best is not searched:
                 self.settle(best)
@@ -161,7 +174,35 @@ class Search:
                     keep(known, self.resolved(item) if item.bic < best.bic + IN_QUESTION else item)
                     out |= {item.key} if item.bic > best.bic + FAR_OUT else set()
             best = min(known.values(), key=lambda item: item.bic)
-        return Found(self.noise, own_noise, nominal, sorted(known.values(), key=lambda item: item.bic))
+        return best, known
+
+    def _in_their_own_noise(
+        self, best: Explained, known: dict[Key, Explained], remembering: Sequence[Lead]
+    ) -> tuple[Explained, dict[Key, Explained]]:
+        """If the best leaves too much, so that its noise may be what hides a better one: the others, each with its own.
+
+        Those that act in jumps are asked too, though they promise little: with a noise that carries the filter along,
+        a valve that sticks does not show.
+        """
+        if not best.key or not np.any(minus_log10_p(best.fit.w, self.run.inputs) > DOUBTFUL):
+            return best, known
+        others = {item.hypothesis.causes: item for item in sorted(known.values(), key=lambda item: -item.bic)}
+        others.pop(best.hypothesis.causes, None)
+        by_bic = sorted(others.values(), key=lambda item: item.bic)
+        asked = by_bic[:OTHERS] + [item for item in by_bic[OTHERS:] if item.hypothesis.sized.effects[0].jumps]
+        for lead in remembering:
+            if lead.effect.jumps and (lead.effect.name,) not in (best.hypothesis.causes, *others):
+                others[(lead.effect.name,)] = self.fitted(lead)
+                asked.append(others[(lead.effect.name,)])
+        held, found = self.noise, best
+        for item in asked:
+            self.settle(item)
+            self._use_noise(item.hypothesis.sized)
+            item = self.fit(item.hypothesis, item.fit.theta, scan=item.hypothesis.sized.effects[0].jumps)
+            if item.bic < found.bic:
+                held, found = self.noise, item
+        self.noise = held
+        return (best, known) if found is best else self._in_rounds(found, {found.key: found}, remembering)
 
     def _first_noise(self) -> Noise:
         """Under which the nominal model is likeliest. Its free run tells which values are outliers."""
