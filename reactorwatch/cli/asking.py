@@ -76,7 +76,8 @@ def ask(
     replies = [decode(answer.payload, answer.encoding) for answer in answers]
     reply = next((item for item in replies if isinstance(item, CommandReply)), None)
     if reply is None:
-        raise NoAnswerError(f"no {node} of plant {plant!r} answered within {timeout_s:g} s; is it running?")
+        refused = ", and may our certificate ask it?" if bus_config.ca is not None else "?"  # refusals are silent
+        raise NoAnswerError(f"no {node} of plant {plant!r} answered within {timeout_s:g} s; is it running{refused}")
     if not reply.accepted:
         raise InputError(reply.text)
     return reply

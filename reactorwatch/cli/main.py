@@ -10,7 +10,7 @@ from typing import cast
 import typer
 
 from reactorwatch import __version__
-from reactorwatch.cli import alarm, charts, files, models, nodes, playback, recordings, runs, studies, view
+from reactorwatch.cli import alarm, charts, files, models, nodes, playback, recordings, runs, site, studies, view
 from reactorwatch.errors import InputError
 
 # Typer brings a copy of click, or uses the one installed, depending on its version; its errors are one family in both.
@@ -26,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for group in (runs, nodes, view, playback, alarm, files, recordings, studies, models, charts):
+for group in (runs, nodes, view, site, playback, alarm, files, recordings, studies, models, charts):
     group.add_to(app)
 
 

@@ -71,4 +71,7 @@ def rate(
 def _tell(
     command: str, message: "ReplayCommand", config: Settings, endpoint: Endpoint, name: Plant, timeout: float
 ) -> None:
+    import os
+
+    message.by = os.environ.get("USER", "")
     typer.echo(ask("replay", config, endpoint, name, timeout, command, message).text)

@@ -25,6 +25,7 @@ MESSAGES: tuple[type[Message], ...] = (
     messages.Reconstruction,
     messages.Health,
     messages.Fault,
+    messages.Audit,
     messages.SetInput,
     messages.InjectFault,
     messages.ClearFault,
@@ -45,6 +46,7 @@ Body: TypeAlias = (
     | messages.Reconstruction
     | messages.Health
     | messages.Fault
+    | messages.Audit
 )
 """What travels by publication; each has `time_ns`."""
 

@@ -20,6 +20,7 @@ RECONSTRUCTION = "reconstruction"
 HEALTH = "health"
 FAULT = "fault"
 COMMAND = "command"
+AUDIT = "audit"
 ALIVE = "alive"
 
 RECORDING = "recording"

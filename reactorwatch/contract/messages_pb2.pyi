@@ -332,25 +332,47 @@ class Fault(_message.Message):
     onset_ns: int
     def __init__(self, time_ns: _Optional[int] = ..., cause: _Optional[str] = ..., specification: _Optional[str] = ..., active: bool = ..., onset_ns: _Optional[int] = ...) -> None: ...
 
+class Audit(_message.Message):
+    __slots__ = ("time_ns", "command", "by", "accepted", "text", "request")
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    COMMAND_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
+    ACCEPTED_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_FIELD_NUMBER: _ClassVar[int]
+    time_ns: int
+    command: str
+    by: str
+    accepted: bool
+    text: str
+    request: str
+    def __init__(self, time_ns: _Optional[int] = ..., command: _Optional[str] = ..., by: _Optional[str] = ..., accepted: bool = ..., text: _Optional[str] = ..., request: _Optional[str] = ...) -> None: ...
+
 class SetInput(_message.Message):
-    __slots__ = ("signal", "value")
+    __slots__ = ("signal", "value", "by")
     SIGNAL_FIELD_NUMBER: _ClassVar[int]
     VALUE_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
     signal: str
     value: float
-    def __init__(self, signal: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
+    by: str
+    def __init__(self, signal: _Optional[str] = ..., value: _Optional[float] = ..., by: _Optional[str] = ...) -> None: ...
 
 class InjectFault(_message.Message):
-    __slots__ = ("specification",)
+    __slots__ = ("specification", "by")
     SPECIFICATION_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
     specification: str
-    def __init__(self, specification: _Optional[str] = ...) -> None: ...
+    by: str
+    def __init__(self, specification: _Optional[str] = ..., by: _Optional[str] = ...) -> None: ...
 
 class ClearFault(_message.Message):
-    __slots__ = ("cause",)
+    __slots__ = ("cause", "by")
     CAUSE_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
     cause: str
-    def __init__(self, cause: _Optional[str] = ...) -> None: ...
+    by: str
+    def __init__(self, cause: _Optional[str] = ..., by: _Optional[str] = ...) -> None: ...
 
 class AlarmCommand(_message.Message):
     __slots__ = ("alarm", "by", "comment")
@@ -379,12 +401,14 @@ class ListAlarms(_message.Message):
     def __init__(self) -> None: ...
 
 class ReplayCommand(_message.Message):
-    __slots__ = ("rows", "rate")
+    __slots__ = ("rows", "rate", "by")
     ROWS_FIELD_NUMBER: _ClassVar[int]
     RATE_FIELD_NUMBER: _ClassVar[int]
+    BY_FIELD_NUMBER: _ClassVar[int]
     rows: int
     rate: float
-    def __init__(self, rows: _Optional[int] = ..., rate: _Optional[float] = ...) -> None: ...
+    by: str
+    def __init__(self, rows: _Optional[int] = ..., rate: _Optional[float] = ..., by: _Optional[str] = ...) -> None: ...
 
 class CommandReply(_message.Message):
     __slots__ = ("accepted", "text", "alarms")

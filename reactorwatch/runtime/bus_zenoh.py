@@ -23,6 +23,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import structlog
@@ -32,9 +33,11 @@ from google.protobuf.message import Message
 
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.errors import InputError
+from reactorwatch.runtime.access import MEMORY, NOBODY
 from reactorwatch.runtime.bus import Request
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.delivery import Delivery, Numbered
+from reactorwatch.runtime.identity import ROUTER_FILES, TLS, client_settings
 from reactorwatch.runtime.in_order import Gap
 from reactorwatch.runtime.serve import StopSignal
 
@@ -44,13 +47,11 @@ FIRST_RETRY_S = 0.1
 LONGEST_RETRY_S = 2.0
 SAY_AGAIN_S = 30.0
 FLUSH_WITHIN_S = 10.0
-NOBODY = "reactorwatch/nobody"  # a key that no queryable answers
 HEARTBEAT_S = 0.5
 LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that who missed it can ask for it
 STUCK_S = 1.0
 STREAM_PARTS = 3  # of a key: root, plant and kind
 
-CACHES = "@adv/**"  # below a key, where Zenoh's publishers answer for what they remember of it
 HISTORY_WITHIN_S = 10.0
 MOST_ASKED = 4  # times for what was before; what was published while the answers came may be missing
 
@@ -156,7 +157,7 @@ class ZenohBus:
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
         """What publishers remember of what they have published."""
         replies = self._session.get(
-            f"{key_expression}/{CACHES}?{which}",
+            f"{key_expression}/{MEMORY}?{which}",
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=HISTORY_WITHIN_S,
@@ -253,16 +254,7 @@ def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
     Raises:
         InputError: the endpoint is not one that Zenoh understands.
     """
-    settings = {
-        "mode": "client",
-        "connect/endpoints": [config.endpoint],
-        "connect/retry": _RETRY,
-        "connect/timeout_ms": 0,
-        "scouting/multicast/enabled": False,
-        "timestamping/enabled": True,  # by which the age of what was published is known
-        **_STUCK,
-    }
-    client = _checked(settings, config.endpoint)
+    client = _client(config)
     woken = threading.Event()
     stop.wakes(woken.set)
     retry_s = FIRST_RETRY_S
@@ -282,12 +274,44 @@ def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
     return None
 
 
+def connect_now(config: BusConfig) -> ZenohBus:
+    """Join the bus as a client, if its router is there and lets us in.
+
+    Raises:
+        ConnectionError: it is not, or does not; with what Zenoh says.
+        InputError: the endpoint is not one that Zenoh understands.
+    """
+    try:
+        return ZenohBus(zenoh.open(_client(config)), config)
+    except zenoh.ZError as error:
+        raise ConnectionError(_first_line(error)) from error
+
+
+def _client(config: BusConfig) -> zenoh.Config:
+    settings = {
+        "mode": "client",
+        "connect/endpoints": [config.endpoint],
+        "connect/retry": _RETRY,
+        "connect/timeout_ms": 0,
+        "scouting/multicast/enabled": False,
+        "timestamping/enabled": True,  # by which the age of what was published is known
+        **_STUCK,
+        **client_settings(config),
+    }
+    return _checked(settings, config.endpoint)
+
+
 def router(config: BusConfig) -> ZenohBus:
     """Be the router, in this process, until the bus is closed.
 
     Raises:
-        InputError: nothing can listen at the endpoint: it is malformed or taken.
+        InputError: nothing can listen at the endpoint: it is malformed or taken, or needs a router's certificate.
     """
+    if config.ca is not None:
+        raise InputError(
+            f"no router can listen at {config.endpoint!r} with the certificate of a node; "
+            "start one with `reactorwatch router SITE/router/router.json5`, and the nodes one by one"
+        )
     settings = {
         "mode": "router",
         "listen/endpoints": [config.endpoint],
@@ -304,6 +328,26 @@ def router(config: BusConfig) -> ZenohBus:
             f"is another router running there? Choose another with --endpoint"
         ) from error
     return ZenohBus(session, config)
+
+
+def router_from_file(path: Path) -> ZenohBus:
+    """Be the router that a file of Zenoh's own settings describes, as `certify` writes it for a site.
+
+    Args:
+        path: the file, JSON5; files that it names are relative to its folder.
+
+    Raises:
+        InputError: it cannot be read or makes no sense, or nothing can listen where it says.
+    """
+    try:
+        config = zenoh.Config.from_file(str(path))
+        for name in ROUTER_FILES:
+            file = json.loads(config.get_json(f"{TLS}/{name}"))
+            if file is not None:
+                config.insert_json5(f"{TLS}/{name}", json.dumps(str(path.parent / file)))
+        return ZenohBus(zenoh.open(config), BusConfig())
+    except zenoh.ZError as error:
+        raise InputError(f"router settings {path}: {_first_line(error)}") from error
 
 
 def _stream(key: str) -> str:

@@ -22,6 +22,10 @@ SECTIONS = ("bus", "plant", "monitor", "recorder", "replay", "diagnosis")
 """The tables that a file may hold."""
 
 
+IDENTITY = ("ca", "certificate", "key")
+"""Files by which a node shows who it is, and knows the router."""
+
+
 class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where the bus is.
 
@@ -32,12 +36,19 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         cache_messages: how many messages on each key a publisher keeps for those that have not heard them: what a
             link may lose and get back. A message takes half a kilobyte.
         history_s: how old what was published before may be to be told to a recorder that begins to listen, in seconds.
+        ca: file with the certificate of the site's authority (PEM); with it, a certificate and its key, the bus is
+            joined by mutual TLS: each side shows who it is. In a settings file, relative to that file's folder.
+        certificate: file with our own, likewise.
+        key: file with the private key that goes with it, likewise.
     """
 
     endpoint: str = "tcp/127.0.0.1:7447"
     congestion: Literal["block", "drop"] = "drop"
     cache_messages: int = 10_000
     history_s: float = 60.0
+    ca: str | None = None
+    certificate: str | None = None
+    key: str | None = None
 
     def __post_init__(self) -> None:
         if self.endpoint.count("/") != 1 or ":" not in self.endpoint:
@@ -46,6 +57,18 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"cache_messages must be in [1, 10000000], got {self.cache_messages}")
         if not 0.0 < self.history_s <= 86_400.0:
             raise ValueError(f"history_s must be in (0, 86400], got {self.history_s:g}")
+        given = [name for name in IDENTITY if getattr(self, name) is not None]
+        if given and len(given) < len(IDENTITY):
+            missing = ", ".join(name for name in IDENTITY if name not in given)
+            raise ValueError(f"ca, certificate and key belong together, got no {missing}")
+        if bool(given) != self.endpoint.startswith("tls/"):
+            raise ValueError(
+                f"an endpoint like 'tls/127.0.0.1:7447' and ca, certificate and key belong together, got "
+                f"{self.endpoint!r} {'with' if given else 'without'} them"
+            )
+        for name in given:
+            if not Path(getattr(self, name)).is_file():
+                raise ValueError(f"{name} must be a file that is there, got {getattr(self, name)!r}")
 
 
 Section = TypeVar("Section", bound=msgspec.Struct)
@@ -70,6 +93,10 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
             raise InputError(f"settings file {path}: {_unknown(name, SECTIONS, 'table')}")
         if not isinstance(table, dict):
             raise InputError(f"settings file {path}: '{name}' must be a table, like [{name}]")
+    bus = tables.get("bus", {})
+    for name in IDENTITY:
+        if isinstance(bus.get(name), str):  # so that a folder with settings and certificates can be moved as it is
+            bus[name] = str(path.parent / bus[name])
     return tables
 
 

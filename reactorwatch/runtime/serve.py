@@ -1,7 +1,8 @@
 """The loop of every node: wait for a message, a command or the next moment something is due; hand it to the core.
 
 The core says what it wants published and when it wants to be woken; the loop alone reads the clock, listens to
-signals and touches the bus. Handlers of the bus run in its own threads and only put what came into the inbox.
+signals and touches the bus. It also publishes a record of each command and its answer (`audit`). Handlers of the bus
+run in its own threads and only put what came into the inbox.
 """
 
 import contextlib
@@ -15,6 +16,7 @@ from typing import Protocol
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.runtime.audit import audit
 from reactorwatch.runtime.bus import Bus, Request
 from reactorwatch.runtime.in_order import Gap
 
@@ -158,7 +160,8 @@ def serve(
         else:
             reply, publications = node.on_command(item.question, time.time_ns())
             item.reply(reply)
-            publish(publications)
+            record = audit(item.question, reply, time.time_ns())
+            publish(publications if record is None else [*publications, record])
 
     while not (stop.is_set or node.finished):
         wait_s = (node.next_tick_ns() - time.time_ns()) / 1e9

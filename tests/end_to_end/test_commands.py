@@ -24,7 +24,7 @@ from .conftest import PATIENCE_S, Command, Start, WaitAlive
 
 COMMANDS = (
     *("up", "demo", "view", "alarm"),
-    *("plant", "monitor", "record", "replay", "alive"),
+    *("plant", "monitor", "record", "replay", "alive", "certify", "router", "doctor", "status"),
     *("dashboard", "import", "export", "recover", "info", "cut", "merge"),
     *("simulate", "backtest", "diagnose", "identify", "linearise", "reproduce", "charts"),
 )

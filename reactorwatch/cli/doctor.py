@@ -1,0 +1,243 @@
+"""`doctor`: what is wrong with a deployment, seen from this machine with these settings.
+
+What a router refuses it refuses in silence, so a node that may not publish looks like one that has nothing to say.
+The doctor therefore says something and listens for it by a second session of the same certificate: below `@doctor`,
+where the same role may publish the same kinds, and no node listens.
+"""
+
+import shutil
+import stat
+import threading
+import time
+from collections.abc import Iterator
+from datetime import datetime
+from ipaddress import ip_address
+from pathlib import Path
+from typing import NamedTuple
+
+from cryptography.exceptions import InvalidSignature
+
+from reactorwatch import __version__
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, Encoded, decode
+from reactorwatch.contract.messages_pb2 import Health
+from reactorwatch.runtime.access import Role, kinds_of, role_of
+from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
+from reactorwatch.runtime.certificates import common_name_of, read_certificate, read_key
+from reactorwatch.runtime.config import BusConfig
+
+RENEW_DAYS = 30
+LARGEST_OFFSET_S = 1.0
+SAY_AGAIN_S = 0.2
+NODES = ("plant", "monitor", "recorder")
+MB = 1_000_000
+
+
+class Finding(NamedTuple):
+    """What one check found.
+
+    Attributes:
+        check: in a word or two.
+        found: what is so.
+        cure: what to do; empty if nothing is wrong.
+    """
+
+    check: str
+    found: str
+    cure: str = ""
+
+
+def examine(
+    config: BusConfig, plant: str, folder: Path, room_mb: float, timeout_s: float, now: datetime
+) -> Iterator[Finding]:
+    """Check a deployment, one thing after the other; what cannot be checked without a router is left out without one.
+
+    Args:
+        config: how the bus is joined.
+        plant: the plant's name.
+        folder: where recordings go.
+        room_mb: what they need there.
+        timeout_s: how long to listen for nodes.
+        now: the time.
+
+    Raises:
+        InputError: a certificate or key that cannot be read.
+    """
+    yield from _certificate(config, plant, now)
+    yield _disk(folder, room_mb)
+    try:
+        bus = connect_now(config)
+    except ConnectionError as error:
+        cure = "start it, or correct endpoint in [bus]"
+        if config.ca is not None:
+            cure += "; or, if it is there, its certificate is not for this host, or one of both is of another authority"
+        yield Finding("router", f"no way in at {config.endpoint}: {error}", cure)
+        return
+    try:
+        yield Finding("router", f"lets us in at {config.endpoint}")
+        yield from _heard(bus, config, plant, timeout_s)
+        yield from _nodes(bus, plant, timeout_s)
+    finally:
+        bus.close()
+
+
+def _certificate(config: BusConfig, plant: str, now: datetime) -> Iterator[Finding]:
+    if config.ca is None or config.certificate is None or config.key is None:
+        if _is_loopback(config.endpoint):
+            yield Finding("certificate", "none, and the bus is on this machine's loopback only")
+        else:
+            cure = "make certificates with `reactorwatch certify`"
+            yield Finding("certificate", f"none: whoever reaches {config.endpoint} may publish and command", cure)
+        return
+    own, ca = read_certificate(Path(config.certificate)), read_certificate(Path(config.ca))
+    name = common_name_of(own)
+    renew = "renew it: delete its folder in the site, and call `reactorwatch certify` again"
+    for what, certificate in (("certificate", own), ("authority", ca)):
+        left = certificate.not_valid_after_utc - now
+        until = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC, {left.days} days"
+        who = common_name_of(certificate)
+        if now < certificate.not_valid_before_utc:
+            begin = f"{certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC"
+            yield Finding(what, f"{who}: not valid before {begin}", "set this machine's clock, or make it anew")
+        elif left.days < RENEW_DAYS:
+            passed = left.total_seconds() <= 0
+            yield Finding(what, f"{who}: expired" if passed else f"{who}: {until}", renew)
+        else:
+            yield Finding(what, f"{who}: {until}")
+    key_file = Path(config.key)
+    try:
+        own.verify_directly_issued_by(ca)
+    except (ValueError, TypeError, InvalidSignature):
+        yield Finding("identity", f"{name} is not signed by the authority in {config.ca}", "copy its whole folder anew")
+    if read_key(key_file).public_key() != own.public_key():
+        yield Finding("identity", f"{config.key} is not the key of {config.certificate}", "copy its whole folder anew")
+    if stat.S_IMODE(key_file.stat().st_mode) & 0o077:
+        yield Finding("private key", f"{key_file} can be read by others", f"chmod 600 {key_file}")
+    holder = role_of(name)
+    if holder is None or holder[0] != plant:
+        cure = f"use a certificate of {plant}, or name its plant by --plant"
+        yield Finding("identity", f"{name or 'nobody'}: is of no role of plant {plant}", cure)
+
+
+def _disk(folder: Path, room_mb: float) -> Finding:
+    while not folder.exists() and folder != folder.parent:  # it is made when it is needed
+        folder = folder.parent
+    free_mb = shutil.disk_usage(folder).free / MB
+    found = f"{free_mb:,.0f} MB free at {folder.resolve()}"
+    if free_mb < room_mb:
+        return Finding("disk", found, f"make room for {room_mb:,.0f} MB, or set keep_mb in [recorder]")
+    return Finding("disk", found)
+
+
+def _heard(bus: ZenohBus, config: BusConfig, plant: str, timeout_s: float) -> Iterator[Finding]:
+    role = _role(config)
+    kinds = (keys.SAMPLE,) if role is None else kinds_of(role)
+    if not kinds:
+        yield Finding("heard", "this certificate is for reading and asking; it publishes nothing")
+        return
+    speaker = connect_now(config)
+    try:
+        deaf = [kind for kind in kinds if not _is_heard(speaker, bus, plant, kind, timeout_s)]
+    finally:
+        speaker.close()
+    if deaf:
+        cure = "its rules know no such holder: call `certify` for the plant, and start the router with its router.json5"
+        yield Finding("heard", f"what we publish does not come through: {', '.join(deaf)}", cure)
+    else:
+        yield Finding("heard", f"what we publish comes through: {', '.join(kinds)}")
+
+
+def _is_heard(speaker: ZenohBus, listener: ZenohBus, plant: str, kind: str, timeout_s: float) -> bool:
+    heard = threading.Event()
+    proof = Encoded(keys.key(plant, kind, "@doctor/proof"), b"heard", "text/plain")
+    listener.subscribe(proof.key, lambda _: heard.set())
+    until = time.monotonic() + timeout_s
+    while not heard.is_set() and time.monotonic() < until:
+        speaker.publish(proof)
+        heard.wait(SAY_AGAIN_S)
+    return heard.is_set()
+
+
+def _role(config: BusConfig) -> Role | None:
+    if config.certificate is None:
+        return None
+    holder = role_of(common_name_of(read_certificate(Path(config.certificate))))
+    return holder[1] if holder is not None else None
+
+
+class _Listening:
+    """Who says that he is alive, and what each says of himself, with how far his clock is ahead of ours in seconds."""
+
+    def __init__(self, bus: ZenohBus, plant: str) -> None:
+        self.alive: set[str] = set()
+        self.said: dict[str, tuple[Health, float]] = {}
+        self._settled: set[str] = set()
+        self._changed = threading.Condition()
+        bus.watch_alive(keys.all_of(plant, keys.ALIVE), self._on_token)
+        bus.subscribe(keys.key(plant, keys.HEALTH, "*"), self._on_health)
+
+    def wait(self, timeout_s: float) -> None:
+        """Until all who are expected have spoken; twice, if a clock seems to be off."""
+        with self._changed:
+            self._changed.wait_for(lambda: set(NODES) <= self._settled & self.alive, timeout_s)
+
+    def _on_token(self, key: str, is_alive: bool) -> None:
+        topic = keys.parse(key)
+        if topic is not None:
+            with self._changed:
+                (self.alive.add if is_alive else self.alive.discard)(topic.name)
+                self._changed.notify_all()
+
+    def _on_health(self, message: Encoded) -> None:
+        topic = keys.parse(message.key)
+        try:
+            health = decode(message.payload, message.encoding)
+        except DecodeError:
+            return
+        if topic is not None and isinstance(health, Health):
+            with self._changed:
+                offset_s = (health.time_ns - message.received_ns) / 1e9
+                before = self.said.get(topic.name)
+                if before is not None:  # one that was recovered came late, so the later of two clocks is the truer
+                    offset_s = max(offset_s, before[1])
+                if before is not None or abs(offset_s) <= LARGEST_OFFSET_S:
+                    self._settled.add(topic.name)
+                self.said[topic.name] = health, offset_s
+                self._changed.notify_all()
+
+
+def _nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Finding]:
+    listening = _Listening(bus, plant)
+    listening.wait(timeout_s)
+    alive, said = set(listening.alive), dict(listening.said)
+    expected = [node for node in NODES if node != "plant" or "replay" not in alive]
+    for node in (*expected, *sorted(alive - set(expected))):
+        if node not in alive:
+            cure = f"start it, and call doctor with the settings of {node} if it is running"
+            yield Finding(node, f"is not there on {plant}", cure)
+        elif node not in said:
+            if node not in NODES:
+                yield Finding(node, "is alive")  # a replay, and who diagnoses, say nothing of themselves
+            else:
+                cure = "call doctor with its settings; or listen for longer than its health_period_s by --timeout"
+                yield Finding(node, f"is alive, and says nothing of itself within {timeout_s:g} s", cure)
+        else:
+            yield _node(node, *said[node])
+
+
+def _node(node: str, health: Health, offset_s: float) -> Finding:
+    found = f"{health.phase}, version {health.version}, its clock {offset_s:+.3f} s from ours"
+    cures = []
+    if health.version != __version__:
+        cures.append(f"install the same version as here, {__version__}")
+    if abs(offset_s) > LARGEST_OFFSET_S:
+        cures.append("have both machines' clocks set by NTP, as with chrony")
+    return Finding(node, found, "; ".join(cures))
+
+
+def _is_loopback(endpoint: str) -> bool:
+    host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"

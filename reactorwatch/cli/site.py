@@ -1,0 +1,138 @@
+"""A site: `certify` makes its certificates and rules, `router` keeps them, `doctor` and `status` say how it is."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from reactorwatch.cli.options import Endpoint, Json, Plant, Settings
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the commands."""
+    app.command("certify")(certify)
+    app.command("router")(router)
+    app.command("doctor")(doctor)
+    app.command("status")(status)
+
+
+def certify(
+    folder: Annotated[Path, typer.Argument(help="Of the site: new, or one to add to.", show_default=False)],
+    plant: Annotated[
+        list[str] | None,
+        typer.Option("--plant", help="A plant to add [those there, or cstr]. Repeatable.", show_default=False),
+    ] = None,
+    endpoint: Annotated[
+        str | None,
+        typer.Option(help="Where nodes call the router [as before, or tls/127.0.0.1:7447].", show_default=False),
+    ] = None,
+    listen: Annotated[
+        str | None,
+        typer.Option(help="Where the router listens [as before, or where it is called].", show_default=False),
+    ] = None,
+    days: Annotated[float, typer.Option(help="How long certificates are valid.", min=1, max=3650)] = 365.0,
+) -> None:
+    """Make the certificates and access rules of a site.
+
+    Each who joins its bus gets a folder of its own, to be copied to its machine: certificate, key and settings for
+    --config. What is there already stays: a plant is added by naming it, and a certificate renewed by deleting its
+    folder first. The router's rules are written anew; start it again after that.
+    """
+    from datetime import UTC, datetime
+
+    from reactorwatch.runtime.site import AUTHORITY, make_site
+
+    for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, datetime.now(UTC)):
+        said = "; signs new certificates, keep it off line" if made.name == AUTHORITY else ""
+        typer.echo(f"{made}{said}")
+
+
+def router(
+    file: Annotated[
+        Path, typer.Argument(help="Zenoh's settings, as `certify` writes them: router.json5.", show_default=False)
+    ],
+) -> None:
+    """Run the router of a site, with its certificates and access rules."""
+    import threading
+
+    import structlog
+
+    from reactorwatch.cli.options import existing
+    from reactorwatch.runtime.bus_zenoh import router_from_file
+    from reactorwatch.runtime.logs import configure
+    from reactorwatch.runtime.serve import stop_on_signals
+
+    configure()
+    with stop_on_signals() as stop:
+        bus = router_from_file(existing(file))
+        stopped = threading.Event()
+        stop.wakes(stopped.set)
+        structlog.get_logger().info("router", settings=str(file))
+        try:
+            if not stop.is_set:
+                stopped.wait()
+        finally:
+            bus.close()
+
+
+def doctor(
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Plant = None,
+    timeout: Annotated[float, typer.Option(help="Seconds to listen for nodes.", min=0.1)] = 12.0,
+    as_json: Json = False,
+) -> None:
+    """Check a deployment from here: one line a check, with the cure. Ends with 0 if all is well, 1 if not."""
+    import logging
+    from datetime import UTC, datetime
+
+    import msgspec
+
+    from reactorwatch.cli.doctor import examine
+    from reactorwatch.runtime.config import BusConfig, read_settings, section
+    from reactorwatch.runtime.logs import configure
+    from recorder.config import RecorderConfig
+
+    configure(logging.WARNING)
+    tables = read_settings(config)
+    bus = section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    recorder = section(RecorderConfig, "recorder", tables, {"plant": name})
+    out = Path(recorder.out)
+    folder = out.parent if out.suffix == ".mcap" else out
+    is_well = True
+    checks = []
+    for finding in examine(bus, recorder.plant, folder, recorder.rotate_mb, timeout, datetime.now(UTC)):
+        is_well = is_well and not finding.cure
+        checks.append({"ok": not finding.cure, **finding._asdict()})
+        if not as_json:
+            cure = f"; {finding.cure}" if finding.cure else ""
+            typer.echo(f"{'WRONG' if finding.cure else 'ok':5s}  {finding.check}: {finding.found}{cure}")
+    if as_json:
+        typer.echo(msgspec.json.encode({"ok": is_well, "checks": checks}).decode())
+    raise typer.Exit(0 if is_well else 1)
+
+
+def status(
+    config: Settings = None,
+    endpoint: Endpoint = None,
+    name: Annotated[
+        str | None, typer.Option("--plant", help="Which plant [all that may be read].", show_default=False)
+    ] = None,
+    once: Annotated[bool, typer.Option("--once", help="Show it once.")] = False,
+    seconds: Annotated[float, typer.Option(help="How long to listen before showing it once.", min=0.1)] = 4.0,
+    as_json: Json = False,
+) -> None:
+    """Show plants, nodes, rates and alarms as they are now, until stopped."""
+    import logging
+
+    from reactorwatch.cli.status import run
+    from reactorwatch.runtime.config import BusConfig, read_settings, section
+    from reactorwatch.runtime.logs import configure
+    from recorder.config import RecorderConfig
+
+    configure(logging.WARNING)
+    tables = read_settings(config)
+    bus = section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    plant = section(RecorderConfig, "recorder", tables, {"plant": name}).plant
+    # a certificate is for one plant, and what it may not read it gets nothing of
+    run(bus, plant if name is not None or bus.ca is not None else None, seconds, once=once, as_json=as_json)

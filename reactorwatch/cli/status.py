@@ -1,0 +1,245 @@
+"""`status`: plants, their nodes, rates and alarms, as they are now."""
+
+import contextlib
+import threading
+import time
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import typer
+
+from reactorwatch.cli.reports import priority_word
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Health, ListAlarms, Sample
+from reactorwatch.errors import InputError
+from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.serve import stop_on_signals
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+SECOND_NS = 1_000_000_000
+WINDOW_S = 10
+"""Rates are of so many whole seconds, the one that is running left out."""
+REFRESH_S = 1.0
+ANSWER_WITHIN_S = 2.0
+
+
+class Board:
+    """What is known of the plants; may be called from any thread.
+
+    Args:
+        start_ns: when listening began.
+    """
+
+    def __init__(self, start_ns: int) -> None:
+        self._start_ns = start_ns
+        self._alive: set[tuple[str, str]] = set()
+        self._health: dict[tuple[str, str], Health] = {}
+        self._alarms: dict[tuple[str, str], Alarm] = {}
+        self._samples: dict[str, Counter[int]] = {}  # by plant and second
+        self._lock = threading.Lock()
+
+    def on_token(self, key: str, is_alive: bool) -> None:
+        """A node came or went."""
+        topic = keys.parse(key)
+        if topic is not None:
+            with self._lock:
+                (self._alive.add if is_alive else self._alive.discard)((topic.plant, topic.name))
+
+    def on_message(self, message: Encoded) -> None:
+        """Something was published."""
+        topic = keys.parse(message.key)
+        try:
+            said = decode(message.payload, message.encoding)
+        except DecodeError:
+            return
+        if topic is None:
+            return
+        with self._lock:
+            if isinstance(said, Health):
+                self._health[topic.plant, topic.name] = said
+            elif isinstance(said, Alarm):
+                self._alarms[topic.plant, said.alarm] = said
+            elif isinstance(said, Sample):
+                seconds = self._samples.setdefault(topic.plant, Counter())
+                second = message.received_ns // SECOND_NS
+                seconds[second] += 1
+                for old in [item for item in seconds if item < second - WINDOW_S]:
+                    del seconds[old]
+
+    def on_alarms(self, plant: str, alarms: list[Alarm]) -> None:
+        """All alarms of a node, as it lists them; what was published meanwhile is newer."""
+        with self._lock:
+            for alarm in alarms:
+                self._alarms.setdefault((plant, alarm.alarm), alarm)
+
+    @property
+    def plants(self) -> list[str]:
+        """All of which anything is known."""
+        with self._lock:
+            known = {plant for plant, _ in (*self._alive, *self._health, *self._alarms)}
+            return sorted(known | self._samples.keys())
+
+    def plant(self, name: str, now_ns: int) -> dict[str, Any]:
+        """A plant as it is now, for machines."""
+        with self._lock:
+            second = now_ns // SECOND_NS
+            span_s = min(WINDOW_S, second - self._start_ns // SECOND_NS - 1)  # the second of the start was not whole
+            counts = self._samples.get(name, Counter())
+            heard = sum(count for item, count in counts.items() if second - span_s <= item < second)
+            nodes = {node for plant, node in (*self._alive, *self._health) if plant == name}
+            alarms = [alarm for (plant, _), alarm in self._alarms.items() if plant == name]
+            return {
+                "plant": name,
+                "samples_per_s": heard / span_s if span_s > 0 else None,
+                "nodes": [self._node(name, node, now_ns) for node in sorted(nodes)],
+                "alarms": [_alarm(alarm) for alarm in sorted(alarms, key=_rank) if _is_in_sight(alarm)],
+            }
+
+    def _node(self, plant: str, node: str, now_ns: int) -> dict[str, Any]:
+        found: dict[str, Any] = {"node": node, "alive": (plant, node) in self._alive}
+        health = self._health.get((plant, node))
+        if health is not None:
+            found |= {
+                "phase": health.phase,
+                "version": health.version,
+                "said_s_ago": (now_ns - health.time_ns) / SECOND_NS,
+                "uptime_s": health.uptime_s,
+                **{name: getattr(health, name) for name in ("received", "published", "lost", "late", "refused")},
+                "lag_ms": health.lag_ms,
+            }
+        return found
+
+
+def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as_json: bool) -> None:
+    """Show the status, once or until SIGINT or SIGTERM.
+
+    Args:
+        config: where the bus is.
+        plant: which; None: all that there are.
+        listen_s: for how long, before it is shown once.
+        once: whether that is all.
+        as_json: whether it is one JSON object, once.
+
+    Raises:
+        InputError: there is no router, or it does not let us in.
+    """
+    with stop_on_signals() as stop:
+        try:
+            bus = connect_now(config)
+        except ConnectionError as error:
+            raise InputError(f"no router at {config.endpoint}: {error}; `reactorwatch doctor` says more") from error
+        try:
+            stopped = threading.Event()
+            stop.wakes(stopped.set)
+            board = _listening(bus, plant or "*")
+            if once or as_json:
+                stopped.wait(listen_s)
+                _ask_alarms(bus, board)
+                typer.echo(_text(board, as_json=as_json), nl=False)
+            else:
+                _show(bus, board, stopped)
+        finally:
+            bus.close()
+
+
+def _listening(bus: ZenohBus, plant: str) -> Board:
+    board = Board(time.time_ns())
+    bus.watch_alive(keys.all_of(plant, keys.ALIVE), board.on_token)
+    bus.subscribe(keys.all_of(plant, keys.HEALTH), board.on_message, history=True)
+    for kind in (keys.SAMPLE, keys.ALARM):
+        bus.subscribe(keys.all_of(plant, kind), board.on_message)
+    return board
+
+
+def _ask_alarms(bus: ZenohBus, board: Board) -> None:
+    for plant in board.plants:
+        for command in ("list_alarms", keys.LIST_RECORDER_ALARMS):
+            question = Encoded(keys.key(plant, keys.COMMAND, command), *encode_message(ListAlarms()))
+            for answer in bus.ask(question, ANSWER_WITHIN_S):
+                with contextlib.suppress(DecodeError):
+                    reply = decode(answer.payload, answer.encoding)
+                    if isinstance(reply, CommandReply):
+                        board.on_alarms(plant, list(reply.alarms))
+
+
+def _show(bus: ZenohBus, board: Board, stopped: threading.Event) -> None:
+    from rich.live import Live
+
+    asked: list[str] = []
+    with Live(auto_refresh=False) as live:
+        while not stopped.wait(REFRESH_S):
+            if board.plants != asked:
+                _ask_alarms(bus, board)
+                asked = board.plants
+            live.update(_table(board, time.time_ns()), refresh=True)
+
+
+def _text(board: Board, *, as_json: bool) -> str:
+    now_ns = time.time_ns()
+    if as_json:
+        plants = [board.plant(name, now_ns) for name in board.plants]
+        return msgspec.json.encode({"plants": plants}).decode() + "\n"
+    from io import StringIO
+
+    from rich.console import Console
+
+    console = Console(file=StringIO(), width=120)
+    console.print(_table(board, now_ns))
+    assert isinstance(console.file, StringIO)
+    return console.file.getvalue()
+
+
+def _table(board: Board, now_ns: int) -> "Table":
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table("plant", "node", "phase", "samples/s", "lost", "refused", "lag", "said", "alarms")
+    for name in board.plants:
+        plant = board.plant(name, now_ns)
+        rate = plant["samples_per_s"]
+        alarms = "\n".join(f"{item['alarm']} ({item['priority']}): {item['state']}" for item in plant["alarms"])
+        rates = "" if rate is None else f"{rate:.3g}"
+        for number, node in enumerate(plant["nodes"] or [{"node": "", "alive": True}]):
+            first = number == 0
+            cells = (
+                name if first else "",
+                node["node"],
+                node.get("phase", "") if node["alive"] else "not there",
+                rates if first else "",
+                str(node.get("lost", "")),
+                str(node.get("refused", "")),
+                f"{node['lag_ms']:.1f} ms" if "lag_ms" in node else "",
+                f"{node['said_s_ago']:.0f} s ago" if "said_s_ago" in node else "",
+                (alarms or "none") if first else "",
+            )
+            table.add_row(*map(Text, cells))  # what came from the bus is no markup
+    if not table.row_count:
+        table.add_row("nobody is there", *[""] * 8)
+    return table
+
+
+def _alarm(alarm: Alarm) -> dict[str, Any]:
+    return {
+        "alarm": alarm.alarm,
+        "state": AlarmState.Name(alarm.state).removeprefix("ALARM_STATE_").lower().replace("_", " "),
+        "priority": priority_word(alarm),
+        "text": alarm.text,
+    }
+
+
+def _is_in_sight(alarm: Alarm) -> bool:
+    return alarm.state in (
+        AlarmState.ALARM_STATE_UNACKNOWLEDGED,
+        AlarmState.ALARM_STATE_ACKNOWLEDGED,
+        AlarmState.ALARM_STATE_RETURNED_UNACKNOWLEDGED,
+    )
+
+
+def _rank(alarm: Alarm) -> tuple[int, int]:
+    """The most urgent first, then the newest."""
+    return -alarm.priority, -alarm.raised_ns

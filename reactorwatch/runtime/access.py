@@ -1,0 +1,167 @@
+"""Who may say what on the bus: the roles, and the access rules that a router enforces for them.
+
+Everyone has a certificate, and its common name says the plant and the role: `cstr.monitor`. What a rule does not allow
+is refused, silently, so that who is refused sees nothing but silence (`reactorwatch doctor` tells the difference).
+
+A router looks at each message twice, when it comes in and when it goes out. Speaking is allowed where it comes in;
+hearing is allowed at both: a subscription that is wider than the rule is not let in, and nothing of another plant goes
+out. What publishers remember is asked for below `@adv`, which no `**` reaches, and has keys of its own in each rule.
+
+Source of the words: https://zenoh.io/docs/manual/access-control
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+from reactorwatch.contract import keys
+
+MEMORY = "@adv/**"
+"""Below a key: where Zenoh's publishers answer for what they remember of it."""
+NOBODY = f"{keys.ROOT}watch/nobody"
+"""A key that no queryable answers: a question to it comes back when all before it is through. Everyone may ask it."""
+
+PLANT_COMMANDS = ("set_input", "inject_fault", "clear_fault", "pause", "resume", "step", "set_rate")
+"""What the plant, or a replay in its place, is told."""
+ALARM_COMMANDS = ("acknowledge", "shelve", "unshelve", "comment", keys.ACKNOWLEDGE_RECORDER)
+"""What an operator does with alarms."""
+ALARM_ENGINEERING = ("suppress", "unsuppress", "take_out_of_service", "return_to_service")
+"""What needs more than an operator: alarms that nobody then sees until somebody brings them back."""
+LISTS = ("list_alarms", keys.LIST_RECORDER_ALARMS)
+"""Questions that change nothing."""
+
+
+@dataclass(frozen=True)
+class Role:
+    """What the holder of a certificate may do beyond reading its plant.
+
+    Attributes:
+        name: the second part of the common name.
+        nodes: the nodes that run with it, each of which says that it is alive and how it does.
+        publishes: below the plant's key, such as `sample/**`.
+        answers: the commands it listens to, and keeps a record of.
+        asks: the commands it may give.
+    """
+
+    name: str
+    nodes: tuple[str, ...] = ()
+    publishes: tuple[str, ...] = ()
+    answers: tuple[str, ...] = ()
+    asks: tuple[str, ...] = LISTS
+
+
+PROOF = "@doctor/**"
+"""Below a kind: where `doctor` publishes to see whether it is heard; nobody else hears it, for no `**` reaches it."""
+
+ROLES = (
+    Role("plant", ("plant", "replay"), (f"{keys.SAMPLE}/**", f"{keys.FAULT}/**"), PLANT_COMMANDS),
+    Role(
+        "monitor",
+        ("monitor", "diagnosis"),
+        (
+            *(f"{kind}/**" for kind in (keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.RECONSTRUCTION)),
+            f"{keys.ALARM_KPIS}/monitor",
+        ),
+        ("acknowledge", "shelve", "unshelve", "comment", *ALARM_ENGINEERING, "list_alarms"),
+    ),
+    Role(
+        "recorder",
+        ("recorder",),
+        (f"{keys.ALARM}/{keys.RECORDING}/**",),
+        (keys.ACKNOWLEDGE_RECORDER, keys.LIST_RECORDER_ALARMS),
+    ),
+    Role("operator", asks=(*LISTS, *ALARM_COMMANDS)),
+    Role("engineer", asks=(*LISTS, *ALARM_COMMANDS, *ALARM_ENGINEERING, *PLANT_COMMANDS)),
+    Role("viewer"),
+)
+"""Everyone that a certificate can be made for, but the router."""
+
+HEAR_IN = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+HEAR_OUT = ("put", "delete", "reply", "liveliness_token", "declare_queryable", "declare_subscriber")
+
+
+def common_name(plant: str, role: str) -> str:
+    """What a certificate calls its holder.
+
+    >>> common_name("cstr", "viewer")
+    'cstr.viewer'
+    """
+    return f"{plant}.{role}"
+
+
+def kinds_of(role: Role) -> tuple[str, ...]:
+    """What a role publishes, by kind: the first part of its keys, such as `sample`."""
+    return tuple(dict.fromkeys(key.split("/")[0] for key in role.publishes))
+
+
+def role_of(name: str) -> tuple[str, Role] | None:
+    """The plant and the role that a common name says; None if it says none.
+
+    >>> role_of("line.2.viewer")[0]
+    'line.2'
+    >>> role_of("router") is None
+    True
+    """
+    plant, _, word = name.rpartition(".")
+    return next(((plant, role) for role in ROLES if plant and role.name == word), None)
+
+
+def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
+    """A router's settings `access_control`: nothing is allowed but what the roles of these plants may do.
+
+    Args:
+        plants: their names.
+    """
+    rules: list[dict[str, Any]] = [_rule("everyone", "ask nobody", ("ingress",), ("query",), [NOBODY])]
+    subjects, policies = [], []
+    for plant in plants:
+        root = f"{keys.ROOT}/{plant}"
+        everything = [f"{root}/**", f"{root}/**/{MEMORY}", f"{root}/*/{PROOF}"]
+        reading = [
+            _rule(plant, "hear", ("ingress",), HEAR_IN, everything),
+            _rule(plant, "be told", ("egress",), HEAR_OUT, everything),
+            _rule(plant, "ask what is remembered", ("ingress",), ("query",), everything[1:2]),
+        ]
+        rules += reading
+        for role in ROLES:
+            name = common_name(plant, role.name)
+            asks = [f"{root}/{keys.COMMAND}/{command}" for command in role.asks]
+            own = [_rule(name, "ask", ("ingress",), ("query",), asks)]
+            if role.nodes:
+                said = [f"{root}/{kind}" for kind in role.publishes]
+                said += [f"{root}/{keys.HEALTH}/{node}" for node in role.nodes]
+                said += [f"{root}/{keys.AUDIT}/{command}" for command in role.answers]
+                memory = [f"{key}/{MEMORY}" for key in said]
+                proofs = [f"{root}/{kind}/{PROOF}" for kind in kinds_of(role)]
+                answers = [f"{root}/{keys.COMMAND}/{command}" for command in role.answers]
+                alive = [f"{root}/{keys.ALIVE}/{node}" for node in role.nodes]
+                own += [
+                    _rule(name, "publish", ("ingress",), ("put", "reply"), [*said, *memory, *proofs]),
+                    _rule(name, "remember", ("ingress",), ("declare_queryable", "liveliness_token"), memory),
+                    _rule(name, "answer", ("ingress",), ("declare_queryable", "reply"), answers),
+                    _rule(name, "be alive", ("ingress",), ("liveliness_token",), alive),
+                    _rule(name, "be asked", ("egress",), ("query",), [*everything[1:2], *answers]),
+                    _rule(name, "know who listens", ("egress",), ("declare_liveliness_subscriber",), everything),
+                ]
+            rules += own
+            subjects.append({"id": name, "cert_common_names": [name]})
+            used = [rules[0], *reading, *own]
+            policies.append({"rules": [rule["id"] for rule in used], "subjects": [name]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+
+
+def _rule(
+    who: str, what: str, flows: tuple[str, ...], messages: tuple[str, ...], key_expressions: list[str]
+) -> dict[str, Any]:
+    return {
+        "id": f"{who}: {what}",
+        "permission": "allow",
+        "flows": list(flows),
+        "messages": list(messages),
+        "key_exprs": key_expressions,
+    }

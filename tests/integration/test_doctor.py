@@ -1,0 +1,211 @@
+"""`reactorwatch doctor` on deployments with one thing wrong: it names the thing, and nothing else is wrong."""
+
+import datetime
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from reactorwatch import __version__
+from reactorwatch.cli.doctor import NODES, Finding, examine
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.contract.messages_pb2 import Health
+from reactorwatch.runtime.access import access_control
+from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now, router, router_from_file
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.site import make_site
+
+from .site import WITHIN_S, Site, make, settings
+
+REACTORWATCH = str(Path(sys.executable).with_name("reactorwatch"))
+SHORTLY_S = 0.3
+"""For what never comes."""
+
+
+def now() -> datetime.datetime:
+    return datetime.datetime.now(datetime.UTC)
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    opened = Site(tmp_path / "site")
+    yield opened
+    opened.close()
+
+
+@contextmanager
+def nodes(buses: dict[str, ZenohBus], late_s: float = 0.0, version: str = __version__) -> Iterator[None]:
+    """Nodes that are alive and say so again and again, with a clock that is late."""
+    stopped = threading.Event()
+
+    def speak(node: str, bus: ZenohBus) -> None:
+        bus.announce(keys.key("cstr", keys.ALIVE, node))
+        while not stopped.wait(0.05):
+            time_ns = round((now().timestamp() - late_s) * 1e9)
+            health = Health(time_ns=time_ns, node=node, version=version, phase="watching")
+            bus.publish(encode(Publication(keys.key("cstr", keys.HEALTH, node), health)))
+
+    threads = [threading.Thread(target=speak, args=item) for item in buses.items()]
+    for thread in threads:
+        thread.start()
+    try:
+        yield
+    finally:
+        stopped.set()
+        for thread in threads:
+            thread.join()
+
+
+def wrong(
+    config: BusConfig, folder: Path, timeout_s: float = WITHIN_S, plant: str = "cstr", room_mb: float = 0.0
+) -> dict[str, Finding]:
+    """What is wrong, by check."""
+    return {item.check: item for item in examine(config, plant, folder, room_mb, timeout_s, now()) if item.cure}
+
+
+def test_nothing_is_wrong_with_a_site_where_all_is_well(site: Site, tmp_path: Path) -> None:
+    with nodes({node: site.join(f"cstr/{node}") for node in NODES}):
+        for who in ("plant", "monitor", "recorder", "operator", "engineer", "viewer"):
+            assert wrong(settings(site.folder, f"cstr/{who}"), tmp_path) == {}
+
+
+def test_nothing_is_wrong_on_loopback_without_certificates(tmp_path: Path) -> None:
+    config = BusConfig(endpoint=free_endpoint())
+    bus = router(config)
+    speakers = {node: connect_now(config) for node in NODES}
+    try:
+        with nodes(speakers):
+            assert wrong(config, tmp_path) == {}
+    finally:
+        for speaker in speakers.values():
+            speaker.close()
+        bus.close()
+
+
+def test_what_the_doctor_says_is_heard_by_no_node(site: Site, tmp_path: Path) -> None:
+    heard: list[Encoded] = []
+    recorder = site.join("cstr/recorder")
+    recorder.subscribe("reactor/cstr/**", heard.append)
+    plant = site.join("cstr/plant")
+    found = examine(settings(site.folder, "cstr/plant"), "cstr", tmp_path, 0.0, SHORTLY_S, now())
+    assert Finding("heard", "what we publish comes through: sample, fault") in list(found)
+    plant.publish(Encoded("reactor/cstr/sample/T", b"measured", ""))
+    site.leave(plant)
+    site.leave(recorder)
+    assert [message.payload for message in heard] == [b"measured"]
+
+
+def test_a_router_that_is_not_there_is_told(tmp_path: Path) -> None:
+    assert set(wrong(BusConfig(endpoint=free_endpoint()), tmp_path)) == {"router"}
+
+
+def test_a_router_of_another_authority_is_told(site: Site, tmp_path: Path) -> None:
+    make(tmp_path / "foreign", site.endpoint)
+    found = wrong(settings(tmp_path / "foreign", "cstr/plant"), tmp_path)
+    assert set(found) == {"router"}
+    assert "authority" in found["router"].cure
+
+
+def test_a_bus_open_to_all_is_told(tmp_path: Path) -> None:
+    """The first check, before anything is called: the address is one set aside for documents."""
+    found = next(iter(examine(BusConfig(endpoint="tcp/192.0.2.1:7447"), "cstr", tmp_path, 0.0, 0.0, now())))
+    assert found.check == "certificate"
+    assert "certify" in found.cure
+
+
+@pytest.mark.parametrize(("days", "expected"), [(1.0, "valid until"), (-1.0, "expired")])
+def test_a_certificate_that_is_or_will_soon_be_expired_is_told(tmp_path: Path, days: float, expected: str) -> None:
+    endpoint = make(tmp_path)
+    shutil.rmtree(tmp_path / "cstr" / "viewer")
+    make_site(tmp_path, ("cstr",), endpoint, endpoint, 10.0, now() + datetime.timedelta(days=days - 10.0))
+    found = wrong(settings(tmp_path, "cstr/viewer"), tmp_path)
+    assert expected in found["certificate"].found
+    assert "certify" in found["certificate"].cure
+
+
+def test_a_key_that_others_can_read_is_told(tmp_path: Path) -> None:
+    make(tmp_path)
+    (tmp_path / "cstr" / "viewer" / "key.pem").chmod(0o644)
+    assert "chmod 600" in wrong(settings(tmp_path, "cstr/viewer"), tmp_path)["private key"].cure
+
+
+def test_a_key_of_another_certificate_is_told(tmp_path: Path) -> None:
+    make(tmp_path)
+    (tmp_path / "cstr" / "viewer" / "key.pem").write_bytes((tmp_path / "cstr" / "plant" / "key.pem").read_bytes())
+    assert "is not the key of" in wrong(settings(tmp_path, "cstr/viewer"), tmp_path)["identity"].found
+
+
+def test_a_certificate_of_another_plant_is_told(tmp_path: Path) -> None:
+    make(tmp_path)
+    assert "other.viewer" in wrong(settings(tmp_path, "other/viewer"), tmp_path)["identity"].found
+
+
+def test_a_plant_that_the_router_has_no_rules_for_is_told(tmp_path: Path) -> None:
+    """As when it was not started again after the plant was added: it lets in, and lets nothing through."""
+    make(tmp_path)
+    file = tmp_path / "router" / "router.json5"
+    rules = json.loads(file.read_text(encoding="utf-8"))
+    file.write_text(json.dumps({**rules, "access_control": access_control(("cstr",))}), encoding="utf-8")
+    bus = router_from_file(file)
+    try:
+        found = wrong(settings(tmp_path, "other/plant"), tmp_path, SHORTLY_S, plant="other")
+        assert "sample, fault" in found["heard"].found
+    finally:
+        bus.close()
+
+
+def test_a_node_that_is_not_there_is_told(site: Site, tmp_path: Path) -> None:
+    with nodes({node: site.join(f"cstr/{node}") for node in ("plant", "monitor")}):
+        assert set(wrong(settings(site.folder, "cstr/viewer"), tmp_path, SHORTLY_S)) == {"recorder"}
+
+
+def test_a_clock_that_is_off_and_another_version_are_told(site: Site, tmp_path: Path) -> None:
+    others = {node: site.join(f"cstr/{node}") for node in ("plant", "recorder")}
+    with nodes(others), nodes({"monitor": site.join("cstr/monitor")}, late_s=60.0, version="0.0.1"):
+        found = wrong(settings(site.folder, "cstr/viewer"), tmp_path)
+    assert set(found) == {"monitor"}
+    assert "NTP" in found["monitor"].cure
+    assert f"same version as here, {__version__}" in found["monitor"].cure
+    assert "its clock -60." in found["monitor"].found
+
+
+def test_a_disk_without_room_is_told(tmp_path: Path) -> None:
+    found = wrong(BusConfig(endpoint=free_endpoint()), tmp_path / "not" / "made yet", room_mb=1e12)
+    assert "make room" in found["disk"].cure
+
+
+def doctor(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([REACTORWATCH, "doctor", *arguments], capture_output=True, text=True, check=False)
+
+
+def test_the_command_ends_with_0_if_all_is_well(site: Site) -> None:
+    with nodes({node: site.join(f"cstr/{node}") for node in NODES}):
+        done = doctor("--config", str(site.folder / "cstr" / "viewer" / "settings.toml"), "--json")
+    assert msgspec.json.decode(done.stdout)["ok"] is True
+    assert done.returncode == 0
+
+
+def test_the_command_ends_with_1_and_a_cure_if_something_is_wrong() -> None:
+    done = doctor("--endpoint", free_endpoint())
+    assert done.returncode == 1
+    (line,) = [line for line in done.stdout.splitlines() if line.startswith("WRONG")]
+    assert line.startswith("WRONG  router: no way in at tcp/127.0.0.1:")
+    assert "; start it" in line
+
+
+@pytest.mark.parametrize("arguments", [["--config", "nowhere.toml"], ["--endpoint", "here"], ["--plant", "a/b"]])
+def test_the_command_ends_with_2_and_one_line_if_it_was_asked_wrongly(arguments: list[str]) -> None:
+    done = doctor(*arguments)
+    assert done.returncode == 2
+    assert done.stderr.startswith("reactorwatch: ")
+    assert done.stderr.count(os.linesep) == 1

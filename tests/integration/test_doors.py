@@ -1,0 +1,274 @@
+"""Who may not, cannot: real sessions on loopback, against the router's settings that `certify` writes.
+
+What is refused is refused in silence. So each test also shows the like that is let in, and looks once whatever was
+sent before has come through: a session that leaves has a question answered by the router first.
+"""
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from benchmarks.link_cuts import Proxy
+from reactorwatch.contract.codec import Encoded, decode, encode_message
+from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply
+from reactorwatch.runtime.bus import Request
+from reactorwatch.runtime.bus_zenoh import connect
+from reactorwatch.runtime.config import BusConfig
+
+from .site import WITHIN_S, OneAttempt, Site, make, settings
+
+SAMPLE = "reactor/cstr/sample/T"
+ALARM = "application/protobuf;reactorwatch.v1.AlarmCommand"
+OTHERS = ("cstr/monitor", "cstr/recorder", "cstr/operator", "cstr/engineer", "cstr/viewer", "other/plant")
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Iterator[Site]:
+    opened = Site(tmp_path / "site")
+    yield opened
+    opened.close()
+
+
+def sample(payload: bytes) -> Encoded:
+    return Encoded(SAMPLE, payload, "")
+
+
+def tls_client(endpoint: str, **tls: str | bool) -> zenoh.Config:
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([endpoint]))
+    config.insert_json5("connect/timeout_ms", "0")
+    config.insert_json5("scouting/multicast/enabled", "false")
+    for name, value in tls.items():
+        config.insert_json5(f"transport/link/tls/{name}", json.dumps(value))
+    return config
+
+
+def test_who_has_a_certificate_of_the_site_is_let_in(site: Site) -> None:
+    for who in (*OTHERS, "cstr/plant"):
+        assert site.join(who)
+
+
+def test_who_has_no_certificate_is_not_let_in(site: Site) -> None:
+    ca = str(site.folder / "cstr" / "viewer" / "ca.pem")
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(tls_client(site.endpoint, root_ca_certificate=ca))
+
+
+def test_who_has_a_certificate_of_another_authority_is_not_let_in(site: Site, tmp_path: Path) -> None:
+    make(tmp_path / "foreign", site.endpoint)
+    foreign = tmp_path / "foreign" / "cstr" / "plant"
+    ca = str(site.folder / "cstr" / "plant" / "ca.pem")  # so that it is not the client that turns away
+    with pytest.raises(zenoh.ZError):
+        zenoh.open(
+            tls_client(
+                site.endpoint,
+                root_ca_certificate=ca,
+                connect_certificate=str(foreign / "certificate.pem"),
+                connect_private_key=str(foreign / "key.pem"),
+                enable_mtls=True,
+            )
+        )
+
+
+def test_a_router_of_another_authority_is_not_trusted(site: Site, tmp_path: Path) -> None:
+    make(tmp_path / "foreign", site.endpoint)
+    assert connect(settings(tmp_path / "foreign", "cstr/plant"), "plant", OneAttempt()) is None
+
+
+def test_a_client_s_certificate_makes_no_router(tmp_path: Path) -> None:
+    """Its holder listens with it where the router should be."""
+    endpoint = make(tmp_path)
+    viewer = tmp_path / "cstr" / "viewer"
+    config = zenoh.Config.from_file(str(tmp_path / "router" / "router.json5"))
+    names = {"root_ca_certificate": "ca", "listen_certificate": "certificate", "listen_private_key": "key"}
+    for name, file in names.items():
+        config.insert_json5(f"transport/link/tls/{name}", json.dumps(str(viewer / f"{file}.pem")))
+    with zenoh.open(config):
+        assert connect(settings(tmp_path, "cstr/plant"), "plant", OneAttempt()) is None
+    assert endpoint == settings(tmp_path, "cstr/plant").endpoint
+
+
+def test_plain_tcp_is_not_let_in(site: Site) -> None:
+    plain = BusConfig(endpoint=site.endpoint.replace("tls/", "tcp/"))
+    assert connect(plain, "plant", OneAttempt()) is None
+
+
+@pytest.mark.parametrize("who", OTHERS)
+def test_nobody_but_the_plant_publishes_its_samples(site: Site, who: str) -> None:
+    intruder = site.join(who)
+    intruder.publish(sample(b"made up"))
+    site.leave(intruder)
+    site.join("cstr/plant").publish(sample(b"measured"))
+    heard = site.heard_until(lambda message: message.payload == b"measured")
+    assert [message.payload for message in heard] == [b"measured"]
+
+
+@pytest.mark.parametrize("who", ["cstr/engineer", "cstr/monitor", "other/plant"])
+def test_who_told_the_plant_what_cannot_be_forged(site: Site, who: str) -> None:
+    intruder = site.join(who)
+    intruder.publish(Encoded("reactor/cstr/audit/set_input", b"forged", ""))
+    site.leave(intruder)
+    site.join("cstr/plant").publish(Encoded("reactor/cstr/audit/set_input", b"recorded", ""))
+    heard = site.heard_until(lambda message: message.payload == b"recorded")
+    assert [message.payload for message in heard] == [b"recorded"]
+
+
+def answered(site: Site, node: str, who: str, command: str) -> bool:
+    """Whether a holder gets an answer to a command that a node answers."""
+    asked = []
+
+    def answer(request: Request) -> None:
+        asked.append(request)
+        request.reply(CommandReply(accepted=True))
+
+    key = f"reactor/cstr/command/{command}"
+    site.join(f"cstr/{node}").answer(key, answer)
+    question = Encoded(key, *encode_message(AlarmCommand(alarm="shewhart/T", by=who)))
+    replies = site.join(who).ask(question, WITHIN_S)
+    assert bool(asked) == bool(replies)
+    return bool(replies)
+
+
+@pytest.mark.parametrize(
+    ("who", "may"),
+    [
+        ("cstr/operator", True),
+        ("cstr/engineer", True),
+        ("cstr/viewer", False),
+        ("cstr/plant", False),
+        ("cstr/recorder", False),
+        ("other/operator", False),
+        ("other/engineer", False),
+    ],
+)
+def test_operators_and_engineers_of_the_plant_acknowledge(site: Site, who: str, *, may: bool) -> None:
+    assert answered(site, "monitor", who, "acknowledge") is may
+
+
+@pytest.mark.parametrize(
+    ("who", "may"),
+    [
+        ("cstr/engineer", True),
+        ("cstr/operator", False),
+        ("cstr/viewer", False),
+        ("cstr/monitor", False),
+        ("other/engineer", False),
+    ],
+)
+@pytest.mark.parametrize("command", ["set_input", "inject_fault"])
+def test_engineers_of_the_plant_alone_command_it(site: Site, who: str, command: str, *, may: bool) -> None:
+    assert answered(site, "plant", who, command) is may
+
+
+@pytest.mark.parametrize(("who", "may"), [("cstr/engineer", True), ("cstr/operator", False)])
+def test_engineers_alone_take_an_alarm_out_of_sight_for_good(site: Site, who: str, *, may: bool) -> None:
+    assert answered(site, "monitor", who, "suppress") is may
+
+
+@pytest.mark.parametrize(("node", "command"), [("monitor", "list_alarms"), ("recorder", "list_recorder_alarms")])
+def test_a_viewer_may_ask_what_alarms_there_are(site: Site, node: str, command: str) -> None:
+    assert answered(site, node, "cstr/viewer", command)
+
+
+def test_a_node_that_pretends_to_be_another_is_not_asked(site: Site) -> None:
+    """The plant's certificate cannot answer for the monitor."""
+    assert not answered(site, "plant", "cstr/operator", "acknowledge")
+
+
+def test_a_viewer_reads_its_own_plant_and_no_other(site: Site) -> None:
+    own: list[Encoded] = []
+    foreign: list[Encoded] = []
+    wide: list[Encoded] = []
+    site.join("cstr/viewer").subscribe("reactor/cstr/**", own.append)
+    site.join("other/viewer").subscribe("reactor/cstr/**", foreign.append)
+    site.join("other/viewer").subscribe("reactor/**", wide.append)
+    plant, stranger = site.join("cstr/plant"), site.join("other/plant")
+    plant.publish(sample(b"measured"))
+    stranger.publish(Encoded("reactor/other/sample/T", b"not yours", ""))
+    site.leave(plant)
+    site.leave(stranger)
+    site.close_readers()
+    assert [message.payload for message in own] == [b"measured"]
+    assert not foreign
+    assert not wide
+
+
+def test_a_recorder_of_the_whole_plant_is_told_what_was_before(site: Site) -> None:
+    """It asks for that below a wider key than any that the plant publishes on."""
+    heard: list[Encoded] = []
+    site.join("cstr/plant").publish(sample(b"measured"))
+    site.heard_until(lambda message: message.payload == b"measured")
+    site.join("cstr/recorder").subscribe("reactor/cstr/**", heard.append, history=True)
+    site.close_readers()
+    assert [message.payload for message in heard] == [b"measured"]
+
+
+@pytest.mark.parametrize("whose", ["plant", "recorder"])
+def test_what_is_published_while_a_link_is_cut_is_recovered_past_the_rules(site: Site, whose: str) -> None:
+    proxy = Proxy(site.endpoint)
+    around = {whose: proxy.endpoint.replace("tcp/", "tls/")}
+    heard: list[bytes] = []
+    changed = threading.Condition()
+
+    def hear(message: Encoded) -> None:
+        with changed:
+            heard.append(message.payload)
+            changed.notify_all()
+
+    def wait_for(count: int) -> None:
+        with changed:
+            assert changed.wait_for(lambda: len(heard) >= count, WITHIN_S), f"{len(heard)} of {count}"
+
+    site.join("cstr/recorder", around.get("recorder")).subscribe("reactor/cstr/**", hear)
+    plant = site.join("cstr/plant", around.get("plant"))
+    for number in range(50):
+        plant.publish(sample(b"%d" % number))
+    wait_for(50)
+    with proxy.cut("closed"):
+        for number in range(50, 100):
+            plant.publish(sample(b"%d" % number))
+    wait_for(100)
+    proxy.close()
+    assert heard == [b"%d" % number for number in range(100)]
+
+
+def test_what_a_plant_remembers_is_not_told_to_a_reader_of_another(site: Site) -> None:
+    own: list[Encoded] = []
+    foreign: list[Encoded] = []
+    site.join("cstr/plant").publish(sample(b"measured"))
+    site.heard_until(lambda message: message.payload == b"measured")
+    site.join("cstr/viewer").subscribe("reactor/cstr/sample/**", own.append, history=True)
+    site.join("other/viewer").subscribe("reactor/cstr/sample/**", foreign.append, history=True)
+    site.close_readers()
+    assert [message.payload for message in own] == [b"measured"]
+    assert not foreign
+
+
+def test_who_is_alive_is_told_to_readers_of_the_plant_and_cannot_be_feigned(site: Site) -> None:
+    alive: list[str] = []
+    foreign: list[str] = []
+    intruder = site.join("cstr/viewer")
+    intruder.announce("reactor/cstr/alive/monitor")
+    intruder.ask(Encoded("reactor/cstr/command/list_alarms", b"", ALARM), WITHIN_S)  # after which the token was judged
+    site.join("cstr/monitor").announce("reactor/cstr/alive/monitor")
+    site.join("cstr/plant").announce("reactor/cstr/alive/plant")
+    site.join("cstr/operator").watch_alive("reactor/cstr/alive/**", lambda key, _: alive.append(key))
+    site.join("other/operator").watch_alive("reactor/cstr/alive/**", lambda key, _: foreign.append(key))
+    site.close_readers()
+    assert sorted(alive) == ["reactor/cstr/alive/monitor", "reactor/cstr/alive/plant"]
+    assert not foreign
+
+
+def test_an_answer_says_what_was_done(site: Site) -> None:
+    """The whole way of a command and its reply, over TLS."""
+    site.join("cstr/monitor").answer(
+        "reactor/cstr/command/acknowledge", lambda request: request.reply(CommandReply(accepted=True, text="seen"))
+    )
+    question = Encoded("reactor/cstr/command/acknowledge", *encode_message(AlarmCommand(alarm="a", by="Anna")))
+    (answer,) = site.join("cstr/operator").ask(question, WITHIN_S)
+    assert decode(answer.payload, answer.encoding) == CommandReply(accepted=True, text="seen")
