@@ -44,6 +44,8 @@ class Beginning:
         self._corrected = ArrayFunction(corrected_function(own))
         self._lower = np.array([state.lower for state in own.states])
         self._upper = np.array([state.upper for state in own.states])
+        outputs = own.output_names
+        self._named = [(place, outputs.index(name)) for place, name in enumerate(own.state_names) if name in outputs]
         self._where: tuple[object, ...] = ()
         self._points: list[SteadyState] = []
         self._wide = np.diag(np.square([START_SD * state.scale for state in own.states]))
@@ -73,8 +75,8 @@ class Beginning:
         if not known.any() or not np.all(np.isfinite(u)):
             return None
         p = self._model.values(changes)
-        x = 0.5 * (self._lower + self._upper)
-        if np.linalg.matrix_rank(self._slope(x, u, p, time_min)[known]) < x.size:
+        x = self._guessed(y)
+        if not _tells_all(self._slope(x, u, p, time_min)[known]):
             points = self._steady_states(u, time_min, changes)
             distances = [float(np.nansum(((point.outputs - y) / measurement_sd) ** 2)) for point in points]
             x = points[int(np.argmin(distances))].state if points else x
@@ -91,6 +93,14 @@ class Beginning:
             x, P = after[0], J.T @ P @ J + further
         return x, P
 
+    def _guessed(self, y: Array) -> Array:
+        """Where a sensor has the name of a state, it shows about that; the others are in the middle of their range."""
+        x: Array = 0.5 * (self._lower + self._upper)
+        for state, output in self._named:
+            if np.isfinite(y[output]):
+                x[state] = min(max(y[output], self._lower[state]), self._upper[state])
+        return x
+
     def _steady_states(self, u: Array, time_min: float, changes: Mapping[str, float]) -> list[SteadyState]:
         """As they are now. Kept until they are asked for elsewhere: one record is often begun many times."""
         where = (time_min, *u, *changes.items())
@@ -105,6 +115,11 @@ class Beginning:
     def _slope(self, x: Array, u: Array, p: Array, time_min: float) -> Array:
         """The outputs' derivatives with respect to the state."""
         return _called(self._outputs, x, u, p, time_min)[1].T
+
+
+def _tells_all(slope: Array) -> bool:
+    """Whether the state can be read off outputs with this derivative; far from where it runs a model has none."""
+    return bool(np.all(np.isfinite(slope)) and np.linalg.matrix_rank(slope) == slope.shape[1])
 
 
 def _called(function: ArrayFunction, *values: Array | float) -> list[Array]:

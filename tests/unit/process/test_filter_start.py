@@ -1,5 +1,8 @@
 """Where a filter begins: at what is measured; a state that does not show, at the steady state that goes with it."""
 
+from dataclasses import replace
+
+import casadi as ca
 import numpy as np
 import pytest
 
@@ -71,3 +74,13 @@ def test_it_begins_anew_after_a_row_whose_input_nobody_knows() -> None:
         kalman.update(*row) for row in zip(time_min.tolist(), inputs[:, None].tolist(), measured.tolist(), strict=True)
     ]
     np.testing.assert_array_equal([item.prediction for item in told], found.prediction)
+
+
+def test_it_begins_where_outputs_far_from_there_are_no_numbers() -> None:
+    """In the middle of the range of C this analyser shows the root of something negative."""
+    model = cstr()
+    C, T = model.outputs
+    shown = C.expression + 1e-9 * ca.sqrt(0.5 - C.expression)
+    kalman = Filter(replace(model, outputs=(replace(C, expression=shown), T)), SENSORS)
+    kalman.update(0.0, (100.0,), (0.09, 441.0))
+    assert kalman.state.x == pytest.approx((0.09, 441.0), rel=1e-3)
