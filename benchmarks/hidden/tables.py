@@ -5,6 +5,7 @@ from math import isfinite, isnan
 
 from benchmarks.hidden.classes import CLASSES
 from benchmarks.hidden.score import Score, confusion
+from diagnosis.result import UNKNOWN
 from tests.hidden_effect.judge import Judged
 
 Cell = Callable[[Score], str]
@@ -77,11 +78,12 @@ def confusion_table(found: Mapping[str, Sequence[Judged]], kinds: Sequence[str] 
 
 
 def failures(found: Mapping[str, Sequence[Judged]]) -> list[str]:
-    """A line for each record in which exactly what is hidden was not named."""
+    """A line for each record in which exactly what is hidden was not named; or, where it has no name, not its place."""
+    nameless = {study.name for study in CLASSES if study.kind == "outside"}
     lines = []
     for name, judged in found.items():
         for item in judged:
-            if item.first:
+            if item.first or (name in nameless and item.verdict == UNKNOWN and item.right_place):
                 continue
             truth = ", ".join(
                 f"{cause} {course} {size:.4g}"

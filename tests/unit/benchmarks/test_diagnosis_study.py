@@ -99,3 +99,9 @@ def test_nothing_is_hidden_in_a_nominal_record() -> None:
 def test_an_unknown_class_is_refused_with_the_names_of_those_there_are() -> None:
     with pytest.raises(KeyError, match=r"no class .easy.*closed loop"):
         class_named("easy")
+
+
+def test_what_has_no_name_fails_where_it_is_not_in_its_place() -> None:
+    found = [one("x", "", verdict="unknown", right_place=True), one("x", "", verdict="unknown", seed=2)]
+    (line,) = failures({"outside": found})
+    assert "seed 2" in line
