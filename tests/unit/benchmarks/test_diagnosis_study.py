@@ -102,6 +102,7 @@ def test_an_unknown_class_is_refused_with_the_names_of_those_there_are() -> None
 
 
 def test_what_has_no_name_fails_where_it_is_not_in_its_place() -> None:
-    found = [one("x", "", verdict="unknown", right_place=True), one("x", "", verdict="unknown", seed=2)]
+    unknown = {"verdict": "unknown", "profiles": ()}
+    found = [one("x", "", right_place=True, **unknown), one("x", "", seed=2, **unknown)]
     (line,) = failures({"outside": found})
     assert "seed 2" in line
