@@ -6,10 +6,9 @@ from google.protobuf.message import Message
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_states import Event
-from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encoding_of
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.commands import command_in, signed
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms, ShelveAlarm
-from reactorwatch.errors import InputError
 
 EVENTS: Mapping[str, Event] = {
     event.replace(" ", "_"): event
@@ -30,9 +29,6 @@ COMMANDS: Mapping[str, type[Message]] = {
 }
 """The commands and what they carry."""
 
-LONGEST_NAME = 64
-LONGEST_COMMENT = 1000
-
 
 def obey(board: AlarmBoard, question: Encoded) -> tuple[CommandReply, list[Publication]]:
     """Do what is asked.
@@ -44,23 +40,12 @@ def obey(board: AlarmBoard, question: Encoded) -> tuple[CommandReply, list[Publi
         InputError: it cannot be done; nothing has changed.
         DecodeError: the payload is not what the command carries; nothing has changed.
     """
-    topic = keys.parse(question.key)
-    name = topic.name if topic is not None and topic.kind == keys.COMMAND else question.key
-    if name not in COMMANDS:
-        raise InputError(f"unknown command {name!r} (valid: {', '.join(COMMANDS)})")
-    command = decode(question.payload, question.encoding)
-    if type(command) is not COMMANDS[name]:
-        wanted = encoding_of(COMMANDS[name])
-        raise DecodeError("encoding", f"command {name} must carry {wanted!r}, got {question.encoding!r}")
+    name, command = command_in(question, COMMANDS)
     if isinstance(command, ListAlarms):
         alarms = board.all_alarms()
         return CommandReply(accepted=True, text=f"{len(alarms)} alarms", alarms=alarms), []
     assert isinstance(command, AlarmCommand | ShelveAlarm), "the catalogue holds no others"
-    by, comment = command.by.strip(), command.comment.strip()
-    if not 1 <= len(by) <= LONGEST_NAME:
-        raise InputError(f"by must name the person, in 1 to {LONGEST_NAME} characters, got {by[:LONGEST_NAME]!r}")
-    if len(comment) > LONGEST_COMMENT:
-        raise InputError(f"comment must have at most {LONGEST_COMMENT} characters, got {len(comment)}")
+    by, comment = signed(command.by, command.comment)
     if isinstance(command, ShelveAlarm):
         said = board.shelve(command.alarm, command.minutes, by, comment)
     elif name == "comment":

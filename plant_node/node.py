@@ -12,7 +12,8 @@ from plant_node.config import PlantConfig
 from plant_node.core import FaultChange, Plant, Row
 from reactorwatch import __version__
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encoding_of
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication
+from reactorwatch.contract.commands import command_in
 from reactorwatch.contract.messages_pb2 import (
     ClearFault,
     CommandReply,
@@ -121,24 +122,19 @@ class PlantNode:
         return started_ns + round(self._plant.time_min * 60e9 / self._config.speed)
 
     def _obey(self, question: Encoded) -> str:
-        topic = keys.parse(question.key)
-        name = topic.name if topic is not None and topic.kind == keys.COMMAND else question.key
-        if name not in COMMANDS:
-            raise InputError(f"unknown command {name!r} (valid: {', '.join(COMMANDS)})")
-        command = decode(question.payload, question.encoding)
+        _, command = command_in(question, COMMANDS)
         when = f"from {self._plant.time_min:g} min on"
         match command:
-            case SetInput() if name == "set_input":
+            case SetInput():
                 self._plant.set_input(command.signal, command.value)
                 text = f"{command.signal} = {command.value:g} {self._plant.units[command.signal]} {when}"
                 return text if self._plant.mode == "open loop" else f"{text}, on {self._plant.mode}"
-            case InjectFault() if name == "inject_fault":
+            case InjectFault():
                 return f"fault {self._plant.inject(parse_fault(command.specification))} is in the plant"
-            case ClearFault() if name == "clear_fault":
+            case ClearFault():
                 gone = ", ".join(str(item) for item in self._plant.clear(command.cause))
                 return f"fault {gone} is taken away {when}"
-        wanted, got = encoding_of(COMMANDS[name]), question.encoding
-        raise DecodeError("encoding", f"command {name} must carry {wanted!r}, got {got!r}")
+        raise AssertionError("the catalogue holds no others")
 
     def _publications(self, row: Row) -> list[Publication]:
         time_ns = self._time_ns(row.time_min)

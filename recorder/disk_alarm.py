@@ -11,7 +11,8 @@ from google.protobuf.message import Message
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encoding_of
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication
+from reactorwatch.contract.commands import command_in, signed
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms
 from reactorwatch.errors import InputError
 
@@ -21,8 +22,6 @@ COMMANDS: Mapping[str, type[Message]] = {
     keys.ACKNOWLEDGE_RECORDER: AlarmCommand,
 }
 """The recorder's commands and what they carry."""
-
-_LONGEST_NAME, _LONGEST_COMMENT = 64, 1000
 
 
 class DiskAlarm:
@@ -59,14 +58,7 @@ class DiskAlarm:
             return CommandReply(accepted=False, text=str(error)), []
 
     def _answer(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        topic = keys.parse(question.key)
-        name = topic.name if topic is not None and topic.kind == keys.COMMAND else question.key
-        if name not in COMMANDS:
-            raise InputError(f"unknown command {name!r} (valid: {', '.join(COMMANDS)})")
-        command = decode(question.payload, question.encoding)
-        if type(command) is not COMMANDS[name]:
-            wanted = encoding_of(COMMANDS[name])
-            raise DecodeError("encoding", f"command {name} must carry {wanted!r}, got {question.encoding!r}")
+        _, command = command_in(question, COMMANDS)
         if isinstance(command, ListAlarms):
             return CommandReply(accepted=True, text="1 alarm", alarms=[self._now]), []
         assert isinstance(command, AlarmCommand), "the catalogue holds no others"
@@ -74,13 +66,9 @@ class DiskAlarm:
         return CommandReply(accepted=True, text=f"alarm {DISK_ALARM}: acknowledge", alarms=[self._now]), [told]
 
     def _acknowledge(self, command: AlarmCommand, now_ns: int) -> Publication:
-        by, comment = command.by.strip(), command.comment.strip()
         if command.alarm != DISK_ALARM:
             raise InputError(f"no alarm {command.alarm!r} of the recorder (there is: {DISK_ALARM})")
-        if not 1 <= len(by) <= _LONGEST_NAME:
-            raise InputError(f"by must name the person, in 1 to {_LONGEST_NAME} characters, got {by[:_LONGEST_NAME]!r}")
-        if len(comment) > _LONGEST_COMMENT:
-            raise InputError(f"comment must have at most {_LONGEST_COMMENT} characters, got {len(comment)}")
+        by, comment = signed(command.by, command.comment)
         after = {
             messages.ALARM_STATE_UNACKNOWLEDGED: messages.ALARM_STATE_ACKNOWLEDGED,
             messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED: messages.ALARM_STATE_NORMAL,

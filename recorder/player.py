@@ -11,7 +11,8 @@ from typing import cast
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, encoding_of
+from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.commands import command_in
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import UNITS, Record, to_time_ns
@@ -22,8 +23,8 @@ BATCH = 256
 
 NEVER_NS = 2**62
 
-COMMANDS = ("pause", "resume", "step", "set_rate")
-"""Of the queryables `reactor/{plant}/command/{name}`; each carries a `ReplayCommand`."""
+COMMANDS = dict.fromkeys(("pause", "resume", "step", "set_rate"), messages.ReplayCommand)
+"""The commands and what they carry."""
 
 SAMPLES = frozenset({keys.SAMPLE})
 EVERYTHING = frozenset(
@@ -168,14 +169,8 @@ class Player:
     # --- within ----------------------------------------------------------------------------------------------
 
     def _obey(self, question: Encoded, now_ns: int) -> tuple[str, list[Publication]]:
-        topic = keys.parse(question.key)
-        name = topic.name if topic is not None and topic.kind == keys.COMMAND else question.key
-        if name not in COMMANDS:
-            raise InputError(f"unknown command {name!r} (valid: {', '.join(COMMANDS)})")
-        command = decode(question.payload, question.encoding)
-        if not isinstance(command, messages.ReplayCommand):
-            wanted = encoding_of(messages.ReplayCommand)
-            raise DecodeError("encoding", f"command {name} must carry {wanted!r}, got {question.encoding!r}")
+        name, command = command_in(question, COMMANDS)
+        assert isinstance(command, messages.ReplayCommand), "the catalogue holds no others"
         if name == "set_rate" and not command.rate > 0.0:
             raise InputError(f"rate must be positive, got {command.rate:g}")
         if name == "step" and not self._paused:
