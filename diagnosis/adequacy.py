@@ -23,6 +23,9 @@ BURN_IN_ROWS = 20
 WHITE = 6.0
 """Minus the decimal logarithm of the p-value, beyond which what is left is not white: a search looks at a lot."""
 
+DOUBTFUL = 3.0
+"""Likewise, beyond which it is asked whether something else explains the run better."""
+
 LARGEST = 999.0
 
 

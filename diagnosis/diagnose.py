@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from diagnosis.adequacy import WHITE, minus_log10_p
+from diagnosis.adequacy import DOUBTFUL, WHITE, minus_log10_p
 from diagnosis.drawn import curves_of, differences_of
 from diagnosis.estimates import adjusted_parameters, causes_of, with_rough_numbers
 from diagnosis.experiment import proposed
@@ -42,12 +42,9 @@ LEAST_GAIN = 10.0
 SURE = 6.0
 """In BIC, odds of twenty to one: where a rival is worse by less, the record does not rank them."""
 
-DOUBTFUL = 3.0
-"""Minus the decimal logarithm of the p-value that what is left is white, beyond which it is asked whether something
-unknown explains the run better."""
-
 MUCH_LEFT, MUCH_LEFT_BY_TWO = 30.0, 10.0
-"""Likewise; so much is left by no cause that is right, nor by two of them, which can imitate a third."""
+"""Minus the decimal logarithm of the p-value that what is left is white: so much is left by no cause that is right, nor
+by two of them, which can imitate a third."""
 
 NOISY_SHARE = 0.003
 """Of a state's scale per square root of a minute: a cause that leaves the process so noisy may not be all there is."""

@@ -17,7 +17,7 @@ from math import inf
 
 import numpy as np
 
-from diagnosis.adequacy import minus_log10_p
+from diagnosis.adequacy import DOUBTFUL, minus_log10_p
 from diagnosis.courses import Constant, Course, Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Hypothesis
 from diagnosis.pair_screen import PairLead, PairScreen, Remembered
@@ -29,9 +29,6 @@ from reactorwatch.process.model import Array
 
 LEAST_PAIR_GAIN = 40.0
 """In BIC, of a pair over the best single cause."""
-
-DOUBTFUL = 3.0
-"""Minus the decimal logarithm of the p-value that what the best single cause leaves is white: beyond, it may be two."""
 
 SHORTLIST, AGAIN, REFINED = 6, 3, 2
 """How many pairs of a screen are fitted, how many of these again with the noise of the best, and how many well."""

@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from diagnosis.adequacy import minus_log10_p
+from diagnosis.adequacy import DOUBTFUL, minus_log10_p
 from diagnosis.courses import Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.knots import best_resolved
@@ -48,8 +48,6 @@ LEAST_SENSOR_GAIN = 10.0
 """In BIC: less does not make a sensor's noise remember."""
 
 ROUNDS, OTHERS = 5, 2
-DOUBTFUL = 3.0
-"""Minus the decimal logarithm of the p-value that what the best leaves is white, beyond which others are asked."""
 
 SETTLED_NOISE = 10.0
 """In BIC: a noise that gains less is not worth another round."""
@@ -197,8 +195,7 @@ class Search:
         held, found = self.noise, best
         for item in asked:
             self.settle(item)
-            self._use_noise(item.hypothesis.sized)
-            item = self.fit(item.hypothesis, item.fit.theta, scan=item.hypothesis.sized.effects[0].jumps)
+            item = self.refitted(item, scan=item.hypothesis.sized.effects[0].jumps)
             if item.bic < found.bic:
                 held, found = self.noise, item
         self.noise = held
@@ -334,10 +331,10 @@ class Search:
         apart = np.abs(lead.theta - theta)[lead.course.coefficients :]
         return bool(np.any(apart > _NEAR * lead.course.least_differences))
 
-    def refitted(self, explained: Explained) -> Explained:
-        """With the noise that holds now; sizes that act in jumps stay."""
+    def refitted(self, explained: Explained, scan: bool = False) -> Explained:
+        """With the noise that holds now; sizes that act in jumps stay, unless they are looked for anew."""
         self._use_noise(explained.hypothesis.sized)
-        return self.fit(explained.hypothesis, explained.fit.theta, scan=False)
+        return self.fit(explained.hypothesis, explained.fit.theta, scan=scan)
 
     def explained(self, hypothesis: Hypothesis, theta: Sequence[Array]) -> Explained:
         """A hypothesis at some numbers."""

@@ -51,8 +51,9 @@ class Sized:
         self.late = places[0] if places else None
         self._plant, self._noise, self._period_min = model, noise, period_min
         sized = with_size_inputs(model, tuple(item for item in self.effects if item.late_output is None))
-        wandering = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
-        self._filtered = wandering if noise.wandering else sized
+        if noise.wandering:
+            sized = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
+        self._filtered = sized
         self._filter = Filter(self.model, self._levels_of(noise))
         self._errors = self._filtered.errors.with_noise(self.levels)
         self.noise = noise
