@@ -67,6 +67,7 @@ def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], N
         with viewer(*arguments, port=data, bind=shown.bind, log=log) as process:
             _wait_for(process, data, shown, log)
             if shown.web:
+                _wait_for(process, page, shown, log)  # it is served some time after the data are
                 host = _in_url(_reached(shown.bind))
                 say(f"open http://{host}:{page}/?url=rerun%2Bhttp://{host}:{data}/proxy")
             bus = bus_zenoh.connect(bus_config, NODE, stop)
@@ -188,7 +189,7 @@ def _origins(shown: Shown, page: int) -> tuple[str, ...]:
 
 
 def _wait_for(process: subprocess.Popen[bytes], port: int, shown: Shown, log: Path) -> None:
-    """Wait until the viewer listens.
+    """Wait until the viewer listens at a port.
 
     Raises:
         InputError: it has ended, or does not within the time.
