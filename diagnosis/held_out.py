@@ -68,7 +68,7 @@ def gained(run: Run, nominal: Explained, best: Explained) -> tuple[Errors, Error
     seen = replace(run, measured=np.where(hidden[:, None], np.nan, run.measured))
     fit = best.fit
     if best is not nominal:
-        fit = best.hypothesis.fit(seen, best.fit.theta, scan=False)
+        fit = best.hypothesis.fit(seen, best.fit.theta)
     elif best.hypothesis.sized.model.lasting:
         fit = best.hypothesis.at(seen, ())
     known = best.hypothesis.offsets(fit)

@@ -5,7 +5,7 @@ Robust estimation of a location parameter, Annals of Mathematical Statistics 35)
 grows no faster than the deviation. The filter follows what is measured as far as its process noise lets it, and with
 none it runs freely; so a start on the wrong branch or an extinguished plant leads no fit astray. The loss is lowered by
 Gauss and Newton's steps, damped as Levenberg and Marquardt do, whose derivatives come from the equations of the
-filter's own errors (`signatures`).
+filter's own errors (`signatures`). Sizes that act in jumps have none, and are scanned (`jumping`).
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ import numpy as np
 from diagnosis import signatures
 from diagnosis.courses import Course, Signal
 from diagnosis.run import Run
-from diagnosis.sized import HUBER, Sized, clipped, loss_of
+from diagnosis.sized import HUBER, Sized, clipped
 from diagnosis.uncertain import last_state, offsets
 from reactorwatch.process.filter import Innovations
 from reactorwatch.process.filter_errors import Ways
@@ -32,8 +32,6 @@ _RUNAWAY = 1e100
 """A filter that lost an unstable plant has signatures without bound, and no step makes sense."""
 
 _SHARE = 0.02
-_SCANS = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
-_LEAST_SCANNED = 5.0  # in log likelihood
 _WIDENINGS, _WIDER = 10, 2.0
 _TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 5, 1e-3, 10.0, 0.1
 
@@ -85,25 +83,15 @@ class Hypothesis:
         loss, w, found = self.sized.follow(run, self._signals(theta))
         return Fit(theta, loss, w, found)
 
-    def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True) -> Fit:
-        """The best numbers that are found from a start.
+    def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS) -> Fit:
+        """The best numbers that so many steps of least squares find from a start; sizes that act in jumps stay.
 
         Args:
             run: the record.
             start: where it begins, theta of each effect.
             steps: at most; fewer than `MOST_STEPS` are for a rough fit.
-            scan: whether sizes that act in jumps are looked for; else they stay.
         """
-        best = self._climbed(run, self.at(run, start), steps)
-        jumping = [place for place, effect in enumerate(self.sized.effects) if effect.jumps]
-        for place in jumping if scan else ():
-            best = self._scanned(run, best, place)
-            if len(self.courses) > 1:
-                best = self._climbed(run, best, steps)
-        return best
-
-    def _climbed(self, run: Run, best: Fit, steps: int) -> Fit:
-        """What so many steps of least squares find."""
+        best = self.at(run, start)
         damping = _DAMPING
         differences = self._least_differences()
         for _ in range(steps):
@@ -127,25 +115,6 @@ class Hypothesis:
             if best.loss > before.loss - SETTLED:
                 break
             differences = self._widened(self._inverse(g), differences)
-        return best
-
-    def _scanned(self, run: Run, best: Fit, place: int) -> Fit:
-        """Of a size that the innovations depend on in jumps: the best of many, then of nearer ones.
-
-        Where none of the first few gains anything, none will.
-        """
-        nothing = loss_of(self.without(run, best, place))
-        for reach, count in _SCANS:
-            numbers, course = best.theta[place], self.courses[place]
-            scaled = np.arange(numbers.size) < course.coefficients
-            tried = []
-            for share in np.geomspace(1.0 / reach, reach, count):
-                theta = list(best.theta)
-                theta[place] = np.where(scaled, share * numbers, numbers)
-                tried.append(self.at(run, theta))
-            best = min(best, *tried, key=lambda item: item.loss)
-            if loss_of(best.w) > nothing - _LEAST_SCANNED:
-                break
         return best
 
     def covariance(self, run: Run, fit: Fit) -> Array:

@@ -26,6 +26,7 @@ from scipy.stats import norm
 
 from diagnosis.courses import Constant, Course, Sine
 from diagnosis.hypothesis import Fit, Hypothesis
+from diagnosis.jumping import fitted
 from diagnosis.result import LISTED
 from diagnosis.run import Run
 from reactorwatch.process.integrate import SimulationError
@@ -104,7 +105,7 @@ class Rival:
     def loss(self, run: Run) -> float:
         """Minus the log likelihood of what another predicts, at its best."""
         hypothesis, theta = self._going_on(run.time_min)
-        return hypothesis.fit(run, theta, REFINED_STEPS).loss
+        return fitted(run, hypothesis, theta, REFINED_STEPS).loss
 
     def _going_on(self, time_min: Array) -> tuple[Hypothesis, list[Array]]:
         courses, numbers = [], []

@@ -14,8 +14,9 @@ from typing import TypeAlias
 
 import numpy as np
 
+from diagnosis import jumping
 from diagnosis.adequacy import DOUBTFUL, minus_log10_p
-from diagnosis.courses import Free, Signal
+from diagnosis.courses import Free, Signal, Step
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.knots import best_resolved
 from diagnosis.memory_screen import MemoryScreen
@@ -185,7 +186,8 @@ class Search:
         if not best.key or not np.any(minus_log10_p(best.fit.w, self.run.inputs) > DOUBTFUL):
             return best, known
         others = {item.hypothesis.causes: item for item in sorted(known.values(), key=lambda item: -item.bic)}
-        others.pop(best.hypothesis.causes, None)
+        if not best.hypothesis.sized.effects[0].jumps:
+            others.pop(best.hypothesis.causes, None)
         by_bic = sorted(others.values(), key=lambda item: item.bic)
         asked = by_bic[:OTHERS] + [item for item in by_bic[OTHERS:] if item.hypothesis.sized.effects[0].jumps]
         for lead in remembering:
@@ -195,11 +197,24 @@ class Search:
         held, found = self.noise, best
         for item in asked:
             self.settle(item)
-            item = self.refitted(item, scan=item.hypothesis.sized.effects[0].jumps)
+            item = self._set_in(item) if item.hypothesis.sized.effects[0].jumps else self.refitted(item)
             if item.bic < found.bic:
                 held, found = self.noise, item
         self.noise = held
         return (best, known) if found is best else self._in_rounds(found, {found.key: found}, remembering)
+
+    def _set_in(self, item: Explained) -> Explained:
+        """An effect that acts in jumps, set in when that explains most, with the noise that it needs itself."""
+        item = self.refitted(item, scan=True)
+        for _ in range(OTHERS):
+            before, step = item.bic, Hypothesis(item.hypothesis.sized, (Step(self.run.time_min),))
+            fit = step.at(self.run, (np.append(item.fit.theta[0][:1], self.run.time_min[0]),))
+            item = min(item, self.judged(step, jumping.set_in(self.run, step, fit)), key=lambda each: each.bic)
+            self.settle(item)
+            item = self.refitted(item)
+            if item.bic > before - SETTLED_NOISE:
+                break
+        return item
 
     def _first_noise(self) -> Noise:
         """Under which the nominal model is likeliest. Its free run tells which values are outliers."""
@@ -320,8 +335,10 @@ class Search:
     def fit(
         self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True
     ) -> Explained:
-        """A hypothesis, fitted from a start; see there."""
-        return self.judged(hypothesis, hypothesis.fit(self.run, start, steps, scan))
+        """A hypothesis, fitted from a start; see there and, if sizes that act in jumps are looked for, `jumping`."""
+        if scan:
+            return self.judged(hypothesis, jumping.fitted(self.run, hypothesis, start, steps))
+        return self.judged(hypothesis, hypothesis.fit(self.run, start, steps))
 
     def _elsewhere(self, lead: Lead, best: Explained) -> bool:
         """Whether a lead of the best's own cause and course begins where its fit is not."""

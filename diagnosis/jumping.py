@@ -1,0 +1,94 @@
+"""The size and the onset of an effect that acts in jumps, such as a valve that sticks.
+
+Its innovations change with them in jumps, so there is no slope to climb: they are scanned, widely first and then about
+the best. Where the deviation sets in decides as well where the memory of the effect stands from then on, and so an
+onset that is somewhat off may explain nothing; it is scanned over the whole record, by itself, once a size is known
+that gains something, after every row in which an input moves, for each leaves the memory elsewhere.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
+from diagnosis.run import Run
+from diagnosis.sized import loss_of
+from reactorwatch.process.model import Array
+
+_SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
+_FINELY = ((1.06, 25), (1.006, 25))
+_MOST_ONSETS, _NEAREST_ROWS = 800, 30
+_LEAST_GAIN = 5.0  # in log likelihood
+
+
+def fitted(run: Run, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS) -> Fit:
+    """The best numbers that are found from a start, with sizes that act in jumps scanned.
+
+    Args:
+        run: the record.
+        hypothesis: with or without such effects.
+        start: where it begins, theta of each effect.
+        steps: of least squares, at most.
+    """
+    best = hypothesis.fit(run, start, steps)
+    for place, effect in enumerate(hypothesis.sized.effects):
+        if effect.jumps:
+            best = sized(run, hypothesis, best, place)
+            if len(hypothesis.courses) > 1:
+                best = hypothesis.fit(run, best.theta, steps)
+    return best
+
+
+def sized(run: Run, hypothesis: Hypothesis, best: Fit, place: int, scans: Sequence[tuple[float, int]] = _SIZES) -> Fit:
+    """With the best size of many, then of nearer ones. Where none of the first few gains anything, none will.
+
+    Args:
+        run: the record.
+        hypothesis: with such an effect.
+        best: where it begins.
+        place: of the effect.
+        scans: how far to either side of the best, and how many sizes.
+    """
+    nothing = loss_of(hypothesis.without(run, best, place))
+    for reach, count in scans:
+        numbers, course = best.theta[place], hypothesis.courses[place]
+        scaled = np.arange(numbers.size) < course.coefficients
+        for share in np.geomspace(1.0 / reach, reach, count):
+            best = _better(run, hypothesis, best, place, np.where(scaled, share * numbers, numbers))
+        if loss_of(best.w) > nothing - _LEAST_GAIN:
+            break
+    return best
+
+
+def set_in(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
+    """With the best onset for its size, and then the best size.
+
+    Args:
+        run: the record.
+        hypothesis: one such effect, as a step.
+        best: where it begins.
+    """
+    rows = hypothesis.courses[0].period_min * np.arange(-_NEAREST_ROWS, _NEAREST_ROWS + 1)
+    best = _moved(run, hypothesis, best, _after_moves(run))
+    best = _moved(run, hypothesis, best, best.theta[0][1] + rows)
+    return sized(run, hypothesis, best, 0, _SIZES + _FINELY)
+
+
+def _after_moves(run: Run) -> Array:
+    """Between rows, each after one in which an input moved; not too many."""
+    moved = np.flatnonzero(np.any(np.diff(run.inputs, axis=0) != 0.0, axis=1))[:-1] + 1
+    moved = moved[:: max(-(-moved.size // _MOST_ONSETS), 1)]
+    return np.asarray(0.5 * (run.time_min[moved] + run.time_min[moved + 1]))
+
+
+def _moved(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> Fit:
+    size = best.theta[0][0]
+    for onset in onsets:
+        best = _better(run, hypothesis, best, 0, np.array([size, onset]))
+    return best
+
+
+def _better(run: Run, hypothesis: Hypothesis, best: Fit, place: int, numbers: Array) -> Fit:
+    theta = [numbers if other == place else item for other, item in enumerate(best.theta)]
+    tried = hypothesis.at(run, theta)
+    return tried if tried.loss < best.loss else best
