@@ -11,6 +11,7 @@ from diagnosis.estimates import adjusted_parameters, causes_of, with_rough_numbe
 from diagnosis.experiment import proposed
 from diagnosis.extended import extended_model
 from diagnosis.held_out import Errors, gained
+from diagnosis.hidden_by_noise import explained_by_one
 from diagnosis.integration import looks_like_integration
 from diagnosis.limits import checked_limits
 from diagnosis.pairs import with_pairs
@@ -89,9 +90,9 @@ def diagnose(
     plant = with_uncertain(model, uncertain or {})
     search = Search(plant, effects, whole, _smallest_sd(model))
     run = search.run
-    found = search.found()
+    found = explained_by_one(search)
     if search.remembers(found.best):
-        found = search.found()
+        found = explained_by_one(search)
     found = with_pairs(search, found)
     best = found.best if found.nominal.bic - found.best.bic >= LEAST_GAIN else found.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)

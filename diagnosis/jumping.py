@@ -16,7 +16,8 @@ from diagnosis.sized import loss_of
 from reactorwatch.process.model import Array
 
 _SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
-_FINELY = ((1.06, 25), (1.006, 25))
+_FINELY = ((1.06, 25), (1.006, 25), (1.0006, 25))
+_USUAL = 24  # of the sizes that an effect usually has
 _MOST_ONSETS, _NEAREST_ROWS = 800, 30
 _LEAST_GAIN = 5.0  # in log likelihood
 
@@ -60,17 +61,21 @@ def sized(run: Run, hypothesis: Hypothesis, best: Fit, place: int, scans: Sequen
     return best
 
 
-def set_in(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
-    """With the best onset for its size, and then the best size.
+def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
+    """With the best onset for its size, if it is a step, and then the best size to a tenth of a permille.
 
     Args:
         run: the record.
-        hypothesis: one such effect, as a step.
+        hypothesis: one such effect, constant or as a step.
         best: where it begins.
     """
-    rows = hypothesis.courses[0].period_min * np.arange(-_NEAREST_ROWS, _NEAREST_ROWS + 1)
-    best = _moved(run, hypothesis, best, _after_moves(run))
-    best = _moved(run, hypothesis, best, best.theta[0][1] + rows)
+    course, usual = hypothesis.courses[0], hypothesis.sized.effects[0].starts
+    for size in np.geomspace(usual[0], usual[-1], _USUAL):
+        best = _better(run, hypothesis, best, 0, np.append(size, best.theta[0][1:]))
+    if course.numbers:
+        best = _moved(run, hypothesis, best, _after_moves(run))
+        rows = course.period_min * np.arange(-_NEAREST_ROWS, _NEAREST_ROWS + 1)
+        best = _moved(run, hypothesis, best, best.theta[0][1] + rows)
     return sized(run, hypothesis, best, 0, _SIZES + _FINELY)
 
 

@@ -15,8 +15,7 @@ from typing import TypeAlias
 import numpy as np
 
 from diagnosis import jumping
-from diagnosis.adequacy import DOUBTFUL, minus_log10_p
-from diagnosis.courses import Free, Signal, Step
+from diagnosis.courses import Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.knots import best_resolved
 from diagnosis.memory_screen import MemoryScreen
@@ -48,7 +47,7 @@ ROUGH = 1e-3
 LEAST_SENSOR_GAIN = 10.0
 """In BIC: less does not make a sensor's noise remember."""
 
-ROUNDS, OTHERS = 5, 2
+ROUNDS = 5
 
 SETTLED_NOISE = 10.0
 """In BIC: a noise that gains less is not worth another round."""
@@ -92,12 +91,14 @@ class Found:
         own_noise: likewise, under the nominal one.
         nominal: the one without any effect, with the noise that it needs itself; its key is empty.
         explained: all that were fitted, the best first.
+        remembering: leads among effects with memory.
     """
 
     noise: Noise
     own_noise: Noise
     nominal: Explained
     explained: list[Explained]
+    remembering: tuple[Lead, ...] = ()
 
     @property
     def best(self) -> Explained:
@@ -145,14 +146,18 @@ class Search:
             best = min(best, item, key=lambda item: item.bic)
         least = max([LEAST_SCORE, *(_SHARE * item.score(self.run.values) for item in leads[:1])])
         remembering = self.chosen(remembering, LEADS, least, of_a_cause=1)
-        best, known = self._in_rounds(best, known, remembering)
-        best, known = self._in_their_own_noise(best, known, remembering)
-        return Found(self.noise, own_noise, nominal, sorted(known.values(), key=lambda item: item.bic))
+        known = self._in_rounds(best, known, remembering)
+        return Found(self.noise, own_noise, nominal, _in_order(known), tuple(remembering))
+
+    def about(self, best: Explained, found: Found) -> Found:
+        """What is found once it is known how noisy the process is under a better explanation."""
+        known = self._in_rounds(best, {best.key: best}, found.remembering)
+        return Found(self.noise, found.own_noise, found.nominal, _in_order(known), found.remembering)
 
     def _in_rounds(
         self, best: Explained, known: dict[Key, Explained], remembering: Sequence[Lead]
-    ) -> tuple[Explained, dict[Key, Explained]]:
-        """Noise and hypothesis in turn; the best, and all that were fitted with its noise."""
+    ) -> dict[Key, Explained]:
+        """Noise and hypothesis in turn; all that were fitted with the noise of the best."""
         searched: Explained | None = None
         out = set[Key]()
         for _ in range(ROUNDS):
@@ -173,48 +178,7 @@ class Search:
                     keep(known, self.resolved(item) if item.bic < best.bic + IN_QUESTION else item)
                     out |= {item.key} if item.bic > best.bic + FAR_OUT else set()
             best = min(known.values(), key=lambda item: item.bic)
-        return best, known
-
-    def _in_their_own_noise(
-        self, best: Explained, known: dict[Key, Explained], remembering: Sequence[Lead]
-    ) -> tuple[Explained, dict[Key, Explained]]:
-        """If the best leaves too much, so that its noise may be what hides a better one: the others, each with its own.
-
-        Those that act in jumps are asked too, though they promise little: with a noise that carries the filter along,
-        a valve that sticks does not show.
-        """
-        if not best.key or not np.any(minus_log10_p(best.fit.w, self.run.inputs) > DOUBTFUL):
-            return best, known
-        others = {item.hypothesis.causes: item for item in sorted(known.values(), key=lambda item: -item.bic)}
-        if not best.hypothesis.sized.effects[0].jumps:
-            others.pop(best.hypothesis.causes, None)
-        by_bic = sorted(others.values(), key=lambda item: item.bic)
-        asked = by_bic[:OTHERS] + [item for item in by_bic[OTHERS:] if item.hypothesis.sized.effects[0].jumps]
-        for lead in remembering:
-            if lead.effect.jumps and (lead.effect.name,) not in (best.hypothesis.causes, *others):
-                others[(lead.effect.name,)] = self.fitted(lead)
-                asked.append(others[(lead.effect.name,)])
-        held, found = self.noise, best
-        for item in asked:
-            self.settle(item)
-            item = self._set_in(item) if item.hypothesis.sized.effects[0].jumps else self.refitted(item)
-            if item.bic < found.bic:
-                held, found = self.noise, item
-        self.noise = held
-        return (best, known) if found is best else self._in_rounds(found, {found.key: found}, remembering)
-
-    def _set_in(self, item: Explained) -> Explained:
-        """An effect that acts in jumps, set in when that explains most, with the noise that it needs itself."""
-        item = self.refitted(item, scan=True)
-        for _ in range(OTHERS):
-            before, step = item.bic, Hypothesis(item.hypothesis.sized, (Step(self.run.time_min),))
-            fit = step.at(self.run, (np.append(item.fit.theta[0][:1], self.run.time_min[0]),))
-            item = min(item, self.judged(step, jumping.set_in(self.run, step, fit)), key=lambda each: each.bic)
-            self.settle(item)
-            item = self.refitted(item)
-            if item.bic > before - SETTLED_NOISE:
-                break
-        return item
+        return known
 
     def _first_noise(self) -> Noise:
         """Under which the nominal model is likeliest. Its free run tells which values are outliers."""
@@ -377,6 +341,10 @@ def keep(known: dict[Key, Explained], item: Explained) -> None:
     """Put a fit among those that are known, unless a better one of the same effects and courses is."""
     if item.key not in known or item.bic < known[item.key].bic:
         known[item.key] = item
+
+
+def _in_order(known: dict[Key, Explained]) -> list[Explained]:
+    return sorted(known.values(), key=lambda item: item.bic)
 
 
 def _of_different_causes(leads: Sequence[Lead]) -> list[Lead]:

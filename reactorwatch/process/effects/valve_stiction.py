@@ -34,7 +34,7 @@ class ValveStiction(Effect):
         """
         qc = coolant_flow_of(self, model)
         name = f"{self.prefix(model)}.flow"
-        state = variable(name, qc.unit, (qc.lower, qc.upper), qc.scale, "flow that the valve stands at")
+        state = variable(name, qc.unit, (qc.lower, qc.upper), self.typical, "flow that the valve stands at")
         free = ca.logic_or(ca.fabs(qc.symbol - state.symbol) > size, size <= 0)
         moved = ca.if_else(free, qc.symbol, state.symbol)
         stuck = model.substitute(qc.symbol, state.symbol)

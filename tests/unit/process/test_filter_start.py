@@ -84,3 +84,14 @@ def test_it_begins_where_outputs_far_from_there_are_no_numbers() -> None:
     kalman = Filter(replace(model, outputs=(replace(C, expression=shown), T)), SENSORS)
     kalman.update(0.0, (100.0,), (0.09, 441.0))
     assert kalman.state.x == pytest.approx((0.09, 441.0), rel=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_valve_that_sticks_is_taken_to_begin_near_what_is_asked_of_it(seed: int) -> None:
+    """What noise moves it by in the first minute is less than half of what it sticks by, so that it opens in time."""
+    fault = parse_fault("valve_stiction:constant:6.0")
+    record = simulate_record(PlantConfig(seed=seed, faults=("valve_stiction:constant:6.0",)), 10)
+    measured = np.column_stack([record.columns["C"], record.columns["T"]])
+    sensors = NoiseLevels(SENSORS.measurement_sd, (0.0, 0.0, 0.0))
+    found = Filter(fault.extend(cstr()), sensors).run(record.time_min, record.columns["qc"], measured)
+    assert np.all(np.abs(found.x[:, 2] - record.columns["qc"][0]) < 3.0)

@@ -1,0 +1,83 @@
+"""Explanations that another one's noise hides.
+
+All hypotheses are compared with the noise of the best. If that is a wrong one, its process seems so noisy that the
+filter is carried along by what is measured, and under such a noise the right one shows little. So if the best leaves
+what is not white, others are asked anew, each with the noise that it needs itself.
+"""
+
+import numpy as np
+from msgspec.structs import replace
+
+from diagnosis import jumping
+from diagnosis.adequacy import DOUBTFUL, minus_log10_p
+from diagnosis.courses import Constant, Step
+from diagnosis.hypothesis import Hypothesis
+from diagnosis.search import SETTLED_NOISE, Explained, Found, Search
+
+OTHERS, ROUNDS = 2, 2
+
+QUIET_SHARE = 0.003
+"""Of a state's scale per square root of a minute: noise that hides no valve that sticks."""
+
+
+def explained_by_one(search: Search) -> Found:
+    """What one effect explains best, and its rivals, with the noise of the best."""
+    found = search.found()
+    hidden = _uncovered(search, found)
+    return found if hidden is None else search.about(hidden, found)
+
+
+def _uncovered(search: Search, known: Found) -> Explained | None:
+    """A better explanation, whose noise then is that of the search; None if there is none, or nothing calls for one.
+
+    Those that act in jumps are asked too, though they promise little: with a noise that carries the filter along, a
+    valve that sticks does not show.
+    """
+    best = known.best
+    if not best.key or not np.any(minus_log10_p(best.fit.w, search.run.inputs) > DOUBTFUL):
+        return None
+    others = {item.hypothesis.causes: item for item in reversed(known.explained)}
+    if not _jumps(best):
+        others.pop(best.hypothesis.causes, None)
+    by_bic = sorted(others.values(), key=lambda item: item.bic)
+    asked = by_bic[:OTHERS] + [item for item in by_bic[OTHERS:] if _jumps(item)]
+    for lead in known.remembering:
+        if lead.effect.jumps and (lead.effect.name,) not in (best.hypothesis.causes, *others):
+            others[(lead.effect.name,)] = search.fitted(lead)
+            asked.append(others[(lead.effect.name,)])
+    held, found = search.noise, best
+    for item in asked:
+        search.settle(item)
+        item = _set_in(search, item) if _jumps(item) else search.refitted(item)
+        if item.bic < found.bic:
+            held, found = search.noise, item
+    search.noise = held
+    return None if found is best else found
+
+
+def _jumps(item: Explained) -> bool:
+    return item.hypothesis.sized.effects[0].jumps
+
+
+def _set_in(search: Search, item: Explained) -> Explained:
+    """An effect that acts in jumps, set in when that explains most, with the noise that it needs itself.
+
+    It begins with little noise: a process that is noisy enough for the wrong size hides how far off that is.
+    """
+    sized, run = item.hypothesis.sized, search.run
+    quiet = (QUIET_SHARE * state.scale for state in sized.model.states)
+    process_sd = tuple(min(sd, least) for sd, least in zip(search.noise.process_sd, quiet, strict=False))
+    search.noise = replace(search.noise, process_sd=process_sd)
+    item = search.refitted(item)
+    for _ in range(ROUNDS):
+        before = item.bic
+        for course in (Constant(run.time_min), Step(run.time_min)):
+            other = Hypothesis(sized, (course,))
+            numbers = [item.fit.theta[0][0], *(number.lower for number in course.numbers)]
+            fit = jumping.finely(run, other, other.at(run, (np.array(numbers),)))
+            item = min(item, search.judged(other, fit), key=lambda each: each.bic)
+        search.settle(item)
+        item = search.refitted(item)
+        if item.bic > before - SETTLED_NOISE:
+            break
+    return item

@@ -1,0 +1,36 @@
+"""Sizes that act in jumps, and when they set in."""
+
+import numpy as np
+import pytest
+
+from diagnosis import jumping
+from diagnosis.courses import Constant, Step
+from diagnosis.hypothesis import Hypothesis
+from diagnosis.sized import Sized
+from diagnosis.wandering import Noise
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
+
+from .runs import run_of
+
+STICKS = next(effect for effect in EFFECTS if effect.name == "valve_stiction")
+NOISE = Noise((0.002, 0.3), (0.0, 0.0))
+
+
+def test_an_onset_that_no_slope_leads_to_is_found() -> None:
+    run = run_of("valve_stiction:step:6.0@150.23min", rows=3000)
+    hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
+    truth = hypothesis.at(run, (np.array([6.0, 150.23]),))
+    found = jumping.finely(run, hypothesis, hypothesis.at(run, (np.array([6.3, 40.0]),)))
+    assert found.loss <= truth.loss + 1e-6
+    # When it began to stick shows only in where it stands from the next move on that it does not follow.
+    np.testing.assert_allclose(found.found.x[1600:, 2], truth.found.x[1600:, 2], atol=0.01)
+
+
+def test_a_size_is_found_between_the_two_moves_that_it_lies_between() -> None:
+    run = run_of("valve_stiction:constant:4.0", rows=1500)
+    hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Constant(run.time_min),))
+    truth = hypothesis.at(run, (np.array([4.0]),))
+    found = jumping.fitted(run, hypothesis, (np.array([1.5]),))
+    assert found.loss <= truth.loss + 1e-6
+    assert found.theta[0][0] == pytest.approx(4.0, abs=0.5)
