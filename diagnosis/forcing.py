@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from diagnosis.courses import Signal
 from diagnosis.forcing_filter import Linear, smoothed, whitened
-from diagnosis.run import Run
+from diagnosis.run import Run, doubt_of
 from diagnosis.size_inputs import SizedModel, with_size_inputs
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array, ProcessModel
@@ -118,7 +118,8 @@ class Forcing:
 
     def about(self, reference: Reference, run: Run) -> "Linearised":
         """The forcing about a path."""
-        path = self._errors.about(run.time_min, self._sized.inputs(run.inputs, [reference.size]), reference.x)
+        inputs = self._sized.inputs(run.inputs, [reference.size])
+        path = self._errors.about(run.time_min, inputs, reference.x, doubt_of(run, inputs))
         rows, n_x = reference.x.shape
         F, G, D = np.zeros((rows, n_x, n_x)), np.zeros((rows, n_x)), path.D[:, :, 0]
         F[1:], G[1:] = path.F, path.G[:, :, 0]
@@ -129,7 +130,7 @@ class Forcing:
             G,
             path.H,
             D,
-            np.square(reference.process_sd) * step_min[:, None],
+            np.square(reference.process_sd) * step_min[:, None] + np.square(np.vstack([np.zeros(n_x), path.spread])),
             reference.known,
             reference.began,
             reference.start - reference.x,

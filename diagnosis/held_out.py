@@ -54,7 +54,7 @@ def held_out_rows(run: Run, onsets_min: Sequence[float] = ()) -> Array:
     told = found & ~np.isin(block, [np.floor((onset - run.time_min[0]) / block_min) for onset in onsets_min])
     found = told if np.count_nonzero(told) >= FEWEST_ROWS else found
     calm = found.copy()
-    for row in run.breaks:
+    for row in run.after_doubt:
         calm[row : row + WAKE_ROWS] = False
     return np.asarray(calm if np.count_nonzero(calm) >= FEWEST_ROWS else found)
 

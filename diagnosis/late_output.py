@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnosis.run import Run
+from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import Innovations
 from reactorwatch.process.model import Array
 
@@ -23,12 +24,14 @@ class Moved(NamedTuple):
         prompt: where the run's rows are in it, shape (rows,).
         late: where the values of the late output are, shape (rows,).
         before: whether such a value was true before the filter began, so that nothing tells what it is, shape (rows,).
+        doubt: the ways of the run on which nobody knows when inputs changed; None: there are none.
     """
 
     run: Run
     prompt: NDArray[np.int64]
     late: NDArray[np.int64]
     before: NDArray[np.bool_]
+    doubt: Doubt | None = None
 
 
 def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_min: Array) -> Moved:
@@ -55,7 +58,17 @@ def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_m
     for place in range(measured.shape[1]):
         measured[late if place == output else prompt, place] = run.measured[:, place]
     spread[late[:, None], np.flatnonzero(~held)] = inputs[:, ~held]
-    return Moved(Run(times, spread, measured), prompt, late, before)
+    return Moved(Run(times, spread, measured), prompt, late, before, _doubt(run, times, spread))
+
+
+def _doubt(run: Run, times: Array, inputs: Array) -> Doubt | None:
+    """Of every way within one that is in doubt."""
+    if run.early is None:
+        return None
+    to = np.searchsorted(run.time_min, times, side="left")
+    others = np.vstack([inputs[:1], inputs[:-1]])
+    others[:, : run.inputs.shape[1]] = run.inputs[to]
+    return Doubt(others, run.early[to])
 
 
 def gathered(found: Innovations, by: Moved, output: int) -> Innovations:

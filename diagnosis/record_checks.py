@@ -1,11 +1,13 @@
 """From a record to a run of a model, and what a record must have so that anything can be said of it."""
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diagnosis.run import Run
 from diagnosis.units import check_units
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.doubt import early_share
+from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.records.record import Record
 
 FEWEST_ROWS = 200
@@ -15,6 +17,8 @@ FEWEST_VALUES = 100
 LEAST_MOVE = 1e-3
 """Of an input, in its scales: less is no excitation."""
 
+FEW_ROWS = 10
+"""Of them missing, the plant is followed through; behind more, a filter begins anew."""
 
 _OFF_GRID, _REGULAR = 0.05, 0.95
 """Rows are on a grid if steps are whole periods, give or take so much of one, in so many of them."""
@@ -69,14 +73,14 @@ def run_of(record: Record, model: ProcessModel) -> Run:
             f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} all the time; "
             "nothing can be told apart without excitation: record a stretch with steps in it"
         )
-    known = np.column_stack([np.isfinite(record.columns[item.name]) for item in model.inputs])
+    there: NDArray[np.bool_] = np.column_stack([np.isfinite(record.columns[item.name]) for item in model.inputs])
     u = np.column_stack(inputs)
-    run = Run(record.time_min, u, np.column_stack(outputs), _breaks(record.time_min, u, known))
+    run = Run(record.time_min, u, np.column_stack(outputs), *_breaks(record.time_min, u, there))
     check_units(name, run, model)
     return run
 
 
-def _check_bounds(name: str, signal: str, unit: str, values: np.ndarray, lower: float, upper: float) -> None:
+def _check_bounds(name: str, signal: str, unit: str, values: Array, lower: float, upper: float) -> None:
     typical = float(np.median(values))
     if not lower <= typical <= upper:
         hint = "; is it in degrees C? then add 273.15" if unit == "K" and lower <= typical + 273.15 <= upper else ""
@@ -84,21 +88,27 @@ def _check_bounds(name: str, signal: str, unit: str, values: np.ndarray, lower: 
         raise InputError(f"{name}: {rule}, its median is {typical:g}{hint or '; check its unit'}")
 
 
-def _breaks(time_min: np.ndarray, inputs: np.ndarray, known: np.ndarray) -> tuple[int, ...]:
+def _breaks(time_min: Array, inputs: Array, known: NDArray[np.bool_]) -> tuple[tuple[int, ...], Array | None]:
     """Rows whose inputs differ from those of the row before, with rows missing between them or the inputs in it.
 
     Nobody knows when they changed. Where rows are irregular by nature none is taken to be missing.
+
+    Returns:
+        Those before which too much is missing, and what the others are (see `Run.early`).
     """
     step = np.diff(time_min)
     period = float(np.median(step))
     counts = step / period
     regular = np.mean(np.abs(counts - np.round(counts)) < _OFF_GRID) > _REGULAR
-    gap = (counts > 1.5) & regular | ~np.all(known[:-1], axis=1)
     changed = np.any(np.diff(inputs, axis=0) != 0.0, axis=1)
-    return tuple((np.flatnonzero(gap & changed) + 1).tolist())
+    missing = np.round(counts) - 1.0
+    short = changed & regular & (missing > 0.5) & (missing <= FEW_ROWS) & np.all(known[:-1], axis=1)
+    long = changed & ((counts > 1.5) & regular | ~np.all(known[:-1], axis=1)) & ~short
+    early = np.append(0.0, np.where(short, early_share(np.maximum(missing, 0.0)), 0.0))
+    return tuple((np.flatnonzero(long) + 1).tolist()), early if np.any(short) else None
 
 
-def _held(values: np.ndarray) -> np.ndarray:
+def _held(values: Array) -> Array:
     """With what is missing as it was before."""
     places = np.where(np.isfinite(values), np.arange(values.size), -1)
     places = np.maximum.accumulate(places)

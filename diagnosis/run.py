@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.model import Array
 
 
@@ -15,13 +17,16 @@ class Run:
         time_min: shape (rows,), increasing.
         inputs: shape (rows, n_u); each row is held until the next one.
         measured: shape (rows, n_y); NaN where missing.
-        breaks: rows before which nobody knows what the inputs did: a filter begins anew there.
+        breaks: rows before which nobody knows what the inputs did for long: a filter begins anew there.
+        early: where they changed in a few missing rows before a row, nobody knows in which: for what share of the way
+            to it they were on average what they are there, shape (rows,), else 0; None: nowhere.
     """
 
     time_min: Array
     inputs: Array
     measured: Array
     breaks: tuple[int, ...] = ()
+    early: Array | None = None
 
     @property
     def known_inputs(self) -> Array:
@@ -29,6 +34,11 @@ class Run:
         known = self.inputs.copy()
         known[np.array(self.breaks, dtype=int) - 1] = np.nan
         return known
+
+    @property
+    def after_doubt(self) -> NDArray[np.intp]:
+        """Rows before which nobody knows what the inputs did."""
+        return np.concatenate([self.breaks, [] if self.early is None else np.flatnonzero(self.early)]).astype(np.intp)
 
     @property
     def values(self) -> int:
@@ -39,3 +49,17 @@ class Run:
     def span_min(self) -> float:
         """From the first row to the last."""
         return float(self.time_min[-1] - self.time_min[0])
+
+
+def doubt_of(run: Run, inputs: Array) -> Doubt | None:
+    """The ways of a run on which nobody knows when inputs changed.
+
+    Args:
+        run: the record.
+        inputs: of a filter of it: those of the run, and then others, whose courses are known; shape (rows, n).
+    """
+    if run.early is None:
+        return None
+    others = np.vstack([inputs[:1], inputs[:-1]])
+    others[:, : run.inputs.shape[1]] = run.inputs
+    return Doubt(others, run.early)

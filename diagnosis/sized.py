@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from diagnosis.courses import Signal
 from diagnosis.late_output import Moved, gathered, moved
-from diagnosis.run import Run
+from diagnosis.run import Run, doubt_of
 from diagnosis.size_inputs import SizedModel, with_size_inputs
 from diagnosis.wandering import Noise, first_rate_sd, learned, with_wandering
 from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.filled import Filled, filled
 from reactorwatch.process.filter import Filter, Innovations, NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors, Ways
 from reactorwatch.process.model import Array, ProcessModel
@@ -108,11 +109,12 @@ class Sized:
         known, least = np.isfinite(run.measured), np.array(self.noise.measurement_sd)
         unseen = np.zeros_like(known)
         if self.late is None:
-            found = self._filter.run(run.time_min, self.inputs(run, signals), run.measured)
+            inputs = self.inputs(run, signals)
+            found = self._filtered_run(filled(run.time_min, inputs, run.measured, doubt_of(run, inputs)))
         else:
             by, output = self._moved(run, signals, self.late), self._output(self.late)
-            found = self._filter.run(by.run.time_min, by.run.inputs, by.run.measured)
-            found = gathered(found, by, output)
+            rows = filled(by.run.time_min, by.run.inputs, by.run.measured, by.doubt)
+            found = gathered(self._filtered_run(rows), by, output)
             unseen[:, output] = by.before & known[:, output]
             known[by.before, output] = False
         # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
@@ -124,18 +126,25 @@ class Sized:
         spread = np.log(np.where(known & good, found.conditional_sd, np.where(unseen, least, 1.0)))
         return loss_of(w) + float(np.sum(spread)), w, found
 
+    def _filtered_run(self, rows: Filled) -> Innovations:
+        return rows.of_record(self._filter.run(rows.time_min, rows.inputs, rows.measured, doubt=rows.doubt))
+
     def tuned(self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float]) -> Noise:
         """The noise under which the run is likeliest with these deviations."""
         inputs = self.inputs(run, signals)
+        doubt = doubt_of(run, inputs)
         if self.late is not None:
-            run = self._moved(run, signals, self.late).run
-            inputs = run.inputs
+            by = self._moved(run, signals, self.late)
+            run, inputs, doubt = by.run, by.run.inputs, by.doubt
+        rows = filled(run.time_min, inputs, run.measured, doubt)
         times = self._noise.times
         # It begins anew with a short memory: a model that lacks something makes it seem long, and there it would stay.
         first_sd = {
             f"{item.output}.noise": first_rate_sd(item.scale, self._period_min) for item in self._noise.wandering
         }
-        found, times = tune_with(self.model, run.time_min, inputs, run.measured, smallest_sd, tuple(times), first_sd)
+        found, times = tune_with(
+            self.model, rows.time_min, rows.inputs, rows.measured, smallest_sd, tuple(times), first_sd, rows.doubt
+        )
         of_sensors = len(found.process_sd) - len(times)
         wandering = learned(self._noise.wandering, found.process_sd[of_sensors:], times, self._period_min)
         return Noise(found.measurement_sd, found.process_sd[: len(self._plant.states)], wandering)
@@ -172,7 +181,17 @@ def ways_between(errors: FilterErrors, run: Run, inputs: Array, found: Innovatio
     began = np.all(np.isnan(found.prediction), axis=1)
     # What inputs did before a break nobody knows, but in the row itself they were measured, and outputs may show them.
     inputs = np.column_stack([run.inputs, inputs[:, run.inputs.shape[1] :]])
-    return errors.ways(run.time_min[1:], inputs[1:], found.x[1:], found.P[1:], found.residual[1:], used[1:], began[1:])
+    doubt, later = doubt_of(run, inputs), slice(1, None)
+    return errors.ways(
+        run.time_min[later],
+        inputs[later],
+        found.x[later],
+        found.P[later],
+        found.residual[later],
+        used[later],
+        began[later],
+        None if doubt is None else doubt.of_rows(later),
+    )
 
 
 def clipped(w: Array) -> Array:

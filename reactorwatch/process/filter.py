@@ -22,6 +22,8 @@ What is out of the ordinary is handled like this:
 - A row more than `LONGEST_STEP_MIN` after the one before is walked to in steps. After a gap of more than
   `LONGEST_GAP_MIN`, or a step back in time, the filter begins anew: on an unstable stretch the uncertainty grows
   without bound, and the model does not know what was done to the plant meanwhile.
+- Where an input is another behind missing rows, nobody knows when it changed; the state is predicted for both, and is
+  as uncertain as that makes it (see `doubt`).
 - It begins anew as well where the equations leave the bounds of the states, or are no numbers any more. A correction
   that leads out of the bounds is cut off there.
 - It begins at what is measured (see `filter_start`), and says nothing of that row; as long as nothing is, it waits.
@@ -40,6 +42,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.process.doubt import Doubt, variance_of
 from reactorwatch.process.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.process.filter_start import Beginning
 from reactorwatch.process.filter_step import row_code, row_function, walk_function
@@ -209,6 +212,7 @@ class Filter:
         *,
         gate: float = inf,
         accept: Sequence[bool] = (),
+        doubt: tuple[Sequence[float], float] | None = None,
     ) -> Innovation:
         """Take a row in.
 
@@ -218,13 +222,18 @@ class Filter:
             measured: one an output; NaN: missing.
             gate: standard deviations beyond which a measurement does not correct the state ...
             accept: ... unless this says so for its output; empty: for none.
+            doubt: the inputs that may have held already since the row before, and for what share of the way they did on
+                average (see `doubt`); None: it is known that those of the row before did.
         """
         n, before = self._n_y, self._time_min
         if before is None or not 0.0 < time_min - before <= LONGEST_GAP_MIN:
             return self._begin(time_min, inputs, measured)
         step = 0.5 * (time_min - before)
         steps = (step, step)
-        if 2.0 * step > LONGEST_ROW_MIN or self._breaks:
+        if doubt is not None:
+            self._predict_in_doubt(before, time_min, inputs, *doubt)
+            steps = (0.0, 0.0)
+        elif 2.0 * step > LONGEST_ROW_MIN or self._breaks:
             steps = self._steps(before, time_min, step)
         limits = [inf if follow else gate for follow in accept] if True in accept else [gate] * n
         self._pack(self._new, 0, *self._inputs, *inputs, time_min, *steps, *measured, *limits)
@@ -249,6 +258,7 @@ class Filter:
         gate: float = inf,
         accept: NDArray[np.bool_] | None = None,
         start: FilterState | None = None,
+        doubt: Doubt | None = None,
     ) -> Innovations:
         """Take a whole record in; the numbers are those of `update`, several times faster.
 
@@ -259,8 +269,9 @@ class Filter:
             gate: as for `update`.
             accept: likewise, shape (rows, n_y).
             start: what the filter remembers of the row before the first; None: it begins with the first row.
+            doubt: ways on which nobody knows when inputs changed; None: there are none.
         """
-        return self.over(FilterRecord.of(time_min, inputs, measured, gate, accept), start)
+        return self.over(FilterRecord.of(time_min, inputs, measured, gate, accept, doubt), start)
 
     def over(self, record: FilterRecord, start: FilterState | None = None) -> Innovations:
         """As `run`, of a record that is laid out already."""
@@ -293,7 +304,9 @@ class Filter:
     def _run_row(self, record: FilterRecord, row: int, told: Array, memory: Array) -> None:
         """Take a row in by itself."""
         time_min, inputs, values = record.time_min[row], record.inputs[row].tolist(), record.measured[row].tolist()
-        found = self.update(float(time_min), inputs, values, gate=record.gate, accept=record.accept[row].tolist())
+        doubt, accept = record.doubt, record.accept[row].tolist()
+        other = (doubt.inputs[row].tolist(), float(doubt.early[row])) if doubt is not None and doubt.rows[row] else None
+        found = self.update(float(time_min), inputs, values, gate=record.gate, accept=accept, doubt=other)
         if found is not self._nothing:
             told[row], memory[row] = self._told, self._memory
         elif self._time_min is not None:
@@ -330,6 +343,12 @@ class Filter:
 
     def _walk_to_last_steps(self, before: float, time_min: float) -> tuple[float, float]:
         """Predict up to the last two steps of the way; returns their lengths."""
+        *edges, middle, end = self._edges(before, time_min)
+        self._memory[:] = self._walked(self._memory, self._inputs, edges)
+        return middle - edges[-1], end - middle
+
+    def _edges(self, before: float, time_min: float) -> list[float]:
+        """Where the steps of a way begin and end, an even number of steps."""
         edges = [before]
         for end in (*self._within(before, time_min), time_min):
             count, begin = ceil((end - edges[-1]) / (0.5 * LONGEST_ROW_MIN)), edges[-1]
@@ -337,16 +356,38 @@ class Filter:
             edges.append(end)
         if len(edges) % 2 == 0:
             edges.append(edges[-1])
+        return edges
+
+    def _walked(self, memory: Array, inputs: Sequence[float], edges: Sequence[float]) -> Array:
+        """State and covariance after some steps, two by two."""
         walk = self._walk
         walk.arguments[2][0] = self._constants
-        for place in range(0, len(edges) - 3, 2):
-            begin, middle, end = edges[place : place + 3]
-            walk.arguments[0][0] = self._memory
-            walk.arguments[1][0] = [*self._inputs, end, middle - begin, end - middle]
+        for begin, middle, end in zip(edges[:-2:2], edges[1:-1:2], edges[2::2], strict=True):
+            walk.arguments[0][0] = memory
+            walk.arguments[1][0] = [*inputs, end, middle - begin, end - middle]
             walk()
-            self._memory[:] = walk.results[0][0]
-        begin, middle, end = edges[-3:]
-        return middle - begin, end - middle
+            memory = walk.results[0][0].copy()
+        return memory
+
+    def _predict_in_doubt(
+        self, before: float, time_min: float, inputs: Sequence[float], other: Sequence[float], early: float
+    ) -> None:
+        """Predict a whole way on which the inputs became others, nobody knows when."""
+        edges, start = self._edges(before, time_min), self._memory.copy()
+        held = self._reset(self._walked(start, self._inputs, edges), inputs, time_min)
+        changed = self._reset(self._walked(self._reset(start, other, before), other, edges), inputs, time_min)
+        apart = changed[: self._n_x] - held[: self._n_x]
+        self._memory[:] = held + early * (changed - held)
+        self._memory[self._n_x :] += float(variance_of(np.array(early))) * np.outer(apart, apart).ravel()
+        self._inputs = tuple(inputs)
+
+    def _reset(self, memory: Array, inputs: Sequence[float], time_min: float) -> Array:
+        """When a row has begun, with its inputs."""
+        if not self.model.resets:
+            return memory
+        n, p = self._n_x, self._constants[: len(self.model.parameters)]
+        x, P = self._beginning.reset(memory[:n], memory[n:].reshape(n, n), np.asarray(inputs), p, time_min)
+        return np.concatenate([x, P.ravel()])
 
     @cached_property
     def _beginning(self) -> Beginning:

@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.process.doubt import Doubt, variance_of
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_step import exponential
 from reactorwatch.process.integrate import LONGEST_STEP_MIN, symbolic_step
@@ -61,6 +62,8 @@ class Path:
         there: where the way from each row but the last leads, shape (n_x,).
         F: d there / d state before, shape (n_x, n_x).
         G: d there / d sizes, shape (n_x, sizes).
+        spread: how uncertain there is, standard deviations with signs, where nobody knows when inputs changed, shape
+            (n_x,).
         shown: the outputs in each row, shape (rows, n_y).
         H: d outputs / d state, shape (rows, n_y, n_x).
         D: d outputs / d sizes, shape (rows, n_y, sizes).
@@ -69,6 +72,7 @@ class Path:
     there: Array
     F: Array
     G: Array
+    spread: Array
     shown: Array
     H: Array
     D: Array
@@ -110,6 +114,7 @@ class FilterErrors:
         residual: Array,
         used: NDArray[np.bool_],
         began: NDArray[np.bool_] | None = None,
+        doubt: Doubt | None = None,
     ) -> Ways:
         """Those between the rows of a record.
 
@@ -122,9 +127,10 @@ class FilterErrors:
             used: whether a value corrected the filter, shape (rows, n_y).
             began: rows that it began anew with, shape (rows,), so that what was before is forgotten, but for states
                 that never change; None: none.
+            doubt: ways on which nobody knows when inputs changed; None: there are none.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # about a run that has lost an unstable plant
-            found = self._ways(time_min, inputs, x, P, residual, used)
+            found = self._ways(time_min, inputs, x, P, residual, used, doubt)
         if began is None:
             return found
         kept = np.zeros(found.F.shape[1:])
@@ -134,13 +140,21 @@ class FilterErrors:
         return Ways(F, G, H, D, K, found.L_inverse, found.w)
 
     def _ways(
-        self, time_min: Array, inputs: Array, x: Array, P: Array, residual: Array, used: NDArray[np.bool_]
+        self,
+        time_min: Array,
+        inputs: Array,
+        x: Array,
+        P: Array,
+        residual: Array,
+        used: NDArray[np.bool_],
+        doubt: Doubt | None,
     ) -> Ways:
         R, q = np.square(self.noise.measurement_sd), np.square(self.noise.process_sd)
         p, step = self.model.values(self.changes), np.diff(time_min)
-        there, F, G = self._walked(x[:-1], inputs[:-1], time_min[:-1], step, p)
+        there, F, G, spread = self._walked(x[:-1], inputs[:-1], time_min, p, doubt)
         H, D = self._code.shown.over(there, inputs[1:], p, time_min[1:])
         prior = F @ P[:-1] @ F.transpose(0, 2, 1) + np.eye(there.shape[1]) * q * step[:, None, None]
+        prior += spread[:, :, None] * spread[:, None, :]
         covariance = H @ prior @ H.transpose(0, 2, 1) + np.diag(R)
         known = np.isfinite(residual[1:]) & np.all(np.isfinite(covariance), axis=2)
         both = known[:, :, None] & known[:, None, :]
@@ -150,22 +164,38 @@ class FilterErrors:
         K = P[1:] @ H.transpose(0, 2, 1) * (used[1:] / R)[:, None, :]
         return Ways(F, G, H, D, K, L_inverse, w)
 
-    def about(self, time_min: Array, inputs: Array, x: Array) -> "Path":
+    def about(self, time_min: Array, inputs: Array, x: Array, doubt: Doubt | None = None) -> "Path":
         """The equations along a path that need not be a filter's.
 
         Args:
             time_min: shape (rows,).
             inputs: shape (rows, n_u).
             x: the path, shape (rows, n_x).
+            doubt: ways on which nobody knows when inputs changed; None: there are none.
         """
         p = self.model.values()
-        there, F, G = self._walked(x[:-1], inputs[:-1], time_min[:-1], np.diff(time_min), p)
+        there, F, G, spread = self._walked(x[:-1], inputs[:-1], time_min, p, doubt)
         H, D = self._code.shown.over(x, inputs, p, time_min)
         (y,) = self._code.outputs.over(x, inputs, p, time_min)
-        return Path(there, F, G, y[:, :, 0], H, D)
+        return Path(there, F, G, spread, y[:, :, 0], H, D)
 
-    def _walked(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
-        """Where the ways lead, and their derivatives."""
+    def _walked(
+        self, x: Array, u: Array, time_min: Array, p: Array, doubt: Doubt | None
+    ) -> tuple[Array, Array, Array, Array]:
+        """Where the ways lead, their derivatives, and how uncertain the first is because of its inputs."""
+        t, step = time_min[:-1], np.diff(time_min)
+        there, F, G = self._walked_surely(x, u, t, step, p)
+        spread = np.zeros_like(there)
+        if doubt is not None:
+            rows = np.flatnonzero(doubt.rows[1:])
+            early = doubt.early[1:][rows]
+            others = self._walked_surely(x[rows], doubt.inputs[1:][rows], t[rows], step[rows], p)
+            spread[rows] = np.sqrt(variance_of(early))[:, None] * (others[0] - there[rows])
+            for found, other in zip((there, F, G), others, strict=True):
+                found[rows] += early.reshape(-1, *(1,) * (found.ndim - 1)) * (other - found[rows])
+        return there, F, G, spread
+
+    def _walked_surely(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
         pieces = np.maximum(np.ceil(step / _LONGEST_PIECE_MIN), 1.0)
         there, F, G = self._code.piece.over(x, u, p, t, step / pieces)
         there = there[:, :, 0]

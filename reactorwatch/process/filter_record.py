@@ -7,6 +7,7 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.integrate import LONGEST_STEP_MIN
 from reactorwatch.process.model import Array
 
@@ -27,6 +28,7 @@ class FilterRecord:
             before is not yet there.
         near: whether a row is so soon after the one before that two steps lead to it, shape (rows,); of the first one
             nobody knows yet.
+        doubt: ways on which nobody knows when inputs changed; None: there are none.
     """
 
     time_min: Array
@@ -36,6 +38,7 @@ class FilterRecord:
     accept: NDArray[np.bool_]
     rows: Array
     near: NDArray[np.bool_]
+    doubt: Doubt | None = None
 
     @classmethod
     def of(
@@ -45,6 +48,7 @@ class FilterRecord:
         measured: Array,
         gate: float = inf,
         accept: NDArray[np.bool_] | None = None,
+        doubt: Doubt | None = None,
     ) -> "FilterRecord":
         """Lay a record out.
 
@@ -54,6 +58,7 @@ class FilterRecord:
             measured: shape (rows, n_y); NaN where missing.
             gate: see the attributes.
             accept: see the attributes; None: for none.
+            doubt: see the attributes.
         """
         count, n_y = measured.shape
         inputs = inputs.reshape(count, -1)
@@ -62,10 +67,12 @@ class FilterRecord:
         rows, near = np.zeros((count, 2 * n_u + 3 + 2 * n_y)), np.zeros(count, dtype=np.bool_)
         half = 0.5 * np.diff(time_min)
         near[1:] = (half > 0.0) & (2.0 * half <= LONGEST_ROW_MIN) & np.all(np.isfinite(inputs[:-1]), axis=1)
+        if doubt is not None:
+            near &= ~doubt.rows
         rows[1:, :n_u], rows[:, n_u : 2 * n_u], rows[:, 2 * n_u] = inputs[:-1], inputs, time_min
         rows[1:, 2 * n_u + 1], rows[1:, 2 * n_u + 2] = half, half
         rows[:, -2 * n_y : -n_y], rows[:, -n_y:] = measured, np.where(accept, inf, gate)
-        return cls(time_min, inputs, measured, gate, accept, rows, near)
+        return cls(time_min, inputs, measured, gate, accept, rows, near, doubt)
 
     def rest(self, row: int) -> "FilterRecord":
         """The record from a row on."""
@@ -77,6 +84,7 @@ class FilterRecord:
             self.accept[row:],
             self.rows[row:],
             self.near[row:],
+            None if self.doubt is None else self.doubt.of_rows(slice(row, None)),
         )
 
     def following(
@@ -95,7 +103,7 @@ class FilterRecord:
         if before_min is not None:
             half = 0.5 * (times[0] - before_min)
             rows[0, :n_u], rows[0, first], rows[0, second] = inputs, half, half
-            near[0] = 0.0 < 2.0 * half <= LONGEST_ROW_MIN
+            near[0] = 0.0 < 2.0 * half <= LONGEST_ROW_MIN and not (self.doubt is not None and self.doubt.rows[0])
         for point in breaks:
             row = int(times.searchsorted(point))
             since = times[row - 1] if row else before_min

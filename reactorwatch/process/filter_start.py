@@ -88,10 +88,13 @@ class Beginning:
 
     def _with_memory(self, x: Array, u: Array, p: Array, time_min: float, P: Array) -> tuple[Array, Array]:
         """The same with the states that nobody measures at rest, give or take their scales."""
-        for function, further in ((self._completed, np.diag(np.square(self._memory))), (self._begun, 0.0)):
-            after, J = _called(function, x, u, p, time_min)
-            x, P = after[0], J.T @ P @ J + further
-        return x, P
+        after, J = _called(self._completed, x, u, p, time_min)
+        return self.reset(after[0], J.T @ P @ J + np.diag(np.square(self._memory)), u, p, time_min)
+
+    def reset(self, x: Array, P: Array, u: Array, p: Array, time_min: float) -> tuple[Array, Array]:
+        """The state and its covariance when a row has begun, from which on inputs u hold: memory may jump then."""
+        after, J = _called(self._begun, x, u, p, time_min)
+        return after[0], J.T @ P @ J
 
     def _guessed(self, y: Array) -> Array:
         """Where a sensor has the name of a state, it shows about that; the others are in the middle of their range."""

@@ -28,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_record import FilterRecord
 from reactorwatch.process.model import Array, ProcessModel
@@ -105,6 +106,7 @@ def tune_with(
     smallest_sd: Sequence[float],
     learned: Sequence[str],
     first_sd: Mapping[str, float],
+    doubt: Doubt | None = None,
 ) -> tuple[NoiseLevels, dict[str, float]]:
     """The noise levels, and positive parameters of the model, under which a record is likeliest.
 
@@ -116,8 +118,10 @@ def tune_with(
         smallest_sd: likewise.
         learned: names of the parameters; the search begins at their values.
         first_sd: by name of a state, its process noise to begin with, where it is not one of those that move alike.
+        doubt: ways on which nobody knows when inputs changed; None: there are none.
     """
-    return _Tuning(model, time_min, inputs, measured, np.asarray(smallest_sd, dtype=float), learned, first_sd).found()
+    smallest = np.asarray(smallest_sd, dtype=float)
+    return _Tuning(model, time_min, inputs, measured, smallest, learned, first_sd, doubt).found()
 
 
 class _Tuning:
@@ -132,7 +136,9 @@ class _Tuning:
         smallest_sd: Array,
         learned: Sequence[str],
         first_sd: Mapping[str, float],
+        doubt: Doubt | None,
     ) -> None:
+        self._doubt = doubt
         self._whole, self._rows = (time_min, inputs, measured), time_min.size
         self._take(FIRST_ROWS)
         self._n_y = len(model.outputs)
@@ -166,7 +172,8 @@ class _Tuning:
     def _take(self, rows: int) -> None:
         """Go on with so many rows from the beginning."""
         time_min, inputs, measured = self._whole
-        self._record = FilterRecord.of(time_min[:rows], inputs[:rows], measured[:rows], GATE)
+        doubt = None if self._doubt is None else self._doubt.of_rows(slice(rows))
+        self._record = FilterRecord.of(time_min[:rows], inputs[:rows], measured[:rows], GATE, doubt=doubt)
 
     def _without_outliers(self, best: _Trial) -> _Trial:
         """The same noise levels on the record without its outliers: an outlier of one sensor whitens into all."""
@@ -175,7 +182,7 @@ class _Tuning:
         run = self._filter.over(record)
         with np.errstate(invalid="ignore"):
             measured = np.where(np.abs(run.residual) > GATE * run.sd, np.nan, record.measured)
-        self._record = FilterRecord.of(record.time_min, record.inputs, measured, GATE)
+        self._record = FilterRecord.of(record.time_min, record.inputs, measured, GATE, doubt=record.doubt)
         return self._tried(best.theta)
 
     def _climbed(self, best: _Trial) -> _Trial:

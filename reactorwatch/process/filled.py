@@ -1,0 +1,68 @@
+"""A record with rows put in where rows are far apart, so that two steps lead from each row to the next.
+
+A filter takes such rows at once, and any others one by one, thirty times as slowly. Nothing is measured in a row that
+is put in, and the inputs are those of the row before.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.process.doubt import Doubt
+from reactorwatch.process.filter import LONGEST_GAP_MIN, Innovations
+from reactorwatch.process.filter_record import LONGEST_ROW_MIN
+from reactorwatch.process.model import Array
+
+
+class Filled(NamedTuple):
+    """A record with more rows.
+
+    Attributes:
+        time_min: shape (more,).
+        inputs: shape (more, n_u).
+        measured: shape (more, n_y); NaN in rows that were put in.
+        doubt: as it was.
+        own: where the rows of the record are, shape (rows,).
+    """
+
+    time_min: Array
+    inputs: Array
+    measured: Array
+    doubt: Doubt | None
+    own: NDArray[np.intp]
+
+    def of_record(self, found: Innovations) -> Innovations:
+        """What a filter says of the rows of the record."""
+        if self.own.size == self.time_min.size:
+            return found
+        return Innovations(*(item[self.own] for item in found))
+
+
+def filled(time_min: Array, inputs: Array, measured: Array, doubt: Doubt | None = None) -> Filled:
+    """Put rows in, but for ways in doubt and for those that no filter goes.
+
+    Args:
+        time_min: shape (rows,), increasing.
+        inputs: shape (rows, n_u).
+        measured: shape (rows, n_y).
+        doubt: ways on which nobody knows when inputs changed; None: there are none.
+    """
+    step = np.diff(time_min)
+    pieces = np.where((step > LONGEST_ROW_MIN) & (step <= LONGEST_GAP_MIN), np.ceil(step / LONGEST_ROW_MIN), 1.0)
+    if doubt is not None:
+        pieces[doubt.rows[1:]] = 1.0
+    counts = np.append(pieces.astype(np.intp), 1)
+    own = np.cumsum(counts) - counts
+    if own[-1] == own.size - 1:
+        return Filled(time_min, inputs, measured, doubt, own)
+    source = np.repeat(np.arange(own.size), counts)
+    share = (np.arange(source.size) - own[source]) / counts[source]
+    times = time_min[source] + share * np.append(step, 0.0)[source]
+    more = np.full((source.size, measured.shape[1]), np.nan)
+    more[own] = measured
+    if doubt is not None:
+        early = np.zeros(source.size)
+        early[own] = doubt.early
+        doubt = Doubt(doubt.inputs[source], early)
+    return Filled(times, inputs[source], more, doubt, own)

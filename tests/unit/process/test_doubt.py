@@ -1,0 +1,134 @@
+"""Ways on which an input changed, and nobody knows when."""
+
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.doubt import Doubt, early_share, variance_of
+from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.filled import filled
+from reactorwatch.process.filter import Filter, Innovations, NoiseLevels
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.noise import tune_with
+
+SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
+
+
+@pytest.mark.parametrize("missing", [1, 2, 5, 40])
+def test_the_share_has_the_mean_and_variance_of_all_rows_that_it_may_have_changed_with(missing: int) -> None:
+    changed_with = np.arange(1, missing + 2)
+    shares = 1.0 - changed_with / (missing + 1)
+    share = early_share(np.array(float(missing)))
+    assert share == pytest.approx(np.mean(shares), abs=1e-12)
+    assert variance_of(share) == pytest.approx(np.var(shares), abs=1e-12)
+
+
+def test_a_tank_that_fills_is_as_uncertain_as_when_its_valve_opened() -> None:
+    """dx/dt = u: by 0.2 min the level rises by 0.2 u times the share for which the valve was open."""
+    model, noise = filling(), NoiseLevels((0.1,), (0.0,))
+    kalman, sure = Filter(model, noise), Filter(model, noise)
+    for tank in (kalman, sure):
+        for row in range(50):
+            tank.update(0.1 * row, (0.0,), (5.0,))
+    kalman.update(5.1, (3.0,), (np.nan,), doubt=((3.0,), 0.25))
+    sure.update(5.1, (3.0,), (np.nan,))
+    by = 3.0 * (5.1 - 4.9)
+    assert kalman.state.x[0] == pytest.approx(sure.state.x[0] + 0.25 * by, rel=1e-9)
+    assert kalman.state.P[0] == pytest.approx(sure.state.P[0] + variance_of(np.array(0.25)) * by**2, rel=1e-9)
+
+
+def test_innovations_behind_holes_are_as_large_as_the_filter_says() -> None:
+    """Mean squares of 600 and more, whose standard deviation is 0.06; without doubt they are far larger."""
+    time_min, qc, measured, there = with_holes(seed=3)
+    inputs, early = qc[there][:, None], early_of(time_min[there], qc[there])
+    doubt = Doubt(inputs, early)
+    doubted = Filter(cstr(), SENSORS).run(time_min[there], inputs, measured[there], doubt=doubt)
+    behind = np.flatnonzero(early)
+    assert behind.size > 300
+    assert np.mean(doubted.whitened[behind] ** 2) == pytest.approx(1.0, abs=0.25)
+    assert np.mean(doubted.whitened[behind + 1] ** 2) == pytest.approx(1.0, abs=0.25)
+    taken_as_held = Filter(cstr(), SENSORS).run(time_min[there], inputs, measured[there])
+    assert np.mean(taken_as_held.whitened[behind] ** 2) > 2.0
+
+
+def test_what_a_noise_search_learns_does_not_take_holes_for_noise() -> None:
+    time_min, qc, measured, there = with_holes(seed=4)
+    inputs = qc[there][:, None]
+    doubt = Doubt(inputs, early_of(time_min[there], qc[there]))
+    with_doubt, without = (
+        tune_with(cstr(), time_min[there], inputs, measured[there], (1e-4, 0.01), (), {}, item)[0]
+        for item in (doubt, None)
+    )
+    assert with_doubt.process_sd[1] < 0.02
+    assert without.process_sd[1] > 0.05
+
+
+def test_a_sticking_valve_keeps_its_place_behind_a_hole() -> None:
+    """It follows moves of more than 6 l/min alone, whenever they were."""
+    fault = parse_fault("valve_stiction:constant:6.0")
+    record = simulate_record(PlantConfig(seed=5, faults=(str(fault),)), 3000)
+    qc, there = record.columns["qc"], np.ones(3000, dtype=bool)
+    there[2 + np.flatnonzero(np.diff(qc[1:]))[::3]] = False
+    measured = np.column_stack([record.columns["C"], record.columns["T"]])
+    doubt = Doubt(qc[there][:, None], early_of(record.time_min[there], qc[there]))
+    kalman = Filter(fault.extend(cstr()), NoiseLevels(SENSORS.measurement_sd, (0.0,) * 3))
+    found = kalman.run(record.time_min[there], qc[there], measured[there], doubt=doubt)
+    stands = np.empty(3000)
+    stands[0] = qc[0]
+    for row in range(1, 3000):
+        stands[row] = qc[row] if abs(qc[row] - stands[row - 1]) > 6.0 else stands[row - 1]
+    np.testing.assert_allclose(found.x[20:, 2], stands[there][20:], atol=0.5)
+
+
+def test_with_rows_put_in_a_filter_says_what_it_says_row_by_row() -> None:
+    time_min, qc, measured, there = with_holes(seed=6)
+    inputs, early = qc[there][:, None], early_of(time_min[there], qc[there])
+    doubt = Doubt(inputs, early)
+    kalman = Filter(cstr(), NoiseLevels(SENSORS.measurement_sd, (1e-4, 0.05)))
+    rows = filled(time_min[there], inputs, measured[there], doubt)
+    assert rows.own.size == np.count_nonzero(there) < rows.time_min.size
+    found = rows.of_record(kalman.run(rows.time_min, rows.inputs, rows.measured, doubt=rows.doubt))
+    expected = kalman.run(time_min[there], inputs, measured[there], doubt=doubt)
+    for name in Innovations._fields:
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-9, err_msg=name)
+
+
+def test_a_record_without_holes_stays_as_it_is() -> None:
+    time_min = 0.1 * np.arange(10.0)
+    rows = filled(time_min, np.zeros((10, 1)), np.zeros((10, 2)))
+    assert rows.time_min is time_min
+
+
+def filling() -> ProcessModel:
+    """A tank that fills as fast as its valve lets it; built from the reactor's parts."""
+    model = cstr()
+    level = replace(model.states[1], lower=-100.0, upper=100.0, scale=1.0)
+    output = replace(model.outputs[1], expression=level.symbol)
+    return replace(
+        model, states=(level,), rhs=(model.inputs[0].symbol + ca.SX(0),), outputs=(output,), at_rest={}, resets={}
+    )
+
+
+def with_holes(seed: int) -> tuple[Array, Array, Array, Array]:
+    """A run of the reactor with rows missing, most where qc moves; which rows are there."""
+    random = np.random.default_rng(seed)
+    rows = 6000
+    record = simulate_record(PlantConfig(seed=seed), rows)
+    measured = np.column_stack([record.columns["C"], record.columns["T"]])
+    qc = record.columns["qc"]
+    there = np.ones(rows, dtype=bool)
+    moves = np.flatnonzero(np.diff(qc)) + 1
+    there[moves[random.random(moves.size) < 0.7]] = False
+    there[random.random(rows) < 0.05] = False
+    there[0] = True
+    return record.time_min, qc, measured, there
+
+
+def early_of(time_min: Array, qc: Array) -> Array:
+    missing = np.round(np.diff(time_min) / 0.1) - 1.0
+    return np.append(0.0, np.where((np.diff(qc) != 0.0) & (missing > 0), early_share(np.maximum(missing, 0.0)), 0.0))
