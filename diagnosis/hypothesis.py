@@ -114,7 +114,8 @@ class Hypothesis:
                 damping *= _MORE_DAMPING
             if best.loss > before.loss - SETTLED:
                 break
-            differences = self._widened(self._inverse(g), differences)
+            if any(course.numbers for course in self.courses):
+                differences = self._widened(self._inverse(g), differences)
         return best
 
     def covariance(self, run: Run, fit: Fit) -> Array:

@@ -26,6 +26,10 @@ from reactorwatch.process.filter_errors import Ways
 from reactorwatch.process.model import Array
 
 
+_DEAD = 1e-150
+"""Of an error of the state: its square is still a number."""
+
+
 class Onsets(NamedTuple):
     """Of a course that sets in right after a row; each of shape (rows - 1, causes).
 
@@ -87,29 +91,37 @@ def _shown(F: Array, H: Array, K: Array, L_inverse: Array, G: Array, D: Array, o
     rows, n_x, n_y, courses = F.shape[0], F.shape[1], H.shape[1], over_row.shape[1]
     found = np.zeros((rows, n_y, courses))
     e, before, off = np.zeros((n_x, courses)), np.zeros((n_x, courses)), np.zeros((n_y, courses))
-    for k in range(rows):
+    for k in range(rows):  # courses innermost, so that several are taken at once
         for i in range(n_x):
+            by = G[k, i]
             for c in range(courses):
-                value = G[k, i] * over_row[k, c]
-                for j in range(n_x):
-                    value += F[k, i, j] * e[j, c]
-                before[i, c] = value
+                before[i, c] = by * over_row[k, c]
+            for j in range(n_x):
+                by = F[k, i, j]
+                for c in range(courses):
+                    before[i, c] += by * e[j, c]
         for i in range(n_y):
+            by = D[k, i]
             for c in range(courses):
-                value = D[k, i] * at_row[k, c]
-                for j in range(n_x):
-                    value += H[k, i, j] * before[j, c]
-                off[i, c] = value
+                off[i, c] = by * at_row[k, c]
+            for j in range(n_x):
+                by = H[k, i, j]
+                for c in range(courses):
+                    off[i, c] += by * before[j, c]
         for i in range(n_x):
             for c in range(courses):
-                value = before[i, c]
-                for j in range(n_y):
-                    value -= K[k, i, j] * off[j, c]
-                e[i, c] = value
+                e[i, c] = before[i, c]
+            for j in range(n_y):
+                by = K[k, i, j]
+                for c in range(courses):
+                    e[i, c] -= by * off[j, c]
+            for c in range(courses):  # what has died away takes a hundred times as long to multiply
+                e[i, c] = e[i, c] if abs(e[i, c]) > _DEAD else 0.0
         for i in range(n_y):
             for j in range(i + 1):
+                by = L_inverse[k, i, j]
                 for c in range(courses):
-                    found[k, i, c] += L_inverse[k, i, j] * off[j, c]
+                    found[k, i, c] += by * off[j, c]
     return found
 
 

@@ -20,6 +20,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.compiled import compiled
 from reactorwatch.process.doubt import Doubt, variance_of
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_step import exponential
@@ -153,15 +154,7 @@ class FilterErrors:
         p, step = self.model.values(self.changes), np.diff(time_min)
         there, F, G, spread = self._walked(x[:-1], inputs[:-1], time_min, p, doubt)
         H, D = self._code.shown.over(there, inputs[1:], p, time_min[1:])
-        prior = F @ P[:-1] @ F.transpose(0, 2, 1) + np.eye(there.shape[1]) * q * step[:, None, None]
-        prior += spread[:, :, None] * spread[:, None, :]
-        covariance = H @ prior @ H.transpose(0, 2, 1) + np.diag(R)
-        known = np.isfinite(residual[1:]) & np.all(np.isfinite(covariance), axis=2)
-        both = known[:, :, None] & known[:, None, :]
-        L = _cholesky(np.where(both, covariance, np.eye(R.size)))
-        L_inverse = np.asarray(np.linalg.inv(L) * both)
-        w = np.einsum("kij,kj->ki", L_inverse, np.where(known, residual[1:], 0.0))
-        K = P[1:] @ H.transpose(0, 2, 1) * (used[1:] / R)[:, None, :]
+        L_inverse, w, K = _whitened(F, H, P, q, step, spread, R, residual, used)
         return Ways(F, G, H, D, K, L_inverse, w)
 
     def about(self, time_min: Array, inputs: Array, x: Array, doubt: Doubt | None = None) -> "Path":
@@ -229,14 +222,83 @@ class _Code:
         return RowCode(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
 
 
-def _cholesky(A: Array) -> Array:
-    """L with L L' = A, of many matrices, shape (n, m, m); about a run that has lost the plant these are anything."""
-    L = np.zeros_like(A)
-    for i in range(A.shape[1]):
-        for j in range(i + 1):
-            left = A[:, i, j] - np.sum(L[:, i, :j] * L[:, j, :j], axis=1)
-            L[:, i, j] = np.sqrt(np.maximum(left, _LEAST_PIVOT * np.abs(A[:, i, i]))) if i == j else left / L[:, j, j]
-    return L
+@compiled
+def _whitened(
+    F: Array,
+    H: Array,
+    P: Array,
+    q: Array,
+    step: Array,
+    spread: Array,
+    R: Array,
+    residual: Array,
+    used: NDArray[np.bool_],
+) -> tuple[Array, Array, Array]:
+    """What whitens each way's innovation, that innovation, and the gain.
+
+    About a run that has lost the plant these are anything; pivots are kept positive.
+    """
+    ways, n_x, n_y = F.shape[0], F.shape[1], H.shape[1]
+    L_inverse, w, K = np.zeros((ways, n_y, n_y)), np.zeros((ways, n_y)), np.zeros((ways, n_x, n_y))
+    FP, prior, HP = np.zeros((n_x, n_x)), np.zeros((n_x, n_x)), np.zeros((n_y, n_x))
+    S, L, known = np.zeros((n_y, n_y)), np.zeros((n_y, n_y)), np.zeros(n_y, dtype=np.bool_)
+    for k in range(ways):
+        for i in range(n_x):
+            for j in range(n_x):
+                value = 0.0
+                for m in range(n_x):
+                    value += F[k, i, m] * P[k, m, j]
+                FP[i, j] = value
+        for i in range(n_x):
+            for j in range(n_x):
+                value = spread[k, i] * spread[k, j]
+                if i == j:
+                    value += q[i] * step[k]
+                for m in range(n_x):
+                    value += FP[i, m] * F[k, j, m]
+                prior[i, j] = value
+        for i in range(n_y):
+            for j in range(n_x):
+                value = 0.0
+                for m in range(n_x):
+                    value += H[k, i, m] * prior[m, j]
+                HP[i, j] = value
+        for i in range(n_y):
+            known[i] = np.isfinite(residual[k + 1, i])
+            for j in range(n_y):
+                value = R[i] if i == j else 0.0
+                for m in range(n_x):
+                    value += HP[i, m] * H[k, j, m]
+                S[i, j] = value
+                known[i] = known[i] and np.isfinite(value)
+        for i in range(n_y):
+            for j in range(n_y):
+                if not (known[i] and known[j]):
+                    S[i, j] = 1.0 if i == j else 0.0
+        for i in range(n_y):
+            for j in range(i + 1):
+                left = S[i, j]
+                for m in range(j):
+                    left -= L[i, m] * L[j, m]
+                L[i, j] = np.sqrt(max(left, _LEAST_PIVOT * abs(S[i, i]))) if i == j else left / L[j, j]
+        for j in range(n_y):  # column by column of the inverse; 0 where nothing was measured
+            for i in range(j, n_y):
+                value = 1.0 if i == j else 0.0
+                for m in range(j, i):
+                    value -= L[i, m] * L_inverse[k, m, j]
+                L_inverse[k, i, j] = value / L[i, i] if known[i] and known[j] else 0.0
+        for i in range(n_y):
+            for j in range(i + 1):
+                if known[j]:
+                    w[k, i] += L_inverse[k, i, j] * residual[k + 1, j]
+        for i in range(n_x):
+            for j in range(n_y):
+                if used[k + 1, j]:
+                    value = 0.0
+                    for m in range(n_x):
+                        value += P[k + 1, i, m] * H[k, j, m]
+                    K[k, i, j] = value / R[j]
+    return L_inverse, w, K
 
 
 def piece_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
