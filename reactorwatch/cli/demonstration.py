@@ -178,7 +178,7 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: Path, folder: Path, pl
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
     """Diagnose the recording, draw it, read from it what happened, and write that down."""
     from diagnosis.report.words import verdict
-    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, cases, diagnosed
+    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, Asked, case_of, diagnosed
     from reactorwatch.process import effects_of
     from recorder.dashboard.file import write_rrd
     from recorder.run_reader import stretches
@@ -188,7 +188,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         first_ns, faults, alarms = _events(recording)
         again = backtest.run(messages(recording, PLANT), monitor)
     with task("diagnosing"):
-        (case,) = cases([recording], PLANT, {}, None, folder / DIAGNOSIS_FOLDER)
+        case = case_of(recording, folder / DIAGNOSIS_FOLDER, Asked(plant=PLANT))
         diagnosis, _ = diagnosed(case)
     with task("drawing"):
         write_rrd(stretches(messages(recording, PLANT)), drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)
