@@ -17,7 +17,7 @@ from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import router
-from reactorwatch.runtime.config import BusConfig, read_settings, section
+from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.model_file import read_extended_model
 from reactorwatch.runtime.serve import stop_on_signals
@@ -47,8 +47,9 @@ def run_until_stopped(
     Raises:
         InputError: settings that cannot be used.
     """
-    configure()
     tables = read_settings(config)
+    log_config = section(LogConfig, "log", tables, {})
+    configure(as_json=log_config.format == "json")
     bus_config = section(BusConfig, "bus", tables, {"endpoint": endpoint})
     name = flags.get("name")
     waiting = {"wait_for": ["monitor", "recorder"]}
@@ -56,9 +57,11 @@ def run_until_stopped(
     monitor = section(MonitorConfig, "monitor", tables, {"plant": name or plant.name})
     recorder = section(RecorderConfig, "recorder", tables, {"plant": name or plant.name})
     diagnosis = diagnosis_settings(tables, monitor, diagnose)
+    metrics = section(MetricsConfig, "metrics", tables, {})
     bus = router(bus_config)  # before anything is written: an address that is taken leaves nothing behind
     try:
         tables_written = {"bus": bus_config, "plant": plant, "monitor": monitor, "diagnosis": diagnosis}
+        tables_written |= {"metrics": metrics, "log": log_config}
         settings = _write_down(out, recorder, plant.seed, tables_written)
         with stop_on_signals() as stop, Processes(settings) as processes:
             woken = threading.Event()
@@ -99,11 +102,11 @@ def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig
 
 
 @contextlib.contextmanager
-def diagnosing(config: DiagnosisConfig, bus_config: BusConfig) -> Iterator[None]:
+def diagnosing(config: DiagnosisConfig, bus_config: BusConfig, log_config: LogConfig) -> Iterator[None]:
     """Diagnose after alarms, in a process of its own, while the context lasts."""
     with TemporaryDirectory() as folder:
         settings = Path(folder) / "settings.toml"
-        write_settings(settings, {"bus": bus_config, "diagnosis": config})
+        write_settings(settings, {"bus": bus_config, "diagnosis": config, "log": log_config})
         with Processes(settings) as processes:
             processes.start("diagnosis")
             yield
