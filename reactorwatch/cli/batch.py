@@ -123,9 +123,9 @@ def say(
             typer.echo(outcome.said)
             rows.append(outcome.row)
     failed = sum(bool(row["error"]) for row in rows)
-    if not as_json:
+    if len(rows) > 1 and not as_json:
         typer.echo(f"\n{kind.summary(rows)}")
-    if out is not None and failed < len(rows):
+    if len(rows) > 1 and out is not None and failed < len(rows):
         write_summary(out, rows)
     if failed:
         raise typer.Exit(2)

@@ -92,11 +92,9 @@ def _check_workers(client: Any, address: str) -> None:
         raise InputError(
             f"--scheduler {address}: has no workers; start some with: dask worker {address} --nthreads 1"
         ) from error
-    try:
-        versions = client.run(installed_version)
-    except ImportError as error:
-        raise InputError(f"--scheduler {address}: its workers cannot import reactorwatch: install it there") from error
-    for worker, version in versions.items():
+    for worker, version in client.run(_asks_for_version()).items():
+        if version is None:
+            raise InputError(f"--scheduler {address}: worker {worker} has no reactorwatch; install {__version__} there")
         if version != __version__:
             raise InputError(
                 f"--scheduler {address}: worker {worker} has reactorwatch {version}, this is {__version__}; "
@@ -104,6 +102,14 @@ def _check_workers(client: Any, address: str) -> None:
             )
 
 
-def installed_version() -> str:
-    """The version of this software where it is called."""
-    return __version__
+def _asks_for_version() -> Callable[[], str | None]:
+    """A function that is sent as it is, and not by its name: a worker that cannot find a name never answers."""
+
+    def version() -> str | None:
+        try:
+            import reactorwatch
+        except ImportError:
+            return None
+        return reactorwatch.__version__
+
+    return version

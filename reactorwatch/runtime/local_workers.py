@@ -10,11 +10,12 @@ other longer than they work.
 
 import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar, cast
@@ -129,16 +130,29 @@ def _end(worker: _Worker) -> None:
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """What is started meanwhile never hears Ctrl-C, which the terminal sends to all: we end it."""
+    """What is started meanwhile does not hear Ctrl-C, which the terminal sends to all: we end it.
+
+    We hear it afterwards: a process that is half told what to do would complain. The mask is what the new process
+    inherits, and the handler is for us, because another of our threads may be the one that is told.
+    """
+    resource_tracker.ensure_running()  # by the first process otherwise, and it lets the signal through again
+    heard: list[int] = []
+    in_main = threading.current_thread() is threading.main_thread()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    handler = signal.signal(signal.SIGINT, lambda number, _frame: heard.append(number)) if in_main else None
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if in_main:
+            signal.signal(signal.SIGINT, handler if handler is not None else signal.SIG_DFL)
+        if heard:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _do_jobs(work: Callable[[Job], Result], pipe: "Connection[Any, Any]") -> None:
     """What a worker does until nobody is there to tell."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         while True:
             outcome = attempt(work, pipe.recv())

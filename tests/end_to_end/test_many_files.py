@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.records.csv_file import write_csv
 from recorder.convert import import_csv
+from tests.cluster import dask_cluster
 
 from .conftest import PATIENCE_S, REACTORWATCH, Command
 
@@ -34,11 +36,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
     """The address of a Dask cluster of two workers on this machine."""
-    distributed = pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-    ) as running:
-        yield running.scheduler_address
+    with dask_cluster(2) as address:
+        yield address
 
 
 def objects(done: subprocess.CompletedProcess[str]) -> list[dict[str, Any]]:
@@ -105,6 +104,38 @@ def test_options_that_cannot_be_meant_are_told_once_and_not_for_each_file(folder
         done = command("diagnose", "run-*.csv", "-o", "nothing", *options, cwd=folder)
         assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, "", 1), options
         assert not (folder / "nothing").exists()
+
+
+def test_a_process_that_is_killed_meanwhile_costs_no_result(folder: Path) -> None:
+    arguments = [REACTORWATCH, "diagnose", "run-?.csv", "--json", "--jobs", "2"]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder) as running:
+        assert running.stdout is not None
+        first = running.stdout.readline()
+        os.kill(workers_of(running.pid)[0], signal.SIGKILL)
+        rest, complaints = running.communicate(timeout=PATIENCE_S)
+    assert (running.returncode, complaints) == (0, "")
+    said = [json.loads(line) for line in (first + rest).splitlines()]
+    assert [item["file"] for item in said] == [f"run-{number}.csv" for number in range(FILES)]
+
+
+def test_ctrl_c_ends_all_processes_and_says_nothing(folder: Path) -> None:
+    arguments = [REACTORWATCH, "diagnose", "run-?.csv", "--json", "--jobs", "2"]
+    with subprocess.Popen(
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder, start_new_session=True
+    ) as running:
+        assert running.stdout is not None
+        running.stdout.readline()
+        workers = workers_of(running.pid)
+        os.killpg(running.pid, signal.SIGINT)  # as a terminal does: to all of them
+        _, complaints = running.communicate(timeout=PATIENCE_S)
+    assert (running.returncode, complaints) == (130, "")
+    assert not [number for number in workers if Path(f"/proc/{number}").exists()]
+
+
+def workers_of(number: int) -> list[int]:
+    """The processes that do the work of another."""
+    children = map(int, Path(f"/proc/{number}/task/{number}/children").read_text().split())
+    return [child for child in children if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes()]
 
 
 def test_what_is_printed_goes_to_its_file_while_the_terminal_shows_progress(folder: Path) -> None:

@@ -10,17 +10,15 @@ import pytest
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.jobs import RETRIES, Failed, Here, Workers, in_order, workers
 from reactorwatch.runtime.local_workers import THREADS, LocalWorkers, cores
+from tests.cluster import dask_cluster
 from tests.unit.runtime.work import deadly, linear_algebra_threads, picky, square, unspeakable
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
     """The address of a Dask cluster of two workers on this machine."""
-    distributed = pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None
-    ) as running:
-        yield running.scheduler_address
+    with dask_cluster(2) as address:
+        yield address
 
 
 @pytest.fixture(params=["here", "one process", "two processes", "cluster"])
@@ -136,6 +134,26 @@ def test_without_dask_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"^--scheduler needs Dask: pip install 'reactorwatch\[cluster\]'$"):
         workers(None, "tcp://127.0.0.1:8786")
+
+
+@pytest.mark.parametrize(
+    ("theirs", "said"),
+    [("0.0.1", "has reactorwatch 0.0.1, this is "), (None, "has no reactorwatch; install ")],
+)
+def test_workers_with_another_version_or_none_are_told(
+    cluster: str, theirs: str | None, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reactorwatch.runtime.dask_workers._asks_for_version", lambda: lambda: theirs)
+    with pytest.raises(InputError, match=said):
+        list(workers(None, cluster).outcomes(square, range(2)))
+
+
+def test_a_cluster_without_workers_is_told_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("reactorwatch.runtime.dask_workers.WORKERS_WITHIN_S", 0.2)
+    with dask_cluster(0) as address:
+        said = f"has no workers; start some with: dask worker {address} --nthreads 1"
+        with pytest.raises(InputError, match=said):
+            list(workers(None, address).outcomes(square, range(2)))
 
 
 def test_a_scheduler_that_is_not_there_is_told_by_its_address(monkeypatch: pytest.MonkeyPatch) -> None:
