@@ -11,7 +11,7 @@ COPY plant_node ./plant_node
 COPY monitor_node ./monitor_node
 COPY recorder ./recorder
 COPY diagnosis ./diagnosis
-RUN pip install --no-cache-dir .
+RUN pip install --no-cache-dir '.[metrics]'
 
 USER reactorwatch
 WORKDIR /home/reactorwatch

@@ -3,8 +3,8 @@
 Records of every class (`benchmarks/hidden/classes.py`) are drawn from fresh seeds, with a solver and equations that the
 diagnosis does not use (`tests/hidden_effect/`), diagnosed in parallel, and held against the truth.
 
-    python benchmarks/diagnosis_study.py [--quick] [--records N] [--jobs N] [--classes NAME ...] [--seed N]
-                                         [--json FILE] [--from FILE ...] [--write]
+    python benchmarks/diagnosis_study.py [--quick] [--records N] [--jobs N] [--scheduler ADDRESS] [--classes NAME ...]
+                                         [--seed N] [--json FILE] [--from FILE ...] [--write]
 
 `--write` puts the tables into docs/diagnosis.md. All classes take hours; one after the other, each with `--json`, they
 can be put together by `--from`.
@@ -12,12 +12,9 @@ can be put together by `--from`.
 
 import argparse
 import json
-import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict
-from multiprocessing import get_context
 from pathlib import Path
 
 import msgspec
@@ -28,6 +25,7 @@ from benchmarks.hidden.classes import CLASSES, StudyClass, class_named, drawn
 from benchmarks.hidden.tables import confusion_table, failures, main_table
 from diagnosis.diagnose import diagnose
 from reactorwatch.process.cstr import cstr
+from reactorwatch.runtime.jobs import Failed, workers
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.judge import Judged, failed, judge
 
@@ -61,8 +59,6 @@ _warm = False
 def main() -> None:
     """Run the study and print it."""
     chosen = arguments()
-    # The matrices are small: threads of the linear algebra would only wait for each other.
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     if chosen.earlier:
         report(earlier(chosen.earlier), chosen, 0.0)
         return
@@ -72,16 +68,15 @@ def main() -> None:
     found: dict[str, list[Judged]] = {study.name: [] for study in classes}
     with Progress(console=Console(stderr=True)) as progress:
         bar = progress.add_task("diagnoses", total=len(tasks))
-        if chosen.jobs == 1:
-            for study, number in tasks:
-                found[study.name].append(judged(study.name, number, chosen.seed))
-                progress.advance(bar)
-        else:
-            with ProcessPoolExecutor(chosen.jobs, get_context("spawn")) as executor:
-                futures = {executor.submit(judged, study.name, n, chosen.seed): study for study, n in tasks}
-                for future in as_completed(futures):
-                    found[futures[future].name].append(future.result())
-                    progress.advance(bar)
+        jobs = [(study.name, number, chosen.seed) for study, number in tasks]
+        for number, outcome in workers(chosen.jobs, chosen.scheduler).outcomes(judge_one, jobs):
+            study, of_class = tasks[number]
+            found[study.name].append(
+                failed(drawn(study, of_class, chosen.seed), outcome.reason, 0.0)
+                if isinstance(outcome, Failed)
+                else outcome
+            )
+            progress.advance(bar)
     for items in found.values():
         items.sort(key=lambda item: item.seed)
     report(found, chosen, time.perf_counter() - began)
@@ -109,6 +104,11 @@ def earlier(files: Sequence[Path]) -> dict[str, list[Judged]]:
         for name, items in json.loads(file.read_text()).items():
             found[name] = msgspec.convert(items, list[Judged])
     return {study.name: found[study.name] for study in CLASSES if study.name in found}
+
+
+def judge_one(job: tuple[str, int, int]) -> Judged:
+    """As `judged`: class, number and first seed in one."""
+    return judged(*job)
 
 
 def judged(name: str, number: int, first_seed: int) -> Judged:
@@ -166,7 +166,8 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="The diagnosis on records with something hidden in them.")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_RECORDS} records a class, for a try")
     parser.add_argument("--records", type=int, help=f"a class (default {RECORDS}, {NOMINAL_RECORDS} nominal ones)")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
+    parser.add_argument("--jobs", type=int, help="processes (default: one a core)")
+    parser.add_argument("--scheduler", help="address of a Dask cluster that does it instead")
     parser.add_argument("--classes", nargs="+", metavar="NAME", help=", ".join(item.name for item in CLASSES))
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="the first")
     parser.add_argument("--json", type=Path, help="where the numbers are written, record by record")

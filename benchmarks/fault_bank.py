@@ -9,20 +9,17 @@ without a fault, then the fault for 150. All detectors watch the same records at
 
 Then runs without a fault, with white and with autocorrelated noise: the realised rate of false alarms.
 
-    python benchmarks/fault_bank.py [--quick] [--jobs N] [--json FILE] [--write FILE] [--budgets 1 30]
+    python benchmarks/fault_bank.py [--quick] [--jobs N] [--scheduler ADDRESS] [--json FILE] [--write FILE]
+                                    [--budgets 1 30]
 
 Goals: the median delay at most half that of the report's method at an equal rate of false alarms; that rate kept.
 """
 
 import argparse
 import json
-import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,6 +31,7 @@ from benchmarks.faults.report_method import METHODS, calibrated_width
 from benchmarks.faults.score import rows_to_false_alarm
 from benchmarks.faults.study import Widths, fault_free_statistics, run_case, run_fault_free
 from benchmarks.faults.tables import as_json, print_fault_free, print_summary, print_table
+from reactorwatch.runtime.jobs import Failed, Workers, in_order, workers
 
 SEEDS, FAULT_FREE_RUNS, CALIBRATION_RUNS = 20, 200, 400
 QUICK_SEEDS, QUICK_FAULT_FREE_RUNS, QUICK_CALIBRATION_RUNS = 2, 6, 60
@@ -62,7 +60,8 @@ def main() -> None:
     )
     budgets = tuple(chosen.budgets)
     began = time.perf_counter()
-    with workers(chosen.jobs) as everywhere:
+    with Progress(console=Console(stderr=True)) as progress:
+        everywhere = Everywhere(workers(chosen.jobs, chosen.scheduler), progress)
         widths = report_widths(everywhere, calibration_runs, budgets)
         found = everywhere.do("faults", partial(run_case, budgets=budgets, widths=widths), cases(seeds))
         quiet = everywhere.do(
@@ -87,7 +86,8 @@ def arguments() -> argparse.Namespace:
     """What was asked for on the command line."""
     parser = argparse.ArgumentParser(description="The monitor against a bank of faults.")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_SEEDS} seeds, for a try")
-    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="processes (default: one a core)")
+    parser.add_argument("--jobs", type=int, help="processes (default: one a core)")
+    parser.add_argument("--scheduler", help="address of a Dask cluster that does it instead")
     parser.add_argument("--json", type=Path, help="where the numbers are written, run by run")
     parser.add_argument("--write", type=Path, help="where the tables are written too, as a page (.md)")
     parser.add_argument(
@@ -96,16 +96,16 @@ def arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-class Workers:
-    """Does a piece of work for many arguments, in several processes or in this one.
+class Everywhere:
+    """Does a piece of work for many arguments, in order, under a bar.
 
     Args:
-        executor: of the processes; None: this one.
+        done_by: who does it.
         progress: that is shown.
     """
 
-    def __init__(self, executor: ProcessPoolExecutor | None, progress: Progress) -> None:
-        self._executor = executor
+    def __init__(self, done_by: Workers, progress: Progress) -> None:
+        self._done_by = done_by
         self._progress = progress
 
     def do(self, title: str, work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
@@ -115,33 +115,25 @@ class Workers:
             title: what a person reads meanwhile.
             work: to be done.
             arguments: for each argument of it, its values.
+
+        Raises:
+            RuntimeError: one failed.
         """
-        results = (
-            map(work, *arguments)
-            if self._executor is None
-            else self._executor.map(work, *arguments, chunksize=max(1, min(10, len(arguments[0]) // 20)))
-        )
-        return list(self._progress.track(results, total=len(arguments[0]), description=title))
+        jobs = list(zip(*arguments, strict=True))
+        outcomes = in_order(self._done_by.outcomes(partial(_spread, work), jobs))
+        found: list[Result] = []
+        for job, outcome in zip(jobs, self._progress.track(outcomes, total=len(jobs), description=title), strict=True):
+            if isinstance(outcome, Failed):
+                raise RuntimeError(f"{title}: {job}: {outcome.reason}")  # noqa: TRY004 (no wrong type: it failed)
+            found.append(outcome)
+        return found
 
 
-@contextmanager
-def workers(jobs: int) -> Iterator[Workers]:
-    """Processes that do the work.
-
-    Args:
-        jobs: how many.
-    """
-    # The matrices are small: threads of the linear algebra would only wait for each other.
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    with Progress(console=Console(stderr=True)) as progress:
-        if jobs == 1:
-            yield Workers(None, progress)
-        else:
-            with ProcessPoolExecutor(jobs, get_context("spawn")) as executor:
-                yield Workers(executor, progress)
+def _spread(work: Callable[..., Result], job: tuple[Any, ...]) -> Result:
+    return work(*job)
 
 
-def report_widths(everywhere: Workers, runs: int, budgets: Sequence[float]) -> Widths:
+def report_widths(everywhere: Everywhere, runs: int, budgets: Sequence[float]) -> Widths:
     """The widths at which the report's limits keep the promised rates in runs without a fault.
 
     Args:

@@ -15,6 +15,19 @@ PRACTICAL_SHARE = 0.02
 """Of an output's range in the record: a difference in it that matters, where the user does not say."""
 
 
+def checked_tolerance(model: ProcessModel, tolerance: Mapping[str, float]) -> None:
+    """Hold that tolerances can be meant.
+
+    Raises:
+        InputError: as `bands_of`.
+    """
+    for name, value in tolerance.items():
+        if name not in model.output_names:
+            raise InputError(f"tolerance must be of {', '.join(model.output_names)}, got {name}")
+        if not 0.0 < value < np.inf:
+            raise InputError(f"tolerance of {name} must be a positive number, got {value:g}")
+
+
 def bands_of(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> dict[str, float]:
     """The root mean square difference in each output that does not matter, in its unit.
 
@@ -26,11 +39,7 @@ def bands_of(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> d
     Raises:
         InputError: a tolerance is of no output, or not positive.
     """
-    for name, value in tolerance.items():
-        if name not in model.output_names:
-            raise InputError(f"tolerance must be of {', '.join(model.output_names)}, got {name}")
-        if not 0.0 < value < np.inf:
-            raise InputError(f"tolerance of {name} must be a positive number, got {value:g}")
+    checked_tolerance(model, tolerance)
     ranges = np.nanquantile(run.measured, 0.99, axis=0) - np.nanquantile(run.measured, 0.01, axis=0)
     return {
         name: tolerance.get(name, PRACTICAL_SHARE * float(size))

@@ -18,8 +18,9 @@ from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.entry import main
+from reactorwatch.runtime.metrics import Metrics, served
 from reactorwatch.runtime.model_file import model_on_the_bus
 from reactorwatch.runtime.serve import serve, stop_on_signals
 
@@ -95,14 +96,23 @@ class MonitorNode(Monitor):
                 log.warning(self._said)
 
 
-def run(config: MonitorConfig, bus_config: BusConfig) -> None:
+def run(
+    config: MonitorConfig,
+    bus_config: BusConfig,
+    metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
+) -> None:
     """Watch until SIGINT or SIGTERM.
+
+    Args:
+        config: how the plant is watched.
+        bus_config: where the bus is.
+        metrics_config: where its counts are shown.
 
     Raises:
         InputError: settings that the bus cannot use, or a damaged file of alarm states.
     """
     node = MonitorNode(config, time.time_ns())
-    with stop_on_signals() as stop:
+    with served(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:
             return
@@ -116,6 +126,7 @@ def run(config: MonitorConfig, bus_config: BusConfig) -> None:
                 commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
                 on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
                 linger_s=LINGER_S,
+                on_publish=metrics.of(node.alarms.all_alarms) if metrics is not None else None,
             )
         finally:
             bus.close()

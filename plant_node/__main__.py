@@ -1,6 +1,7 @@
 """`python -m plant_node [settings.toml]`: the plant as a process."""
 
 import sys
+from collections.abc import Callable
 
 import msgspec
 import structlog
@@ -9,26 +10,33 @@ from plant_node.config import PlantConfig
 from plant_node.node import COMMANDS, NODE, PlantNode
 from plant_node.record import plant_from
 from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Publication
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.bus_zenoh import connect
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.entry import main
 from reactorwatch.runtime.liveliness import wait_alive
+from reactorwatch.runtime.metrics import Metrics, served
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 
 log = structlog.get_logger()
 
 
 def run(
-    config: PlantConfig, bus_config: BusConfig, model: ProcessModel | None = None, driver: Record | None = None
+    config: PlantConfig,
+    bus_config: BusConfig,
+    metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
+    model: ProcessModel | None = None,
+    driver: Record | None = None,
 ) -> None:
     """Simulate a plant on the bus until its duration is over, or SIGINT or SIGTERM.
 
     Args:
         config: of the plant.
         bus_config: where the bus is.
+        metrics_config: where its counts are shown.
         model: the process; that of the settings if not given.
         driver: a record whose input drives the plant, instead of the scenario of `config`.
 
@@ -37,17 +45,25 @@ def run(
     """
     plant = plant_from(config, model, driver)
     log.info("plant", seed=config.seed, settings=msgspec.to_builtins(config))
-    with stop_on_signals() as stop:
+    with served(metrics_config, Metrics(config.name, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = connect(bus_config, NODE, stop)
         if bus is None:
             return
         try:
-            serve_plant(PlantNode(plant, config, log.info), config, bus, stop)
+            serve_plant(
+                PlantNode(plant, config, log.info), config, bus, stop, metrics.of() if metrics is not None else None
+            )
         finally:
             bus.close()
 
 
-def serve_plant(node: PlantNode, config: PlantConfig, bus: Bus, stop: StopSignal) -> None:
+def serve_plant(
+    node: PlantNode,
+    config: PlantConfig,
+    bus: Bus,
+    stop: StopSignal,
+    on_publish: Callable[[Publication], None] | None = None,
+) -> None:
     """Run the node on an open bus: listen to commands, show that it is alive, wait for the others, run."""
 
     def on_ready() -> None:
@@ -55,7 +71,7 @@ def serve_plant(node: PlantNode, config: PlantConfig, bus: Bus, stop: StopSignal
         wait_alive(bus, config.name, config.wait_for, stop, NODE)
 
     commands = tuple(keys.key(config.name, keys.COMMAND, name) for name in COMMANDS)
-    serve(node, bus, stop, commands=commands, on_ready=on_ready)
+    serve(node, bus, stop, commands=commands, on_ready=on_ready, on_publish=on_publish)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ import tomli_w
 from reactorwatch.contract import keys
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime import bus_zenoh
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.entry import main
+from reactorwatch.runtime.metrics import Metrics, served
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.black_box import BlackBox
 from recorder.config import RecorderConfig
@@ -33,17 +34,31 @@ HISTORY_MARGIN_NS = 10_000_000_000
 _MB = 1_000_000
 
 
-def run(config: RecorderConfig, bus_config: BusConfig) -> None:
+def run(
+    config: RecorderConfig,
+    bus_config: BusConfig,
+    metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
+) -> None:
     """Record until SIGINT (Ctrl-C) or SIGTERM; the file is closed on every way out.
+
+    Args:
+        config: what is recorded, and where.
+        bus_config: where the bus is.
+        metrics_config: where its counts are shown.
 
     Raises:
         InputError: the file exists already, or cannot be written; or the endpoint makes no sense.
     """
     with stop_on_signals() as stop:
-        record(config, bus_config, stop)
+        record(config, bus_config, stop, metrics_config)
 
 
-def record(config: RecorderConfig, bus_config: BusConfig, stop: StopSignal) -> Path | None:
+def record(
+    config: RecorderConfig,
+    bus_config: BusConfig,
+    stop: StopSignal,
+    metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
+) -> Path | None:
     """Record until `stop` is set.
 
     Returns:
@@ -53,29 +68,31 @@ def record(config: RecorderConfig, bus_config: BusConfig, stop: StopSignal) -> P
         InputError: as `run`.
     """
     files = files_for(config)  # before the waiting for a router
-    bus = bus_zenoh.connect(bus_config, NODE, stop)
-    if bus is None:
-        return None
-    try:
-        start_ns = time.time_ns()
-        with files:
-            history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
-            known = files.received_since(start_ns - history_ns)
-            node = begin(config, files, start_ns, known, known_until_ns=start_ns + history_ns)
-            serve(
-                node,
-                bus,
-                stop,
-                subscriptions=(config.key_expression,),
-                history=True,
-                on_gap=node.on_gap,
-                commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
-                on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
-                linger_s=config.linger_s,
-            )
-            return files.path
-    finally:
-        bus.close()
+    with served(metrics_config, Metrics(config.plant, NODE, files.free_bytes), NODE) as metrics:
+        bus = bus_zenoh.connect(bus_config, NODE, stop)
+        if bus is None:
+            return None
+        try:
+            start_ns = time.time_ns()
+            with files:
+                history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
+                known = files.received_since(start_ns - history_ns)
+                node = begin(config, files, start_ns, known, known_until_ns=start_ns + history_ns)
+                serve(
+                    node,
+                    bus,
+                    stop,
+                    subscriptions=(config.key_expression,),
+                    history=True,
+                    on_gap=node.on_gap,
+                    commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
+                    on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
+                    linger_s=config.linger_s,
+                    on_publish=metrics.of(node.alarms) if metrics is not None else None,
+                )
+                return files.path
+        finally:
+            bus.close()
 
 
 def files_for(config: RecorderConfig, open_part: Callable[[Path], PartFile] = PartFile) -> RecordingFiles:

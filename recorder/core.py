@@ -146,6 +146,11 @@ class Recorder:
         """Whether what is received cannot be written."""
         return self._stopped
 
+    @property
+    def alarm(self) -> messages.Alarm:
+        """Its alarm as it is."""
+        return self._disk.now
+
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """What people ask of its alarm, or do to it."""
         return self._disk.obey(question, now_ns)

@@ -37,6 +37,11 @@ class DiskAlarm:
             alarm=DISK_ALARM, state=messages.ALARM_STATE_NORMAL, priority=messages.PRIORITY_CRITICAL
         )
 
+    @property
+    def now(self) -> messages.Alarm:
+        """The alarm as it is."""
+        return self._now
+
     def come_up(self, why: str, now_ns: int) -> Publication:
         """The file cannot be written."""
         text = f"recording stopped: {why}; it goes on when there is room"

@@ -26,7 +26,7 @@ from recorder.cut import cut, received_between
 from recorder.entry import Entry
 from recorder.gaps import GAP, to_metadata
 from recorder.mcap_scan import Scan, Stored, Wanted
-from recorder.mcap_writer import RecordingWriter, check_free, part_of
+from recorder.mcap_writer import NUMBER, RecordingWriter, check_free, part_of
 from recorder.part_file import PART, PartFile, is_held, left_behind
 from recorder.recover import origin, recover
 from recorder.retention import Finished, Limits, to_delete
@@ -109,7 +109,7 @@ class RecordingFiles:
         self.complete()
         path = self._series.next(now_ns, {path.name.removesuffix(PART) for path in self._series.folder.iterdir()})
         started = datetime.fromtimestamp(now_ns / 1e9, UTC).isoformat(timespec="milliseconds")
-        about = {**self._metadata, "started": started, "file": str(self._begun + 1)}
+        about = {**self._metadata, "started": started, NUMBER: str(self._begun + 1)}
         if self._before:
             about["after"] = self._before
         self._writer = RecordingWriter(path, about, self._open_part)

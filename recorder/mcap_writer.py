@@ -22,6 +22,8 @@ from recorder.mcap_stream import McapStream
 from recorder.part_file import PART, PartFile, is_held
 
 METADATA = "reactorwatch"
+NUMBER = "file"
+"""In it: which file of its run it is, if it was written by a recorder."""
 
 
 class WriteError(InputError):

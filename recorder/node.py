@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
 from recorder.black_box import BlackBox, Stretch
@@ -94,6 +94,10 @@ class RecorderNode:
             self._next_health_ns = now_ns + self._health_period_ns
             told.append(self._core.health(now_ns))
         return told
+
+    def alarms(self) -> list[Alarm]:
+        """Its alarms as they are."""
+        return [self._core.alarm]
 
     def next_tick_ns(self) -> int:
         """The next of these."""

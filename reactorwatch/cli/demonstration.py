@@ -15,7 +15,8 @@ import typer
 from monitor_node import backtest
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
-from reactorwatch.cli.processes import Processes, settings_text, write_settings
+from reactorwatch.cli.joining import VIEWER, heard_by, joining, open_router, write_node_settings
+from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.sources import messages
 from reactorwatch.contract import keys
@@ -25,14 +26,15 @@ from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
-from reactorwatch.runtime.bus_zenoh import ZenohBus, router
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal, stop_on_signals
 from recorder.config import RecorderConfig
 
 PLANT = "demo"
+NODES = ("recorder", "monitor", "plant")
+"""In the order in which they are started."""
 START_WITHIN_S = 60.0
 DRAIN_WITHIN_S = 20.0
 LOOK_EVERY_S = 0.1
@@ -89,7 +91,7 @@ class Watch:
             self._judged_ns = max(self._judged_ns, estimate.time_ns)
 
 
-def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: int) -> int:
+def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: int, site: Path | None = None) -> int:
     """Run the demonstration.
 
     Args:
@@ -98,6 +100,7 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
         speed: plant time over wall time.
         fault: specification.
         seed: of input and noise.
+        site: folder of certificates, whose router is run and whose roles the nodes take; None: all is plain.
 
     Returns:
         0 if the alarm came after the fault and not before, and the back-test agreed; 1 if not; 130 if it was stopped.
@@ -107,8 +110,8 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
     """
     configure()
     specification = parse_fault(fault)
+    join = joining(site, PLANT, {}, free_endpoint() if site is None else None)
     folder = _new_folder(out)
-    bus_config = BusConfig(endpoint=free_endpoint())
     recording = folder / f"{PLANT}.mcap"
     plant = PlantConfig(
         name=PLANT,
@@ -119,13 +122,13 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
         wait_for=("monitor", "recorder"),
     )
     monitor = MonitorConfig(plant=PLANT)
-    settings = folder / SETTINGS_FILE
-    nodes = {"bus": bus_config, "plant": plant, "monitor": monitor}
-    about = {"seed": str(seed), "settings": settings_text(nodes)}
+    nodes = {"plant": plant, "monitor": monitor}
+    about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **nodes})}
     recorder = RecorderConfig(plant=PLANT, out=str(recording), linger_s=LINGER_S, black_box_min=0.0, about=about)
-    write_settings(settings, {**nodes, "recorder": recorder})
-    bus = router(bus_config)
+    bus = open_router(site, join)
     try:
+        tables = {**nodes, "recorder": heard_by(recorder, site)}
+        settings = write_node_settings(folder / SETTINGS_FILE, tables, join, NODES)
         with stop_on_signals() as stop:
             if not _run_nodes(bus, stop, settings, folder, plant):
                 typer.echo(f"stopped; what was recorded until then is in {folder}", err=True)
@@ -146,7 +149,7 @@ def _new_folder(out: Path | None) -> Path:
     return folder
 
 
-def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: Path, folder: Path, plant: PlantConfig) -> bool:
+def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folder: Path, plant: PlantConfig) -> bool:
     """Run the nodes until the plant has come to its end; False if that was cut short by a signal."""
     woken = threading.Event()
     stop.wakes(woken.set)
@@ -154,7 +157,7 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: Path, folder: Path, pl
     duration_min = plant.rows * plant.period_min
     watch = Watch(bus, to_time_ns((plant.rows - 1) * plant.period_min))
     with Processes(settings, logs=folder) as processes, bar("starting the nodes", duration_min) as advance:
-        for node in ("recorder", "monitor", "plant"):
+        for node in NODES:
             processes.start(node)
         started = time.monotonic()
         while not woken.wait(LOOK_EVERY_S):
@@ -178,7 +181,7 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: Path, folder: Path, pl
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
     """Diagnose the recording, draw it, read from it what happened, and write that down."""
     from diagnosis.report.words import verdict
-    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, cases, diagnosed
+    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, Asked, case_of, diagnosed
     from reactorwatch.process import effects_of
     from recorder.dashboard.file import write_rrd
     from recorder.run_reader import stretches
@@ -188,7 +191,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         first_ns, faults, alarms = _events(recording)
         again = backtest.run(messages(recording, PLANT), monitor)
     with task("diagnosing"):
-        (case,) = cases([recording], PLANT, {}, None, folder / DIAGNOSIS_FOLDER)
+        case = case_of(recording, folder / DIAGNOSIS_FOLDER, Asked(plant=PLANT))
         diagnosis, _ = diagnosed(case)
     with task("drawing"):
         write_rrd(stretches(messages(recording, PLANT)), drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)

@@ -1,11 +1,6 @@
-"""`diagnose`: what the simulation gets wrong of some records, said, and written down as a report.
-
-All files are read and checked before the first is diagnosed. So a file that cannot be used is told at once, before
-anything else is said or written, and not after minutes of others.
-"""
+"""What the simulation gets wrong of a record: read, checked, diagnosed, and written down as a report."""
 
 import time
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
@@ -15,13 +10,12 @@ import numpy as np
 
 from diagnosis.diagnose import diagnose
 from diagnosis.record_checks import run_of
-from diagnosis.report.machine import as_object, with_differences
+from diagnosis.report.machine import with_differences
 from diagnosis.report.page import as_page
-from diagnosis.report.plain import as_text
 from diagnosis.result import Diagnosis, Experiment
 from diagnosis.uncertain import stated
 from reactorwatch.cli.diagnosis_drawing import write_drawing
-from reactorwatch.cli.progress import bar, task
+from reactorwatch.cli.options import existing_recording
 from reactorwatch.cli.sources import process_model, record, signals_of
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
@@ -44,6 +38,29 @@ Limits: TypeAlias = dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
+class Asked:
+    """What is asked about all files alike, as it was given.
+
+    Attributes:
+        plant: in recordings.
+        columns: their names by signal.
+        model: file of an extended model; None: the nominal reactor.
+        uncertain: which parameters are known but to a standard deviation, as text; None: none.
+        tolerance: differences that do not matter, by output.
+        limits: that an experiment keeps to, by signal.
+        as_json: whether it is to be said to a machine.
+    """
+
+    plant: str | None = None
+    columns: dict[str, str] = field(default_factory=dict)
+    model: Path | None = None
+    uncertain: str | None = None
+    tolerance: dict[str, float] = field(default_factory=dict)
+    limits: Limits = field(default_factory=dict)
+    as_json: bool = False
+
+
+@dataclass(frozen=True)
 class Case:
     """A record to be diagnosed.
 
@@ -62,55 +79,23 @@ class Case:
     uncertain: dict[str, float] = field(default_factory=dict)
 
 
-def cases(
-    files: Sequence[Path],
-    plant: str | None,
-    columns: dict[str, str],
-    model: Path | None,
-    out: Path | None,
-    uncertain: str | None = None,
-) -> list[Case]:
-    """The records in the files, read and checked.
+def case_of(file: Path, folder: Path | None, asked: Asked, at: Path | None = None) -> Case:
+    """The record in a file, read and checked, and the simulation of it.
 
     Args:
-        files: .csv or .mcap.
-        plant: in them.
-        columns: their names by signal.
-        model: file of an extended model; None: the nominal reactor.
-        out: folder for the report; of several files, each gets a folder in it.
-        uncertain: which parameters are known but to a standard deviation, as text; None: none.
+        file: as it was named.
+        folder: for the report; None: none is wanted.
+        asked: about it.
+        at: where the file is; None: where its name says.
 
     Raises:
-        InputError: a file cannot be read or diagnosed, the folder cannot be one, or what is uncertain is no parameter.
+        InputError: the file cannot be read or diagnosed, or what is uncertain is no parameter.
     """
-    if out is not None and out.exists() and not out.is_dir():
-        raise InputError(f"--out {out}: is a file, the name of a folder was expected")
-    signals = signals_of(model)
-    found = []
-    for file, folder in zip(files, _folders(files, out), strict=True):
-        measured = record(file, plant, columns, signals)
-        process = process_model(model, measured)
-        known = stated(uncertain, process) if uncertain is not None else {}
-        run_of(measured, process)
-        found.append(Case(file, measured, process, folder, known))
-    return found
-
-
-def results(found: Sequence[Case], tolerance: dict[str, float], limits: Limits, *, as_json: bool) -> Iterator[str]:
-    """Diagnose one after the other, write its report if there is a folder for it, and yield what is to be said.
-
-    Raises:
-        InputError: a tolerance or limits that cannot be, or a folder that cannot be written to.
-    """
-    if len(found) == 1:
-        with task(f"diagnosing {found[0].file.name}"):
-            said = _result(found[0], tolerance, limits, as_json=as_json)
-        yield said
-        return
-    with bar("diagnosing", len(found)) as advance:
-        for number, case in enumerate(found):
-            advance(number, f"diagnosing {case.file.name}")
-            yield _result(case, tolerance, limits, as_json=as_json)
+    measured = record(existing_recording(at or file), asked.plant, asked.columns, signals_of(asked.model))
+    process = process_model(asked.model, measured)
+    known = stated(asked.uncertain, process) if asked.uncertain is not None else {}
+    run_of(measured, process)
+    return Case(file, measured, process, folder, known)
 
 
 def diagnosed(
@@ -119,7 +104,7 @@ def diagnosed(
     """The diagnosis of a record and the seconds that it took; its report is written if there is a folder for it.
 
     Raises:
-        InputError: as `results`.
+        InputError: a tolerance or limits that cannot be, or a folder that cannot be written to.
     """
     began = time.monotonic()
     diagnosis = diagnose(case.measured, case.model, None, tolerance, case.uncertain, limits)
@@ -160,26 +145,3 @@ def _write_experiment(experiment: Experiment | None, path: Path) -> None:
         return
     time_min, level = np.array([*experiment.input, (experiment.span_min, experiment.input[-1][1])]).T
     write_csv(path, Record(time_min, {experiment.signal: level}, path.name))
-
-
-def _result(case: Case, tolerance: dict[str, float], limits: Limits, *, as_json: bool) -> str:
-    diagnosis, seconds = diagnosed(case, tolerance, limits)
-    if as_json:
-        return msgspec.json.encode(as_object(diagnosis, str(case.file), seconds)).decode()
-    said = as_text(diagnosis, str(case.file), effects_of(case.model))
-    if case.folder is None:
-        return said
-    if diagnosis.experiment is not None:
-        said += f"\n  input       {case.folder / EXPERIMENT}"
-    return f"{said}\n  report      {case.folder / PAGE}"
-
-
-def _folders(files: Sequence[Path], out: Path | None) -> list[Path | None]:
-    """One for each file: named after it, if there are several."""
-    if out is None or len(files) == 1:
-        return [out] * len(files)
-    names: list[str] = []
-    for file in files:
-        same = sum(name == file.stem or name.startswith(f"{file.stem}-") for name in names)
-        names.append(file.stem if not same else f"{file.stem}-{same + 1}")
-    return [out / name for name in names]

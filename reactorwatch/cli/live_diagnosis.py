@@ -189,4 +189,11 @@ def _last_line(text: str) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main("reactorwatch.cli.live_diagnosis", "diagnosis", DiagnosisConfig, run))
+    sys.exit(
+        main(
+            "reactorwatch.cli.live_diagnosis",
+            "diagnosis",
+            DiagnosisConfig,
+            lambda config, bus_config, _metrics: run(config, bus_config),
+        )
+    )

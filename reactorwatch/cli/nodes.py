@@ -33,12 +33,19 @@ def add_to(app: typer.Typer) -> None:
 
 
 def _settings(path: Path | None, endpoint: str | None, *, quiet: bool = False) -> tuple[dict[str, dict[str, Any]], Any]:
-    from reactorwatch.runtime.config import BusConfig, read_settings, section
+    from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
     from reactorwatch.runtime.logs import configure
 
-    configure(logging.WARNING if quiet else logging.INFO)
     tables = read_settings(path)
+    log = section(LogConfig, "log", tables, {})
+    configure(logging.WARNING if quiet else logging.INFO, as_json=log.format == "json")
     return tables, section(BusConfig, "bus", tables, {"endpoint": endpoint})
+
+
+def _metrics(tables: dict[str, dict[str, Any]]) -> Any:
+    from reactorwatch.runtime.config import MetricsConfig, section
+
+    return section(MetricsConfig, "metrics", tables, {})
 
 
 def plant(
@@ -85,7 +92,7 @@ def plant(
         "faults": fault or None,
         "model": str(existing(model)) if model is not None else None,
     }
-    run(section(PlantConfig, "plant", tables, flags), bus)
+    run(section(PlantConfig, "plant", tables, flags), bus, _metrics(tables))
 
 
 def monitor(
@@ -104,14 +111,14 @@ def monitor(
     from monitor_node.__main__ import run
     from monitor_node.config import MonitorConfig
     from reactorwatch.cli.supervise import diagnosing, diagnosis_settings
-    from reactorwatch.runtime.config import section
+    from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = _settings(config, endpoint)
     flags = {"plant": name, "training_min": training, "model": str(existing(model)) if model is not None else None}
     config_of_monitor = section(MonitorConfig, "monitor", tables, flags)
     diagnosis = diagnosis_settings(tables, config_of_monitor, diagnose)
-    with diagnosing(diagnosis, bus) if diagnosis.out else nullcontext():
-        run(config_of_monitor, bus)
+    with diagnosing(diagnosis, bus, section(LogConfig, "log", tables, {})) if diagnosis.out else nullcontext():
+        run(config_of_monitor, bus, _metrics(tables))
 
 
 def record(
@@ -129,7 +136,7 @@ def record(
 
     tables, bus = _settings(config, endpoint)
     flags = {"plant": name, "out": str(out) if out is not None else None}
-    run(section(RecorderConfig, "recorder", tables, flags), bus)
+    run(section(RecorderConfig, "recorder", tables, flags), bus, _metrics(tables))
 
 
 def replay(

@@ -32,6 +32,24 @@ Diagnose = Annotated[
     ),
 ]
 
+Files = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Records (.csv) or recordings (.mcap), folders of them, or patterns such as 'runs/*.csv'.",
+        show_default=False,
+    ),
+]
+Processes = Annotated[
+    int | None,
+    typer.Option("--jobs", help="How many at a time, each in a process [one a core].", min=1, show_default=False),
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="Of a Dask cluster to do it, such as tcp://127.0.0.1:8786 (reactorwatch[cluster]).", show_default=False
+    ),
+]
+
 
 def columns(pairs: list[str] | None) -> dict[str, str]:
     """The columns' names by signal, from `signal=column` pairs.

@@ -7,7 +7,7 @@ before has said its last words.
 
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -30,18 +30,18 @@ class Processes:
     """The running nodes, as a context that ends them.
 
     Args:
-        settings: file that all of them read.
+        settings: the file that each of them reads.
         logs: folder for what they say; None: to our own standard error.
     """
 
-    def __init__(self, settings: Path, logs: Path | None = None) -> None:
+    def __init__(self, settings: Mapping[str, Path], logs: Path | None = None) -> None:
         self._settings = settings
         self._logs = logs
         self._running: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(self, node: str) -> subprocess.Popen[bytes]:
         """Start a node."""
-        command = [sys.executable, "-m", MODULES[node], str(self._settings)]
+        command = [sys.executable, "-m", MODULES[node], str(self._settings[node])]
         if self._logs is None:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, start_new_session=True)  # noqa: S603 (our own modules)
         else:

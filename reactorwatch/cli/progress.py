@@ -1,4 +1,7 @@
-"""Progress for people: only on a terminal, and on standard error, so that what a command prints stays clean."""
+"""Progress for people: only on a terminal, and on standard error, so that what a command prints stays clean.
+
+What is printed meanwhile goes above the bar if it goes to the terminal, too; into a file it goes as it is.
+"""
 
 import contextlib
 import sys
@@ -17,7 +20,8 @@ def task(text: str) -> Iterator[None]:
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
         progress.add_task(text, total=None)
         yield
 
@@ -32,7 +36,8 @@ def bar(text: str, total: float) -> Iterator[Advance]:
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+    console = Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
         number = progress.add_task(text, total=total)
 
         def advance(completed: float, now: str) -> None:

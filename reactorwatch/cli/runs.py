@@ -7,6 +7,14 @@ import typer
 
 from reactorwatch.cli.options import Diagnose, Endpoint, Plant, Settings, pace
 
+Site = Annotated[
+    Path | None,
+    typer.Option(
+        help="Folder that `certify` made: run its router, and each node with its certificate [none].",
+        show_default=False,
+    ),
+]
+
 
 def add_to(app: typer.Typer) -> None:
     """Register the commands."""
@@ -25,12 +33,13 @@ def up(
     seed: Annotated[int | None, typer.Option(help="Of the input and the noise.", show_default=False)] = None,
     fault: Annotated[list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset. Repeatable.")] = None,
     diagnose: Diagnose = None,
+    site: Site = None,
 ) -> None:
     """Run router, plant, monitor and recorder until stopped."""
     from reactorwatch.cli.supervise import run_until_stopped
 
     flags = {"name": name, "speed": pace(speed, "--speed"), "seed": seed, "faults": fault or None}
-    raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose))
+    raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose, site))
 
 
 def demo(
@@ -43,10 +52,11 @@ def demo(
         str, typer.Option(help="The fault, as cause:profile:size@onset.")
     ] = "coolant_flow:step:-0.15@150min",
     seed: Annotated[int, typer.Option(help="Of the input and the noise.")] = 1,
+    site: Site = None,
 ) -> None:
     """Run it all with a fault in it, draw it, say what happened."""
     from reactorwatch.cli.demonstration import run
 
     speed_value = pace(speed, "--speed")
     assert speed_value is not None
-    raise typer.Exit(run(out, duration, speed_value, fault, seed))
+    raise typer.Exit(run(out, duration, speed_value, fault, seed, site))

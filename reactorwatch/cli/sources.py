@@ -1,9 +1,11 @@
 """Wherever a file is asked for, `.csv` and `.mcap` both serve: this turns either into a record or into messages.
 
-A folder stands for the recordings in it, as one. And `--model` is turned into a process model on the record's clock.
+A folder stands for the recordings in it, as one; where many files may be named, for all in it (`stands_for`). And
+`--model` is turned into a process model on the record's clock.
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from reactorwatch.contract.codec import Encoded, encode
@@ -54,6 +56,30 @@ def messages(path: Path, plant: str | None = None, columns: dict[str, str] | Non
     from recorder.mcap_file import read_messages
 
     return (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
+
+
+def stands_for(folder: Path) -> list[Path]:
+    """What a folder stands for where many files may be named: each record (.csv) in it, and its recordings (.mcap).
+
+    What a recorder has written there, one file after the other, is one recording, which the folder itself stands for.
+    Recordings of another origin, such as imported ones, are one each.
+
+    Raises:
+        InputError: there is neither in it.
+    """
+    from recorder.mcap_file import read_metadata
+    from recorder.mcap_writer import NUMBER
+
+    records, recordings = (sorted(folder.glob(f"*.{ending}")) for ending in ("csv", "mcap"))
+    if not records and not recordings:
+        raise InputError(f"{folder}: holds no record (.csv) and no recording (.mcap)")
+    origins = []
+    for file in recordings:
+        with suppress(InputError):  # one that is damaged is told of when it is read
+            origins.append(read_metadata(file))
+    if origins and all(NUMBER in origin for origin in origins):
+        return [folder, *records]
+    return sorted([*records, *recordings])
 
 
 def signals_of(path: Path | None) -> tuple[str, ...]:

@@ -7,9 +7,12 @@ import typer
 
 from reactorwatch.cli.options import (
     Columns,
+    Files,
     Json,
     Model,
     Plant,
+    Processes,
+    Scheduler,
     Settings,
     columns,
     existing,
@@ -57,7 +60,7 @@ def simulate(
 
 
 def backtest(
-    file: Annotated[Path, typer.Argument(help="A recording (.mcap) or record (.csv).", show_default=False)],
+    files: Files,
     config: Settings = None,
     plant: Plant = None,
     training: Annotated[
@@ -65,28 +68,33 @@ def backtest(
     ] = None,
     model: Model = None,
     column: Columns = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for a summary of several files.", show_default=False)
+    ] = None,
+    jobs: Processes = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
-    """Run the monitor over a recording at full speed."""
-    from monitor_node.backtest import run
+    """Run the monitor over recordings at full speed."""
     from monitor_node.config import MonitorConfig
-    from reactorwatch.cli.progress import task
-    from reactorwatch.cli.reports import backtest_json, backtest_text
-    from reactorwatch.cli.sources import messages, plant_of, zero_of
+    from reactorwatch.cli.backtest_jobs import WATCHING, jobs_of
+    from reactorwatch.cli.batch import files_named, say
+    from reactorwatch.cli.sources import DEFAULT_PLANT
     from reactorwatch.runtime.config import read_settings, section
 
-    existing_recording(file)
-    name = plant_of(file, plant)
-    flags = {"plant": name, "training_min": training, "model": str(existing(model)) if model is not None else None}
+    named = files_named(files)
+    flags = {
+        "plant": plant or DEFAULT_PLANT,
+        "training_min": training,
+        "model": str(existing(model)) if model is not None else None,
+    }
     settings = section(MonitorConfig, "monitor", read_settings(config), flags)
-    with task(f"watching {file.name}"):
-        result = run(messages(file, name, columns(column)), settings)
-    zero_ns = zero_of(file, result.first_ns)
-    typer.echo(backtest_json(result, zero_ns) if as_json else backtest_text(result, zero_ns, file))
+    todo = jobs_of(named, settings, plant, columns(column), as_json=as_json, elsewhere=scheduler is not None)
+    say(WATCHING, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)
 
 
 def diagnose(
-    files: Annotated[list[Path], typer.Argument(help="Records (.csv) or recordings (.mcap).", show_default=False)],
+    files: Files,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for a report; of several files, a folder each.", show_default=False),
@@ -116,12 +124,16 @@ def diagnose(
     model: Model = None,
     plant: Plant = None,
     column: Columns = None,
+    jobs: Processes = None,
+    scheduler: Scheduler = None,
     as_json: Json = False,
 ) -> None:
     """Say what the simulation gets wrong, and why."""
-    from reactorwatch.cli.diagnosis import cases, results
+    from reactorwatch.cli.batch import files_named, say
+    from reactorwatch.cli.diagnosis import Asked
+    from reactorwatch.cli.diagnosis_jobs import DIAGNOSING, jobs_of
 
-    accepted, kept = tolerances(tolerance), limits(limit)
-    found = cases([existing_recording(file) for file in files], plant, columns(column), model, out, uncertain)
-    for said in results(found, accepted, kept, as_json=as_json):
-        typer.echo(said)
+    named = files_named(files)
+    asked = Asked(plant, columns(column), model, uncertain, tolerances(tolerance), limits(limit))
+    todo = jobs_of(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
+    say(DIAGNOSING, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)

@@ -2,7 +2,7 @@
 
 import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,10 +14,10 @@ import structlog
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from reactorwatch.cli.after_alarm import DiagnosisConfig
+from reactorwatch.cli.joining import VIEWER, Joining, heard_by, joining, open_router, write_node_settings
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.bus_zenoh import router
-from reactorwatch.runtime.config import BusConfig, read_settings, section
+from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.model_file import read_extended_model
 from reactorwatch.runtime.serve import stop_on_signals
@@ -30,7 +30,12 @@ LOOK_EVERY_S = 0.5
 
 
 def run_until_stopped(
-    config: Path | None, endpoint: str | None, out: Path, flags: dict[str, Any], diagnose: Path | None = None
+    config: Path | None,
+    endpoint: str | None,
+    out: Path,
+    flags: dict[str, Any],
+    diagnose: Path | None = None,
+    site: Path | None = None,
 ) -> int:
     """Run everything until SIGINT or SIGTERM, or until a node ends by itself.
 
@@ -40,6 +45,7 @@ def run_until_stopped(
         out: folder for the recording and the settings that ran; made if it is not there.
         flags: of the plant; None: not said.
         diagnose: folder for diagnoses after alarms; None: that of the settings, or none.
+        site: folder of certificates, whose router is run and whose roles the nodes take; None: all is plain.
 
     Returns:
         0 if it was stopped or the plant came to its end, 1 if a node failed.
@@ -47,25 +53,28 @@ def run_until_stopped(
     Raises:
         InputError: settings that cannot be used.
     """
-    configure()
     tables = read_settings(config)
-    bus_config = section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    log_config = section(LogConfig, "log", tables, {})
+    configure(as_json=log_config.format == "json")
     name = flags.get("name")
     waiting = {"wait_for": ["monitor", "recorder"]}
     plant = section(PlantConfig, "plant", {"plant": {**waiting, **tables.get("plant", {})}}, flags)
     monitor = section(MonitorConfig, "monitor", tables, {"plant": name or plant.name})
-    recorder = section(RecorderConfig, "recorder", tables, {"plant": name or plant.name})
+    recorder = heard_by(section(RecorderConfig, "recorder", tables, {"plant": name or plant.name}), site)
+    join = joining(site, plant.name, tables, endpoint)
     diagnosis = diagnosis_settings(tables, monitor, diagnose)
-    bus = router(bus_config)  # before anything is written: an address that is taken leaves nothing behind
+    metrics = section(MetricsConfig, "metrics", tables, {})
+    bus = open_router(site, join)  # before anything is written: an address that is taken leaves nothing behind
     try:
-        tables_written = {"bus": bus_config, "plant": plant, "monitor": monitor, "diagnosis": diagnosis}
-        settings = _write_down(out, recorder, plant.seed, tables_written)
+        tables_written = {"plant": plant, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
+        nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", "plant")
+        settings = _write_down(out, recorder, plant.seed, {**tables_written, "log": log_config}, join, nodes)
         with stop_on_signals() as stop, Processes(settings) as processes:
             woken = threading.Event()
             stop.wakes(woken.set)
-            for node in ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", "plant"):
+            for node in nodes:
                 processes.start(node)
-            log.info("running", plant=plant.name, router=bus_config.endpoint, folder=str(out), stop="Ctrl-C")
+            log.info("running", plant=plant.name, router=join[VIEWER].endpoint, folder=str(out), stop="Ctrl-C")
             while not woken.wait(LOOK_EVERY_S):
                 ended = processes.ended()
                 if ended:
@@ -99,25 +108,31 @@ def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig
 
 
 @contextlib.contextmanager
-def diagnosing(config: DiagnosisConfig, bus_config: BusConfig) -> Iterator[None]:
+def diagnosing(config: DiagnosisConfig, bus_config: BusConfig, log_config: LogConfig) -> Iterator[None]:
     """Diagnose after alarms, in a process of its own, while the context lasts."""
     with TemporaryDirectory() as folder:
         settings = Path(folder) / "settings.toml"
-        write_settings(settings, {"bus": bus_config, "diagnosis": config})
-        with Processes(settings) as processes:
+        write_settings(settings, {"bus": bus_config, "diagnosis": config, "log": log_config})
+        with Processes({"diagnosis": settings}) as processes:
             processes.start("diagnosis")
             yield
 
 
-def _write_down(out: Path, recorder: RecorderConfig, seed: int, others: dict[str, msgspec.Struct]) -> Path:
-    """Write the whole settings where the recordings will be, named after the moment as they are; returns their file."""
+def _write_down(
+    out: Path,
+    recorder: RecorderConfig,
+    seed: int,
+    others: dict[str, msgspec.Struct],
+    join: Joining,
+    nodes: Sequence[str],
+) -> dict[str, Path]:
+    """Write the whole settings where the recordings will be, named after the moment as they are; each node's file."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--out {out}: the folder cannot be made: {error.strerror}") from error
     recorder = msgspec.structs.replace(recorder, out=str(out))
     settings = file_for(recorder, datetime.now(UTC)).with_suffix(".toml")
-    about = {"seed": str(seed), "settings": settings_text(others), **recorder.about}
+    about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **others}), **recorder.about}
     recorder = msgspec.structs.replace(recorder, about=about)
-    write_settings(settings, {**others, "recorder": recorder})
-    return settings
+    return write_node_settings(settings, {**others, "recorder": recorder}, join, nodes)

@@ -310,7 +310,7 @@ def router(config: BusConfig) -> ZenohBus:
     if config.ca is not None:
         raise InputError(
             f"no router can listen at {config.endpoint!r} with the certificate of a node; "
-            "start one with `reactorwatch router SITE/router/router.json5`, and the nodes one by one"
+            "name the site with --site, or start its router: `reactorwatch router SITE/router/router.json5`"
         )
     settings = {
         "mode": "router",

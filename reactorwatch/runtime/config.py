@@ -11,6 +11,7 @@ One file may serve all nodes, with a table for each:
 
 import difflib
 import tomllib
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -18,9 +19,10 @@ import msgspec
 
 from reactorwatch.errors import InputError
 
-SECTIONS = ("bus", "plant", "monitor", "recorder", "replay", "diagnosis")
+SECTIONS = ("bus", "plant", "monitor", "recorder", "replay", "diagnosis", "metrics", "log")
 """The tables that a file may hold."""
 
+_LAST_PORT = 65535
 
 IDENTITY = ("ca", "certificate", "key")
 """Files by which a node shows who it is, and knows the router."""
@@ -69,6 +71,39 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for name in given:
             if not Path(getattr(self, name)).is_file():
                 raise ValueError(f"{name} must be a file that is there, got {getattr(self, name)!r}")
+
+
+class MetricsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where a node shows what it counts, for Prometheus.
+
+    Attributes:
+        port: of the plant's page; the monitor's is at the next one, the recorder's at the one after, so that one file
+            may be the settings of all. None: there are no pages.
+        address: of this machine, at which they are. Loopback unless asked otherwise.
+    """
+
+    port: int | None = None
+    address: str = "127.0.0.1"
+
+    def __post_init__(self) -> None:
+        if self.port is not None and not 1 <= self.port <= _LAST_PORT - 2:
+            raise ValueError(f"port must be in [1, {_LAST_PORT - 2}], got {self.port}")
+        try:
+            ip_address(self.address)
+        except ValueError:
+            raise ValueError(
+                f"address must be an IP address of this machine, such as 127.0.0.1, got {self.address!r}"
+            ) from None
+
+
+class LogConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How a node says what happens to it, on standard error.
+
+    Attributes:
+        format: `text`, a line for people; or `json`, an object a line.
+    """
+
+    format: Literal["text", "json"] = "text"
 
 
 Section = TypeVar("Section", bound=msgspec.Struct)

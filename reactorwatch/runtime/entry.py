@@ -9,12 +9,12 @@ import msgspec
 
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import logs
-from reactorwatch.runtime.config import BusConfig, read_settings, section
+from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 
 Config = TypeVar("Config", bound=msgspec.Struct)
 
 
-def main(module: str, table: str, kind: type[Config], run: Callable[[Config, BusConfig], object]) -> int:
+def main(module: str, table: str, kind: type[Config], run: Callable[[Config, BusConfig, MetricsConfig], object]) -> int:
     """Read the settings file that the command line names, and run the node.
 
     Args:
@@ -33,7 +33,12 @@ def main(module: str, table: str, kind: type[Config], run: Callable[[Config, Bus
     logs.configure()
     try:
         tables = read_settings(Path(arguments[0]) if arguments else None)
-        run(section(kind, table, tables, {}), section(BusConfig, "bus", tables, {}))
+        logs.configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
+        run(
+            section(kind, table, tables, {}),
+            section(BusConfig, "bus", tables, {}),
+            section(MetricsConfig, "metrics", tables, {}),
+        )
     except InputError as error:
         sys.stderr.write(f"{table}: {error}\n")
         return 2

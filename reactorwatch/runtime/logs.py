@@ -1,19 +1,36 @@
-"""What a node says while it runs: one line an event, to standard error."""
+"""What a node says while it runs: one line an event, to standard error.
+
+For people a line of text; for programs that collect logs an object, in which the time is that of UTC to the microsecond
+(ISO 8601), `event` says what happened, `level` how bad it is, and every other key is a field of that event.
+"""
 
 import logging
 import sys
 
 import structlog
+from structlog.tracebacks import ExceptionDictTransformer
+from structlog.typing import Processor
 
 
-def configure(level: int = logging.INFO) -> None:
-    """Send the log to standard error: coloured for people on a terminal, plain `key=value` elsewhere."""
+def configure(level: int = logging.INFO, *, as_json: bool = False) -> None:
+    """Send the log to standard error.
+
+    Args:
+        level: what is less is not said.
+        as_json: an object a line; else coloured for people on a terminal, plain `key=value` elsewhere.
+    """
+    form: list[Processor] = [
+        structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),
+        structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), pad_event_to=0),
+    ]
+    if as_json:
+        form = [
+            structlog.processors.TimeStamper(fmt="iso", utc=True),
+            structlog.processors.ExceptionRenderer(ExceptionDictTransformer(show_locals=False)),
+            structlog.processors.JSONRenderer(default=str),
+        ]
     structlog.configure(
-        processors=[
-            structlog.processors.add_log_level,
-            structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),
-            structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), pad_event_to=0),
-        ],
+        processors=[structlog.processors.add_log_level, *form],
         wrapper_class=structlog.make_filtering_bound_logger(level),
         logger_factory=structlog.PrintLoggerFactory(sys.stderr),
     )

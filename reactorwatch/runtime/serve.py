@@ -116,6 +116,7 @@ def serve(
     commands: tuple[str, ...] = (),
     on_ready: Callable[[], None] | None = None,
     linger_s: float = 0.0,
+    on_publish: Callable[[Publication], None] | None = None,
 ) -> None:
     """Run a node until it is finished or asked to stop.
 
@@ -129,6 +130,7 @@ def serve(
         commands: key expressions of queryables whose questions go to `node.on_command`.
         on_ready: called once the node listens.
         linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
+        on_publish: told of each thing that the node publishes, before the bus is, in the loop's own thread.
     """
     inbox: SimpleQueue[Encoded | Gap | Request | None] = SimpleQueue()
     room, ended = threading.Event(), threading.Event()
@@ -150,6 +152,8 @@ def serve(
 
     def publish(publications: list[Publication]) -> None:
         for publication in publications:
+            if on_publish is not None:
+                on_publish(publication)
             bus.publish(encode(publication))
 
     def handle(item: Encoded | Gap | Request) -> None:

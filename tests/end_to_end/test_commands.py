@@ -65,7 +65,10 @@ def record_csv(tmp_path: Path) -> Path:
         (["fly"], "No such command 'fly'"),
         (["replay"], "Missing argument"),
         (["backtest", "nowhere.csv"], "nowhere.csv: there is no such file"),
-        (["backtest", "."], "BAD.mcap"),  # a folder stands for the recordings in it
+        (["backtest", "bad*.csv"], "bad*.csv: no file is called like this"),
+        (["backtest", "EMPTY"], "holds no record (.csv) and no recording (.mcap)"),
+        (["backtest", "RECORD", "--jobs", "0"], "Invalid value for '--jobs'"),
+        (["backtest", "RECORD", "--scheduler", "here"], "--scheduler"),
         (["import", ".", "-o", "OUT"], "is a folder"),
         (["recover", "BAD.mcap"], "BAD.mcap: expected an MCAP recording, got another kind of file"),
         (["recover", "BAD.mcap", "-o", "no/such/a.mcap"], "folder"),
@@ -120,6 +123,7 @@ def test_what_is_wrong_is_told_in_one_line_and_nothing_is_written(
     (tmp_path / "BAD.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,x,440\n")
     (tmp_path / "BAD.mcap").write_bytes(b"this is no recording")
     (tmp_path / "BAD.txt").write_text("?")
+    (tmp_path / "EMPTY").mkdir()
     before = sorted(tmp_path.rglob("*"))
     named = [{"RECORD": str(record_csv), "OUT": str(tmp_path / "out.csv")}.get(item, item) for item in arguments]
     done = command(*named, cwd=tmp_path)

@@ -140,16 +140,30 @@ def test_several_files_give_one_line_each_in_their_order(
     assert [item["file"] for item in found] == files
     assert {item["verdict"] for item in found} == {"nominal"}
     assert [item["location"] for item in found] == [None, None]
-    assert sorted(path.name for path in (folder / "all").iterdir()) == ["quiet", "quiet-2"]
+    assert sorted(path.name for path in (folder / "all").iterdir()) == [
+        "quiet",
+        "quiet-2",
+        "summary.csv",
+        "summary.json",
+    ]
 
 
-def test_one_bad_file_among_several_is_told_before_anything_is_said_or_written(folder: Path, command: Command) -> None:
+def test_one_bad_file_among_several_is_told_in_a_line_and_the_rest_is_finished(folder: Path, command: Command) -> None:
+    write_csv(folder / "right.csv", simulate_record(PlantConfig(seed=6), 600))
     (folder / "short.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,0.1,440\n")
-    done = command("diagnose", "leak.csv", "short.csv", "--json", "-o", "nothing", cwd=folder)
+    done = command("diagnose", "short.csv", "right.csv", "nowhere.csv", "--json", "-o", "rest", cwd=folder)
     assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr == "reactorwatch: short.csv: a diagnosis needs at least 200 rows, got 2; record for longer\n"
-    assert not (folder / "nothing").exists()
+    (line,) = done.stdout.splitlines()
+    assert json.loads(line)["file"] == "right.csv"
+    assert done.stderr.splitlines() == [
+        "reactorwatch: short.csv: a diagnosis needs at least 200 rows, got 2; record for longer",
+        "reactorwatch: nowhere.csv: there is no such file",
+    ]
+    assert sorted(path.name for path in (folder / "rest").iterdir()) == ["right", "summary.csv", "summary.json"]
+    rows = json.loads((folder / "rest" / "summary.json").read_text())
+    assert (rows["files"], rows["failed"]) == (3, 2)
+    assert [row["verdict"] for row in rows["results"]] == [None, "nominal", None]
+    assert rows["results"][2]["error"] == "there is no such file"
 
 
 def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, command: Command) -> None:

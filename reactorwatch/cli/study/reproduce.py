@@ -1,9 +1,10 @@
 """`reproduce`: draws the figures that are asked for and writes the page."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from reactorwatch.cli.progress import bar
+from reactorwatch.cli.batch import results
 from reactorwatch.cli.study.canvas import paper, require_matplotlib
 from reactorwatch.cli.study.catalogue import FIGURES
 from reactorwatch.cli.study.figure import Figure, Finding
@@ -12,11 +13,37 @@ from reactorwatch.cli.study.study import Study
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.record import Record
+from reactorwatch.runtime.jobs import Failed
 
 PAGE = "study.md"
 
 
-def reproduce(out: Path, seed: int, only: str | None = None, measured: Record | None = None) -> str:
+@dataclass(frozen=True)
+class Job:
+    """A figure to be drawn.
+
+    Attributes:
+        number: of the figure.
+        picture: file of it.
+        seed: of every simulated record.
+        measured: a record that models are identified from, or None.
+    """
+
+    number: int
+    picture: Path
+    seed: int
+    measured: Record | None
+
+
+def reproduce(
+    out: Path,
+    seed: int,
+    only: str | None = None,
+    measured: Record | None = None,
+    *,
+    processes: int | None = 1,
+    scheduler: str | None = None,
+) -> str:
     """Write `out`/study.md and its pictures.
 
     Args:
@@ -24,27 +51,37 @@ def reproduce(out: Path, seed: int, only: str | None = None, measured: Record | 
         seed: of every simulated record.
         only: numbers of figures, such as `7,12`; all, if not given.
         measured: a record that figures 14 to 17 identify their models from.
+        processes: in which they are drawn; None: one a core.
+        scheduler: of a cluster that draws them, or None.
 
     Returns:
         What was written, for people.
 
     Raises:
-        InputError: figures that there are not, a folder that cannot be written to, or matplotlib is not installed.
+        InputError: figures that there are not, a folder that cannot be written to, workers that there are not, or
+            matplotlib is not installed.
+        RuntimeError: a figure could not be drawn.
     """
     figures = _chosen(only)
     require_matplotlib()
-    pictures = _folder(out)
-    study = Study(seed, measured)
+    pictures = _folder(out).absolute()
+    jobs = [Job(figure.number, pictures / figure.file_name, seed, measured) for figure in figures]
     found: list[tuple[Figure, Finding]] = []
-    with bar("reproducing", len(figures)) as advance:
-        for done, figure in enumerate(figures):
-            advance(done, f"figure {figure.number}")
-            with paper(pictures / figure.file_name, figure.height_px) as drawing:
-                found.append((figure, figure.draw(study, drawing)))
+    for figure, finding in zip(figures, results(draw, jobs, "reproducing", processes, scheduler), strict=True):
+        if isinstance(finding, Failed):
+            raise (RuntimeError if finding.ours else InputError)(f"figure {figure.number}: {finding.reason}")
+        found.append((figure, finding))
     text = page(found, seed, measured.name if measured else "")
     with replacing(out / PAGE) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return _report(out, found)
+
+
+def draw(job: Job) -> Finding:
+    """Draw a figure."""
+    (figure,) = (item for item in FIGURES if item.number == job.number)
+    with paper(job.picture, figure.height_px) as drawing:
+        return figure.draw(Study(job.seed, job.measured), drawing)
 
 
 def _chosen(only: str | None) -> Sequence[Figure]:

@@ -77,6 +77,15 @@ def test_the_same_seed_gives_the_same_bytes_and_another_gives_others(tmp_path: P
     assert (runs[0] / "study.md").read_bytes() == (runs[1] / "study.md").read_bytes()
 
 
+def test_figures_drawn_at_the_same_time_are_those_drawn_one_after_the_other(tmp_path: Path) -> None:
+    for folder, processes in (("one", 1), ("two", 2)):
+        reproduce(tmp_path / folder, 3, "5,6,18", processes=processes)
+    names = ["study.md", *(f"study/figure-{number}.png" for number in ("05", "06", "18"))]
+    assert [(tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in names] == (
+        [True] * 4
+    )
+
+
 def test_the_report_s_operating_point_is_not_on_the_curve_and_belongs_to_103_41(study: Study, tmp_path: Path) -> None:
     """Flow and states as computed from the equations: T = 438.54 K rests at 103.41 l/min, and 441.22 K at 100."""
     finding = found(study, 4, tmp_path)

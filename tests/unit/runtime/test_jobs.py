@@ -1,0 +1,163 @@
+"""Jobs come to the same whoever does them; a failure stays with its job, and a dead worker costs a retry."""
+
+import multiprocessing
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from reactorwatch.errors import InputError
+from reactorwatch.runtime.jobs import RETRIES, Failed, Here, Workers, in_order, workers
+from reactorwatch.runtime.local_workers import THREADS, LocalWorkers, cores
+from tests.cluster import dask_cluster
+from tests.unit.runtime.work import deadly, linear_algebra_threads, picky, square, unspeakable
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[str]:
+    """The address of a Dask cluster of two workers on this machine."""
+    with dask_cluster(2) as address:
+        yield address
+
+
+@pytest.fixture(params=["here", "one process", "two processes", "cluster"])
+def anyone(request: pytest.FixtureRequest) -> Workers:
+    """Each kind of workers in turn."""
+    if request.param == "cluster":
+        return workers(None, request.getfixturevalue("cluster"))
+    if request.param == "here":
+        return Here()
+    return LocalWorkers(1 if request.param == "one process" else 2)
+
+
+@pytest.fixture(params=["two processes", "cluster"])
+def elsewhere(request: pytest.FixtureRequest) -> Workers:
+    """Each kind of workers that can die without us."""
+    return workers(None, request.getfixturevalue("cluster")) if request.param == "cluster" else LocalWorkers(2)
+
+
+def test_answers_are_those_of_the_function_in_the_order_of_the_jobs(anyone: Workers) -> None:
+    assert list(in_order(anyone.outcomes(square, range(12)))) == [number**2 for number in range(12)]
+
+
+def test_a_job_that_fails_is_told_in_a_line_and_the_others_are_done(anyone: Workers) -> None:
+    first, bad, broken, last = in_order(anyone.outcomes(picky, range(4)))
+    assert (first, last) == (0, 3)
+    assert bad == Failed("x must not be 1, got 1")
+    assert isinstance(broken, Failed)
+    assert broken.ours
+    assert broken.reason.startswith("a fault of ours: ZeroDivisionError: by x - 2 (work.py, line ")
+
+
+def test_no_jobs_have_no_outcomes(anyone: Workers) -> None:
+    assert list(anyone.outcomes(square, [])) == []
+
+
+def test_a_worker_that_dies_costs_a_retry(elsewhere: Workers, tmp_path: Path) -> None:
+    jobs = [(number, str(tmp_path), int(number == 2)) for number in range(6)]
+    assert list(in_order(elsewhere.outcomes(deadly, jobs))) == list(range(6))
+    assert (tmp_path / "deaths-2").read_text() == "x"
+
+
+def test_a_job_that_its_workers_always_die_of_is_given_up_and_the_others_are_done(
+    elsewhere: Workers, tmp_path: Path
+) -> None:
+    jobs = [(number, str(tmp_path), 99 * int(number == 1)) for number in range(6)]
+    found = list(in_order(elsewhere.outcomes(deadly, jobs)))
+    given_up = found.pop(1)
+    assert found == [0, 2, 3, 4, 5]
+    assert isinstance(given_up, Failed)
+    assert given_up.reason.startswith("given up: ")
+    if isinstance(elsewhere, LocalWorkers):
+        assert (tmp_path / "deaths-1").read_text() == "x" * (1 + RETRIES)
+
+
+def test_a_result_that_cannot_be_sent_is_a_failure(tmp_path: Path) -> None:
+    found = list(in_order(LocalWorkers(2).outcomes(unspeakable, range(3))))
+    assert (found[0], found[2]) == (0, 2)
+    assert isinstance(found[1], Failed)
+
+
+def test_each_process_has_one_thread_of_linear_algebra(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in THREADS:
+        monkeypatch.delenv(name, raising=False)
+    assert list(LocalWorkers(1).outcomes(linear_algebra_threads, [0])) == [(0, "1")]
+
+
+def test_who_stops_asking_leaves_no_process_behind() -> None:
+    before = set(multiprocessing.active_children())
+    outcomes = LocalWorkers(2).outcomes(square, range(100))
+    next(outcomes)
+    assert set(multiprocessing.active_children()) > before
+    outcomes.close()  # type: ignore[attr-defined] # it is a generator
+    assert set(multiprocessing.active_children()) == before
+
+
+def test_outcomes_wait_for_those_before_them() -> None:
+    seen = []
+
+    def done() -> Iterator[tuple[int, str]]:
+        for number in (2, 0, 3, 1):
+            seen.append(number)
+            yield number, "abcd"[number]
+
+    order = in_order(done())
+    assert next(order) == "a"
+    assert seen == [2, 0]
+    assert [*order] == ["b", "c", "d"]
+
+
+def test_one_process_is_this_one_and_by_default_there_is_one_a_core() -> None:
+    assert isinstance(workers(1), Here)
+    assert isinstance(workers(2), LocalWorkers)
+    assert isinstance(workers(), Here if cores() == 1 else LocalWorkers)
+
+
+@pytest.mark.parametrize(
+    ("processes", "scheduler", "said"),
+    [
+        (0, None, "--jobs must be at least 1, got 0"),
+        (2, "tcp://127.0.0.1:8786", "--jobs is for this machine, and --scheduler for a cluster; give one of them"),
+        (None, "here", "--scheduler must be an address like tcp://127.0.0.1:8786, got 'here'"),
+    ],
+)
+def test_what_cannot_be_is_told_in_a_line(processes: int | None, scheduler: str | None, said: str) -> None:
+    if scheduler == "here":
+        pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
+    with pytest.raises(InputError) as told:
+        workers(processes, scheduler)
+    assert str(told.value) == said
+
+
+def test_without_dask_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"^--scheduler needs Dask: pip install 'reactorwatch\[cluster\]'$"):
+        workers(None, "tcp://127.0.0.1:8786")
+
+
+@pytest.mark.parametrize(
+    ("theirs", "said"),
+    [("0.0.1", "has reactorwatch 0.0.1, this is "), (None, "has no reactorwatch; install ")],
+)
+def test_workers_with_another_version_or_none_are_told(
+    cluster: str, theirs: str | None, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reactorwatch.runtime.dask_workers._asks_for_version", lambda: lambda: theirs)
+    with pytest.raises(InputError, match=said):
+        list(workers(None, cluster).outcomes(square, range(2)))
+
+
+def test_a_cluster_without_workers_is_told_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("reactorwatch.runtime.dask_workers.WORKERS_WITHIN_S", 0.2)
+    with dask_cluster(0) as address:
+        said = f"has no workers; start some with: dask worker {address} --nthreads 1"
+        with pytest.raises(InputError, match=said):
+            list(workers(None, address).outcomes(square, range(2)))
+
+
+def test_a_scheduler_that_is_not_there_is_told_by_its_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
+    monkeypatch.setattr("reactorwatch.runtime.dask_workers.CONNECT_WITHIN_S", 0.2)
+    with pytest.raises(InputError, match=r"^--scheduler tcp://127\.0\.0\.1:1: cannot be reached: "):
+        list(workers(None, "tcp://127.0.0.1:1").outcomes(square, range(2)))

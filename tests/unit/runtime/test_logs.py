@@ -1,0 +1,42 @@
+"""A log is a line an event: for people as text, for programs as an object."""
+
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import structlog
+
+from reactorwatch.runtime.logs import configure
+
+
+def test_for_programs_each_line_is_an_object_with_the_fields_of_the_event(capsys: pytest.CaptureFixture[str]) -> None:
+    configure(as_json=True)
+    log = structlog.get_logger()
+    log.info("alarm", alarm="ewma/T", value=3.5, file=Path("a.mcap"))
+    log.warning("a second\nline")
+    first, second = map(json.loads, capsys.readouterr().err.splitlines())
+    said = datetime.fromisoformat(first.pop("timestamp"))
+    assert said.tzinfo is not None
+    assert abs(datetime.now(UTC) - said) < timedelta(minutes=1)
+    assert first == {"event": "alarm", "level": "info", "alarm": "ewma/T", "value": 3.5, "file": "a.mcap"}
+    assert (second["event"], second["level"]) == ("a second\nline", "warning")
+
+
+def test_an_error_has_its_traceback_in_the_object(capsys: pytest.CaptureFixture[str]) -> None:
+    configure(as_json=True)
+    try:
+        int("no")
+    except ValueError:
+        structlog.get_logger().exception("failed")
+    (line,) = capsys.readouterr().err.splitlines()
+    (error,) = json.loads(line)["exception"]
+    assert not any(frame.get("locals") for frame in error["frames"])  # values may be private
+    assert (error["exc_type"], error["exc_value"]) == ("ValueError", "invalid literal for int() with base 10: 'no'")
+
+
+def test_for_people_it_is_a_line_of_text(capsys: pytest.CaptureFixture[str]) -> None:
+    configure()
+    structlog.get_logger().info("alarm", alarm="ewma/T")
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "alarm=ewma/T" in line

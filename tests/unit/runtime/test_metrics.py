@@ -1,0 +1,187 @@
+"""What a node counts is on its page as it was published, in the words of Prometheus."""
+
+import socket
+import sys
+from collections.abc import Callable, Iterator
+from urllib.request import urlopen
+
+import pytest
+
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Sample
+from reactorwatch.errors import InputError
+from reactorwatch.runtime.config import MetricsConfig, section
+from reactorwatch.runtime.metrics import PORT_AFTER, Metrics, served
+from tests.ports import LOOPBACK, three_free_ports
+
+HEALTH = Health(
+    time_ns=1_700_000_000_500_000_000,
+    node="monitor",
+    version="1.2.3",
+    phase="watching",
+    uptime_s=12.5,
+    received=1000,
+    lost=3,
+    late=4,
+    refused=7,
+    refused_by_reason={"payload": 5, "not_finite": 2},
+    lag_ms=1.5,
+    duplicated=6,
+    out_of_order=8,
+    published=900,
+    rows=330,
+    incomplete_rows=2,
+)
+OF_NODE = 'node="monitor",plant="R-101"'
+
+
+@pytest.fixture
+def port() -> int:
+    """Of the plant's page; the others are free as well."""
+    return three_free_ports()
+
+
+def page(port: int, node: str = "monitor") -> dict[str, float]:
+    """Value by name and labels, as read over HTTP."""
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    from prometheus_client.parser import text_string_to_metric_families
+
+    with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER[node]}/metrics", timeout=10) as answer:
+        text = answer.read().decode()
+    found = {}
+    for family in text_string_to_metric_families(text):
+        for sample in family.samples:
+            labels = ",".join(f'{name}="{value}"' for name, value in sorted(sample.labels.items()))
+            found[f"{sample.name}{{{labels}}}"] = sample.value
+    return found
+
+
+Told = Callable[[Health | Alarm | Sample], None]
+
+
+@pytest.fixture
+def alarms() -> list[Alarm]:
+    return [
+        Alarm(alarm="ewma/T", state=AlarmState.ALARM_STATE_UNACKNOWLEDGED),
+        Alarm(alarm="ewma/C", state=AlarmState.ALARM_STATE_NORMAL),
+        Alarm(alarm="stuck/C", state=AlarmState.ALARM_STATE_NORMAL),
+    ]
+
+
+@pytest.fixture
+def tell(port: int, alarms: list[Alarm]) -> Iterator[Told]:
+    """Publishes as the monitor, whose page is served."""
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    with served(MetricsConfig(port=port), Metrics("R-101", "monitor", lambda: 5_000_000), "monitor") as metrics:
+        assert metrics is not None
+        told = metrics.of(lambda: alarms)
+        yield lambda message: told(Publication("key", message))
+
+
+def test_the_counts_of_health_are_there_in_base_units(port: int, tell: Told) -> None:
+    tell(HEALTH)
+    found = page(port)
+    expected = {
+        "messages_received_total": 1000,
+        "messages_published_total": 900,
+        "samples_lost": 3,
+        "samples_late_total": 4,
+        "samples_duplicated_total": 6,
+        "samples_out_of_order_total": 8,
+        "rows_total": 330,
+        "rows_incomplete_total": 2,
+        "lag_seconds": 0.0015,
+        "uptime_seconds": 12.5,
+        "reported_timestamp_seconds": 1_700_000_000.5,
+        "disk_free_bytes": 5_000_000,
+    }
+    for name, value in expected.items():
+        assert found[f"reactorwatch_{name}{{{OF_NODE}}}"] == pytest.approx(value, rel=1e-12), name
+    assert found[f'reactorwatch_messages_refused_total{{{OF_NODE},reason="payload"}}'] == 5
+    assert found[f'reactorwatch_messages_refused_total{{{OF_NODE},reason="not_finite"}}'] == 2
+    assert found['reactorwatch_phase{node="monitor",phase="watching",plant="R-101"}'] == 1
+    assert found[f'reactorwatch_node_info{{{OF_NODE},version="1.2.3"}}'] == 1
+    assert found["process_resident_memory_bytes{}"] > 1e6
+
+
+def test_alarms_are_counted_by_state_also_where_there_are_none(port: int, tell: Told, alarms: list[Alarm]) -> None:
+    def counted() -> dict[str, float]:
+        return {
+            name.split('state="')[1].rstrip('"}'): value
+            for name, value in page(port).items()
+            if name.startswith("reactorwatch_alarms{")
+        }
+
+    tell(HEALTH)
+    none = dict.fromkeys(
+        ("acknowledged", "returned_unacknowledged", "shelved", "suppressed_by_design", "out_of_service"), 0.0
+    )
+    assert counted() == {"normal": 2.0, "unacknowledged": 1.0, **none}
+    alarms[0].state = AlarmState.ALARM_STATE_ACKNOWLEDGED
+    tell(alarms[0])
+    assert counted() == {"normal": 2.0, "unacknowledged": 0.0, **none, "acknowledged": 1.0}
+
+
+def test_a_node_that_has_said_nothing_yet_has_a_page_without_counts(port: int, tell: Told) -> None:
+    tell(Sample(time_ns=1))
+    assert not any(name.startswith(("reactorwatch_messages", "reactorwatch_alarms")) for name in page(port))
+
+
+def test_a_disk_that_is_gone_leaves_its_number_out(port: int) -> None:
+    def gone() -> int:
+        raise FileNotFoundError
+
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    with served(MetricsConfig(port=port), Metrics("R-101", "recorder", gone), "recorder"):
+        assert not any("disk" in name for name in page(port, "recorder"))
+
+
+def test_nothing_is_served_unless_asked() -> None:
+    with served(MetricsConfig(), Metrics("R-101", "plant"), "plant") as metrics:
+        assert metrics is None
+
+
+def test_the_page_goes_with_the_node(port: int) -> None:
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    for _ in range(2):  # the port is free again, too
+        with served(MetricsConfig(port=port), Metrics("R-101", "plant"), "plant"):
+            assert page(port, "plant")
+    with pytest.raises(OSError, match="refused"):
+        page(port, "plant")
+
+
+def test_a_port_that_is_taken_is_told_with_the_node_and_the_address(port: int) -> None:
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    with socket.socket() as other:
+        other.bind((LOOPBACK, port + 1))
+        other.listen()
+        metrics = served(MetricsConfig(port=port), Metrics("R-101", "monitor"), "monitor")
+        said = rf"\[metrics\] port {port}: the monitor cannot listen at 127\.0\.0\.1:{port + 1}: "
+        with pytest.raises(InputError, match=said), metrics:
+            pass
+
+
+def test_without_the_library_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "prometheus_client", None)
+    metrics = served(MetricsConfig(port=9464), Metrics("R-101", "monitor"), "monitor")
+    with pytest.raises(InputError, match=r"pip install 'reactorwatch\[metrics\]'"), metrics:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"port": 0}, "port must be in [1, 65533], got 0"),
+        ({"port": 65534}, "port must be in [1, 65533], got 65534"),
+        ({"address": "here"}, "address must be an IP address of this machine, such as 127.0.0.1, got 'here'"),
+        ({"ports": 1}, "unknown key 'ports'; did you mean 'port'?"),
+    ],
+)
+def test_settings_that_cannot_be_are_told(values: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError) as told:
+        section(MetricsConfig, "metrics", {"metrics": values}, {})
+    assert said in str(told.value)
+
+
+def test_pages_are_on_loopback_unless_asked() -> None:
+    assert MetricsConfig(port=9464).address == LOOPBACK
