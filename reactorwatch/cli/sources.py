@@ -61,8 +61,8 @@ def messages(path: Path, plant: str | None = None, columns: dict[str, str] | Non
 def stands_for(folder: Path) -> list[Path]:
     """What a folder stands for where many files may be named: each record (.csv) in it, and its recordings (.mcap).
 
-    What a recorder has written there, one file after the other, is one recording, which the folder itself stands for.
-    Recordings of another origin, such as imported ones, are one each.
+    What a recorder has written there, one file after the other, is one recording, which the folder itself stands for;
+    so is what was cut or merged. Where there are recordings of another origin, such as imported ones, each is one.
 
     Raises:
         InputError: there is neither in it.
@@ -70,6 +70,7 @@ def stands_for(folder: Path) -> list[Path]:
     from recorder.mcap_file import read_metadata
     from recorder.mcap_writer import NUMBER
 
+    of_a_piece = {NUMBER, "cut", "merged"}
     records, recordings = (sorted(folder.glob(f"*.{ending}")) for ending in ("csv", "mcap"))
     if not records and not recordings:
         raise InputError(f"{folder}: holds no record (.csv) and no recording (.mcap)")
@@ -77,7 +78,7 @@ def stands_for(folder: Path) -> list[Path]:
     for file in recordings:
         with suppress(InputError):  # one that is damaged is told of when it is read
             origins.append(read_metadata(file))
-    if origins and all(NUMBER in origin for origin in origins):
+    if origins and all(of_a_piece & origin.keys() for origin in origins):
         return [folder, *records]
     return sorted([*records, *recordings])
 

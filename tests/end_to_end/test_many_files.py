@@ -5,7 +5,9 @@ import json
 import os
 import signal
 import subprocess
+import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -110,9 +112,11 @@ def test_a_process_that_is_killed_meanwhile_costs_no_result(folder: Path) -> Non
     arguments = [REACTORWATCH, "diagnose", "run-?.csv", "--json", "--jobs", "2"]
     with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder) as running:
         assert running.stdout is not None
+        assert running.stderr is not None
         first = running.stdout.readline()
         os.kill(workers_of(running.pid)[0], signal.SIGKILL)
-        rest, complaints = running.communicate(timeout=PATIENCE_S)
+        rest = running.stdout.read()  # and not by communicate, which forgets what was read ahead of the first line
+        complaints = running.stderr.read()
     assert (running.returncode, complaints) == (0, "")
     said = [json.loads(line) for line in (first + rest).splitlines()]
     assert [item["file"] for item in said] == [f"run-{number}.csv" for number in range(FILES)]
@@ -140,13 +144,23 @@ def workers_of(number: int) -> list[int]:
 
 def test_what_is_printed_goes_to_its_file_while_the_terminal_shows_progress(folder: Path) -> None:
     terminal, theirs = os.openpty()
+    shown = bytearray()
+
+    def show() -> None:
+        with suppress(OSError):  # what a terminal's end reads as
+            while text := os.read(terminal, 65536):
+                shown.extend(text)
+
+    screen = threading.Thread(target=show)
+    screen.start()
     try:
         arguments = [REACTORWATCH, "backtest", "run-0.csv", "run-3.csv", "--training", "15", "--json", "--jobs", "2"]
         done = subprocess.run(
             arguments, stdout=subprocess.PIPE, stderr=theirs, text=True, check=False, cwd=folder, timeout=PATIENCE_S
         )
-        assert [json.loads(line)["file"] for line in done.stdout.splitlines()] == ["run-0.csv", "run-3.csv"]
-        assert b"watching" in os.read(terminal, 65536)
     finally:
         os.close(theirs)
+        screen.join()
         os.close(terminal)
+    assert [json.loads(line)["file"] for line in done.stdout.splitlines()] == ["run-0.csv", "run-3.csv"]
+    assert b"watching" in shown

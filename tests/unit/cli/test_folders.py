@@ -16,8 +16,8 @@ def recording(path: Path, **metadata: str) -> Path:
 
 
 def test_what_a_recorder_has_written_into_a_folder_is_one_recording(tmp_path: Path) -> None:
-    for number in ("1", "2"):
-        recording(tmp_path / f"run-{number}.mcap", **{NUMBER: number})
+    recording(tmp_path / "run-1.mcap", **{NUMBER: "1"})
+    recording(tmp_path / "cut.mcap", cut="from 3min to the end of run-2.mcap")
     (tmp_path / "a.csv").touch()
     assert files_named([tmp_path]) == [tmp_path, tmp_path / "a.csv"]
 
