@@ -25,7 +25,6 @@ from reactorwatch.compiled import compiled
 from reactorwatch.process.filter_errors import Ways
 from reactorwatch.process.model import Array
 
-
 _DEAD = 1e-150
 """Of an error of the state: its square is still a number."""
 
