@@ -52,6 +52,8 @@ class Monitor:
         alarms: of the plant.
         first_ns: time of the first row; None before it.
         last_ns: time of the last row; None before the first.
+        received: messages so far.
+        not_stored: how often what is remembered could not be stored; who stores it counts.
     """
 
     def __init__(
@@ -74,7 +76,8 @@ class Monitor:
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self._watching_since_ns: int | None = None
-        self._received = 0
+        self.received = 0
+        self.not_stored = 0
         self._published = 0
         self._heard_ns = 0
         self._lag_ns = 0
@@ -87,7 +90,7 @@ class Monitor:
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Take in whatever was published on a key of the plant's samples."""
-        self._received += 1
+        self.received += 1
         if message.received_ns and now_ns - message.received_ns > self._lag_ns:
             self._lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
@@ -140,7 +143,7 @@ class Monitor:
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Let a person act on the alarms, at the time of the newest row; or say why not."""
-        self._received += 1
+        self.received += 1
         try:
             reply, publications = obey(self.alarms, question)
         except (InputError, DecodeError) as error:
@@ -189,7 +192,7 @@ class Monitor:
                 self.last_ns,
                 self._watching_since_ns,
                 self._snapshot_due_ns,
-                self._received,
+                self.received,
                 self._published,
                 self.refusals.by_reason,
             )
@@ -219,7 +222,7 @@ class Monitor:
         self._output_units = [self._units[output] for output in self.config.outputs]
         self.first_ns, self.last_ns = state.first_ns, state.last_ns
         self._watching_since_ns, self._snapshot_due_ns = state.watching_since_ns, state.snapshot_due_ns
-        self._received, self._published = state.received, state.published
+        self.received, self._published = state.received, state.published
         self.refusals.by_reason = state.refused
 
     def _learned_with(self) -> dict[str, Any]:
@@ -302,7 +305,7 @@ class Monitor:
             version=__version__,
             phase=phase,
             uptime_s=(now_ns - self._start_ns) / 1e9,
-            received=self._received,
+            received=self.received,
             lost=counts.lost,
             late=counts.late,
             refused=self.refusals.total,
@@ -314,6 +317,7 @@ class Monitor:
             rows=counts.rows,
             incomplete_rows=counts.incomplete_rows,
             heard_from_ns=self._heard_from_ns,
+            not_stored=self.not_stored,
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

@@ -124,6 +124,7 @@ class ZenohBus:
         *,
         on_gap: Callable[[Gap], None] | None = None,
         history: bool = False,
+        on_told: Callable[[], None] | None = None,
     ) -> None:
         """See `Bus`."""
         delivery = Delivery(handler, on_gap or _say_gap) if _is_of_whole_streams(key_expression) else None
@@ -152,7 +153,10 @@ class ZenohBus:
                     if delivery.is_told():
                         break
                     since_s = time.monotonic() - began + HEARTBEAT_S
-            threading.Thread(target=delivery.begin, daemon=True).start()  # the handler may wait for who called us
+            # In a thread of its own: the handler may wait for who called us.
+            threading.Thread(target=delivery.begin, args=(on_told,), daemon=True).start()
+        elif on_told is not None:
+            on_told()
 
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
         """What publishers remember of what they have published."""

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from queue import Empty, SimpleQueue
 from types import FrameType
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
@@ -50,6 +50,14 @@ class Node(Protocol):
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """The loop ends; last words."""
+
+
+class _Told:
+    """Stands in the inbox behind what was before."""
+
+
+_TOLD = _Told()
+_Item: TypeAlias = Encoded | Gap | Request | _Told
 
 
 class StopSignal:
@@ -113,6 +121,7 @@ def serve(
     subscriptions: tuple[str, ...] = (),
     history: bool = False,
     on_gap: Callable[[Gap, int], list[Publication]] | None = None,
+    on_told: Callable[[], None] | None = None,
     commands: tuple[str, ...] = (),
     on_ready: Callable[[], None] | None = None,
     linger_s: float = 0.0,
@@ -126,23 +135,30 @@ def serve(
         subscriptions: key expressions whose publications go to `node.on_message`.
         history: whether those from before do, too, as far as they are remembered.
         on_gap: told, in its turn between the messages, what was published on them and never came, and what time it is.
+        on_told: called, in its turn between the messages, when those from before have all come.
         commands: key expressions of queryables whose questions go to `node.on_command`.
         on_ready: called once the node listens.
         linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
     """
-    inbox: SimpleQueue[Encoded | Gap | Request | None] = SimpleQueue()
+    inbox: SimpleQueue[_Item | None] = SimpleQueue()
     room, ended = threading.Event(), threading.Event()
     stop.wakes(lambda: inbox.put(None))
     stop.wakes(room.set)
 
-    def receive(item: Encoded | Gap | Request) -> None:
+    def receive(item: _Item) -> None:
         while inbox.qsize() >= LARGEST_INBOX and not (stop.is_set or ended.is_set()):
             room.clear()
             room.wait(LOOK_AGAIN_S)
         inbox.put(item)
 
     for expression in subscriptions:
-        bus.subscribe(expression, receive, on_gap=receive if on_gap is not None else None, history=history)
+        bus.subscribe(
+            expression,
+            receive,
+            on_gap=receive if on_gap is not None else None,
+            history=history,
+            on_told=(lambda: receive(_TOLD)) if on_told is not None else None,
+        )
     for expression in commands:
         bus.answer(expression, receive)
     if on_ready is not None:
@@ -152,9 +168,12 @@ def serve(
         for publication in publications:
             bus.publish(encode(publication))
 
-    def handle(item: Encoded | Gap | Request) -> None:
+    def handle(item: _Item) -> None:
         if isinstance(item, Encoded):
             publish(node.on_message(item, time.time_ns()))
+        elif isinstance(item, _Told):
+            if on_told is not None:
+                on_told()
         elif isinstance(item, Gap):
             publish(on_gap(item, time.time_ns()) if on_gap is not None else [])
         else:
