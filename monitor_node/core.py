@@ -13,10 +13,11 @@ from typing import Any
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_commands import obey
-from monitor_node.alignment import Aligner, Row
+from monitor_node.alignment import REMEMBERED, Aligner, Row
 from monitor_node.config import MonitorConfig
 from monitor_node.monitor_state import MonitorState, opened, sealed, settings_of
 from monitor_node.refusals import Refusals
+from monitor_node.sample_run import Held, SampleRun
 from monitor_node.told_again import ToldAgain
 from monitor_node.watch import PlantWatch
 from reactorwatch import __version__
@@ -32,7 +33,17 @@ NODE = "monitor"
 HEARD_AGAIN_NS = 1_000_000
 """Samples nearer to each other are one sign of life: the signals of a row come together."""
 
+LARGEST_SAMPLE = 1000
+"""Bytes. A sample takes some thirty and its unit; what is larger is not even read."""
+
+LARGEST_VALUE = 1e15
+"""What is larger measures nothing, and its square would soon be more than a number can hold."""
+
+LARGEST_NUMBER = 2**62
+"""Of a sample, and of its time, 146 years from 1970: sums of them must still fit a message."""
+
 UNSPECIFIED, BAD = Quality.QUALITY_UNSPECIFIED, Quality.QUALITY_BAD  # looked up once, not at every sample
+USABLE = frozenset({Quality.QUALITY_GOOD, Quality.QUALITY_UNCERTAIN})
 
 
 class Monitor:
@@ -67,6 +78,8 @@ class Monitor:
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
         self._places = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)
+        self._runs = [SampleRun() for _ in self._signals]
+        self._window = REMEMBERED * config.reorder_rows
         self._told_again: ToldAgain | None = None
         self.alarms = AlarmBoard(config)
         self._watch = PlantWatch(config, self.alarms, points=points, model=model)
@@ -97,6 +110,9 @@ class Monitor:
         if signal is None:
             self.refusals.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
             return []
+        if len(message.payload) > LARGEST_SAMPLE:
+            self.refusals.add("too_large", f"{message.key}: {len(message.payload)} bytes are no Sample")
+            return []
         try:
             sample = decode(message.payload, message.encoding)
         except DecodeError as error:
@@ -114,32 +130,54 @@ class Monitor:
             What is to be published because of it.
         """
         quality, value = sample.quality, sample.value  # each look into the message costs as much as a line here
-        if quality == UNSPECIFIED:
-            self.refusals.add("payload", f"{signal}: the sample has no quality, so it is no Sample of ours")
-            return []
-        if not isfinite(value):
-            self.refusals.add("not_finite", f"{signal} is {value} at {sample.time_ns} ns")
-            return []
-        if quality == BAD:
-            self.refusals.add("bad_quality", f"{signal} is marked bad at {sample.time_ns} ns")
+        if quality not in USABLE or not abs(value) < LARGEST_VALUE:
+            self.refusals.add(*_unusable(signal, sample))
             return []
         if self._told_again is not None and self._told_again.heard(
             self._places[signal], sample.time_ns, sample.sequence
         ):
             self._aligner.state.counts.duplicated += 1
             return []
-        if sample.unit != self._units[signal] or signal not in self._heard_from_ns:
-            self._heard_from_ns.setdefault(signal, sample.time_ns)
-            self._units[signal] = sample.unit
-            self._output_units = [self._units[output] for output in self.config.outputs]
         publications: list[Publication] = []
-        if now_ns >= self._heard_ns + HEARD_AGAIN_NS:
+        place, time_ns, number = self._places[signal], sample.time_ns, sample.sequence
+        run, heard = self._runs[place], True
+        if run.goes_on(time_ns, number):  # as nearly always
+            self._hear(signal, time_ns, number, value, sample.unit, publications)
+        elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
+            self.refusals.add(
+                "out_of_range", f"{signal} number {number} at {time_ns} ns: no plant counts or lasts so far"
+            )
+            return []
+        else:
+            believed, refused = run.take(Held(time_ns, number, value, sample.unit), self._window)
+            heard = bool(believed)
+            for item in refused:
+                self._refuse(signal, item, run)
+            for item in believed:
+                self._hear(signal, *item, publications)
+        if heard and now_ns >= self._heard_ns + HEARD_AGAIN_NS:
             self._heard_ns = now_ns
             self._watch.signals.received(now_ns)
-        for row in self._aligner.update(signal, sample.time_ns, sample.sequence, value):
-            self._on_row(row, publications)
         self._published += len(publications)
         return publications
+
+    def _hear(
+        self, signal: str, time_ns: int, number: int, value: float, unit: str, publications: list[Publication]
+    ) -> None:
+        """Take a sample in that is of the plant."""
+        if unit != self._units[signal] or signal not in self._heard_from_ns:
+            self._heard_from_ns.setdefault(signal, time_ns)
+            self._units[signal] = unit
+            self._output_units = [self._units[output] for output in self.config.outputs]
+        for row in self._aligner.update(signal, time_ns, number, value):
+            self._on_row(row, publications)
+
+    def _refuse(self, signal: str, sample: Held, run: SampleRun) -> None:
+        self.refusals.add(
+            "out_of_place",
+            f"{signal} number {sample.number} at {sample.time_ns} ns does not follow number {run.number} at "
+            f"{run.time_ns} ns; do two plants publish as {self.config.plant}?",
+        )
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Let a person act on the alarms, at the time of the newest row; or say why not."""
@@ -183,6 +221,7 @@ class Monitor:
         return sealed(
             MonitorState(
                 self._learned_with(),
+                self._runs,
                 self._aligner.state,
                 self.alarms.to_bytes(),
                 self._watch.state,
@@ -217,6 +256,7 @@ class Monitor:
         except ValueError as error:
             raise InputError(f"is no state of this software's monitor: {error}") from error
         self.alarms, self._watch = board, watch
+        self._runs = state.runs
         self._aligner.state, self._told_again = state.alignment, ToldAgain(state.alignment)
         self._units, self._heard_from_ns = state.units, state.heard_from_ns
         self._output_units = [self._units[output] for output in self.config.outputs]
@@ -279,6 +319,9 @@ class Monitor:
     def finish(self) -> list[Publication]:
         """Judge the rows that still wait for samples, as at the end of a record."""
         publications: list[Publication] = []
+        for signal, run in zip(self._signals, self._runs, strict=True):
+            for sample in run.released():
+                self._hear(signal, *sample, publications)
         for row in self._aligner.flush():
             self._on_row(row, publications)
         return publications
@@ -321,3 +364,16 @@ class Monitor:
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)
+
+
+def _unusable(signal: str, sample: Sample) -> tuple[str, str]:
+    """Why a sample cannot be used: a word to count by, and what it was."""
+    if sample.quality == UNSPECIFIED:
+        return "payload", f"{signal}: the sample has no quality, so it is no Sample of ours"
+    if not isfinite(sample.value):
+        return "not_finite", f"{signal} is {sample.value} at {sample.time_ns} ns"
+    if sample.quality == BAD:
+        return "bad_quality", f"{signal} is marked bad at {sample.time_ns} ns"
+    if sample.quality not in USABLE:
+        return "bad_quality", f"{signal} has the quality {sample.quality}, which this version does not know"
+    return "out_of_range", f"{signal} is {sample.value} at {sample.time_ns} ns: sizes must be below {LARGEST_VALUE:g}"

@@ -14,6 +14,7 @@ import msgspec
 
 from monitor_node.alignment import AlignmentState
 from monitor_node.config import MonitorConfig
+from monitor_node.sample_run import SampleRun
 from monitor_node.stored_state import StoredState
 from monitor_node.watch_state import WatchState
 from reactorwatch.errors import InputError
@@ -36,6 +37,7 @@ class MonitorState(StoredState, frozen=True):
 
     Attributes:
         settings: that it was learned with, see `settings_of`.
+        runs: of the samples of each signal, the input first.
         alignment: samples on their way into rows.
         board: the alarms, see `AlarmBoard.to_bytes`.
         watch: all that was learned.
@@ -51,6 +53,7 @@ class MonitorState(StoredState, frozen=True):
     """
 
     settings: dict[str, Any]
+    runs: list[SampleRun]
     alignment: AlignmentState
     board: bytes
     watch: WatchState

@@ -1,7 +1,7 @@
 """What a streaming part remembers, in a form that can be stored: one explicit structure, no pickle.
 
-Many numbers of one kind are stored as doubles one after the other (`packed`), which is a third of what they take in
-MessagePack and hundreds of times faster to read.
+Many numbers of one kind are stored as doubles one after the other (`packed`): shorter than a list of MessagePack, and
+much faster to read.
 """
 
 from collections.abc import Iterable
