@@ -38,7 +38,7 @@ class Delivery:
     def __init__(self, handler: Callable[[Encoded], None], on_gap: Callable[[Gap], None]) -> None:
         self._handler = handler
         self._on_gap = on_gap
-        self._order: InOrder[Encoded] = InOrder(gathering=True)
+        self._order: InOrder[Encoded] = InOrder(gathering=True, size=lambda item: len(item.payload))
         self._changed = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._give_up_when_due, name="delivery", daemon=True)

@@ -25,6 +25,7 @@ LONGEST_LINGER = 10  # times linger_s: a bus that never falls silent does not ke
 LARGEST_INBOX = (
     100_000  # messages; beyond it the bus is made to wait, and with it who publishes faster than we can hear
 )
+LARGEST_INBOX_BYTES = 64 << 20  # of payload, likewise
 LOOK_AGAIN_S = 0.1
 BATCH = 256  # messages handled before the loop looks at the clock again
 
@@ -58,6 +59,20 @@ class _Told:
 
 _TOLD = _Told()
 _Item: TypeAlias = Encoded | Gap | Request | _Told
+
+
+class _Weight:
+    """Bytes of payload in an inbox, counted by several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.total = 0
+
+    def add(self, item: _Item, sign: int) -> None:
+        """Count an item that comes (1) or goes (-1)."""
+        if isinstance(item, Encoded):
+            with self._lock:
+                self.total += sign * len(item.payload)
 
 
 class StopSignal:
@@ -141,14 +156,17 @@ def serve(
         linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
     """
     inbox: SimpleQueue[_Item | None] = SimpleQueue()
-    room, ended = threading.Event(), threading.Event()
+    weight, room, ended = _Weight(), threading.Event(), threading.Event()
     stop.wakes(lambda: inbox.put(None))
     stop.wakes(room.set)
 
     def receive(item: _Item) -> None:
-        while inbox.qsize() >= LARGEST_INBOX and not (stop.is_set or ended.is_set()):
+        while inbox.qsize() >= LARGEST_INBOX or weight.total >= LARGEST_INBOX_BYTES:
+            if stop.is_set or ended.is_set():
+                break
             room.clear()
             room.wait(LOOK_AGAIN_S)
+        weight.add(item, 1)
         inbox.put(item)
 
     for expression in subscriptions:
@@ -169,6 +187,7 @@ def serve(
             bus.publish(encode(publication))
 
     def handle(item: _Item) -> None:
+        weight.add(item, -1)
         if isinstance(item, Encoded):
             publish(node.on_message(item, time.time_ns()))
         elif isinstance(item, _Told):
