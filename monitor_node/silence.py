@@ -59,6 +59,9 @@ BURST = 0.125
 """Of the usual spacing: what comes sooner is one sign of life with what came before. After a cut, or a stop of ours,
 all that was held up comes at once, and says nothing of how often samples come."""
 
+LATE_NS = 1_000_000_000
+"""Who looks later than this after the plant was due cannot say that the plant was late."""
+
 
 class Change(NamedTuple):
     """What happens to the silence.
@@ -235,11 +238,19 @@ class Silence:
     def check(self, now_ns: int) -> Change:
         """Look whether it is silent.
 
+        Who looks much later than it was due was not there himself: frozen, or his clock was set. What was said
+        meanwhile may still be on its way, so it is waited for anew.
+
         Args:
             now_ns: by the clock that `received` was told.
         """
         due_ns = self.due_ns()
-        return NOTHING if due_ns is None or now_ns < due_ns else self.begin()
+        if due_ns is None or now_ns < due_ns:
+            return NOTHING
+        if now_ns - due_ns > LATE_NS:
+            self.listen(now_ns)
+            return NOTHING
+        return self.begin()
 
     def begin(self) -> Change:
         """It is silent from now on, whoever says so."""

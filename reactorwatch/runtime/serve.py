@@ -18,6 +18,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.audit import audit
 from reactorwatch.runtime.bus import Bus, Request
+from reactorwatch.runtime.clock import SteadyClock
 from reactorwatch.runtime.in_order import Gap
 
 LONGEST_WAIT_S = 3600.0
@@ -156,6 +157,7 @@ def serve(
         linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
     """
     inbox: SimpleQueue[_Item | None] = SimpleQueue()
+    clock = SteadyClock()
     weight, room, ended = _Weight(), threading.Event(), threading.Event()
     stop.wakes(lambda: inbox.put(None))
     stop.wakes(room.set)
@@ -189,22 +191,22 @@ def serve(
     def handle(item: _Item) -> None:
         weight.add(item, -1)
         if isinstance(item, Encoded):
-            publish(node.on_message(item, time.time_ns()))
+            publish(node.on_message(item, clock.now_ns()))
         elif isinstance(item, _Told):
             if on_told is not None:
                 on_told()
         elif isinstance(item, Gap):
-            publish(on_gap(item, time.time_ns()) if on_gap is not None else [])
+            publish(on_gap(item, clock.now_ns()) if on_gap is not None else [])
         else:
-            reply, publications = node.on_command(item.question, time.time_ns())
+            reply, publications = node.on_command(item.question, clock.now_ns())
             item.reply(reply)
-            record = audit(item.question, reply, time.time_ns())
+            record = audit(item.question, reply, clock.now_ns())
             publish(publications if record is None else [*publications, record])
 
     while not (stop.is_set or node.finished):
-        wait_s = (node.next_tick_ns() - time.time_ns()) / 1e9
+        wait_s = (node.next_tick_ns() - clock.now_ns()) / 1e9
         if wait_s <= 0:
-            publish(node.on_tick(time.time_ns()))
+            publish(node.on_tick(clock.now_ns()))
             wait_s = 0.0
         for _ in range(BATCH):
             try:
@@ -233,4 +235,4 @@ def serve(
         item = inbox.get_nowait()
         if item is not None:
             handle(item)
-    publish(node.on_stop(time.time_ns()))
+    publish(node.on_stop(clock.now_ns()))

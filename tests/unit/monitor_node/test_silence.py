@@ -150,7 +150,9 @@ def test_a_plant_that_runs_fast_is_given_the_least_time() -> None:
 def test_a_silence_is_asked_for_once_and_then_waited_out() -> None:
     """`on_tick` is called when something is due: after the alarm nothing may be, or the loop would spin."""
     silence = heard(100)
-    silence.check(10**15)
+    due_ns = silence.due_ns()
+    assert due_ns is not None
+    silence.check(due_ns)
     assert silence.due_ns() is None
     assert silence.check(10**16) == NOTHING
 
@@ -248,3 +250,15 @@ def test_a_plant_that_goes_on_faster_is_waited_for_less_after_a_while() -> None:
     due_ns = silence.due_ns()
     assert due_ns is not None
     assert due_ns - (100 * PERIOD + 2999 * PERIOD // 100) <= 1.01 * LEAST_S * 1e9
+
+
+def test_who_was_frozen_himself_or_whose_clock_was_set_does_not_blame_the_plant() -> None:
+    """He looks an hour late; if nothing comes then, he tells it in its time."""
+    silence = heard(100)
+    due_ns = silence.due_ns()
+    assert due_ns is not None
+    late_ns = due_ns + 3600 * 10**9
+    assert silence.check(late_ns) == NOTHING
+    again_ns = silence.due_ns()
+    assert again_ns == late_ns + (due_ns - 99 * PERIOD)
+    assert silence.check(again_ns) == Change(104 * PERIOD, None)
