@@ -33,6 +33,9 @@ NODE = "monitor"
 HEARD_AGAIN_NS = 1_000_000
 """Samples nearer to each other are one sign of life: the signals of a row come together."""
 
+STALL_NS = 1_000_000_000
+"""What is due is done within a millisecond; who is so late was frozen, or his clock was set."""
+
 LARGEST_SAMPLE = 1000
 """Bytes. A sample takes some thirty and its unit; what is larger is not even read."""
 
@@ -91,6 +94,7 @@ class Monitor:
         self._watching_since_ns: int | None = None
         self.received = 0
         self.not_stored = 0
+        self._stalls, self._ticked = 0, False
         self._published = 0
         self._heard_ns = 0
         self._lag_ns = 0
@@ -193,6 +197,9 @@ class Monitor:
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish health if it is due, and a silence of the plant."""
+        if self._ticked and now_ns - self._due_ns() > STALL_NS:
+            self._stalls += 1
+        self._ticked = True
         publications = self._watch.signals.check(now_ns)
         self._published += len(publications)
         if now_ns >= self._health_due_ns:
@@ -202,6 +209,9 @@ class Monitor:
 
     def next_tick_ns(self) -> int:
         """When health is due, or the plant overdue."""
+        return self._due_ns()
+
+    def _due_ns(self) -> int:
         overdue_ns = self._watch.signals.due_ns()
         return self._health_due_ns if overdue_ns is None else min(self._health_due_ns, overdue_ns)
 
@@ -361,6 +371,7 @@ class Monitor:
             incomplete_rows=counts.incomplete_rows,
             heard_from_ns=self._heard_from_ns,
             not_stored=self.not_stored,
+            stalls=self._stalls,
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

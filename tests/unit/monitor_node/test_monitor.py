@@ -249,6 +249,17 @@ def test_what_a_stranger_names_does_not_fill_the_log() -> None:
     assert len(report) < 500
 
 
+def test_a_monitor_that_did_not_run_when_something_was_due_counts_it() -> None:
+    """Its health is due every five seconds; it was frozen, or its clock was set, between the second and the third."""
+    monitor, second = Monitor(CONFIG, 10**18), 10**9
+    seen = []
+    for now_s in (40, 45, 50, 3650, 3655):  # first it waited for a router
+        (publication,) = monitor.on_tick(10**18 + now_s * second)
+        assert isinstance(publication.message, Health)
+        seen.append(publication.message.stalls)
+    assert seen == [0, 0, 0, 1, 1]
+
+
 def test_refusals_are_reported_once_a_minute_at_most() -> None:
     monitor, _ = watch([item for _, item in garbage()])
     minute = 60_000_000_000
