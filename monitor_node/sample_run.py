@@ -8,11 +8,13 @@ anew, its clock was set, or it paused. One sample does not tell which, but the n
 
 - It is held back. As soon as one comes that follows the run as it was, the held ones are refused, but for those between
   the two in number and time: nothing was wrong with them but how soon they came.
+- Two with the very numbers that come next, at later times, are of the run: the plant has paused.
 - Three that go on from each other, as evenly as the run did, without any of it between them, are the run from now on,
   and none of them is lost.
 
-So a pause costs a delay of two samples and nothing else, and of two plants with one name the first is watched on as
-long as it lives. What is decided depends on the samples alone, so a replay decides the same.
+So a pause costs a delay of one sample, and a plant that begins anew one of two, and nothing else; and of two plants
+with one name the first is watched on as long as it lives. What is decided depends on the samples alone, so a replay
+decides the same.
 """
 
 from dataclasses import dataclass, field
@@ -95,6 +97,10 @@ class SampleRun:
                 self._go_on(item)
             return [*between, sample], [item for item in held if item not in between]
         held.append(sample)
+        if self._counts_on(held):
+            for item in held:
+                self._go_on(item)
+            return held, []
         if not self._is_run(held, window):
             self.held = [sample]
             return [], held[:-1]
@@ -110,6 +116,13 @@ class SampleRun:
         """The held ones, at the end of a record: nothing contradicts them."""
         held, self.held = self.held, []
         return held
+
+    def _counts_on(self, held: list[Held]) -> bool:
+        """Whether samples have the very numbers that come next, and times that increase: the plant has paused."""
+        number = self.number if self.number is not None else held[0].number - 1
+        counted = all(item.number == number + place for place, item in enumerate(held, start=1))
+        times_ns = [self.time_ns, *(item.time_ns for item in held)]
+        return counted and all(before < after for before, after in pairwise(times_ns))
 
     def _is_run(self, held: list[Held], window: int) -> bool:
         """Whether samples go on from each other, by spacings that are as like as those of the run."""

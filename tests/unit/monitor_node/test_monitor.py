@@ -319,6 +319,17 @@ def test_a_constant_plant_neither_fails_nor_alarms() -> None:
     assert told(said, Alarm) == []
 
 
+@pytest.mark.parametrize("constant", ["C", "T"])
+def test_a_sensor_that_never_moves_neither_ends_the_watch_nor_alarms(constant: str) -> None:
+    """The others are watched all the same."""
+    time_min, columns = leaking_run(0.0, 1.0, 60.0, seed=7)
+    columns[constant] = np.full(time_min.size, columns[constant][0])
+    config = MonitorConfig(training_min=30.0, charts=("shewhart", "ewma", "mewma", "t2"))
+    monitor, said = watch(samples(time_min, columns), config)
+    assert monitor.phase == "watching"
+    assert told(said, Alarm) == []
+
+
 def test_a_record_shorter_than_the_training_is_never_judged() -> None:
     result = backtest.run(samples(*leaking_run(-0.1, 30.0, 60.0, seed=1)), CONFIG)
     assert result.watching_since_ns is None

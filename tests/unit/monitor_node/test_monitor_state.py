@@ -1,6 +1,7 @@
 """A monitor that was stopped and goes on from its stored state says what it would have said, value for value."""
 
 import random
+from itertools import chain
 from typing import Any, Literal
 
 import msgspec
@@ -200,6 +201,23 @@ def test_a_sample_that_was_missing_at_the_stop_is_taken_when_it_comes_again() ->
         again.on_message(message, 0)
     assert again.rows == 21
     assert duplicated(again) == SIGNALS * 10 + 2
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+@pytest.mark.parametrize("told_again", [True, False])
+def test_a_stop_while_samples_are_held_back_after_a_pause_loses_none(rows: int, told_again: bool) -> None:
+    """The plant paused, and began to count anew; nobody knows yet that it is the plant."""
+    before = list(samples(*leaking_run(0.0, 1.0, 10.0, seed=1)))
+    time_min, columns = leaking_run(0.0, 1.0, 5.0, seed=2)
+    messages = before + list(samples(time_min + 100.0, columns))
+    place = len(before) + SIGNALS * rows
+    whole = run(Monitor(CONFIG, 0), messages, 0, len(messages))
+    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
+    run(monitor, messages, 0, place)
+    again.from_bytes(monitor.to_bytes())
+    said = run(again, messages, place - 30 if told_again else place, len(messages))
+    assert list(chain.from_iterable(said)) == list(chain.from_iterable(whole[place:]))
+    assert again.rows == len(messages) // SIGNALS
 
 
 def test_a_plant_that_began_anew_meanwhile_is_heard(leak: list[Encoded]) -> None:

@@ -58,6 +58,18 @@ def test_a_plant_of_irregular_times_loses_none() -> None:
     assert taken(samples) == (samples, [])
 
 
+def test_a_plant_that_pauses_again_and_again_loses_none() -> None:
+    """It says one, two or three samples at a time, after a hundred regular ones, and counts on."""
+    draw, time_ns = random.Random(6), 100 * PERIOD
+    samples = regular(0, 100)
+    for _ in range(50):
+        time_ns += draw.randrange(10, 1000) * PERIOD
+        for _ in range(draw.choice((1, 2, 3))):
+            samples.append(Held(time_ns, len(samples), 0.0, "K"))
+            time_ns += PERIOD
+    assert taken(samples) == (samples, [])
+
+
 def test_missing_and_shuffled_samples_are_believed() -> None:
     draw = random.Random(4)
     samples = [item for item in regular(0, 1000) if draw.random() > 0.1]
