@@ -1,11 +1,11 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study kills cuts pictures protobuf clean
+.PHONY: help setup demo test lint bench faults study kills cuts fuzz pictures protobuf clean
 
 PYTHON ?= python3
 BIN := .venv/bin
 # each has a target of its own
-LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py)
+LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py)
 READY := .venv/.ready
 
 help: ## what there is to make
@@ -51,6 +51,9 @@ kills: $(READY) ## kill a recorder fifty times under load, and count what is mis
 
 cuts: $(READY) ## cut links and kill routers under load for up to 30 seconds, and count what is missing: five minutes
 	@$(BIN)/python benchmarks/link_cuts.py
+
+fuzz: $(READY) ## 200,000 strange messages, commands, states and settings: nothing falls over, no alarm; two minutes
+	@$(BIN)/python benchmarks/fuzz.py
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py

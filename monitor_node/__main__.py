@@ -5,6 +5,7 @@ python -m monitor_node [settings.toml]
 
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import structlog
@@ -13,6 +14,7 @@ from monitor_node.alarm_commands import COMMANDS
 from monitor_node.alarm_file import AlarmFile
 from monitor_node.config import MonitorConfig
 from monitor_node.core import NODE, Monitor
+from monitor_node.state_file import StateFile
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
@@ -31,34 +33,43 @@ LINGER_S = 0.5
 
 
 class MonitorNode(Monitor):
-    """A monitor that keeps the state of its alarms in a file, and says in its log what an operator wants to read there.
+    """A monitor that keeps what it remembers in a file, and says in its log what an operator wants to read there.
 
     Args:
         config: how the plant is watched.
         start_ns: now.
 
     Raises:
-        InputError: a file that the settings name is damaged or cannot be used.
+        InputError: a file that the settings name cannot be used, or the one of the alarms is damaged.
+
+    Attributes:
+        resumed: whether it goes on from a stored state.
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
         super().__init__(config, start_ns, model=model_on_the_bus(config.model))
-        self._file: AlarmFile | None = None
-        self._said = ""
+        self._said: dict[object, str] = {}
+        self._file: StateFile | None = None
+        if config.state_file is not None:
+            self._file = StateFile(Path(config.state_file), self, config.state_every_s)
+            log.info(self._file.load())
+        self.resumed = self.rows > 0
+        self._alarm_file: AlarmFile | None = None
         if config.alarm_state_file is not None:
-            self._file = AlarmFile(Path(config.alarm_state_file), self.alarms)
-            self._file.load()
+            self._alarm_file = AlarmFile(Path(config.alarm_state_file), self.alarms)
+            if not self.resumed:  # else what the state says of the alarms goes with what it learned
+                self._alarm_file.load()
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """See `Monitor`; alarms are stored and logged."""
         publications = super().on_message(message, now_ns)
-        self._keep(publications)
+        self._keep(publications, now_ns)
         return publications
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """See `Monitor`; alarms are stored, before the answer goes out, and logged."""
         reply, publications = super().on_command(question, now_ns)
-        self._keep(publications)
+        self._keep(publications, now_ns)
         return reply, publications
 
     def on_tick(self, now_ns: int) -> list[Publication]:
@@ -67,10 +78,21 @@ class MonitorNode(Monitor):
         if report is not None:
             log.warning(report)
         publications = super().on_tick(now_ns)
-        self._keep(publications)
+        self._keep(publications, now_ns)
         return publications
 
-    def _keep(self, publications: list[Publication]) -> None:
+    def next_tick_ns(self) -> int:
+        """See `Monitor`; or when it is to be stored."""
+        due_ns = None if self._file is None else self._file.due_ns()
+        return super().next_tick_ns() if due_ns is None else min(super().next_tick_ns(), due_ns)
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        """See `Monitor`; it is stored for the last time."""
+        if self._file is not None:
+            self._try(self._file.store)
+        return super().on_stop(now_ns)
+
+    def _keep(self, publications: list[Publication], now_ns: int) -> None:
         for publication in publications:
             alarm = publication.message
             if isinstance(alarm, Alarm):
@@ -85,15 +107,21 @@ class MonitorNode(Monitor):
                 )
         while self.notes:
             log.warning(self.notes.pop(0))
-        if self._file is None:
-            return
+        if self._alarm_file is not None:
+            self._try(self._alarm_file.store)
+        if self._file is not None and self._file.is_due(now_ns):
+            self._try(self._file.store)
+
+    def _try(self, store: Callable[[], None]) -> None:
+        """A full disk is no reason to stop watching the plant: it is said once, and tried again."""
         try:
-            self._file.store()
-            self._said = ""
-        except InputError as error:  # a full disk is no reason to stop watching the plant
-            if str(error) != self._said:
-                self._said = str(error)
-                log.warning(self._said)
+            store()
+        except InputError as error:
+            if str(error) != self._said.get(store):
+                self._said[store] = str(error)
+                log.warning(str(error))
+        else:
+            self._said.pop(store, None)
 
 
 def run(
@@ -123,6 +151,8 @@ def run(
                 bus,
                 stop,
                 subscriptions=(keys.all_of(config.plant, keys.SAMPLE),),
+                history=node.resumed,  # what was published since it was stored
+                on_told=node.caught_up,
                 commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
                 on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
                 linger_s=LINGER_S,

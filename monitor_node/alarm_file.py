@@ -5,7 +5,7 @@ from pathlib import Path
 
 from monitor_node.alarm_board import AlarmBoard
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import is_full, replacing
 
 
 class AlarmFile:
@@ -25,7 +25,8 @@ class AlarmFile:
         """Let the alarms go on from the file; one that is not there yet is begun.
 
         Raises:
-            InputError: the file cannot be read or written, or is damaged; it is left as it is.
+            InputError: the file cannot be read or will never be written, or is damaged; it is left as it is. That the
+                disk is full just now ends nothing.
         """
         try:
             data = self._path.read_bytes() if self._path.exists() else None
@@ -38,7 +39,11 @@ class AlarmFile:
                 raise InputError(
                     f"alarm_state_file {self._path}: {error}; move it away to begin with all alarms normal"
                 ) from error
-        self.store()
+        try:
+            self.store()
+        except InputError as error:
+            if not is_full(error):
+                raise
 
     def store(self) -> None:
         """Write what has changed, if anything has.

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from math import nan
 from typing import NamedTuple
 
+MOST_LOST = 2**62  # more than any plant publishes: a number may be any nonsense, and a message has to hold the sum
 REMEMBERED = 4  # times the reordering: rows that a duplicate is known by, numbers that a restart falls back by
 
 
@@ -227,7 +228,8 @@ class Aligner:
     def _count_sequence(self, position: Sequence, time_ns: int, sequence: int) -> None:
         counts = self.state.counts
         if position.expected is None or sequence >= position.expected:
-            counts.lost += 0 if position.expected is None else sequence - position.expected
+            jump = 0 if position.expected is None else sequence - position.expected
+            counts.lost = min(counts.lost + jump, MOST_LOST)
             position.expected = sequence + 1
         elif time_ns < position.newest_ns:
             counts.out_of_order += 1

@@ -71,7 +71,8 @@ def _correlation(e: Array) -> Array:
     """Of the outputs' residuals, shape (outputs, outputs); none with one that does not vary."""
     off = e - e.mean(axis=0) if len(e) else np.zeros((1, e.shape[1]))
     lengths = np.linalg.norm(off, axis=0)
-    matrix = off.T @ off / np.where(lengths > 0, np.outer(lengths, lengths), 1.0)
+    products = np.outer(lengths, lengths)
+    matrix = off.T @ off / np.where(products > 0, products, 1.0)
     matrix = 0.5 * (matrix + matrix.T)
     matrix[np.diag_indices(e.shape[1])] = 1.0
     return np.asarray(matrix)

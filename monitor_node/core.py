@@ -9,12 +9,16 @@ anything says the same, value for value.
 """
 
 from math import isfinite
+from typing import Any
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_commands import obey
-from monitor_node.alignment import Aligner, Row
+from monitor_node.alignment import REMEMBERED, Aligner, Row
 from monitor_node.config import MonitorConfig
+from monitor_node.monitor_state import MonitorState, opened, sealed, settings_of
 from monitor_node.refusals import Refusals
+from monitor_node.sample_run import Held, SampleRun
+from monitor_node.told_again import ToldAgain
 from monitor_node.watch import PlantWatch
 from reactorwatch import __version__
 from reactorwatch.contract import keys
@@ -29,7 +33,20 @@ NODE = "monitor"
 HEARD_AGAIN_NS = 1_000_000
 """Samples nearer to each other are one sign of life: the signals of a row come together."""
 
+STALL_NS = 1_000_000_000
+"""What is due is done within a millisecond; who is so late was frozen, or his clock was set."""
+
+LARGEST_SAMPLE = 1000
+"""Bytes. A sample takes some thirty and its unit; what is larger is not even read."""
+
+LARGEST_VALUE = 1e15
+"""What is larger measures nothing, and its square would soon be more than a number can hold."""
+
+LARGEST_NUMBER = 2**62
+"""Of a sample, and of its time, 146 years from 1970: sums of them must still fit a message."""
+
 UNSPECIFIED, BAD = Quality.QUALITY_UNSPECIFIED, Quality.QUALITY_BAD  # looked up once, not at every sample
+USABLE = frozenset({Quality.QUALITY_GOOD, Quality.QUALITY_UNCERTAIN})
 
 
 class Monitor:
@@ -46,19 +63,27 @@ class Monitor:
 
     Attributes:
         refusals: what could not be used.
-        alarms: of the plant; `to_bytes` and `from_bytes` carry them over a restart.
+        alarms: of the plant.
         first_ns: time of the first row; None before it.
         last_ns: time of the last row; None before the first.
+        received: messages so far.
+        not_stored: how often what is remembered could not be stored; who stores it counts.
     """
 
     def __init__(
         self, config: MonitorConfig, start_ns: int, *, points: bool = True, model: ProcessModel | None = None
     ) -> None:
         self.config = config
+        self._points, self._model = points, model
+        self._settings: dict[str, Any] | None = None
         self.refusals = Refusals()
         self._signals = (config.input, *config.outputs)
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
+        self._places = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)
+        self._runs = [SampleRun() for _ in self._signals]
+        self._window = REMEMBERED * config.reorder_rows
+        self._told_again: ToldAgain | None = None
         self.alarms = AlarmBoard(config)
         self._watch = PlantWatch(config, self.alarms, points=points, model=model)
         self._units = dict.fromkeys(self._signals, "")
@@ -67,7 +92,9 @@ class Monitor:
         self.first_ns: int | None = None
         self.last_ns: int | None = None
         self._watching_since_ns: int | None = None
-        self._received = 0
+        self.received = 0
+        self.not_stored = 0
+        self._stalls, self._ticked = 0, False
         self._published = 0
         self._heard_ns = 0
         self._lag_ns = 0
@@ -80,12 +107,15 @@ class Monitor:
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Take in whatever was published on a key of the plant's samples."""
-        self._received += 1
+        self.received += 1
         if message.received_ns and now_ns - message.received_ns > self._lag_ns:
             self._lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
         if signal is None:
             self.refusals.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
+            return []
+        if len(message.payload) > LARGEST_SAMPLE:
+            self.refusals.add("too_large", f"{message.key}: {len(message.payload)} bytes are no Sample")
             return []
         try:
             sample = decode(message.payload, message.encoding)
@@ -104,31 +134,58 @@ class Monitor:
             What is to be published because of it.
         """
         quality, value = sample.quality, sample.value  # each look into the message costs as much as a line here
-        if quality == UNSPECIFIED:
-            self.refusals.add("payload", f"{signal}: the sample has no quality, so it is no Sample of ours")
+        if quality not in USABLE or not abs(value) < LARGEST_VALUE:
+            self.refusals.add(*_unusable(signal, sample))
             return []
-        if not isfinite(value):
-            self.refusals.add("not_finite", f"{signal} is {value} at {sample.time_ns} ns")
+        if self._told_again is not None and self._told_again.heard(
+            self._places[signal], sample.time_ns, sample.sequence
+        ):
+            self._aligner.state.counts.duplicated += 1
             return []
-        if quality == BAD:
-            self.refusals.add("bad_quality", f"{signal} is marked bad at {sample.time_ns} ns")
-            return []
-        if sample.unit != self._units[signal] or signal not in self._heard_from_ns:
-            self._heard_from_ns.setdefault(signal, sample.time_ns)
-            self._units[signal] = sample.unit
-            self._output_units = [self._units[output] for output in self.config.outputs]
         publications: list[Publication] = []
-        if now_ns >= self._heard_ns + HEARD_AGAIN_NS:
+        place, time_ns, number = self._places[signal], sample.time_ns, sample.sequence
+        run, heard = self._runs[place], True
+        if run.goes_on(time_ns, number):  # as nearly always
+            self._hear(signal, time_ns, number, value, sample.unit, publications)
+        elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
+            self.refusals.add(
+                "out_of_range", f"{signal} number {number} at {time_ns} ns: no plant counts or lasts so far"
+            )
+            return []
+        else:
+            believed, refused = run.take(Held(time_ns, number, value, sample.unit), self._window)
+            heard = bool(believed)
+            for item in refused:
+                self._refuse(signal, item, run)
+            for item in believed:
+                self._hear(signal, *item, publications)
+        if heard and now_ns >= self._heard_ns + HEARD_AGAIN_NS:
             self._heard_ns = now_ns
             self._watch.signals.received(now_ns)
-        for row in self._aligner.update(signal, sample.time_ns, sample.sequence, value):
-            self._on_row(row, publications)
         self._published += len(publications)
         return publications
 
+    def _hear(
+        self, signal: str, time_ns: int, number: int, value: float, unit: str, publications: list[Publication]
+    ) -> None:
+        """Take a sample in that is of the plant."""
+        if unit != self._units[signal] or signal not in self._heard_from_ns:
+            self._heard_from_ns.setdefault(signal, time_ns)
+            self._units[signal] = unit
+            self._output_units = [self._units[output] for output in self.config.outputs]
+        for row in self._aligner.update(signal, time_ns, number, value):
+            self._on_row(row, publications)
+
+    def _refuse(self, signal: str, sample: Held, run: SampleRun) -> None:
+        self.refusals.add(
+            "out_of_place",
+            f"{signal} number {sample.number} at {sample.time_ns} ns does not follow number {run.number} at "
+            f"{run.time_ns} ns; do two plants publish as {self.config.plant}?",
+        )
+
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """Let a person act on the alarms, at the time of the newest row; or say why not."""
-        self._received += 1
+        self.received += 1
         try:
             reply, publications = obey(self.alarms, question)
         except (InputError, DecodeError) as error:
@@ -140,6 +197,9 @@ class Monitor:
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish health if it is due, and a silence of the plant."""
+        if self._ticked and now_ns - self._due_ns() > STALL_NS:
+            self._stalls += 1
+        self._ticked = True
         publications = self._watch.signals.check(now_ns)
         self._published += len(publications)
         if now_ns >= self._health_due_ns:
@@ -149,6 +209,9 @@ class Monitor:
 
     def next_tick_ns(self) -> int:
         """When health is due, or the plant overdue."""
+        return self._due_ns()
+
+    def _due_ns(self) -> int:
         overdue_ns = self._watch.signals.due_ns()
         return self._health_due_ns if overdue_ns is None else min(self._health_due_ns, overdue_ns)
 
@@ -160,6 +223,66 @@ class Monitor:
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish health for the last time."""
         return [self._health(now_ns, "stopped")]
+
+    # --- what survives a restart -----------------------------------------------------------------------------
+
+    def to_bytes(self) -> bytes:
+        """All that is remembered, between two messages: a monitor that goes on from it says the same, bit for bit."""
+        return sealed(
+            MonitorState(
+                self._learned_with(),
+                self._runs,
+                self._aligner.state,
+                self.alarms.to_bytes(),
+                self._watch.state,
+                self._units,
+                self._heard_from_ns,
+                self.first_ns,
+                self.last_ns,
+                self._watching_since_ns,
+                self._snapshot_due_ns,
+                self.received,
+                self._published,
+                self.refusals.by_reason,
+            )
+        )
+
+    def from_bytes(self, data: bytes) -> None:
+        """Go on from what `to_bytes` returned, of a monitor with the same settings.
+
+        Samples that were heard before may come again, until `caught_up`: they are counted as duplicated, and passed
+        over (see `told_again`).
+
+        Raises:
+            InputError: the bytes are not that; everything is as before.
+            OtherSettingsError: they are, but of a monitor with other settings; likewise.
+        """
+        state = opened(data, self._learned_with())
+        board = AlarmBoard(self.config)
+        try:
+            watch = PlantWatch(self.config, board, points=self._points, model=self._model)
+            board.from_bytes(state.board)
+            watch.restore(state.watch, self._start_ns)
+        except ValueError as error:
+            raise InputError(f"is no state of this software's monitor: {error}") from error
+        self.alarms, self._watch = board, watch
+        self._runs = state.runs
+        self._aligner.state, self._told_again = state.alignment, ToldAgain(state.alignment)
+        self._units, self._heard_from_ns = state.units, state.heard_from_ns
+        self._output_units = [self._units[output] for output in self.config.outputs]
+        self.first_ns, self.last_ns = state.first_ns, state.last_ns
+        self._watching_since_ns, self._snapshot_due_ns = state.watching_since_ns, state.snapshot_due_ns
+        self.received, self._published = state.received, state.published
+        self.refusals.by_reason = state.refused
+
+    def _learned_with(self) -> dict[str, Any]:
+        if self._settings is None:
+            self._settings = settings_of(self.config, self._watch.model, points=self._points)
+        return self._settings
+
+    def caught_up(self) -> None:
+        """What was published before has all come: from now on no sample is one that was heard before a stop."""
+        self._told_again = None
 
     # --- what others may ask ---------------------------------------------------------------------------------
 
@@ -206,6 +329,9 @@ class Monitor:
     def finish(self) -> list[Publication]:
         """Judge the rows that still wait for samples, as at the end of a record."""
         publications: list[Publication] = []
+        for signal, run in zip(self._signals, self._runs, strict=True):
+            for sample in run.released():
+                self._hear(signal, *sample, publications)
         for row in self._aligner.flush():
             self._on_row(row, publications)
         return publications
@@ -232,7 +358,7 @@ class Monitor:
             version=__version__,
             phase=phase,
             uptime_s=(now_ns - self._start_ns) / 1e9,
-            received=self._received,
+            received=self.received,
             lost=counts.lost,
             late=counts.late,
             refused=self.refusals.total,
@@ -244,6 +370,21 @@ class Monitor:
             rows=counts.rows,
             incomplete_rows=counts.incomplete_rows,
             heard_from_ns=self._heard_from_ns,
+            not_stored=self.not_stored,
+            stalls=self._stalls,
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)
+
+
+def _unusable(signal: str, sample: Sample) -> tuple[str, str]:
+    """Why a sample cannot be used: a word to count by, and what it was."""
+    if sample.quality == UNSPECIFIED:
+        return "payload", f"{signal}: the sample has no quality, so it is no Sample of ours"
+    if not isfinite(sample.value):
+        return "not_finite", f"{signal} is {sample.value} at {sample.time_ns} ns"
+    if sample.quality == BAD:
+        return "bad_quality", f"{signal} is marked bad at {sample.time_ns} ns"
+    if sample.quality not in USABLE:
+        return "bad_quality", f"{signal} has the quality {sample.quality}, which this version does not know"
+    return "out_of_range", f"{signal} is {sample.value} at {sample.time_ns} ns: sizes must be below {LARGEST_VALUE:g}"

@@ -116,7 +116,10 @@ def cusum_height(arl0: float, k: float, learned: Prewhitening) -> float:
         return log(float(np.sum(share * _cusum_rate(shift / scale, k / scale, h / scale))) / wanted)
 
     wanted = float(_cusum_rate(np.zeros(1), np.full(1, k), np.full(1, known))[0])
-    return float(optimize.brentq(off, known, 10.0 * known + 10.0, xtol=1e-6 * known))
+    beyond = 10.0 * known + 10.0
+    while off(beyond) > 0.0:  # after a training of few rows; the rate falls with 1 / h, so this comes to an end
+        beyond *= 10.0
+    return float(optimize.brentq(off, known, beyond, xtol=1e-6 * known))
 
 
 def joint_limit(arl0: float, dimension: int, weight: float, learned: list[Prewhitening]) -> float:
@@ -144,7 +147,7 @@ def _cusum_rate(shift: Array, k: Array, h: Array) -> Array:
     for side in (1.0, -1.0):
         off = side * shift - k
         off = np.where(np.abs(off) < 1e-6, 1e-6, off)
-        exponent = np.clip(-2.0 * off * (h + 1.166), -700.0, 700.0)
+        exponent = np.minimum(-2.0 * off * (h + 1.166), 700.0)
         rate += 2.0 * off * off / (np.exp(exponent) - exponent - 1.0)
     return rate
 

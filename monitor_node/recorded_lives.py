@@ -2,6 +2,8 @@
 
 A monitor's life is from its start to its end; its reports of health tell one from another, because each says when it
 was made and how long the monitor had been up. They also tell which sample of each signal was the first that it heard.
+A monitor that goes on from a stored state goes on with the life of the one that stored it, and tells the same first
+samples.
 
 Two things made a monitor say something that are no samples, and both can be read off what it then said: what a person
 did to an alarm is in the message of that alarm, with the time of the newest row; and a silence of the plant that the
@@ -37,7 +39,7 @@ class Life:
     """One life of a monitor.
 
     Attributes:
-        start_s: when it began, in seconds since 1970-01-01 UTC; NaN if nothing of it was recorded.
+        starts_s: when it began, and when it went on after a stop, in seconds since 1970-01-01 UTC.
         first: number of the first message of the recording that may be its.
         end: number of the first message that may be the next one's; None: there is none.
         fresh: whether it had heard nothing yet when it first reported.
@@ -46,7 +48,7 @@ class Life:
         told: what people did to its alarms, and silences of the plant, in order.
     """
 
-    start_s: float
+    starts_s: list[float]
     first: int
     end: int | None = None
     fresh: bool = False
@@ -98,12 +100,23 @@ def is_silence(alarm: Alarm) -> bool:
 
 def _report(lives: list[Life], health: Health, number: int) -> None:
     start_s = health.time_ns / 1e9 - health.uptime_s
-    known = [life for life in lives if abs(life.start_s - start_s) <= SAME_START_S]
-    if not known:
+    known = [life for life in lives if any(abs(item - start_s) <= SAME_START_S for item in life.starts_s)]
+    if not known and lives and _goes_on(lives[-1], health):
+        lives[-1].starts_s.append(start_s)
+    elif not known:
         if lives:
             lives[-1].end = number
-        lives.append(Life(start_s, number, fresh=health.phase == "waiting"))
+        lives.append(Life([start_s], number, fresh=health.phase == "waiting"))
     elif known[0] is not lives[-1]:
         raise InputError("holds the reports of two monitors of the plant at the same time; verify takes one")
     lives[-1].heard_from_ns.update(health.heard_from_ns)
     lives[-1].lost = health.lost
+
+
+def _goes_on(life: Life, health: Health) -> bool:
+    """Whether the first report of a start tells that a life goes on.
+
+    Who begins anew reports first that it waits. A life that was too short for a second report has told no first sample.
+    """
+    told = dict(health.heard_from_ns)
+    return health.phase != "waiting" and (told == life.heard_from_ns or (life.fresh and not life.heard_from_ns))

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 
 REPORT_EVERY_NS = 60_000_000_000
+LONGEST_EXAMPLE = 300
+"""Characters. What is refused may be named by whoever sent it, in as many words as he likes."""
 
 
 @dataclass
@@ -20,7 +22,8 @@ class Refusals:
     def add(self, reason: str, example: str) -> None:
         """Count one; `example` says what it was."""
         self.by_reason[reason] = self.by_reason.get(reason, 0) + 1
-        self._unsaid.setdefault(reason, example)
+        if reason not in self._unsaid:
+            self._unsaid[reason] = example if len(example) <= LONGEST_EXAMPLE else f"{example[:LONGEST_EXAMPLE]}..."
 
     @property
     def total(self) -> int:

@@ -55,6 +55,13 @@ MEMORY = 32
 DEVIATIONS = 2.0
 """Mean deviations that a usual spacing may be longer than the mean."""
 
+BURST = 0.125
+"""Of the usual spacing: what comes sooner is one sign of life with what came before. After a cut, or a stop of ours,
+all that was held up comes at once, and says nothing of how often samples come."""
+
+LATE_NS = 1_000_000_000
+"""Who looks later than this after the plant was due cannot say that the plant was late."""
+
 
 class Change(NamedTuple):
     """What happens to the silence.
@@ -151,6 +158,7 @@ class Silence:
         self._rows, self._receipts = Spacing(), Spacing()
         self._last_ns: int | None = None
         self._received_ns: int | None = None
+        self._counted_ns: int | None = None  # of these, the one that the next spacing is counted from
         self._steady_ns: float | None = None
         self.standing = False
 
@@ -207,10 +215,17 @@ class Silence:
 
     # --- in the time of receipt ------------------------------------------------------------------------------
 
+    def listen(self, now_ns: int) -> None:
+        """Begin to wait, after a stop, for what comes next; how long it takes is no spacing."""
+        self._received_ns, self._counted_ns = now_ns, None
+
     def received(self, now_ns: int) -> None:
-        """Note that something came, whatever it was. A clock that was set back is no spacing."""
-        before_ns, self._received_ns = self._received_ns, now_ns
-        if before_ns is not None and now_ns >= before_ns:
+        """Note that something came, whatever it was. A clock that was set back is no spacing, nor is one in a burst."""
+        before_ns, self._received_ns = self._counted_ns, now_ns
+        if before_ns is None or now_ns < before_ns:
+            self._counted_ns = now_ns
+        elif self._receipts.count < MEMORY or now_ns - before_ns >= BURST * self._receipts.mean_ns:
+            self._counted_ns = now_ns
             self._receipts.learn(min(now_ns - before_ns, self._patience_ns() or now_ns - before_ns))
 
     def due_ns(self) -> int | None:
@@ -223,11 +238,19 @@ class Silence:
     def check(self, now_ns: int) -> Change:
         """Look whether it is silent.
 
+        Who looks much later than it was due was not there himself: frozen, or his clock was set. What was said
+        meanwhile may still be on its way, so it is waited for anew.
+
         Args:
             now_ns: by the clock that `received` was told.
         """
         due_ns = self.due_ns()
-        return NOTHING if due_ns is None or now_ns < due_ns else self.begin()
+        if due_ns is None or now_ns < due_ns:
+            return NOTHING
+        if now_ns - due_ns > LATE_NS:
+            self.listen(now_ns)
+            return NOTHING
+        return self.begin()
 
     def begin(self) -> Change:
         """It is silent from now on, whoever says so."""

@@ -6,7 +6,8 @@ samples are those of the recording in the order of their receipt, which is the o
 them for every subscriber. The first sample that the monitor heard is known from its reports of health. If it is not in
 the recording, the monitor had learned from what nobody recorded, and nothing it said can be verified.
 
-A monitor that was started anew while the recording was made is verified from there on as another.
+A monitor that was started anew while the recording was made is verified from there on as another. One that went on from
+a stored state is verified as if it had never stopped; what it then said once more is passed over.
 """
 
 from collections.abc import Callable, Iterable
@@ -28,6 +29,9 @@ from reactorwatch.runtime.model_file import model_on_the_bus
 
 COMPARED = frozenset({keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.RECONSTRUCTION})
 """The kinds of messages that follow from the samples; health does not."""
+
+MOST_REPEATED = 10_000
+"""On a key: what may have been said between the last time that a monitor was stored and its end."""
 
 
 @dataclass
@@ -125,6 +129,7 @@ class _Replay:
         self._life = life
         self._comparison = comparison
         self._waited_for = dict(life.heard_from_ns)
+        self._newest: dict[str, dict[bytes, None]] = {}
         signals = (config.input, *config.outputs)
         self._signals = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in signals}
 
@@ -139,8 +144,20 @@ class _Replay:
                 topic = keys.parse(message.key)
                 if topic is None or topic.plant != self._config.plant or topic.kind not in COMPARED:
                     continue
-                if not topic.name.startswith(f"{keys.RECORDING}/"):
+                if not (topic.name.startswith(f"{keys.RECORDING}/") or self._is_repeated(message)):
                     self._comparison.recorded(message, topic.kind)
+
+    def _is_repeated(self, message: Encoded) -> bool:
+        """Whether it was said before, by a monitor that since then went on from what it had stored."""
+        if len(self._life.starts_s) == 1:
+            return False
+        newest = self._newest.setdefault(message.key, {})
+        if message.payload in newest:
+            return True
+        newest[message.payload] = None
+        if len(newest) > MOST_REPEATED:
+            del newest[next(iter(newest))]
+        return False
 
     def _hear(self, message: Encoded) -> None:
         signal = self._signals[message.key]

@@ -33,6 +33,9 @@ from reactorwatch.process.level_control import with_level_control
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.records.record import to_minutes, to_time_ns
 
+MOST_FAULTS = 32
+"""In a plant at a time: each makes its equations larger, and slower to compile."""
+
 
 @dataclass(frozen=True)
 class FaultChange:
@@ -208,7 +211,8 @@ class Plant:
             The same with every number said.
 
         Raises:
-            InputError: an onset that is past, a ramp that never ends, or a fault that the model cannot have.
+            InputError: an onset that is past, a ramp that never ends, a fault that the model cannot have, or one too
+                many.
         """
         settled = specification.settled(self.time_min, self._config.duration_min)
         onset_min = settled.values.get("onset", self.time_min)
@@ -217,6 +221,8 @@ class Plant:
                 f"fault {str(settled)!r}: onset must not lie before the plant's time, {self.time_min:g} min, "
                 f"got {onset_min:g} min; leave it out for now"
             )
+        if len(self._installed) >= MOST_FAULTS:
+            raise InputError(f"there are {MOST_FAULTS} faults in the plant, which is the most; clear one")
         self._install([*self._installed, _Installed(settled, onset_min)])
         return settled
 

@@ -15,6 +15,9 @@ from reactorwatch.contract import messages_pb2 as messages
 
 PREFIX = "application/protobuf;"
 
+LARGEST_PAYLOAD = 1 << 20
+"""Bytes. Messages of ours take less than a hundredth of it; what is larger is not read."""
+
 MESSAGES: tuple[type[Message], ...] = (
     messages.Sample,
     messages.Estimate,
@@ -109,8 +112,11 @@ def decode(payload: bytes, encoding: str) -> Message:
     """The message that the encoding names, read from the bytes.
 
     Raises:
-        DecodeError: the encoding is not ours (reason `encoding`), or the bytes do not parse (`payload`).
+        DecodeError: the encoding is not ours (reason `encoding`), the bytes are too many (`too_large`), or do not parse
+            (`payload`).
     """
+    if len(payload) > LARGEST_PAYLOAD:
+        raise DecodeError("too_large", f"a payload must have at most {LARGEST_PAYLOAD} bytes, got {len(payload)}")
     read = _READERS.get(encoding)
     if read is None:
         raise DecodeError("encoding", f"encoding must be '{PREFIX}reactorwatch.v1.<message>', got {encoding!r}")

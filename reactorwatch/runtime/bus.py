@@ -43,6 +43,7 @@ class Bus(Protocol):
         *,
         on_gap: Callable[[Gap], None] | None = None,
         history: bool = False,
+        on_told: Callable[[], None] | None = None,
     ) -> None:
         """Call the handler, from a thread of the bus, with everything published on matching keys.
 
@@ -54,6 +55,7 @@ class Bus(Protocol):
             handler: gets the messages.
             on_gap: gets told, from a thread of the bus, what was published and never came.
             history: whether what was published before, and is still remembered, comes first.
+            on_told: called, from a thread of the bus and between the messages, when that has all come.
         """
 
     def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
@@ -131,10 +133,13 @@ class MemoryBus:
         *,
         on_gap: Callable[[Gap], None] | None = None,
         history: bool = False,
+        on_told: Callable[[], None] | None = None,
     ) -> None:
         """See `Bus`; nothing is lost here, and nothing remembered."""
         with self._exchange.lock:
             self._exchange.subscriptions.append((self, key_expression, handler))
+        if on_told is not None:
+            on_told()
 
     def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
         """See `Bus`."""

@@ -31,7 +31,7 @@ import zenoh
 import zenoh.ext
 from google.protobuf.message import Message
 
-from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.contract.codec import LARGEST_PAYLOAD, Encoded, encode_message
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.access import MEMORY, NOBODY
 from reactorwatch.runtime.bus import Request
@@ -50,6 +50,7 @@ FLUSH_WITHIN_S = 10.0
 HEARTBEAT_S = 0.5
 LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that who missed it can ask for it
 STUCK_S = 1.0
+LONGEST_ENCODING = 1000
 STREAM_PARTS = 3  # of a key: root, plant and kind
 
 HISTORY_WITHIN_S = 10.0
@@ -124,6 +125,7 @@ class ZenohBus:
         *,
         on_gap: Callable[[Gap], None] | None = None,
         history: bool = False,
+        on_told: Callable[[], None] | None = None,
     ) -> None:
         """See `Bus`."""
         delivery = Delivery(handler, on_gap or _say_gap) if _is_of_whole_streams(key_expression) else None
@@ -152,7 +154,10 @@ class ZenohBus:
                     if delivery.is_told():
                         break
                     since_s = time.monotonic() - began + HEARTBEAT_S
-            threading.Thread(target=delivery.begin, daemon=True).start()  # the handler may wait for who called us
+            # In a thread of its own: the handler may wait for who called us.
+            threading.Thread(target=delivery.begin, args=(on_told,), daemon=True).start()
+        elif on_told is not None:
+            on_told()
 
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
         """What publishers remember of what they have published."""
@@ -188,9 +193,8 @@ class ZenohBus:
 
         def on_query(query: zenoh.Query) -> None:
             payload = query.payload
-            question = Encoded(
-                str(query.key_expr), payload.to_bytes() if payload is not None else b"", str(query.encoding)
-            )
+            data = _bytes(payload) if payload is not None else b""
+            question = Encoded(str(query.key_expr), data, str(query.encoding)[:LONGEST_ENCODING])
             handler(ZenohRequest(query, question))
 
         self._declared.append(self._session.declare_queryable(key_expression, on_query))
@@ -358,7 +362,16 @@ def _stream(key: str) -> str:
 def _encoded(sample: zenoh.Sample) -> Encoded:
     """A message that has just come."""
     now_ns = time.time_ns()
-    return Encoded(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), now_ns)
+    return Encoded(str(sample.key_expr), _bytes(sample.payload), str(sample.encoding)[:LONGEST_ENCODING], now_ns)
+
+
+def _bytes(payload: zenoh.ZBytes) -> bytes:
+    """A payload; one that is too large for any message of ours is cut to a size that still is, so that it is refused.
+
+    What waits for a node is counted in messages, and would otherwise be as large as a stranger likes.
+    """
+    data = payload.to_bytes()
+    return data if len(data) <= LARGEST_PAYLOAD else data[: LARGEST_PAYLOAD + 1]
 
 
 def _numbered(sample: zenoh.Sample) -> Numbered | None:

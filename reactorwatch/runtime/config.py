@@ -161,9 +161,12 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
     for key in values:
         if key not in fields:
             raise InputError(f"settings [{name}]: {_unknown(key, fields, 'key')}")
+    for key, value in values.items():
+        if isinstance(value, int) and value.bit_length() > 63:
+            raise InputError(f"settings [{name}]: {key} must be a number of 64 bits, got one of {value.bit_length()}")
     try:
         return msgspec.convert(values, kind)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, OverflowError) as error:
         raise InputError(f"settings [{name}]: {error}") from error
 
 

@@ -38,7 +38,7 @@ class Delivery:
     def __init__(self, handler: Callable[[Encoded], None], on_gap: Callable[[Gap], None]) -> None:
         self._handler = handler
         self._on_gap = on_gap
-        self._order: InOrder[Encoded] = InOrder(gathering=True)
+        self._order: InOrder[Encoded] = InOrder(gathering=True, size=lambda item: len(item.payload))
         self._changed = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._give_up_when_due, name="delivery", daemon=True)
@@ -69,10 +69,16 @@ class Delivery:
         with self._changed:
             return self._order.is_told()
 
-    def begin(self) -> None:
-        """Hand on what has come until now, and from now on what comes."""
+    def begin(self, on_told: Callable[[], None] | None = None) -> None:
+        """Hand on what has come until now, and from now on what comes.
+
+        Args:
+            on_told: called between the two.
+        """
         with self._changed:
             self._hand_on(self._order.gathered(time.monotonic_ns()))
+            if on_told is not None:
+                on_told()
             self._changed.notify()
 
     def close(self) -> None:

@@ -23,7 +23,7 @@ moment (`GATHER_NS`) nothing came that was older than what he had heard already.
 """
 
 from bisect import bisect_right
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import accumulate
 from operator import itemgetter
@@ -39,7 +39,11 @@ GATHER_NS = 500_000_000
 MOST_LOST = 100_000
 """Runs of lost numbers of a stream that are remembered: what comes of them after all goes on."""
 MOST_HELD = 1_000_000
-"""Messages of a stream that may wait; with more, what is missing is given up."""
+MOST_HELD_BYTES = 256 << 20
+"""Messages of a stream that may wait, and their payload; with more, what is missing is given up."""
+MOST_STREAMS = 10_000
+MOST_KEYS = 10_000
+"""Streams, and keys of a stream, that are remembered. A publisher that is started anew is another stream."""
 
 
 class Gap(NamedTuple):
@@ -70,15 +74,27 @@ class _Stream(Generic[Item]):
     told: dict[int, Item] = field(default_factory=dict)  # of what was before
     told_from: dict[str, int] = field(default_factory=dict)  # the first of each key
     held: dict[int, tuple[int, Item]] = field(default_factory=dict)  # with when it came
+    held_bytes: int = 0
+    heard_ns: int = 0  # when something came last
     due_ns: int | None = None  # when to look whether to wait no longer; None: nothing waits
     recovered_ns: int = 0  # when something that was missing came last, or it began to be missing
     keys: dict[str, int] = field(default_factory=dict)  # the newest number that came of each
     lost: list[tuple[int, int]] = field(default_factory=list)  # (first, last)
 
     @property
+    def is_full(self) -> bool:
+        """Whether more waits than there is room for."""
+        return len(self.held) > MOST_HELD or self.held_bytes > MOST_HELD_BYTES
+
+    def note(self, key: str, number: int) -> None:
+        """A key has come to a number."""
+        if key in self.keys or len(self.keys) < MOST_KEYS:
+            self.keys[key] = max(self.keys.get(key, number), number)
+
+    @property
     def passed(self) -> int:
         """The number that every key has come to."""
-        return min(self.keys.values())
+        return min(self.keys.values(), default=self.newest)
 
     @property
     def told_by_all(self) -> int:
@@ -91,9 +107,11 @@ class InOrder(Generic[Item]):
 
     Args:
         gathering: whether everything waits, at first, until `gathered`.
+        size: of a message, in bytes; without it, none has any.
     """
 
-    def __init__(self, *, gathering: bool = False) -> None:
+    def __init__(self, *, gathering: bool = False, size: Callable[[Item], int] = lambda _: 0) -> None:
+        self._size = size
         self._streams: dict[tuple[int, str], _Stream[Item]] = {}
         self._gathering = gathering
 
@@ -104,10 +122,11 @@ class InOrder(Generic[Item]):
         name = publisher, stream
         state = self._streams.get(name)
         if state is None:
-            state = self._streams[name] = _Stream()
+            state = self._new(name)
             if not number and not self._gathering:
                 state.expected = 0
-        state.keys[key] = max(state.keys.get(key, number), number)
+        state.heard_ns = now_ns
+        state.note(key, number)
         if state.expected is None and not self._gathering and number <= state.before:
             return
         if number == state.expected and not state.held:  # as nearly always
@@ -118,7 +137,11 @@ class InOrder(Generic[Item]):
             if _take_out(state.lost, number):
                 yield item  # it was given up, and has come after all
             return
-        state.held.setdefault(number, (now_ns, item))
+        if self._gathering and state.is_full:
+            return  # it will be told as missing
+        if number not in state.held:
+            state.held[number] = now_ns, item
+            state.held_bytes += self._size(item)
         if self._gathering:
             return
         patience_ns = GATHER_NS if state.expected is None else PATIENCE_NS
@@ -127,7 +150,7 @@ class InOrder(Generic[Item]):
             state.recovered_ns = now_ns
         state.newest = max(state.newest, number)
         yield from self._contiguous(state)
-        if len(state.held) > MOST_HELD:
+        if state.is_full:
             yield from self._give_up(name, state, now_ns, now_ns, state.newest)
 
     def overdue(self, now_ns: int) -> Iterator[Item | Gap]:
@@ -145,13 +168,15 @@ class InOrder(Generic[Item]):
 
     def tell_last(self, publisher: int, stream: str, key: str, number: int) -> None:
         """While gathering: the number that a publisher has come to on one of its keys."""
-        state = self._streams.setdefault((publisher, stream), _Stream())
-        state.keys[key] = max(state.keys.get(key, number), number)
+        state = self._stream(publisher, stream)
+        state.note(key, number)
         state.before = max(state.before, number)
 
     def tell(self, publisher: int, stream: str, key: str, number: int, item: Item) -> None:
         """While gathering: a message of before."""
-        state = self._streams.setdefault((publisher, stream), _Stream())
+        state = self._stream(publisher, stream)
+        if len(state.told) >= MOST_HELD:
+            return
         state.told[number] = item
         state.told_from[key] = min(state.told_from.get(key, number), number)
 
@@ -171,13 +196,32 @@ class InOrder(Generic[Item]):
             live = {number: came for number, came in state.held.items() if number > state.before}
             state.held = {number: (now_ns, item) for number, item in state.told.items()} | live
             state.told = {}
+            state.held_bytes = sum(self._size(item) for _, item in state.held.values())
             for number in sorted(number for number in state.held if number < state.told_by_all):
-                yield state.held.pop(number)[1]
+                yield self._released(state, number)
             state.newest = max(state.held, default=state.before)
             if state.held:
                 yield from self._give_up(name, state, now_ns, now_ns, state.newest)
             elif state.before >= 0:
                 state.expected = state.before + 1
+
+    def _stream(self, publisher: int, stream: str) -> _Stream[Item]:
+        return self._streams.get((publisher, stream)) or self._new((publisher, stream))
+
+    def _new(self, name: tuple[int, str]) -> _Stream[Item]:
+        """Begin to remember a stream; if there are too many, those are forgotten that have been silent for longest."""
+        if len(self._streams) >= MOST_STREAMS:
+            idle = [(state.heard_ns, known) for known, state in self._streams.items() if not (state.held or state.told)]
+            for _, known in sorted(idle)[: MOST_STREAMS // 10]:
+                del self._streams[known]
+        state: _Stream[Item] = _Stream()
+        self._streams[name] = state
+        return state
+
+    def _released(self, state: _Stream[Item], number: int) -> Item:
+        item = state.held.pop(number)[1]
+        state.held_bytes -= self._size(item)
+        return item
 
     def due_ns(self) -> int | None:
         """When to ask for what is overdue; None: nothing waits."""
@@ -185,7 +229,7 @@ class InOrder(Generic[Item]):
 
     def _contiguous(self, state: _Stream[Item]) -> Iterator[Item]:
         while state.expected is not None and state.expected in state.held:
-            yield state.held.pop(state.expected)[1]
+            yield self._released(state, state.expected)
             state.expected += 1
         if not state.held:
             state.due_ns = None
@@ -204,14 +248,12 @@ class InOrder(Generic[Item]):
         came_ns = [state.held[number][0] for number in numbers]
         noticed_ns = list(accumulate(reversed(came_ns), min))[::-1]  # when the first came that is behind it, or it did
         for number, known_ns in zip(numbers, noticed_ns, strict=True):
-            item = state.held[number][1]
             if state.expected is not None and number > state.expected:
                 if gathered or known_ns > since_ns or number > passed:
                     break  # what is missing here may still come
                 lost.append((state.expected, number - 1))
-            del state.held[number]
             state.expected = number + 1
-            items.append(item)
+            items.append(self._released(state, number))
         state.due_ns = None
         if state.held:
             first_ns = min(came for came, _ in state.held.values())

@@ -12,12 +12,13 @@ import time
 from collections.abc import Callable, Iterator
 from queue import Empty, SimpleQueue
 from types import FrameType
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.audit import audit
 from reactorwatch.runtime.bus import Bus, Request
+from reactorwatch.runtime.clock import SteadyClock
 from reactorwatch.runtime.in_order import Gap
 
 LONGEST_WAIT_S = 3600.0
@@ -25,6 +26,7 @@ LONGEST_LINGER = 10  # times linger_s: a bus that never falls silent does not ke
 LARGEST_INBOX = (
     100_000  # messages; beyond it the bus is made to wait, and with it who publishes faster than we can hear
 )
+LARGEST_INBOX_BYTES = 64 << 20  # of payload, likewise
 LOOK_AGAIN_S = 0.1
 BATCH = 256  # messages handled before the loop looks at the clock again
 
@@ -50,6 +52,28 @@ class Node(Protocol):
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """The loop ends; last words."""
+
+
+class _Told:
+    """Stands in the inbox behind what was before."""
+
+
+_TOLD = _Told()
+_Item: TypeAlias = Encoded | Gap | Request | _Told
+
+
+class _Weight:
+    """Bytes of payload in an inbox, counted by several threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.total = 0
+
+    def add(self, item: _Item, sign: int) -> None:
+        """Count an item that comes (1) or goes (-1)."""
+        if isinstance(item, Encoded):
+            with self._lock:
+                self.total += sign * len(item.payload)
 
 
 class StopSignal:
@@ -113,6 +137,7 @@ def serve(
     subscriptions: tuple[str, ...] = (),
     history: bool = False,
     on_gap: Callable[[Gap, int], list[Publication]] | None = None,
+    on_told: Callable[[], None] | None = None,
     commands: tuple[str, ...] = (),
     on_ready: Callable[[], None] | None = None,
     linger_s: float = 0.0,
@@ -127,24 +152,35 @@ def serve(
         subscriptions: key expressions whose publications go to `node.on_message`.
         history: whether those from before do, too, as far as they are remembered.
         on_gap: told, in its turn between the messages, what was published on them and never came, and what time it is.
+        on_told: called, in its turn between the messages, when those from before have all come.
         commands: key expressions of queryables whose questions go to `node.on_command`.
         on_ready: called once the node listens.
         linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
         on_publish: told of each thing that the node publishes, before the bus is, in the loop's own thread.
     """
-    inbox: SimpleQueue[Encoded | Gap | Request | None] = SimpleQueue()
-    room, ended = threading.Event(), threading.Event()
+    inbox: SimpleQueue[_Item | None] = SimpleQueue()
+    clock = SteadyClock()
+    weight, room, ended = _Weight(), threading.Event(), threading.Event()
     stop.wakes(lambda: inbox.put(None))
     stop.wakes(room.set)
 
-    def receive(item: Encoded | Gap | Request) -> None:
-        while inbox.qsize() >= LARGEST_INBOX and not (stop.is_set or ended.is_set()):
+    def receive(item: _Item) -> None:
+        while inbox.qsize() >= LARGEST_INBOX or weight.total >= LARGEST_INBOX_BYTES:
+            if stop.is_set or ended.is_set():
+                break
             room.clear()
             room.wait(LOOK_AGAIN_S)
+        weight.add(item, 1)
         inbox.put(item)
 
     for expression in subscriptions:
-        bus.subscribe(expression, receive, on_gap=receive if on_gap is not None else None, history=history)
+        bus.subscribe(
+            expression,
+            receive,
+            on_gap=receive if on_gap is not None else None,
+            history=history,
+            on_told=(lambda: receive(_TOLD)) if on_told is not None else None,
+        )
     for expression in commands:
         bus.answer(expression, receive)
     if on_ready is not None:
@@ -156,21 +192,25 @@ def serve(
                 on_publish(publication)
             bus.publish(encode(publication))
 
-    def handle(item: Encoded | Gap | Request) -> None:
+    def handle(item: _Item) -> None:
+        weight.add(item, -1)
         if isinstance(item, Encoded):
-            publish(node.on_message(item, time.time_ns()))
+            publish(node.on_message(item, clock.now_ns()))
+        elif isinstance(item, _Told):
+            if on_told is not None:
+                on_told()
         elif isinstance(item, Gap):
-            publish(on_gap(item, time.time_ns()) if on_gap is not None else [])
+            publish(on_gap(item, clock.now_ns()) if on_gap is not None else [])
         else:
-            reply, publications = node.on_command(item.question, time.time_ns())
+            reply, publications = node.on_command(item.question, clock.now_ns())
             item.reply(reply)
-            record = audit(item.question, reply, time.time_ns())
+            record = audit(item.question, reply, clock.now_ns())
             publish(publications if record is None else [*publications, record])
 
     while not (stop.is_set or node.finished):
-        wait_s = (node.next_tick_ns() - time.time_ns()) / 1e9
+        wait_s = (node.next_tick_ns() - clock.now_ns()) / 1e9
         if wait_s <= 0:
-            publish(node.on_tick(time.time_ns()))
+            publish(node.on_tick(clock.now_ns()))
             wait_s = 0.0
         for _ in range(BATCH):
             try:
@@ -199,4 +239,4 @@ def serve(
         item = inbox.get_nowait()
         if item is not None:
             handle(item)
-    publish(node.on_stop(time.time_ns()))
+    publish(node.on_stop(clock.now_ns()))

@@ -139,3 +139,10 @@ def test_a_plant_name_that_cannot_is_taken(name: str) -> None:
 @pytest.mark.parametrize("key", ["", "reactor", "reactor/cstr/sample", "reactor//sample/T", "other/cstr/sample/T"])
 def test_a_key_that_is_not_ours_has_no_topic(key: str) -> None:
     assert keys.parse(key) is None
+
+
+def test_a_payload_of_ten_megabytes_is_not_read() -> None:
+    sample = messages.Sample(time_ns=1, unit="K" * 10_000_000, quality=messages.QUALITY_GOOD)
+    with pytest.raises(DecodeError, match="a payload must have at most 1048576 bytes, got 100000") as refused:
+        decode(sample.SerializeToString(), encoding_of(messages.Sample))
+    assert refused.value.reason == "too_large"

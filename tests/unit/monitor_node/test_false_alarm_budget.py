@@ -118,3 +118,14 @@ def test_the_budget_is_shared_equally_and_counts_rows() -> None:
 def test_a_budget_that_no_chart_can_keep_is_refused_with_the_range_that_it_can(per_30_days: float) -> None:
     with pytest.raises(InputError, match=r"false_alarms_per_30_days must be in \[0.02.*, 4.3e\+04\] for 5 alarms"):
         budget.share_arl0(per_30_days, 5, 0.1)
+
+
+@pytest.mark.parametrize("rows", [50, 100, 200])
+def test_a_cusum_after_a_short_training_has_a_limit_and_a_higher_one(rows: int) -> None:
+    """Its mean may be off by more than the allowance, and then the limit is what makes up for it."""
+    heights = [
+        budget.cusum_height(1e6, 0.25, Prewhitening(0.0, (0.0,), 1.0, count, 0.5 / count, 1.0 / count))
+        for count in (rows, 2 * rows)
+    ]
+    assert heights[0] > heights[1] > 0.0
+    assert np.isfinite(heights[0])

@@ -188,6 +188,7 @@ def garbage() -> list[tuple[str, Encoded]]:
     without_end = sample("T", 5000, 500.0, math.inf)
     bare = Sample(time_ns=to_time_ns(500.0), value=440.0)
     bad = Sample(time_ns=to_time_ns(500.0), value=440.0, quality=Quality.QUALITY_BAD)
+    unknown = Sample(time_ns=to_time_ns(500.0), value=440.0, quality=7)  # type: ignore[arg-type]
     key = keys.key(PLANT, keys.SAMPLE, "T")
     return [
         ("not_finite", no_number),
@@ -196,6 +197,11 @@ def garbage() -> list[tuple[str, Encoded]]:
         ("payload", good._replace(payload=b"")),
         ("payload", encode(Publication(key, bare))),
         ("bad_quality", encode(Publication(key, bad))),
+        ("bad_quality", encode(Publication(key, unknown))),
+        ("out_of_range", sample("T", 5000, 500.0, 1e300)),
+        ("out_of_range", sample("T", 2**64 - 1, 500.0, 440.0)),
+        ("out_of_range", sample("T", 5000, 1.5e8, 440.0)),
+        ("too_large", good._replace(payload=b"\x22" * 10_000_000)),
         ("encoding", good._replace(encoding="application/json")),
         ("encoding", good._replace(encoding="application/protobuf;reactorwatch.v2.Sample")),
         ("encoding", encode(Publication(key, Health(time_ns=1)))),
@@ -220,6 +226,38 @@ def test_garbage_is_counted_by_reason_and_harms_nothing(leak: list[Encoded]) -> 
     assert counted.refused == sum(reasons.values())
     assert counted.received == len(dirty)
     assert [encode(item) for item in said] == [encode(item) for item in watch(leak)[1]]
+
+
+def test_a_stranger_on_the_plant_s_keys_is_counted_and_harms_nothing(leak: list[Encoded]) -> None:
+    """A second plant of the same name, with a clock and numbers of its own, from the training until after the fault."""
+    time_min, columns = leaking_run(0.0, 1.0, 150.0, seed=9)
+    theirs = list(samples(time_min + 777.03, {name: values + 0.01 * values for name, values in columns.items()}))
+    mixed = leak[:600]
+    for place in range(len(theirs) - 600):
+        mixed += [leak[600 + place], theirs[place]]
+    mixed += leak[600 + len(theirs) - 600 :]
+    monitor, said = watch(mixed)
+    assert [encode(item) for item in said] == [encode(item) for item in watch(leak)[1]]
+    assert health(monitor).refused_by_reason["out_of_place"] == len(theirs) - 600
+
+
+def test_what_a_stranger_names_does_not_fill_the_log() -> None:
+    monitor = Monitor(CONFIG, 0)
+    monitor.on_message(sample("T", 0, 0.0, 440.0)._replace(key="reactor/" + "x" * 1_000_000), 0)
+    report = monitor.refusals.report(0)
+    assert report is not None
+    assert len(report) < 500
+
+
+def test_a_monitor_that_did_not_run_when_something_was_due_counts_it() -> None:
+    """Its health is due every five seconds; it was frozen, or its clock was set, between the second and the third."""
+    monitor, second = Monitor(CONFIG, 10**18), 10**9
+    seen = []
+    for now_s in (40, 45, 50, 3650, 3655):  # first it waited for a router
+        (publication,) = monitor.on_tick(10**18 + now_s * second)
+        assert isinstance(publication.message, Health)
+        seen.append(publication.message.stalls)
+    assert seen == [0, 0, 0, 1, 1]
 
 
 def test_refusals_are_reported_once_a_minute_at_most() -> None:
@@ -277,6 +315,17 @@ def test_a_constant_plant_neither_fails_nor_alarms() -> None:
     time_min = np.arange(2000) / 10
     columns = {"qc": np.full(2000, 100.0), "C": np.full(2000, 0.1), "T": np.full(2000, 438.54)}
     monitor, said = watch(samples(time_min, columns))
+    assert monitor.phase == "watching"
+    assert told(said, Alarm) == []
+
+
+@pytest.mark.parametrize("constant", ["C", "T"])
+def test_a_sensor_that_never_moves_neither_ends_the_watch_nor_alarms(constant: str) -> None:
+    """The others are watched all the same."""
+    time_min, columns = leaking_run(0.0, 1.0, 60.0, seed=7)
+    columns[constant] = np.full(time_min.size, columns[constant][0])
+    config = MonitorConfig(training_min=30.0, charts=("shewhart", "ewma", "mewma", "t2"))
+    monitor, said = watch(samples(time_min, columns), config)
     assert monitor.phase == "watching"
     assert told(said, Alarm) == []
 

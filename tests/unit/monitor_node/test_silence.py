@@ -150,7 +150,9 @@ def test_a_plant_that_runs_fast_is_given_the_least_time() -> None:
 def test_a_silence_is_asked_for_once_and_then_waited_out() -> None:
     """`on_tick` is called when something is due: after the alarm nothing may be, or the loop would spin."""
     silence = heard(100)
-    silence.check(10**15)
+    due_ns = silence.due_ns()
+    assert due_ns is not None
+    silence.check(due_ns)
     assert silence.due_ns() is None
     assert silence.check(10**16) == NOTHING
 
@@ -227,3 +229,36 @@ def test_a_monitor_that_was_down_does_not_call_the_plant_silent_for_it() -> None
 def test_settings_that_make_no_rule_are_refused(limit: float, least_s: float, text: str) -> None:
     with pytest.raises(InputError, match=text):
         Silence(limit, least_s)
+
+
+def test_what_comes_in_a_burst_after_a_cut_shortens_no_patience() -> None:
+    """A minute of rows that were held up comes within a tenth of a second."""
+    silence, plain = heard(100), heard(100)
+    end_ns = 100 * PERIOD
+    for row in range(200):
+        silence.received(end_ns + row * 500_000)
+    due_ns, usual_ns = silence.due_ns(), plain.due_ns()
+    assert due_ns is not None
+    assert usual_ns is not None
+    assert due_ns - (end_ns + 199 * 500_000) >= 0.99 * (usual_ns - 99 * PERIOD)
+
+
+def test_a_plant_that_goes_on_faster_is_waited_for_less_after_a_while() -> None:
+    silence = heard(100)
+    for row in range(3000):
+        silence.received(100 * PERIOD + row * PERIOD // 100)
+    due_ns = silence.due_ns()
+    assert due_ns is not None
+    assert due_ns - (100 * PERIOD + 2999 * PERIOD // 100) <= 1.01 * LEAST_S * 1e9
+
+
+def test_who_was_frozen_himself_or_whose_clock_was_set_does_not_blame_the_plant() -> None:
+    """He looks an hour late; if nothing comes then, he tells it in its time."""
+    silence = heard(100)
+    due_ns = silence.due_ns()
+    assert due_ns is not None
+    late_ns = due_ns + 3600 * 10**9
+    assert silence.check(late_ns) == NOTHING
+    again_ns = silence.due_ns()
+    assert again_ns == late_ns + (due_ns - 99 * PERIOD)
+    assert silence.check(again_ns) == Change(104 * PERIOD, None)

@@ -279,3 +279,41 @@ def test_no_more_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyPatch) 
     order = InOrder[int]()
     fed(order, [0])
     assert fed(order, list(range(2, 103))) == [Gap(STREAM, 1, 1, 1, 1, 0), *range(2, 103)]
+
+
+def test_no_more_bytes_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(in_order, "MOST_HELD_BYTES", 1000)
+    order = InOrder[int](size=lambda _: 100)
+    fed(order, [0])
+    assert fed(order, list(range(2, 13))) == [Gap(STREAM, 1, 1, 1, 1, 0), *range(2, 13)]
+    assert fed(order, [14]) == []  # there is room again
+
+
+def test_while_what_was_before_is_told_no_more_waits_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What did not find room is told as missing."""
+    monkeypatch.setattr(in_order, "MOST_HELD", 10)
+    order = InOrder[int](gathering=True)
+    assert fed(order, range(100)) == []
+    told = [*order.gathered(0), *fed(order, [100, 101])]
+    told += order.overdue(PATIENCE_NS)
+    assert [item for item in told if not isinstance(item, Gap)] == [*range(11), 100, 101]
+    assert [(item.first, item.last) for item in told if isinstance(item, Gap)] == [(11, 99)]
+
+
+def test_publishers_without_number_are_forgotten_and_the_one_that_goes_on_is_not(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(in_order, "MOST_STREAMS", 100)
+    order = InOrder[int]()
+    for number in range(1000):
+        assert fed(order, [number], now_ns=number) == [number]
+        assert fed(order, [0], now_ns=number, publisher=2 + number) == [0]
+        assert len(order._streams) <= 100
+    assert fed(order, [1001, 1000], now_ns=1000) == [1000, 1001]
+
+
+def test_keys_without_number_are_not_all_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(in_order, "MOST_KEYS", 10)
+    order = InOrder[int]()
+    assert [item for number in range(100) for item in fed(order, [number], key=f"x{number}")] == list(range(100))
+    assert len(order._streams[1, STREAM].keys) == 10

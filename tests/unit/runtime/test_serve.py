@@ -90,9 +90,12 @@ def test_a_question_is_answered_by_the_loop_of_the_node_while_who_asked_waits() 
     assert CommandReply.FromString(answer.payload).text == "heard"
 
 
-def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The inbox stays within its bound, and nothing is lost."""
-    monkeypatch.setattr("reactorwatch.runtime.serve.LARGEST_INBOX", 100)
+@pytest.mark.parametrize(("bound", "most"), [("LARGEST_INBOX", 100), ("LARGEST_INBOX_BYTES", 100_000)])
+def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(
+    bound: str, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The inbox stays within its bound, of messages or of bytes, and nothing is lost."""
+    monkeypatch.setattr(f"reactorwatch.runtime.serve.{bound}", most)
     exchange, count = Exchange(), 5000
     handled, ahead = [0], [0]
 
@@ -111,7 +114,7 @@ def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(monkeypatch: 
     thread.start()
     assert ready.wait(10)
     for number in range(count):
-        speaker.publish(Encoded(f"in/{number}", b"", ""))
+        speaker.publish(Encoded(f"in/{number}", bytes(1000), ""))
         ahead[0] = max(ahead[0], number + 1 - handled[0])
     thread.join(60)
     assert not thread.is_alive()

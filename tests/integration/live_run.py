@@ -1,0 +1,151 @@
+"""Plant, monitor and recorder as processes on a router, and what is heard of them."""
+
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from google.protobuf.message import Message
+
+from benchmarks.link_cuts import Router, connected
+from monitor_node import backtest
+from monitor_node.config import MonitorConfig
+from plant_node.config import PlantConfig
+from reactorwatch.cli.processes import Processes, write_settings
+from reactorwatch.cli.sources import messages
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, Encoded, decode
+from reactorwatch.contract.messages_pb2 import Alarm, Health, Sample
+from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_endpoint
+from recorder.config import RecorderConfig
+from recorder.mcap_file import read_messages
+
+WITHIN_S = 120.0
+PLANT = "cstr"
+PERIOD_MIN = 0.1
+
+
+class LiveRun:
+    """A plant whose coolant leaks, watched and recorded; a context.
+
+    Args:
+        folder: for the recording, the state and what the nodes say.
+        duration_min: of the plant.
+        speed: of the plant.
+        monitor: settings of the monitor beside the usual.
+    """
+
+    def __init__(self, folder: Path, duration_min: float, speed: float, **monitor: Any) -> None:
+        self.folder, self.recording = folder, folder / "run.mcap"
+        self.config = BusConfig(endpoint=free_endpoint())
+        self.monitor = MonitorConfig(training_min=15.0, health_period_s=0.5, **monitor)
+        self.plant = PlantConfig(
+            period_min=PERIOD_MIN,
+            speed=speed,
+            duration_min=duration_min,
+            seed=4,
+            faults=(f"coolant_flow:step:-0.08@{0.6 * duration_min}min",),
+            wait_for=("monitor", "recorder"),
+        )
+        recorder = RecorderConfig(out=str(self.recording), linger_s=1.0, black_box_min=0.0)
+        settings = folder / "settings.toml"
+        tables = {"bus": self.config, "plant": self.plant, "monitor": self.monitor, "recorder": recorder}
+        write_settings(settings, tables)
+        self.router = Router(self.config.endpoint)
+        self.bus = connected(self.config)
+        self.nodes = Processes(settings, folder)
+        self.alarms: list[Alarm] = []
+        """As heard."""
+        self.health = Health()
+        """The monitor's last."""
+        self._changed = threading.Condition()
+        self._first_ns: int | None = None
+        self._now_min = 0.0
+        self._alive: set[str] = set()
+        self.bus.watch_alive(f"reactor/{PLANT}/alive/*", self._on_alive)
+        for kind in (keys.SAMPLE, keys.ALARM, keys.HEALTH):
+            self.bus.subscribe(keys.all_of(PLANT, kind), self._on_message)
+
+    def start(self, node: str) -> "subprocess.Popen[bytes]":
+        """Start a node, and wait until it is alive."""
+        process = self.nodes.start(node)
+        self.wait(lambda: node in self._alive)
+        return process
+
+    def kill(self, node: str, process: "subprocess.Popen[bytes]") -> None:
+        """End it without a last word."""
+        process.kill()
+        process.wait()
+        self.wait(lambda: node not in self._alive)
+
+    def wait_until(self, minute: float) -> None:
+        """Wait until the plant has come so far."""
+        self.wait(lambda: self._now_min >= minute)
+
+    def wait(self, condition: Callable[[], bool]) -> None:
+        """Wait until what was heard makes it so."""
+        with self._changed:
+            assert self._changed.wait_for(condition, WITHIN_S), f"not within {WITHIN_S:g} s"
+
+    def end(self, plant: "subprocess.Popen[bytes]") -> None:
+        """Wait for the plant's end, and end the others."""
+        assert plant.wait(WITHIN_S) == 0
+        assert self.nodes.stop(["monitor", "recorder"]) == {"monitor": 0, "recorder": 0}
+
+    def recorded_alarms(self) -> list[Alarm]:
+        """What the monitor said of its alarms."""
+        recorded = [decode(item.payload, item.encoding) for item in read_messages(self.recording, {keys.ALARM})]
+        return [item for item in recorded if isinstance(item, Alarm)]
+
+    def expected_alarms(self) -> list[Alarm]:
+        """What a monitor says that hears all of the plant, and nothing else, without a stop."""
+        return backtest.run(self._of_plant(messages(self.recording, PLANT)), self.monitor).alarm_messages
+
+    def _of_plant(self, recorded: Iterable[Encoded]) -> Iterable[Encoded]:
+        for message in recorded:
+            if _is_of_plant(_read(message)):
+                yield message
+
+    def _on_message(self, message: Encoded) -> None:
+        body = _read(message)
+        with self._changed:
+            if isinstance(body, Sample) and _is_of_plant(body) and message.key.endswith("/T"):
+                self._first_ns = self._first_ns or body.time_ns
+                self._now_min = (body.time_ns - self._first_ns) / MINUTE_NS
+            elif isinstance(body, Alarm):
+                self.alarms.append(body)
+            elif isinstance(body, Health) and body.node == "monitor":
+                self.health = body
+            self._changed.notify_all()
+
+    def _on_alive(self, key: str, alive: bool) -> None:
+        with self._changed:
+            (self._alive.add if alive else self._alive.discard)(key.rsplit("/", 1)[1])
+            self._changed.notify_all()
+
+    def __enter__(self) -> "LiveRun":
+        """The run itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End all of it."""
+        with self.nodes:
+            pass
+        self.bus.close()
+        self.router.close()
+
+
+def _read(message: Encoded) -> Message | None:
+    try:
+        return decode(message.payload, message.encoding)
+    except DecodeError:
+        return None
+
+
+def _is_of_plant(body: Message | None) -> bool:
+    """Whether it is a sample of this run's plant: strangers' clocks are at another time."""
+    return isinstance(body, Sample) and abs(body.time_ns / 1e9 - time.time()) < 36_000.0

@@ -1,0 +1,139 @@
+"""What breaks around a monitor costs no alarm of the plant's, raises none of its own, and is counted."""
+
+import random
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from benchmarks.fuzz import Mutator
+from benchmarks.link_cuts import connected
+from reactorwatch.cli.processes import write_settings
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication, encode, encoding_of
+from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
+from reactorwatch.runtime.config import BusConfig
+
+from .live_run import PLANT, WITHIN_S, LiveRun
+
+DURATION_MIN, SPEED = 40.0, 240.0
+LARGE, GARBAGE = 30, 20_000
+SECOND_NS = 1_000_000_000
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Iterator[LiveRun]:
+    with LiveRun(tmp_path, DURATION_MIN, SPEED) as going:
+        yield going
+
+
+def test_a_monitor_that_was_frozen_hears_later_what_it_missed(run: LiveRun) -> None:
+    """Stopped for longer than its patience with the plant, while it watches."""
+    run.start("recorder")
+    monitor = run.start("monitor")
+    plant = run.start("plant")
+    run.wait_until(18.0)
+    monitor.send_signal(signal.SIGSTOP)
+    run.wait_until(36.0)
+    monitor.send_signal(signal.SIGCONT)
+    run.end(plant)
+    assert run.health.stalls > 0
+    assert run.health.lost == 0
+    assert run.expected_alarms()
+    assert run.recorded_alarms() == run.expected_alarms()
+
+
+def test_a_plant_that_is_frozen_is_silent_until_it_goes_on(run: LiveRun) -> None:
+    run.start("recorder")
+    run.start("monitor")
+    plant = run.start("plant")
+    run.wait_until(20.0)
+    plant.send_signal(signal.SIGSTOP)
+    run.wait(lambda: [alarm.event for alarm in run.alarms] == ["raised"])
+    plant.send_signal(signal.SIGCONT)
+    run.end(plant)
+    silence = [alarm.event for alarm in run.recorded_alarms() if alarm.alarm == "silence/plant"]
+    assert silence == ["raised", "cleared"]
+    found = {(alarm.alarm, alarm.raised_ns) for alarm in run.recorded_alarms() if alarm.alarm != "silence/plant"}
+    assert found == {(alarm.alarm, alarm.raised_ns) for alarm in run.expected_alarms()}
+    assert run.health.lost == 0
+
+
+def test_a_router_that_is_killed_and_started_again_costs_no_alarm(run: LiveRun) -> None:
+    run.start("recorder")
+    run.start("monitor")
+    plant = run.start("plant")
+    for minute in (8.0, 20.0):
+        run.wait_until(minute)
+        run.router.kill()
+        run.router.restart()
+    run.end(plant)
+    assert run.health.lost == 0
+    assert run.expected_alarms()
+    assert run.recorded_alarms() == run.expected_alarms()
+
+
+def flood(config: BusConfig) -> None:
+    """One publisher sends payloads of ten megabytes, and garbage as fast as it can, on the keys of the samples."""
+    bus = connected(BusConfig(endpoint=config.endpoint, cache_messages=LARGE))
+    mutator, encoding = Mutator(5), encoding_of(Sample)
+    heard = [
+        encode(
+            Publication(keys.key(PLANT, keys.SAMPLE, signal), Sample(time_ns=10**18, value=1.0, quality=QUALITY_GOOD))
+        )
+        for signal in ("qc", "C", "T")
+    ]
+    for number in range(GARBAGE):
+        key = mutator.draw.choice(
+            [message.key for message in heard] + [keys.key(PLANT, keys.SAMPLE, f"x{number % 200}")]
+        )
+        bus.publish(mutator.message(heard)._replace(key=key))
+        if number % (GARBAGE // LARGE) == 0:
+            bus.publish(
+                Encoded(keys.key(PLANT, keys.SAMPLE, "T"), random.Random(number).randbytes(10_000_000), encoding)
+            )
+    bus.close()
+
+
+def memory_mb(process: "subprocess.Popen[bytes]") -> float:
+    """The most that it ever took."""
+    (line,) = [
+        line for line in Path(f"/proc/{process.pid}/status").read_text().splitlines() if line.startswith("VmHWM")
+    ]
+    return int(line.split()[1]) / 1024
+
+
+def test_a_flood_of_garbage_and_of_large_payloads_is_refused_and_takes_no_memory(run: LiveRun) -> None:
+    run.start("recorder")
+    monitor = run.start("monitor")
+    plant = run.start("plant")
+    run.wait_until(17.0)
+    before_mb = memory_mb(monitor)
+    flood(run.config)
+    run.wait(lambda: run.health.refused_by_reason["too_large"] >= LARGE)
+    assert memory_mb(monitor) < before_mb + 300.0
+    run.end(plant)
+    assert run.health.refused_by_reason["payload"] > 0
+    assert run.expected_alarms()
+    assert run.recorded_alarms() == run.expected_alarms()
+
+
+def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun, tmp_path: Path) -> None:
+    """It has a clock of its own, and lives for the middle half of the run."""
+    run.start("recorder")
+    run.start("monitor")
+    plant = run.start("plant")
+    other = msgspec.structs.replace(run.plant, seed=99, zero_ns=0, duration_min=0.5 * DURATION_MIN, wait_for=())
+    settings = tmp_path / "other.toml"
+    write_settings(settings, {"bus": run.config, "plant": other})
+    run.wait_until(10.0)
+    second = subprocess.Popen([sys.executable, "-m", "plant_node", str(settings)], stderr=subprocess.DEVNULL)
+    assert second.wait(WITHIN_S) == 0
+    run.end(plant)
+    assert run.health.refused_by_reason["out_of_place"] > 300
+    assert run.expected_alarms()
+    assert run.recorded_alarms() == run.expected_alarms()

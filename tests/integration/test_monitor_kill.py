@@ -1,0 +1,32 @@
+"""A monitor that is killed goes on where it was: the alarms are those of one that was never stopped."""
+
+from pathlib import Path
+
+from monitor_node.verification import verify
+from reactorwatch.cli.sources import messages
+
+from .live_run import PLANT, LiveRun
+
+KILLS_MIN = (8.0, 20.0, 33.0)
+"""In training, watching, and while the alarms of the leak stand."""
+
+
+def test_three_kills_change_no_alarm(tmp_path: Path) -> None:
+    """What was published while it was down, and since it was stored, the plant tells it once more.
+
+    The recording replays, value for value, as that of a monitor that was never stopped.
+    """
+    state = {"state_file": str(tmp_path / "monitor.state"), "state_every_s": 0.5}
+    with LiveRun(tmp_path, duration_min=50.0, speed=150.0, **state) as run:
+        run.start("recorder")
+        monitor = run.start("monitor")
+        plant = run.start("plant")
+        for minute in KILLS_MIN:
+            run.wait_until(minute)
+            run.kill("monitor", monitor)
+            monitor = run.start("monitor")
+            assert "the monitor goes on from it" in (tmp_path / "monitor.log").read_text(encoding="utf-8")
+        run.end(plant)
+        assert run.expected_alarms()
+        assert run.recorded_alarms() == run.expected_alarms()
+        assert verify(lambda: messages(run.recording, PLANT), run.monitor).exact

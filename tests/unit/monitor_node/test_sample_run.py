@@ -1,0 +1,122 @@
+"""Which samples are of the plant that is watched: a stranger's are refused, and no run of the plant's own loses one."""
+
+import random
+
+import pytest
+
+from monitor_node.sample_run import Held, SampleRun
+
+PERIOD = 6_000_000_000
+WINDOW = 32
+
+
+def regular(first: int, count: int, begin_ns: int = 0) -> list[Held]:
+    """A plant that counts from `first` on, one sample a period."""
+    return [Held(begin_ns + row * PERIOD, first + row, float(row), "K") for row in range(count)]
+
+
+def taken(samples: list[Held], run: SampleRun | None = None) -> tuple[list[Held], list[Held]]:
+    """Those that are believed, in order, and those that are refused."""
+    run = run or SampleRun()
+    believed, refused = list[Held](), list[Held]()
+    for sample in samples:
+        if run.goes_on(sample.time_ns, sample.number):
+            believed.append(sample)
+        else:
+            of_run, strange = run.take(sample, WINDOW)
+            believed += of_run
+            refused += strange
+    return believed + run.released(), refused
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        regular(100, 50, 1000 * PERIOD),  # the plant paused
+        regular(0, 50, 1000 * PERIOD),  # and began to count anew
+        regular(0, 50, 100 * PERIOD),  # at once
+        regular(0, 50),  # with the clock of before
+        regular(100, 50, -5000 * PERIOD),  # its clock was set back
+        regular(5000, 50, 5000 * PERIOD),  # we were away
+        [Held(item.time_ns // 10 + 100 * PERIOD, *item[1:]) for item in regular(100, 50)],  # ten times as fast
+        [Held(item.time_ns * 10 + 100 * PERIOD, *item[1:]) for item in regular(100, 50)],  # and as slow
+    ],
+    ids=["paused", "began anew later", "began anew", "same clock", "set back", "lost", "faster", "slower"],
+)
+def test_whatever_the_plant_does_none_of_its_samples_is_lost(more: list[Held]) -> None:
+    samples = regular(0, 100) + more
+    assert taken(samples) == (samples, [])
+
+
+def test_a_plant_of_irregular_times_loses_none() -> None:
+    """Times between samples are exponential: a few are a hundredth of the usual, a few ten times as much."""
+    draw = random.Random(3)
+    time_ns, samples = 0, list[Held]()
+    for number in range(5000):
+        time_ns += 1 + int(draw.expovariate(1.0) * PERIOD)
+        samples.append(Held(time_ns, number, 0.0, "K"))
+    assert taken(samples) == (samples, [])
+
+
+def test_a_plant_that_pauses_again_and_again_loses_none() -> None:
+    """It says one, two or three samples at a time, after a hundred regular ones, and counts on."""
+    draw, time_ns = random.Random(6), 100 * PERIOD
+    samples = regular(0, 100)
+    for _ in range(50):
+        time_ns += draw.randrange(10, 1000) * PERIOD
+        for _ in range(draw.choice((1, 2, 3))):
+            samples.append(Held(time_ns, len(samples), 0.0, "K"))
+            time_ns += PERIOD
+    assert taken(samples) == (samples, [])
+
+
+def test_missing_and_shuffled_samples_are_believed() -> None:
+    draw = random.Random(4)
+    samples = [item for item in regular(0, 1000) if draw.random() > 0.1]
+    for first in range(3, len(samples), 7):
+        part = samples[first : first + 7]
+        draw.shuffle(part)
+        samples[first : first + 7] = part
+    believed, refused = taken(samples)
+    assert refused == []
+    assert sorted(believed) == sorted(samples)
+
+
+@pytest.mark.parametrize("numbers", [0, 300, 2**40])
+def test_of_two_plants_with_one_name_the_first_is_believed_and_the_other_refused(numbers: int) -> None:
+    ours, theirs = regular(0, 500), regular(numbers + 7, 300, 100 * PERIOD + PERIOD // 3)
+    both = sorted(ours + theirs, key=lambda item: item.time_ns)
+    believed, refused = taken(both)
+    assert believed == ours
+    assert refused == theirs
+
+
+def test_when_the_first_of_two_plants_has_gone_the_other_is_believed() -> None:
+    ours, theirs = regular(0, 200), regular(1000, 400, 100 * PERIOD + PERIOD // 3)
+    believed, refused = taken(sorted(ours + theirs, key=lambda item: item.time_ns))
+    assert believed == ours + theirs[99:]
+    assert refused == theirs[:99]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_damaged_time_or_number_is_refused(seed: int) -> None:
+    """Any bit of either is another; where the sample is still one that may have been, it is of its place in the run."""
+    draw = random.Random(seed)
+    samples = regular(0, 100)
+    for place in range(50, 100):
+        bit = draw.randrange(38, 62)  # of the time: 2**38 ns is 46 periods
+        time_ns, number = samples[place - 1].time_ns, samples[place - 1].number
+        strange = Held(time_ns ^ (1 << bit), number, 0.0, "K")
+        if draw.random() < 0.5:
+            strange = Held(time_ns, number ^ (1 << draw.randrange(3, 62)), 0.0, "K")
+        believed, refused = taken([*samples[:place], strange, *samples[place : place + 3]])
+        assert believed == samples[: place + 3]
+        assert refused == [strange]
+
+
+def test_memory_is_bounded() -> None:
+    """Whatever comes, no more than the samples that would be a run are held."""
+    draw, run = random.Random(5), SampleRun()
+    for _ in range(10_000):
+        run.take(Held(draw.randrange(2**40), draw.randrange(1000), 0.0, "K"), WINDOW)
+        assert len(run.held) < 3

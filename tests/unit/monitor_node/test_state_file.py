@@ -1,0 +1,136 @@
+"""What a monitor remembers outlives it in a file, and a file that is no good costs no more than what was learned."""
+
+import errno
+import os
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from monitor_node.__main__ import MonitorNode
+from monitor_node.config import MonitorConfig
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.contract.messages_pb2 import Health
+from reactorwatch.errors import InputError
+
+from .samples import leaking_run, samples
+
+SECOND = 1_000_000_000
+END_MIN = 70.0
+
+
+@pytest.fixture(scope="module")
+def leak() -> list[Encoded]:
+    """A run whose coolant leaks from minute 65 on."""
+    return list(samples(*leaking_run(-0.1, 65.0, END_MIN, seed=1)))
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> MonitorConfig:
+    return MonitorConfig(training_min=60.0, state_file=str(tmp_path / "monitor.state"), state_every_s=2.0)
+
+
+def health(node: MonitorNode, now_ns: int) -> Health:
+    (message,) = [item.message for item in node.on_tick(now_ns) if isinstance(item.message, Health)]
+    return message
+
+
+def stored_rows(config: MonitorConfig) -> int:
+    """Rows of the run that the file knows."""
+    copy = Path(str(config.state_file)).with_name("copy.state")
+    copy.write_bytes(Path(str(config.state_file)).read_bytes())
+    return MonitorNode(msgspec.structs.replace(config, state_file=str(copy)), 0).rows
+
+
+def test_it_is_stored_when_its_time_has_come_and_something_was_heard(
+    config: MonitorConfig, leak: list[Encoded]
+) -> None:
+    node = MonitorNode(config, 0)
+    path = Path(str(config.state_file))
+    for number, message in enumerate(leak[:60]):
+        node.on_message(message, number * SECOND // 10)
+        assert node.next_tick_ns() <= 2 * SECOND + (number * SECOND // 10)
+    assert 13 <= stored_rows(config) <= 20
+    node.on_tick(60 * SECOND)
+    assert stored_rows(config) == 20
+    before = path.stat().st_mtime_ns
+    node.on_tick(70 * SECOND)
+    assert path.stat().st_mtime_ns == before
+
+
+def test_a_change_of_an_alarm_is_stored_before_it_is_told(config: MonitorConfig, leak: list[Encoded]) -> None:
+    node = MonitorNode(config, 0)
+    for message in leak:
+        said = node.on_message(message, 0)
+        if any("/alarm/" in item.key for item in said):
+            break
+    assert stored_rows(config) == node.rows
+
+
+def test_at_its_end_it_is_stored(config: MonitorConfig, leak: list[Encoded]) -> None:
+    node = MonitorNode(config, 0)
+    for message in leak[:30]:
+        node.on_message(message, 0)
+    node.on_stop(0)
+    assert MonitorNode(config, 0).rows == 10
+
+
+@pytest.mark.parametrize("data", [b"", b"foreign", b"reactorwatch monitor\x00\x01 and then no state"])
+def test_a_damaged_file_is_kept_aside_and_told_in_one_line(
+    data: bytes, config: MonitorConfig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = Path(str(config.state_file))
+    path.write_bytes(data)
+    node = MonitorNode(config, 0)
+    assert (node.phase, node.resumed) == ("waiting", False)
+    assert path.with_name("monitor.state.damaged").read_bytes() == data
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "monitor.state" in line]
+    assert "it is kept as monitor.state.damaged, and the monitor learns anew" in line
+    assert MonitorNode(config, 0).phase == "waiting"
+
+
+def test_what_was_learned_with_other_settings_is_kept_aside_and_the_setting_named(
+    config: MonitorConfig, leak: list[Encoded], capsys: pytest.CaptureFixture[str]
+) -> None:
+    node = MonitorNode(config, 0)
+    for message in leak[:30]:
+        node.on_message(message, 0)
+    node.on_stop(0)
+    other = MonitorNode(msgspec.structs.replace(config, order=2), 0)
+    assert other.rows == 0
+    assert "was learned with other settings: order was 3 and is 2; it is kept as" in capsys.readouterr().out
+    path = Path(str(config.state_file))
+    path.with_name("monitor.state.other-settings").replace(path)
+    assert MonitorNode(config, 0).rows == 10
+
+
+def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        MonitorNode(MonitorConfig(state_file=str(tmp_path / "none" / "monitor.state")), 0)
+
+
+def test_a_full_disk_is_told_once_counted_and_stops_no_watch(
+    config: MonitorConfig, leak: list[Encoded], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither at the start nor later; what was stored before is still there, and it is tried again."""
+    full = True
+
+    def fsync(_: int) -> None:
+        if full:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    node = MonitorNode(config, 0)
+    for number, message in enumerate(leak[:300]):
+        node.on_message(message, number * SECOND)
+    count = health(node, 300 * SECOND).not_stored
+    assert count > 50
+    assert node.rows == 100
+    said = [line for line in capsys.readouterr().out.splitlines() if "No space left" in line]
+    assert len(said) == 2  # at the start, and then
+    assert list(Path(str(config.state_file)).parent.iterdir()) == []
+    full = False
+    node.on_message(leak[300], 310 * SECOND)
+    node.on_tick(320 * SECOND)
+    assert stored_rows(config) == 100
+    assert health(node, 330 * SECOND).not_stored == count + 1
