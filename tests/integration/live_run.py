@@ -13,7 +13,7 @@ from benchmarks.link_cuts import Router, connected
 from monitor_node import backtest
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
-from reactorwatch.cli.processes import Processes, write_settings
+from reactorwatch.cli.processes import MODULES, Processes, write_settings
 from reactorwatch.cli.sources import messages
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
@@ -57,7 +57,7 @@ class LiveRun:
         write_settings(settings, tables)
         self.router = Router(self.config.endpoint)
         self.bus = connected(self.config)
-        self.nodes = Processes(settings, folder)
+        self.nodes = Processes(dict.fromkeys(MODULES, settings), folder)
         self.alarms: list[Alarm] = []
         """As heard."""
         self.health = Health()
