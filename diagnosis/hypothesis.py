@@ -184,7 +184,7 @@ class Hypothesis:
                 columns.append(self._slope_by_differences(run, fit, place, moved))
                 continue
             over_row, at_row = course.derivatives(numbers, moved)
-            column = self._column(place)
+            column = self.column(place)
             g = signatures.shown(ways, column, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
             columns.append(g.reshape(-1, course.freedom))
         return np.concatenate(columns, axis=1)
@@ -213,10 +213,10 @@ class Hypothesis:
         """
         ways = self.sized.ways(run, self._signals(fit.theta), fit.found)
         over_row, at_row = (np.ascontiguousarray(item) for item in course.basis(np.empty(0)))
-        g = signatures.shown(ways, self._column(place), over_row[1:-1], at_row[2:])
+        g = signatures.shown(ways, self.column(place), over_row[1:-1], at_row[2:])
         return g.reshape(-1, course.coefficients)
 
-    def _column(self, place: int) -> int:
+    def column(self, place: int) -> int:
         """Of an effect among the ways, which know nothing of the late output."""
         late = self.sized.late
         return place - (late is not None and late < place)

@@ -19,6 +19,7 @@ from diagnosis.bounded_fit import within
 from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Signal, Sine, Step
 from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
+from diagnosis.size_inputs import with_size_inputs
 from diagnosis.sized import Sized, clipped, ways_between
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter_errors import FilterErrors, Ways
@@ -74,7 +75,7 @@ class Screen:
     """
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run) -> None:
-        self._run, self.effects = run, tuple(effects)
+        self._model, self._run, self.effects = model, run, tuple(effects)
         names = model.state_names
         self.direct = tuple(effect for effect in effects if effect.extend(model).state_names == names)
         self.with_memory = tuple(effect for effect in effects if effect not in self.direct)
@@ -134,11 +135,12 @@ class Screen:
         signals = hypothesis.signals(fit)
         ways = hypothesis.sized.ways(self._run, signals, fit.found)
         over_row, at_row = signals[place]
-        column = place - (hypothesis.sized.late is not None and hypothesis.sized.late < place)
-        return signatures.shown(ways, column, over_row[1:-1, None], at_row[2:, None])[:, :, 0]
+        return signatures.shown(ways, hypothesis.column(place), over_row[1:-1, None], at_row[2:, None])[:, :, 0]
 
     def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit, effects: Sequence[Effect]) -> Ways:
         """Of some effects about the run of a filter."""
+        if sized.is_plain and all(effect in self.direct for effect in sized.effects):
+            return self._ways_among_all(sized, signals, fit, effects)
         extended = sized.model
         of_rates, of_outputs = [], []
         for effect in effects:
@@ -151,6 +153,19 @@ class Screen:
         errors = FilterErrors(extended, sized.levels, of_rates, of_outputs)
         errors.changes = sized.noise.times
         return ways_between(errors, self._run, sized.inputs(self._run, signals), fit.found, sized.used(self._run))
+
+    def _ways_among_all(self, sized: Sized, signals: Sequence[Signal], fit: Fit, effects: Sequence[Effect]) -> Ways:
+        """Likewise, from one model with all direct effects in it: it is compiled once, whatever is in the filter."""
+        of_all = with_size_inputs(self._model, self.direct)
+        nothing = np.zeros(self._run.time_min.size)
+        by_effect = dict(zip(sized.effects, signals, strict=True))
+        inputs = of_all.inputs(
+            self._run.known_inputs, [by_effect.get(effect, Signal(nothing, nothing)) for effect in self.direct]
+        )
+        errors = of_all.errors.with_noise(sized.levels)
+        ways = ways_between(errors, self._run, inputs, fit.found, sized.used(self._run))
+        columns = [self.direct.index(effect) for effect in effects]
+        return Ways(ways.F, ways.G[:, :, columns], ways.H, ways.D[:, :, columns], ways.K, ways.L_inverse, ways.w)
 
     def _set_in(self, ways: Ways, effects: Sequence[Effect]) -> list[Lead]:
         """Constants, steps, ramps and decays."""

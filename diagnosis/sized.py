@@ -69,6 +69,11 @@ class Sized:
         """How many states the plant has that are no memory; they are the first."""
         return sum(state.name not in self._plant.at_rest for state in self._plant.states)
 
+    @property
+    def is_plain(self) -> bool:
+        """Whether the filter has neither a late output nor sensors whose noise remembers."""
+        return self.late is None and not self._noise.wandering
+
     @cached_property
     def whole(self) -> SizedModel:
         """With all effects in it, for free runs."""
