@@ -13,7 +13,7 @@ from typing import Any
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_commands import obey
-from monitor_node.alignment import REMEMBERED, Aligner, Row
+from monitor_node.alignment import Aligner, Row
 from monitor_node.config import MonitorConfig
 from monitor_node.monitor_state import MonitorState, opened, sealed, settings_of
 from monitor_node.refusals import Refusals
@@ -82,7 +82,6 @@ class Monitor:
         self._places = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)
         self._runs = [SampleRun() for _ in self._signals]
-        self._window = REMEMBERED * config.reorder_rows
         self._told_again: ToldAgain | None = None
         self.alarms = AlarmBoard(config)
         self._watch = PlantWatch(config, self.alarms, points=points, model=model)
@@ -153,7 +152,7 @@ class Monitor:
             )
             return []
         else:
-            believed, refused = run.take(Held(time_ns, number, value, sample.unit), self._window)
+            believed, refused = run.take(Held(time_ns, number, value, sample.unit), self.config.reorder_rows)
             heard = bool(believed)
             for item in refused:
                 self._refuse(signal, item, run)

@@ -8,21 +8,25 @@ anew, its clock was set, or it paused. One sample does not tell which, but the n
 
 - It is held back. As soon as one comes that follows the run as it was, the held ones are refused, but for those between
   the two in number and time: nothing was wrong with them but how soon they came.
-- Two with the very numbers that come next, at later times, are of the run: the plant has paused.
-- Three that go on from each other, as evenly as the run did, without any of it between them, are the run from now on,
-  and none of them is lost.
+- Two with the very numbers that come next, at later times, are of the run: the plant has paused. So are three with
+  these numbers at other times, as evenly spaced as the run was: its clock was set.
+- Eight that go on from each other, as evenly as the run did, without any of it between them, are the run from now on:
+  the plant was started anew. (Fewer where rows wait for fewer others: those of one signal must find the others'.)
 
-So a pause costs a delay of one sample, and a plant that begins anew one of two, and nothing else; and of two plants
-with one name the first is watched on as long as it lives. What is decided depends on the samples alone, so a replay
-decides the same.
+None of these is lost: a pause costs a delay of one sample, a clock that was set one of two, a plant that begins anew
+one of seven; and of two plants with one name the first is watched on as long as it lives. What is decided depends on
+the samples alone, so a replay decides the same.
 """
 
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
-CONFIRMED = 3
-"""Samples that follow each other are a run."""
+from monitor_node.alignment import REMEMBERED
+
+CONFIRMED, COUNTED = 8, 3
+"""So many samples that go on from each other are the run: of any numbers, and of those that come next by their count.
+What one publisher says may be held up, and another's come in a bunch meanwhile, so a few of any numbers say little."""
 
 TOLERANCE, DEVIATIONS = 0.25, 4.0
 """Of the usual spacing, and mean deviations from it."""
@@ -75,14 +79,14 @@ class SampleRun:
         self.number, self.time_ns = number, time_ns
         return True
 
-    def take(self, sample: Held, window: int) -> tuple[list[Held], list[Held]]:
+    def take(self, sample: Held, reorder_rows: int) -> tuple[list[Held], list[Held]]:
         """Take a sample in; returns those that are of the run, and those that are refused.
 
         Args:
             sample: that came.
-            window: how far a number may fall back.
+            reorder_rows: of the alignment: how many newer rows one waits for.
         """
-        held = self.held
+        held, window = self.held, REMEMBERED * reorder_rows
         follows = self._follows(sample, window)
         if not held:
             if follows:
@@ -104,7 +108,8 @@ class SampleRun:
         if not self._is_run(held, window):
             self.held = [sample]
             return [], held[:-1]
-        if len(held) < CONFIRMED:
+        confirmed = COUNTED if self._are_next(held) else max(COUNTED, min(CONFIRMED, reorder_rows))
+        if len(held) < confirmed:
             self.held = held
             return [], []
         self.number, self.spacing_ns, self.deviation_ns, self.spacings = None, 0.0, 0.0, 0
@@ -119,10 +124,14 @@ class SampleRun:
 
     def _counts_on(self, held: list[Held]) -> bool:
         """Whether samples have the very numbers that come next, and times that increase: the plant has paused."""
-        number = self.number if self.number is not None else held[0].number - 1
-        counted = all(item.number == number + place for place, item in enumerate(held, start=1))
         times_ns = [self.time_ns, *(item.time_ns for item in held)]
-        return counted and all(before < after for before, after in pairwise(times_ns))
+        return self._are_next(held) and all(before < after for before, after in pairwise(times_ns))
+
+    def _are_next(self, held: list[Held]) -> bool:
+        """Whether samples have the very numbers that come next."""
+        return self.number is not None and all(
+            item.number == self.number + place for place, item in enumerate(held, start=1)
+        )
 
     def _is_run(self, held: list[Held], window: int) -> bool:
         """Whether samples go on from each other, by spacings that are as like as those of the run."""

@@ -4,10 +4,10 @@ import random
 
 import pytest
 
-from monitor_node.sample_run import Held, SampleRun
+from monitor_node.sample_run import CONFIRMED, Held, SampleRun
 
 PERIOD = 6_000_000_000
-WINDOW = 32
+REORDER_ROWS = 8
 
 
 def regular(first: int, count: int, begin_ns: int = 0) -> list[Held]:
@@ -23,7 +23,7 @@ def taken(samples: list[Held], run: SampleRun | None = None) -> tuple[list[Held]
         if run.goes_on(sample.time_ns, sample.number):
             believed.append(sample)
         else:
-            of_run, strange = run.take(sample, WINDOW)
+            of_run, strange = run.take(sample, REORDER_ROWS)
             believed += of_run
             refused += strange
     return believed + run.released(), refused
@@ -91,6 +91,15 @@ def test_of_two_plants_with_one_name_the_first_is_believed_and_the_other_refused
     assert refused == theirs
 
 
+def test_a_bunch_of_the_other_s_samples_does_not_make_it_the_plant() -> None:
+    """Those of the first are held up for seven periods again and again."""
+    ours, theirs = regular(0, 500), regular(3, 300, 100 * PERIOD + PERIOD // 3)
+    both = sorted(ours + theirs, key=lambda item: (item.time_ns // (7 * PERIOD), item in ours, item.time_ns))
+    believed, refused = taken(both)
+    assert believed == ours
+    assert refused == theirs
+
+
 def test_when_the_first_of_two_plants_has_gone_the_other_is_believed() -> None:
     ours, theirs = regular(0, 200), regular(1000, 400, 100 * PERIOD + PERIOD // 3)
     believed, refused = taken(sorted(ours + theirs, key=lambda item: item.time_ns))
@@ -118,5 +127,5 @@ def test_memory_is_bounded() -> None:
     """Whatever comes, no more than the samples that would be a run are held."""
     draw, run = random.Random(5), SampleRun()
     for _ in range(10_000):
-        run.take(Held(draw.randrange(2**40), draw.randrange(1000), 0.0, "K"), WINDOW)
-        assert len(run.held) < 3
+        run.take(Held(draw.randrange(2**40), draw.randrange(1000), 0.0, "K"), REORDER_ROWS)
+        assert len(run.held) < CONFIRMED
