@@ -1,8 +1,9 @@
 FROM python:3.13-slim
 
-# A home of its own: compiled kernels are kept there. /recordings is made here so that a new volume belongs to the user.
+# A home of its own: compiled kernels are kept there. /recordings and /state are made here so that new
+# volumes belong to the user.
 RUN useradd --create-home --uid 1000 reactorwatch \
-    && install --directory --owner=reactorwatch /recordings
+    && install --directory --owner=reactorwatch /recordings /state
 
 WORKDIR /app
 COPY pyproject.toml README.md LICENSE ./

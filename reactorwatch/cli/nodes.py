@@ -104,6 +104,14 @@ def monitor(
     ] = None,
     model: Model = None,
     diagnose: Diagnose = None,
+    state: Annotated[
+        Path | None,
+        typer.Option(
+            "--state",
+            help="Folder where all that it has learned is kept, so that it goes on after a restart.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Watch a plant: predict its signals, raise alarms."""
     from contextlib import nullcontext
@@ -115,6 +123,8 @@ def monitor(
 
     tables, bus = _settings(config, endpoint)
     flags = {"plant": name, "training_min": training, "model": str(existing(model)) if model is not None else None}
+    if state is not None:
+        flags |= {"state_file": str(state / "monitor.state"), "alarm_state_file": str(state / "alarms.state")}
     config_of_monitor = section(MonitorConfig, "monitor", tables, flags)
     diagnosis = diagnosis_settings(tables, config_of_monitor, diagnose)
     with diagnosing(diagnosis, bus, section(LogConfig, "log", tables, {})) if diagnosis.out else nullcontext():

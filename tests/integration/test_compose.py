@@ -29,7 +29,7 @@ def services() -> dict[str, Any]:
 
 def natively(words: list[str], endpoint: str, recordings: Path) -> list[str]:
     """A service's command as it would run outside a container."""
-    replaced = {"tcp/router:7447": endpoint, "/recordings": str(recordings)}
+    replaced = {"tcp/router:7447": endpoint, "/recordings": str(recordings), "/state": str(recordings)}
     return [REACTORWATCH, *(replaced.get(word, word) for word in words)]
 
 
@@ -58,6 +58,7 @@ def test_every_service_s_command_and_health_check_work(services: dict[str, Any],
             process.terminate()
             assert process.wait(30) == 0
         assert len(list(tmp_path.glob("cstr-*.mcap"))) == 1
+        assert (tmp_path / "monitor.state").is_file()
     finally:
         for process in running:
             if process.poll() is None:
@@ -73,12 +74,14 @@ def test_every_service_is_watched_and_comes_back(services: dict[str, Any]) -> No
         assert service["healthcheck"]["test"], name
 
 
-def test_the_recordings_outlive_the_container(services: dict[str, Any]) -> None:
+@pytest.mark.parametrize("node", ["recorder", "monitor"])
+def test_the_recordings_and_what_was_learned_outlive_the_containers(services: dict[str, Any], node: str) -> None:
     declared = yaml.safe_load(COMPOSE.read_text(encoding="utf-8"))
-    (mount,) = services["recorder"]["volumes"]
+    (mount,) = services[node]["volumes"]
     volume, target = mount.split(":")
     assert volume in declared["volumes"]
-    assert target in services["recorder"]["command"]
+    assert target in services[node]["command"]
+    assert f" {target}" in (COMPOSE.parent / "Dockerfile").read_text(encoding="utf-8"), "it would belong to root"
 
 
 def test_the_router_is_open_on_loopback_only(services: dict[str, Any]) -> None:

@@ -37,7 +37,11 @@ def identity(service: dict[str, Any]) -> str:
 
 def natively(words: list[str], folder: Path, recordings: Path) -> list[str]:
     """A service's command as it would run outside a container."""
-    replaced = {"/identity/settings.toml": str(folder / "settings.toml"), "/recordings": str(recordings)}
+    replaced = {
+        "/identity/settings.toml": str(folder / "settings.toml"),
+        "/recordings": str(recordings),
+        "/state": str(recordings),
+    }
     return [REACTORWATCH, *(replaced.get(word, word) for word in words)]
 
 
