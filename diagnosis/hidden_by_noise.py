@@ -13,6 +13,7 @@ from diagnosis.adequacy import DOUBTFUL, minus_log10_p
 from diagnosis.courses import Constant, Step
 from diagnosis.hypothesis import Hypothesis
 from diagnosis.search import SETTLED_NOISE, Explained, Found, Search
+from reactorwatch.process.effects.base import Effect
 
 OTHERS, ROUNDS = 2, 2
 
@@ -30,21 +31,24 @@ def explained_by_one(search: Search) -> Found:
 def _uncovered(search: Search, known: Found) -> Explained | None:
     """A better explanation, whose noise then is that of the search; None if there is none, or nothing calls for one.
 
-    Those that act in jumps are asked too, though they promise little: with a noise that carries the filter along, a
-    valve that sticks does not show.
+    Those that act in jumps are asked too, though they promise little or nothing: with a noise that carries the filter
+    along a valve that sticks does not show, and at the wrong size it explains nothing.
     """
     best = known.best
-    if not best.key or not np.any(minus_log10_p(best.fit.w, search.run.inputs) > DOUBTFUL):
+    if not np.any(minus_log10_p(best.fit.w, search.run.inputs) > DOUBTFUL):
         return None
     others = {item.hypothesis.causes: item for item in reversed(known.explained)}
     if not _jumps(best):
         others.pop(best.hypothesis.causes, None)
     by_bic = sorted(others.values(), key=lambda item: item.bic)
     asked = by_bic[:OTHERS] + [item for item in by_bic[OTHERS:] if _jumps(item)]
-    for lead in known.remembering:
-        if lead.effect.jumps and (lead.effect.name,) not in (best.hypothesis.causes, *others):
-            others[(lead.effect.name,)] = search.fitted(lead)
-            asked.append(others[(lead.effect.name,)])
+    leads = {lead.effect: lead for lead in known.remembering}
+    for effect in search.screen.with_memory:
+        if effect.jumps and (effect.name,) not in (best.hypothesis.causes, *others):
+            if effect in leads:
+                asked.append(search.fitted(leads[effect]))
+            elif not best.key:  # nothing explains anything
+                asked.append(_as_usual(search, effect))
     held, found = search.noise, best
     for item in asked:
         search.settle(item)
@@ -56,7 +60,12 @@ def _uncovered(search: Search, known: Found) -> Explained | None:
 
 
 def _jumps(item: Explained) -> bool:
-    return item.hypothesis.sized.effects[0].jumps
+    return any(effect.jumps for effect in item.hypothesis.sized.effects)
+
+
+def _as_usual(search: Search, effect: Effect) -> Explained:
+    constant = Hypothesis(search.sized((effect,)), (Constant(search.run.time_min),))
+    return search.explained(constant, (np.array([effect.typical]),))
 
 
 def _set_in(search: Search, item: Explained) -> Explained:
