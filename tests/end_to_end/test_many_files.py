@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -23,6 +24,11 @@ from tests.cluster import dask_cluster
 from .conftest import PATIENCE_S, REACTORWATCH, Command
 
 FILES = 5
+
+HEARS_CTRL_C = (
+    "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
+)
+"""Where tests run behind a shell's `&` or `nohup`, what they start ignores it."""
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +134,12 @@ def test_ctrl_c_ends_all_processes_and_says_nothing(folder: Path, tmp_path: Path
         shutil.copy(folder / "run-0.csv", tmp_path / f"run-{number:03}.csv")
     arguments = [REACTORWATCH, "diagnose", "run-*.csv", "--json", "--jobs", "2"]
     with subprocess.Popen(
-        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, start_new_session=True
+        [sys.executable, "-c", HEARS_CTRL_C, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        start_new_session=True,
     ) as running:
         assert running.stdout is not None
         running.stdout.readline()
