@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnosis.run import Run
+from diagnosis.run import Run, doubt_of
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import Innovations
 from reactorwatch.process.model import Array
@@ -58,17 +58,8 @@ def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_m
     for place in range(measured.shape[1]):
         measured[late if place == output else prompt, place] = run.measured[:, place]
     spread[late[:, None], np.flatnonzero(~held)] = inputs[:, ~held]
-    return Moved(Run(times, spread, measured), prompt, late, before, _doubt(run, times, spread))
-
-
-def _doubt(run: Run, times: Array, inputs: Array) -> Doubt | None:
-    """Of every way within one that is in doubt."""
-    if run.early is None:
-        return None
-    to = np.searchsorted(run.time_min, times, side="left")
-    others = np.vstack([inputs[:1], inputs[:-1]])
-    others[:, : run.inputs.shape[1]] = run.inputs[to]
-    return Doubt(others, run.early[to])
+    doubt = doubt_of(run, spread, np.searchsorted(run.time_min, times, side="left"))
+    return Moved(Run(times, spread, measured), prompt, late, before, doubt)
 
 
 def gathered(found: Innovations, by: Moved, output: int) -> Innovations:

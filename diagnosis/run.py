@@ -51,15 +51,17 @@ class Run:
         return float(self.time_min[-1] - self.time_min[0])
 
 
-def doubt_of(run: Run, inputs: Array) -> Doubt | None:
+def doubt_of(run: Run, inputs: Array, leads_to: NDArray[np.intp] | None = None) -> Doubt | None:
     """The ways of a run on which nobody knows when inputs changed.
 
     Args:
         run: the record.
         inputs: of a filter of it: those of the run, and then others, whose courses are known; shape (rows, n).
+        leads_to: if the filter has more rows, the row of the run that each is, or leads to, shape (rows,); else None.
     """
     if run.early is None:
         return None
+    to = slice(None) if leads_to is None else leads_to
     others = np.vstack([inputs[:1], inputs[:-1]])
-    others[:, : run.inputs.shape[1]] = run.inputs
-    return Doubt(others, run.early)
+    others[:, : run.inputs.shape[1]] = run.inputs[to]
+    return Doubt(others, run.early[to])

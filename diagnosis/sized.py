@@ -113,13 +113,11 @@ class Sized:
         """Loss, whitened innovations and the filter's run."""
         known, least = np.isfinite(run.measured), np.array(self.noise.measurement_sd)
         unseen = np.zeros_like(known)
-        if self.late is None:
-            inputs = self.inputs(run, signals)
-            found = self._filtered_run(filled(run.time_min, inputs, run.measured, doubt_of(run, inputs)))
-        else:
-            by, output = self._moved(run, signals, self.late), self._output(self.late)
-            rows = filled(by.run.time_min, by.run.inputs, by.run.measured, by.doubt)
-            found = gathered(self._filtered_run(rows), by, output)
+        rows, by = self._laid_out(run, signals)
+        found = rows.of_record(self._filter.run(rows.time_min, rows.inputs, rows.measured, doubt=rows.doubt))
+        if by is not None and self.late is not None:
+            output = self._output(self.late)
+            found = gathered(found, by, output)
             unseen[:, output] = by.before & known[:, output]
             known[by.before, output] = False
         # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
@@ -131,17 +129,9 @@ class Sized:
         spread = np.log(np.where(known & good, found.conditional_sd, np.where(unseen, least, 1.0)))
         return loss_of(w) + float(np.sum(spread)), w, found
 
-    def _filtered_run(self, rows: Filled) -> Innovations:
-        return rows.of_record(self._filter.run(rows.time_min, rows.inputs, rows.measured, doubt=rows.doubt))
-
     def tuned(self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float]) -> Noise:
         """The noise under which the run is likeliest with these deviations."""
-        inputs = self.inputs(run, signals)
-        doubt = doubt_of(run, inputs)
-        if self.late is not None:
-            by = self._moved(run, signals, self.late)
-            run, inputs, doubt = by.run, by.run.inputs, by.doubt
-        rows = filled(run.time_min, inputs, run.measured, doubt)
+        rows, _ = self._laid_out(run, signals)
         times = self._noise.times
         # It begins anew with a short memory: a model that lacks something makes it seem long, and there it would stay.
         first_sd = {
@@ -165,8 +155,15 @@ class Sized:
             found[:, self._output(self.late)] = False
         return found
 
-    def _moved(self, run: Run, signals: Sequence[Signal], late: int) -> Moved:
+    def _laid_out(self, run: Run, signals: Sequence[Signal]) -> tuple[Filled, Moved | None]:
+        """The rows that the filter takes; and, if an output is late, where its values went."""
         inputs = self.inputs(run, signals)
+        if self.late is None:
+            return filled(run.time_min, inputs, run.measured, doubt_of(run, inputs)), None
+        by = self._moved(run, inputs, signals, self.late)
+        return filled(by.run.time_min, by.run.inputs, by.run.measured, by.doubt), by
+
+    def _moved(self, run: Run, inputs: Array, signals: Sequence[Signal], late: int) -> Moved:
         held: NDArray[np.bool_] = np.ones(inputs.shape[1], dtype=bool)
         held[run.inputs.shape[1] + 1 :: 2] = False  # what the outputs show
         return moved(run, inputs, held, self._output(late), signals[late].at_row)

@@ -131,30 +131,17 @@ class FilterErrors:
             doubt: ways on which nobody knows when inputs changed; None: there are none.
         """
         with np.errstate(over="ignore", invalid="ignore"):  # about a run that has lost an unstable plant
-            found = self._ways(time_min, inputs, x, P, residual, used, doubt)
-        if began is None:
-            return found
-        kept = np.zeros(found.F.shape[1:])
-        kept[self.model.lasting, self.model.lasting] = 1.0
-        F = np.where(began[1:, None, None], kept, found.F)
-        G, H, D, K = (np.where(began[1:, None, None], 0.0, item) for item in (found.G, found.H, found.D, found.K))
-        return Ways(F, G, H, D, K, found.L_inverse, found.w)
-
-    def _ways(
-        self,
-        time_min: Array,
-        inputs: Array,
-        x: Array,
-        P: Array,
-        residual: Array,
-        used: NDArray[np.bool_],
-        doubt: Doubt | None,
-    ) -> Ways:
-        R, q = np.square(self.noise.measurement_sd), np.square(self.noise.process_sd)
-        p, step = self.model.values(self.changes), np.diff(time_min)
-        there, F, G, spread = self._walked(x[:-1], inputs[:-1], time_min, p, doubt)
-        H, D = self._code.shown.over(there, inputs[1:], p, time_min[1:])
-        L_inverse, w, K = _whitened(F, H, P, q, step, spread, R, residual, used)
+            R, q = np.square(self.noise.measurement_sd), np.square(self.noise.process_sd)
+            p = self.model.values(self.changes)
+            there, F, G, spread = self._walked(x[:-1], inputs[:-1], time_min, p, doubt)
+            H, D = self._code.shown.over(there, inputs[1:], p, time_min[1:])
+            L_inverse, w, K = _whitened(F, H, P, q, np.diff(time_min), spread, R, residual, used)
+        if began is not None:
+            anew = began[1:, None, None]
+            kept = np.zeros(F.shape[1:])
+            kept[self.model.lasting, self.model.lasting] = 1.0
+            F = np.where(anew, kept, F)
+            G, H, D, K = (np.where(anew, 0.0, item) for item in (G, H, D, K))
         return Ways(F, G, H, D, K, L_inverse, w)
 
     def about(self, time_min: Array, inputs: Array, x: Array, doubt: Doubt | None = None) -> "Path":

@@ -22,8 +22,9 @@ NOBODY = f"{keys.ROOT}watch/nobody"
 
 PLANT_COMMANDS = ("set_input", "inject_fault", "clear_fault", "pause", "resume", "step", "set_rate")
 """What the plant, or a replay in its place, is told."""
-ALARM_COMMANDS = ("acknowledge", "shelve", "unshelve", "comment", keys.ACKNOWLEDGE_RECORDER)
-"""What an operator does with alarms."""
+OF_THE_PLANT = ("acknowledge", "shelve", "unshelve", "comment")
+ALARM_COMMANDS = (*OF_THE_PLANT, keys.ACKNOWLEDGE_RECORDER)
+"""What an operator does with alarms, those of the plant and the recorder's own."""
 ALARM_ENGINEERING = ("suppress", "unsuppress", "take_out_of_service", "return_to_service")
 """What needs more than an operator: alarms that nobody then sees until somebody brings them back."""
 LISTS = ("list_alarms", keys.LIST_RECORDER_ALARMS)
@@ -61,7 +62,7 @@ ROLES = (
             *(f"{kind}/**" for kind in (keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.RECONSTRUCTION)),
             f"{keys.ALARM_KPIS}/monitor",
         ),
-        ("acknowledge", "shelve", "unshelve", "comment", *ALARM_ENGINEERING, "list_alarms"),
+        (*OF_THE_PLANT, *ALARM_ENGINEERING, "list_alarms"),
     ),
     Role(
         "recorder",
