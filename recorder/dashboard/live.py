@@ -5,11 +5,15 @@ are shows in the first seconds of a run, so the layout is sent again whenever on
 """
 
 import errno
+import os
+import signal
 import socket
 import subprocess
+import sys
 import tempfile
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from ipaddress import ip_address
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +27,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_port
-from reactorwatch.runtime.serve import serve, stop_on_signals
+from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.dashboard.drawing import Drawing
 from recorder.dashboard.stream import APPLICATION
 from recorder.dashboard.viewer import viewer
@@ -31,6 +35,8 @@ from recorder.panels import PANELS
 from recorder.run_reader import STRETCH, RunReader
 
 NODE = "view"
+SCREENS = ("WAYLAND_DISPLAY", "WAYLAND_SOCKET", "DISPLAY")  # whichever of them winit asks
+ENDED_WELL = (None, 0, 130, -signal.SIGINT, -signal.SIGTERM)  # it runs, was closed, or was asked to end as we were
 LOOPBACK = ("127.0.0.1", "::1")
 DRAW_EVERY_NS = 500_000_000
 START_WITHIN_S = 30.0
@@ -58,6 +64,8 @@ def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], N
         InputError: the viewer does not run on this machine, its address or port cannot be had, or the endpoint makes
             no sense.
     """
+    if not shown.web:
+        _check_screen(sys.platform, os.environ)
     page, data = (free_port(), free_port()) if shown.port is None else (shown.port, shown.port + 1)
     for port in (page, data):
         _check_free(shown.bind, port)
@@ -70,8 +78,11 @@ def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], N
                 _wait_for(process, page, shown, log)  # it is served some time after the data are
                 host = _in_url(_reached(shown.bind))
                 say(f"open http://{host}:{page}/?url=rerun%2Bhttp://{host}:{data}/proxy")
+            threading.Thread(target=_stop_with, args=(process, stop), name="viewer", daemon=True).start()
             bus = bus_zenoh.connect(bus_config, NODE, stop)
             if bus is None:
+                if process.poll() not in ENDED_WELL:
+                    raise _ended(process.returncode, shown, log)
                 return
             try:
                 recording = stream_to(data, shown.bind, f"{plant}-{time.time_ns()}")
@@ -156,6 +167,16 @@ def stream_to(port: int, address: str, name: str) -> rr.RecordingStream:
     return recording
 
 
+def _check_screen(platform: str, environment: Mapping[str, str]) -> None:
+    """The viewer listens before it looks for a screen, so it seems to run for a moment where there is none.
+
+    Raises:
+        InputError: no screen is named to programs here.
+    """
+    if platform == "linux" and not any(environment.get(name) for name in SCREENS):
+        raise InputError(f"no window can open: none of {', '.join(SCREENS)} is set; view it with --web in a browser")
+
+
 def _check_free(address: str, port: int) -> None:
     """What somebody else listens at would look like the viewer.
 
@@ -205,7 +226,17 @@ def _wait_for(process: subprocess.Popen[bytes], port: int, shown: Shown, log: Pa
             code = process.wait(LOOK_EVERY_S)
         except subprocess.TimeoutExpired:
             continue
-        said = log.read_text(errors="replace").strip().splitlines()
-        cure = "" if shown.web else "; it needs a screen, try --web"
-        raise InputError(f"the viewer ended with code {code}: {said[-1] if said else 'it did not say why'}{cure}")
+        raise _ended(code, shown, log)
     raise InputError(f"the viewer does not listen at {shown.bind}:{port} after {START_WITHIN_S:g} s")
+
+
+def _ended(code: int, shown: Shown, log: Path) -> InputError:
+    said = log.read_text(errors="replace").strip().splitlines()
+    cure = "" if shown.web else "; it needs a screen, try --web"
+    return InputError(f"the viewer ended with code {code}: {said[-1] if said else 'it did not say why'}{cure}")
+
+
+def _stop_with(process: subprocess.Popen[bytes], stop: StopSignal) -> None:
+    """Nobody is shown anything once the viewer has ended, also while there is no router yet."""
+    process.wait()
+    stop.set()

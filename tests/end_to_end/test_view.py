@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from reactorwatch.runtime.loopback import free_port
 from recorder.panels.base import INPUT, MEASURED, PREDICTED, Colour
 
 from .browser import Browser, browser
@@ -118,3 +119,16 @@ def test_without_a_screen_there_is_no_window_and_one_line_says_what_to_do(
     assert "--web" in done.stderr
     assert "Traceback" not in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_a_viewer_that_finds_no_screen_ends_the_command_while_it_waits_for_a_router(
+    command: Command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("DISPLAY", ":4711")
+    done = command("view", "--endpoint", f"tcp/127.0.0.1:{free_port()}")
+    assert done.returncode == 2
+    assert "the viewer ended with code" in done.stderr
+    assert "try --web" in done.stderr
+    assert "Traceback" not in done.stderr
