@@ -186,7 +186,8 @@ class ChartWatch:
             else:
                 charts = _OfAll(design.of_all(name), config.outputs)
             paths = [keys.key(config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
-            self._watched.append(_Watched(charts, [self._alarms[pair] for pair in pairs], paths))
+            alarms = [self._alarms[pair] for pair in pairs]
+            self._watched.append(_Watched(charts, alarms, paths, all(alarm.at_rest for alarm in alarms)))
 
     def update(
         self,

@@ -8,6 +8,7 @@ plant follows from the samples and from what people said of its alarms, so a rep
 anything says the same, value for value.
 """
 
+from collections.abc import Iterable
 from math import isfinite
 
 from monitor_node.alarm_board import AlarmBoard
@@ -19,7 +20,7 @@ from monitor_node.watch import PlantWatch
 from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import CommandReply, Health, Quality, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, Quality, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -160,6 +161,17 @@ class Monitor:
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish health for the last time."""
         return [self._health(now_ns, "stopped")]
+
+    def go_on_from_alarms(self, alarms: Iterable[Alarm]) -> None:
+        """Go on from what another monitor of the plant said last of its alarms, where nothing else is left of it.
+
+        The plant is learned anew; meanwhile what stands stands, and is cleared when it is found to be over.
+
+        Args:
+            alarms: the newest message of each.
+        """
+        self.alarms.go_on_from(alarms)
+        self._watch.signals.go_on_from_alarms()
 
     # --- what others may ask ---------------------------------------------------------------------------------
 

@@ -157,6 +157,11 @@ class SignalWatch:
         for stuck in self._stuck:
             stuck.restart()
 
+    def go_on_from_alarms(self) -> None:
+        """Take as silent what the alarms say is silent: the next sample ends it."""
+        for silence, alarm in zip(self._silences, self._silent, strict=True):
+            silence.standing = alarm.memory.rule.standing
+
     # --- the clock of receipt --------------------------------------------------------------------------------
 
     def received(self, now_ns: int) -> None:

@@ -23,6 +23,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ from google.protobuf.message import Message
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.access import MEMORY, NOBODY
-from reactorwatch.runtime.bus import Request
+from reactorwatch.runtime.bus import MOST_GATHERED, Request
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.delivery import Delivery, Numbered
 from reactorwatch.runtime.identity import ROUTER_FILES, TLS, client_settings
@@ -50,6 +51,7 @@ FLUSH_WITHIN_S = 10.0
 HEARTBEAT_S = 0.5
 LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that who missed it can ask for it
 STUCK_S = 1.0
+LARGEST_CHANNEL = 5 * MOST_GATHERED
 STREAM_PARTS = 3  # of a key: root, plant and kind
 
 HISTORY_WITHIN_S = 10.0
@@ -82,6 +84,10 @@ class ZenohRequest:
         self.query.reply(self.question.key, payload, encoding=encoding)
         self.query.drop()
 
+    def leave(self) -> None:
+        """See `Request`: who asked waits until nobody holds his question any more."""
+        self.query.drop()
+
 
 @dataclass
 class _Key:
@@ -103,6 +109,7 @@ class ZenohBus:
         self._publishing = threading.Lock()  # what is numbered first goes out first
         self._published_at: float | None = None
         self._declared: list[Any] = []  # Zenoh undeclares what nobody holds
+        self._tokens: dict[str, Any] = {}
         self._deliveries: list[Delivery] = []
 
     def publish(self, message: Encoded) -> None:
@@ -126,45 +133,113 @@ class ZenohBus:
         history: bool = False,
     ) -> None:
         """See `Bus`."""
-        delivery = Delivery(handler, on_gap or _say_gap) if _is_of_whole_streams(key_expression) else None
+
+        def hand_on(messages: list[Encoded]) -> None:
+            for message in messages:
+                handler(message)
+
+        delivery = self._delivery(key_expression, hand_on, on_gap)
 
         def on_sample(sample: zenoh.Sample) -> None:
-            came = _numbered(sample)
-            if delivery is None or came is None:  # or it is of no publisher of ours
-                handler(_encoded(sample))
+            came = _numbered(sample, time.time_ns())
+            if delivery is None or isinstance(came, Encoded):  # or it is of no publisher of ours
+                handler(came if isinstance(came, Encoded) else came.message)
             else:
-                delivery.receive(came)
+                delivery.receive((came,))
 
-        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-        self._declared.append(
-            zenoh.ext.declare_advanced_subscriber(self._session, key_expression, on_sample, recovery=recovery)
-        )
+        self._listen(key_expression, on_sample)
         if delivery is not None:
-            self._deliveries.append(delivery)
-            # The subscriber's own question for what was before left out keys that were being published on meanwhile.
-            for last in self._remembered(key_expression, "_max=1"):
-                delivery.tell_last(last)
-            if history:
-                began, since_s = time.monotonic(), self._config.history_s
-                for _ in range(MOST_ASKED):
-                    for came in self._remembered(key_expression, f"_time=[now(-{since_s}s)..]"):
-                        delivery.tell(came)
-                    if delivery.is_told():
-                        break
-                    since_s = time.monotonic() - began + HEARTBEAT_S
-            threading.Thread(target=delivery.begin, daemon=True).start()  # the handler may wait for who called us
+            self._begin(delivery, key_expression, history=history)
+
+    def gather(
+        self,
+        key_expression: str,
+        handler: Callable[[list[Encoded]], None],
+        *,
+        on_gap: Callable[[Gap], None] | None = None,
+        history: bool = False,
+    ) -> None:
+        """See `Bus`.
+
+        Zenoh calls a handler from a thread of its own, and each call waits for Python's lock. Here it puts what comes
+        into a channel, and one thread empties it: half the time a message.
+        """
+        delivery = self._delivery(key_expression, handler, on_gap)
+        subscriber = self._listen(key_expression, zenoh.handlers.FifoChannel(LARGEST_CHANNEL))
+
+        def hand_on(samples: list[zenoh.Sample]) -> None:
+            now_ns = time.time_ns()
+            came = [_numbered(sample, now_ns) for sample in samples]
+            others = (
+                [item if isinstance(item, Encoded) else item.message for item in came]
+                if delivery is None
+                else [item for item in came if isinstance(item, Encoded)]
+            )
+            if others:
+                handler(others)
+            if delivery is not None and len(others) < len(came):
+                delivery.receive(item for item in came if isinstance(item, Numbered))
+
+        def empty() -> None:
+            with contextlib.suppress(zenoh.ZError):  # it is closed
+                while True:
+                    samples = [subscriber.recv()]
+                    while len(samples) < MOST_GATHERED and (sample := subscriber.try_recv()) is not None:
+                        samples.append(sample)
+                    hand_on(samples)
+
+        threading.Thread(target=empty, name="gather", daemon=True).start()
+        if delivery is not None:
+            self._begin(delivery, key_expression, history=history)
+
+    def _delivery(
+        self,
+        key_expression: str,
+        handler: Callable[[list[Encoded]], None],
+        on_gap: Callable[[Gap], None] | None,
+    ) -> Delivery | None:
+        """What keeps the order of whole streams; None for less than that."""
+        if not _is_of_whole_streams(key_expression):
+            return None
+        delivery = Delivery(handler, on_gap or _say_gap)
+        self._deliveries.append(delivery)
+        return delivery
+
+    def _listen(self, key_expression: str, handler: Any) -> Any:
+        """Subscribe, with a callback or a channel."""
+        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self._session, _spelled(key_expression), handler, recovery=recovery
+        )
+        self._declared.append(subscriber)
+        return subscriber
+
+    def _begin(self, delivery: Delivery, key_expression: str, *, history: bool) -> None:
+        """Ask for what was before, and let what comes go on."""
+        # The subscriber's own question for what was before left out keys that were being published on meanwhile.
+        for last in self._remembered(key_expression, "_max=1"):
+            delivery.tell_last(last)
+        if history:
+            began, since_s = time.monotonic(), self._config.history_s
+            for _ in range(MOST_ASKED):
+                for came in self._remembered(key_expression, f"_time=[now(-{since_s}s)..]"):
+                    delivery.tell(came)
+                if delivery.is_told():
+                    break
+                since_s = time.monotonic() - began + HEARTBEAT_S
+        threading.Thread(target=delivery.begin, daemon=True).start()  # the handler may wait for who called us
 
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
         """What publishers remember of what they have published."""
         replies = self._session.get(
-            f"{key_expression}/{MEMORY}?{which}",
+            f"{_spelled(key_expression)}/{MEMORY}?{which}",
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=HISTORY_WITHIN_S,
         )
         for reply in replies:
-            came = _numbered(reply.ok) if reply.ok is not None else None
-            if came is not None:
+            came = _numbered(reply.ok, time.time_ns()) if reply.ok is not None else None
+            if isinstance(came, Numbered):
                 yield came
 
     def _declare(self, key: str) -> _Key:
@@ -193,7 +268,7 @@ class ZenohBus:
             )
             handler(ZenohRequest(query, question))
 
-        self._declared.append(self._session.declare_queryable(key_expression, on_query))
+        self._declared.append(self._session.declare_queryable(_spelled(key_expression), on_query))
 
     def ask(self, question: Encoded, timeout_s: float) -> list[Encoded]:
         """See `Bus`."""
@@ -209,7 +284,11 @@ class ZenohBus:
 
     def announce(self, key: str) -> None:
         """See `Bus`."""
-        self._declared.append(self._session.liveliness().declare_token(key))
+        self._tokens[key] = self._session.liveliness().declare_token(key)
+
+    def withdraw(self, key: str) -> None:
+        """See `Bus`."""
+        self._tokens.pop(key).undeclare()
 
     def watch_alive(self, key_expression: str, handler: Callable[[str, bool], None]) -> None:
         """See `Bus`."""
@@ -217,7 +296,9 @@ class ZenohBus:
         def on_token(sample: zenoh.Sample) -> None:
             handler(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        self._declared.append(self._session.liveliness().declare_subscriber(key_expression, on_token, history=True))
+        self._declared.append(
+            self._session.liveliness().declare_subscriber(_spelled(key_expression), on_token, history=True)
+        )
 
     def close(self) -> None:
         """See `Bus`.
@@ -232,7 +313,7 @@ class ZenohBus:
         for _ in self._session.get(NOBODY, timeout=FLUSH_WITHIN_S):
             pass
         # Advanced ones may outlive the session otherwise, and hang the process (eclipse-zenoh/zenoh-python#624).
-        for declared in (*self._declared, *(key.publisher for key in self._keys.values())):
+        for declared in (*self._declared, *self._tokens.values(), *(key.publisher for key in self._keys.values())):
             with contextlib.suppress(zenoh.ZError):
                 declared.undeclare()
         self._session.close()
@@ -350,25 +431,28 @@ def router_from_file(path: Path) -> ZenohBus:
         raise InputError(f"router settings {path}: {_first_line(error)}") from error
 
 
+@lru_cache(maxsize=100_000)
 def _stream(key: str) -> str:
     """The stream that a key is in."""
     return "/".join(key.split("/", STREAM_PARTS)[:STREAM_PARTS])
 
 
-def _encoded(sample: zenoh.Sample) -> Encoded:
-    """A message that has just come."""
-    now_ns = time.time_ns()
-    return Encoded(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), now_ns)
-
-
-def _numbered(sample: zenoh.Sample) -> Numbered | None:
-    """A message that has just come, as its publisher numbered it; None if it did not."""
-    numbered = sample.attachment.to_bytes() if sample.attachment is not None else b""
+def _numbered(sample: zenoh.Sample, now_ns: int) -> Numbered | Encoded:
+    """A message that has come, as its publisher numbered it; without a number if it did not."""
+    message = Encoded(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), now_ns)
+    attachment = sample.attachment
+    if attachment is None:
+        return message
+    numbered = attachment.to_bytes()
     if len(numbered) != _NUMBERED.size:
-        return None
+        return message
     publisher, number = _NUMBERED.unpack(numbered)
-    message = _encoded(sample)
     return Numbered(publisher, _stream(message.key), number, message)
+
+
+def _spelled(key_expression: str) -> str:
+    """As Zenoh writes it: a `*` that is only a part of a part is `$*` there."""
+    return "/".join(part if part in ("*", "**") else part.replace("*", "$*") for part in key_expression.split("/"))
 
 
 def _is_of_whole_streams(key_expression: str) -> bool:

@@ -18,7 +18,7 @@ import msgspec
 
 from reactorwatch.errors import InputError
 
-SECTIONS = ("bus", "plant", "monitor", "recorder", "replay", "diagnosis")
+SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis")
 """The tables that a file may hold."""
 
 

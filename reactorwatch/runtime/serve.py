@@ -12,12 +12,12 @@ import time
 from collections.abc import Callable, Iterator
 from queue import Empty, SimpleQueue
 from types import FrameType
-from typing import Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.audit import audit
-from reactorwatch.runtime.bus import Bus, Request
+from reactorwatch.runtime.bus import MOST_GATHERED, Bus, Request
 from reactorwatch.runtime.in_order import Gap
 
 LONGEST_WAIT_S = 3600.0
@@ -25,6 +25,7 @@ LONGEST_LINGER = 10  # times linger_s: a bus that never falls silent does not ke
 LARGEST_INBOX = (
     100_000  # messages; beyond it the bus is made to wait, and with it who publishes faster than we can hear
 )
+LARGEST_GATHERED = LARGEST_INBOX // MOST_GATHERED  # as lists of messages
 LOOK_AGAIN_S = 0.1
 BATCH = 256  # messages handled before the loop looks at the clock again
 
@@ -35,8 +36,8 @@ class Node(Protocol):
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Something was published on a key that the node listens to."""
 
-    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Somebody asked at one of the node's queryables."""
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
+        """Somebody asked at one of the node's queryables; None: the answer is another's to give."""
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """The moment named by `next_tick_ns` has come."""
@@ -50,6 +51,16 @@ class Node(Protocol):
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """The loop ends; last words."""
+
+
+class Token(NamedTuple):
+    """A liveliness token that came or went."""
+
+    key: str
+    is_alive: bool
+
+
+Item: TypeAlias = Encoded | list[Encoded] | Token | Gap | Request
 
 
 class StopSignal:
@@ -113,6 +124,9 @@ def serve(
     subscriptions: tuple[str, ...] = (),
     history: bool = False,
     on_gap: Callable[[Gap, int], list[Publication]] | None = None,
+    on_messages: Callable[[list[Encoded], int], list[Publication]] | None = None,
+    tokens: tuple[str, ...] = (),
+    on_alive: Callable[[str, bool, int], list[Publication]] | None = None,
     commands: tuple[str, ...] = (),
     on_ready: Callable[[], None] | None = None,
     linger_s: float = 0.0,
@@ -126,23 +140,30 @@ def serve(
         subscriptions: key expressions whose publications go to `node.on_message`.
         history: whether those from before do, too, as far as they are remembered.
         on_gap: told, in its turn between the messages, what was published on them and never came, and what time it is.
+        on_messages: gets the publications instead, as many at a time as have come, in their order.
+        tokens: key expressions of liveliness tokens ...
+        on_alive: ... that it is told of: the token, whether it came or went, and what time it is.
         commands: key expressions of queryables whose questions go to `node.on_command`.
         on_ready: called once the node listens.
         linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
     """
-    inbox: SimpleQueue[Encoded | Gap | Request | None] = SimpleQueue()
+    inbox: SimpleQueue[Item | None] = SimpleQueue()
+    largest = LARGEST_INBOX if on_messages is None else LARGEST_GATHERED
     room, ended = threading.Event(), threading.Event()
     stop.wakes(lambda: inbox.put(None))
     stop.wakes(room.set)
 
-    def receive(item: Encoded | Gap | Request) -> None:
-        while inbox.qsize() >= LARGEST_INBOX and not (stop.is_set or ended.is_set()):
+    def receive(item: Item) -> None:
+        while inbox.qsize() >= largest and not (stop.is_set or ended.is_set()):
             room.clear()
             room.wait(LOOK_AGAIN_S)
         inbox.put(item)
 
     for expression in subscriptions:
-        bus.subscribe(expression, receive, on_gap=receive if on_gap is not None else None, history=history)
+        listen = bus.subscribe if on_messages is None else bus.gather
+        listen(expression, receive, on_gap=receive if on_gap is not None else None, history=history)
+    for expression in tokens:
+        bus.watch_alive(expression, lambda key, is_alive: inbox.put(Token(key, is_alive)))
     for expression in commands:
         bus.answer(expression, receive)
     if on_ready is not None:
@@ -152,13 +173,20 @@ def serve(
         for publication in publications:
             bus.publish(encode(publication))
 
-    def handle(item: Encoded | Gap | Request) -> None:
+    def handle(item: Item) -> None:
         if isinstance(item, Encoded):
             publish(node.on_message(item, time.time_ns()))
+        elif isinstance(item, list):
+            publish(on_messages(item, time.time_ns()) if on_messages is not None else [])
+        elif isinstance(item, Token):
+            publish(on_alive(item.key, item.is_alive, time.time_ns()) if on_alive is not None else [])
         elif isinstance(item, Gap):
             publish(on_gap(item, time.time_ns()) if on_gap is not None else [])
         else:
             reply, publications = node.on_command(item.question, time.time_ns())
+            if reply is None:
+                item.leave()
+                return
             item.reply(reply)
             record = audit(item.question, reply, time.time_ns())
             publish(publications if record is None else [*publications, record])
@@ -168,7 +196,8 @@ def serve(
         if wait_s <= 0:
             publish(node.on_tick(time.time_ns()))
             wait_s = 0.0
-        for _ in range(BATCH):
+        handled = 0
+        while handled < BATCH:
             try:
                 item = inbox.get(timeout=min(wait_s, LONGEST_WAIT_S)) if wait_s > 0 else inbox.get_nowait()
             except Empty:
@@ -176,6 +205,7 @@ def serve(
             if item is None:
                 break
             handle(item)
+            handled += len(item) if isinstance(item, list) else 1
             wait_s = 0.0
         room.set()
     ended.set()

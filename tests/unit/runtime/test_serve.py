@@ -256,3 +256,41 @@ def test_signals_are_handled_as_before_once_the_context_is_left() -> None:
     with stop_on_signals():
         assert signal.getsignal(signal.SIGINT) != before[0]
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+def test_messages_are_handed_over_together_in_their_order_and_tokens_as_they_come_and_go() -> None:
+    exchange, ready, stop = Exchange(), threading.Event(), StopSignal()
+    node, speaker = Echo(), MemoryBus(exchange)
+    heard, alive = list[str](), list[tuple[str, bool]]()
+
+    def on_messages(messages: list[Encoded], _now_ns: int) -> list[Publication]:
+        heard.extend(message.key for message in messages)
+        return []
+
+    def on_alive(token: str, is_alive: bool, _now_ns: int) -> list[Publication]:
+        alive.append((token, is_alive))
+        if not is_alive:
+            stop.set()
+        return []
+
+    thread = threading.Thread(
+        target=serve,
+        args=(node, MemoryBus(exchange), stop),
+        kwargs={
+            "subscriptions": ("in/**",),
+            "on_messages": on_messages,
+            "tokens": ("alive/*",),
+            "on_alive": on_alive,
+            "on_ready": ready.set,
+        },
+    )
+    thread.start()
+    assert ready.wait(WITHIN_S)
+    for number in range(1000):
+        speaker.publish(Encoded(f"in/{number}", b"", ""))
+    speaker.announce("alive/x")
+    speaker.withdraw("alive/x")
+    thread.join(WITHIN_S)
+    assert not thread.is_alive()
+    assert heard == [f"in/{number}" for number in range(1000)]
+    assert alive == [("alive/x", True), ("alive/x", False)]
