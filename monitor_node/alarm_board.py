@@ -9,6 +9,7 @@ from math import isfinite
 from typing import Literal
 
 import msgspec
+from google.protobuf.message import DecodeError as ProtobufDecodeError
 
 from monitor_node.alarm_kpis import Counted, KpiCounter, KpiState
 from monitor_node.alarm_states import Event, State, fits
@@ -40,6 +41,10 @@ class BoardState(msgspec.Struct, forbid_unknown_fields=True):
         alarms: by name.
         incident: the latest.
         kpis: what the figures are made of.
+        suspects: of the latest incident.
+        kpi_minute: in which the figures were told last; None: they were not, or it is not known.
+        kpis_changed: whether they are to be told with the next row, like it or not.
+        told: the figures as told last, an `AlarmKpis`.
     """
 
     version: Literal[1]
@@ -48,6 +53,10 @@ class BoardState(msgspec.Struct, forbid_unknown_fields=True):
     alarms: dict[str, AlarmMemory]
     incident: Incident
     kpis: KpiState
+    suspects: list[SuspectedCause] = []
+    kpi_minute: int | None = None
+    kpis_changed: bool = False
+    told: bytes | None = None
 
 
 class AlarmBoard:
@@ -251,6 +260,10 @@ class AlarmBoard:
             alarms={name: alarm.memory for name, alarm in self._alarms.items()},
             incident=self._incidents.state,
             kpis=self._kpis.state,
+            suspects=self._suspects,
+            kpi_minute=self._kpi_minute,
+            kpis_changed=self._kpis_changed,
+            told=None if self._told is None else self._told.SerializeToString(),
         )
         return msgspec.msgpack.encode(state)
 
@@ -262,7 +275,8 @@ class AlarmBoard:
         """
         try:
             state = msgspec.msgpack.decode(data, type=BoardState)
-        except (msgspec.DecodeError, UnicodeDecodeError) as error:
+            told = None if state.told is None else AlarmKpis.FromString(state.told)
+        except (msgspec.DecodeError, UnicodeDecodeError, ProtobufDecodeError) as error:
             raise InputError(f"is no alarm state: {error}") from error
         if state.plant != self._config.plant:
             raise InputError(f"is the alarm state of plant {state.plant!r}, not of {self._config.plant!r}")
@@ -276,7 +290,9 @@ class AlarmBoard:
         self._note()
         self.time_ns = state.time_ns
         self._incidents.state = state.incident
-        self._kpis.state, self._told = state.kpis, None
+        self._kpis.state, self._told = state.kpis, told
+        self._suspects = state.suspects
+        self._kpi_minute, self._kpis_changed = state.kpi_minute, state.kpis_changed
 
     def go_on_from(self, alarms: Iterable[Alarm]) -> None:
         """Go on from what another monitor of the plant said last of its alarms, where nothing else is left of it.

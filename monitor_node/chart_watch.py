@@ -19,12 +19,16 @@ from numpy.typing import NDArray
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import ChartAlarm, Explanation
 from monitor_node.chart_design import ChartDesign, VectorChart
-from monitor_node.charts.base import Bank, Judgement, SignalChart
+from monitor_node.charts.base import Bank, Judgement, SignalChart, SignalState
+from monitor_node.charts.cusum import Cusum
 from monitor_node.charts.ewma import Ewma
-from monitor_node.charts.mewma import Mewma
+from monitor_node.charts.mewma import Mewma, MewmaState
+from monitor_node.charts.pca import PcaModel, PcaSpe, PcaT2
 from monitor_node.charts.shewhart import Shewhart
+from monitor_node.charts.t2 import T2, T2State
 from monitor_node.config import ChartName, MonitorConfig, PriorityName
 from monitor_node.prewhitening import Prewhitening
+from monitor_node.stored_state import StoredState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import ChartPoint
@@ -43,6 +47,23 @@ WITHOUT_MEMORY = ("shewhart", "t2", "pca_t2", "pca_spe")
 """An alarm of theirs takes several points, so that a single outlier raises none."""
 
 
+SIGNAL_CHARTS: dict[str, type[SignalChart]] = {kind.name: kind for kind in (Shewhart, Ewma, Cusum)}
+
+
+class ChartsState(StoredState, frozen=True):
+    """All that the charts of a plant are and remember.
+
+    Attributes:
+        charts: by name, the state of each as bytes.
+        widths: see `ChartWatch`.
+        passed: of each output, the part of a lasting shift that the charts see.
+    """
+
+    charts: dict[str, bytes]
+    widths: list[float]
+    passed: list[float]
+
+
 def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
     """(chart, of what) of every alarm that the charts of a plant can raise."""
     of_all = OF_ALL if len(config.outputs) > 1 else ()
@@ -58,10 +79,22 @@ def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
 class _OfEach:
     """Charts of one kind, one an output."""
 
-    def __init__(self, name: str, charts: list[SignalChart], signals: tuple[str, ...], passed: list[float]) -> None:
+    def __init__(self, name: str, bank: Bank[SignalChart], signals: tuple[str, ...], passed: list[float]) -> None:
         self._name, self._signals, self._passed = name, signals, passed
-        self._bank = Bank(charts)
+        self._bank = bank
         self._shows_outliers = name in WITHOUT_MEMORY
+
+    @classmethod
+    def from_bytes(cls, name: str, data: bytes, signals: tuple[str, ...], passed: list[float]) -> "_OfEach":
+        """The charts that go on where they were."""
+        state = SignalState.from_bytes(data)
+        if state.plants != len(signals):
+            raise ValueError(f"there must be {len(signals)} charts {name}, got {state.plants}")
+        return cls(name, Bank.from_state(SIGNAL_CHARTS[name], state), signals, passed)
+
+    def to_bytes(self) -> bytes:
+        """All that the charts are and remember."""
+        return self._bank.state.to_bytes()
 
     def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
         """Take a row in; whether any chart is out."""
@@ -101,6 +134,20 @@ class _OfAll:
         self._chart, self._signals = chart, signals
         self._last: list[float] = []
         self._judgement: Judgement | None = None
+
+    @classmethod
+    def from_bytes(cls, name: str, data: bytes, signals: tuple[str, ...]) -> "_OfAll":
+        """The chart that goes on where it was."""
+        if name == Mewma.name:
+            return cls(Mewma.from_state(MewmaState.from_bytes(data)), signals)
+        if name == T2.name:
+            return cls(T2.from_state(T2State.from_bytes(data)), signals)
+        model = PcaModel.from_bytes(data)
+        return cls(PcaT2(model) if name == PcaT2.name else PcaSpe(model), signals)
+
+    def to_bytes(self) -> bytes:
+        """All that the chart is and remembers."""
+        return self._chart.state.to_bytes()
 
     def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
         """Take a row in; whether the chart is out. A row in which an output is missing is left out."""
@@ -155,7 +202,8 @@ class ChartWatch:
             pair: board.declare(*pair, at_once=pair[0] not in WITHOUT_MEMORY, priority=self._priority(pair[1]))
             for pair in alarm_names(config)
         }
-        self._watched: list[_Watched] = []
+        self._watched: dict[str, _Watched] = {}
+        self._passed: list[float] = []
         self.widths: list[float] = []
         """Of the Shewhart limits, one an output, in standard deviations; they are shown about the predictions."""
 
@@ -175,19 +223,49 @@ class ChartWatch:
         """
         config = self._config
         design = ChartDesign(config, learned, e, arl0)
-        self.widths = design.widths
-        passed = [item.passed for item in learned]
-        self._watched = []
+        self.widths, self._passed = design.widths, [item.passed for item in learned]
+
+        def made(name: str) -> _OfEach | _OfAll:
+            if name in OF_EACH:
+                return _OfEach(name, Bank(design.of_each(name)), config.outputs, self._passed)
+            return _OfAll(design.of_all(name), config.outputs)
+
+        self._watch(made)
+
+    @property
+    def state(self) -> ChartsState:
+        """A copy of all that the charts are and remember; their alarms are the board's."""
+        charts = {name: watched.charts.to_bytes() for name, watched in self._watched.items()}
+        return ChartsState(charts, list(self.widths), list(self._passed))
+
+    def restore(self, state: ChartsState) -> None:
+        """Go on, bit for bit, where charts of the same settings were when `state` was taken; after the board.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        signals = self._config.outputs
+        self.widths, self._passed = list(state.widths), list(state.passed)
+        names = {chart for chart, _ in self._alarms}
+        if set(state.charts) != names or not len(self.widths) == len(self._passed) == len(signals):
+            raise ValueError(f"there must be the charts {', '.join(sorted(names))}, got {', '.join(state.charts)}")
+
+        def made(name: str) -> _OfEach | _OfAll:
+            data = state.charts[name]
+            if name in OF_EACH:
+                return _OfEach.from_bytes(name, data, signals, self._passed)
+            return _OfAll.from_bytes(name, data, signals)
+
+        self._watch(made)
+
+    def _watch(self, made: Callable[[str], _OfEach | _OfAll]) -> None:
+        """Give the charts of each name their alarms and keys."""
+        self._watched = {}
         for name in dict.fromkeys(chart for chart, _ in self._alarms):
             pairs = [pair for pair in self._alarms if pair[0] == name]
-            charts: _OfEach | _OfAll
-            if name in OF_EACH:
-                charts = _OfEach(name, design.of_each(name), config.outputs, passed)
-            else:
-                charts = _OfAll(design.of_all(name), config.outputs)
-            paths = [keys.key(config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
             alarms = [self._alarms[pair] for pair in pairs]
-            self._watched.append(_Watched(charts, alarms, paths, all(alarm.at_rest for alarm in alarms)))
+            paths = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
+            self._watched[name] = _Watched(made(name), alarms, paths, all(alarm.at_rest for alarm in alarms))
 
     def update(
         self,
@@ -216,7 +294,7 @@ class ChartWatch:
         """
         raised = False
         known = [size == size for size in e]  # NaN is not equal to itself
-        for watched in self._watched:
+        for watched in self._watched.values():
             out = watched.charts.update(e, known, withheld)
             if not (out or points) and watched.at_rest:
                 continue

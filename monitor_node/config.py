@@ -43,6 +43,8 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             of the plant.
         longest_shelf_min: how long an alarm may be shelved at most, in minutes of the plant.
         alarm_state_file: where the state of the alarms is kept, so that it survives a restart; None: nowhere.
+        state_file: where all that the monitor remembers is kept, so that it goes on after a restart; None: nowhere.
+        state_every_s: how often it is stored, in seconds; after a change of an alarm it is stored at once.
         reorder_rows: how many newer rows may begin before an incomplete one is given up.
         snapshot_min: how often the models are published, in minutes of the plant.
         health_period_s: how often health is published, in seconds.
@@ -74,6 +76,8 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     incident_min: float = 60.0
     longest_shelf_min: float = 480.0
     alarm_state_file: str | None = None
+    state_file: str | None = None
+    state_every_s: float = 5.0
     reorder_rows: int = 8
     silence_periods: float = 5.0
     snapshot_min: float = 5.0
@@ -102,6 +106,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             ("incident_min", self.incident_min, 0.0, 1e6),
             ("longest_shelf_min", self.longest_shelf_min, 1e-3, 1e6),
             ("reorder_rows", self.reorder_rows, 1, 1000),
+            ("state_every_s", self.state_every_s, 0.1, 3600.0),
             ("snapshot_min", self.snapshot_min, 1e-3, 1e6),
             ("health_period_s", self.health_period_s, 0.05, 3600.0),
         ):

@@ -10,12 +10,15 @@ anything says the same, value for value.
 
 from collections.abc import Iterable
 from math import isfinite
+from typing import Any
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_commands import obey
 from monitor_node.alignment import Aligner, Row
 from monitor_node.config import MonitorConfig
+from monitor_node.monitor_state import MonitorState, opened, sealed, settings_of
 from monitor_node.refusals import Refusals
+from monitor_node.told_again import ToldAgain
 from monitor_node.watch import PlantWatch
 from reactorwatch import __version__
 from reactorwatch.contract import keys
@@ -47,7 +50,7 @@ class Monitor:
 
     Attributes:
         refusals: what could not be used.
-        alarms: of the plant; `to_bytes` and `from_bytes` carry them over a restart.
+        alarms: of the plant.
         first_ns: time of the first row; None before it.
         last_ns: time of the last row; None before the first.
     """
@@ -56,10 +59,14 @@ class Monitor:
         self, config: MonitorConfig, start_ns: int, *, points: bool = True, model: ProcessModel | None = None
     ) -> None:
         self.config = config
+        self._points, self._model = points, model
+        self._settings: dict[str, Any] | None = None
         self.refusals = Refusals()
         self._signals = (config.input, *config.outputs)
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
+        self._places = {signal: place for place, signal in enumerate(self._signals)}
         self._aligner = Aligner(self._signals, config.reorder_rows)
+        self._told_again: ToldAgain | None = None
         self.alarms = AlarmBoard(config)
         self._watch = PlantWatch(config, self.alarms, points=points, model=model)
         self._units = dict.fromkeys(self._signals, "")
@@ -114,6 +121,11 @@ class Monitor:
         if quality == BAD:
             self.refusals.add("bad_quality", f"{signal} is marked bad at {sample.time_ns} ns")
             return []
+        if self._told_again is not None and self._told_again.heard(
+            self._places[signal], sample.time_ns, sample.sequence
+        ):
+            self._aligner.state.counts.duplicated += 1
+            return []
         if sample.unit != self._units[signal] or signal not in self._heard_from_ns:
             self._heard_from_ns.setdefault(signal, sample.time_ns)
             self._units[signal] = sample.unit
@@ -161,6 +173,64 @@ class Monitor:
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish health for the last time."""
         return [self._health(now_ns, "stopped")]
+
+    # --- what survives a restart -----------------------------------------------------------------------------
+
+    def to_bytes(self) -> bytes:
+        """All that is remembered, between two messages: a monitor that goes on from it says the same, bit for bit."""
+        return sealed(
+            MonitorState(
+                self._learned_with(),
+                self._aligner.state,
+                self.alarms.to_bytes(),
+                self._watch.state,
+                self._units,
+                self._heard_from_ns,
+                self.first_ns,
+                self.last_ns,
+                self._watching_since_ns,
+                self._snapshot_due_ns,
+                self._received,
+                self._published,
+                self.refusals.by_reason,
+            )
+        )
+
+    def from_bytes(self, data: bytes) -> None:
+        """Go on from what `to_bytes` returned, of a monitor with the same settings.
+
+        Samples that were heard before may come again, until `caught_up`: they are counted as duplicated, and passed
+        over (see `told_again`).
+
+        Raises:
+            InputError: the bytes are not that; everything is as before.
+            OtherSettingsError: they are, but of a monitor with other settings; likewise.
+        """
+        state = opened(data, self._learned_with())
+        board = AlarmBoard(self.config)
+        try:
+            watch = PlantWatch(self.config, board, points=self._points, model=self._model)
+            board.from_bytes(state.board)
+            watch.restore(state.watch, self._start_ns)
+        except ValueError as error:
+            raise InputError(f"is no state of this software's monitor: {error}") from error
+        self.alarms, self._watch = board, watch
+        self._aligner.state, self._told_again = state.alignment, ToldAgain(state.alignment)
+        self._units, self._heard_from_ns = state.units, state.heard_from_ns
+        self._output_units = [self._units[output] for output in self.config.outputs]
+        self.first_ns, self.last_ns = state.first_ns, state.last_ns
+        self._watching_since_ns, self._snapshot_due_ns = state.watching_since_ns, state.snapshot_due_ns
+        self._received, self._published = state.received, state.published
+        self.refusals.by_reason = state.refused
+
+    def _learned_with(self) -> dict[str, Any]:
+        if self._settings is None:
+            self._settings = settings_of(self.config, self._watch.model, points=self._points)
+        return self._settings
+
+    def caught_up(self) -> None:
+        """What was published before has all come: from now on no sample is one that was heard before a stop."""
+        self._told_again = None
 
     def go_on_from_alarms(self, alarms: Iterable[Alarm]) -> None:
         """Go on from what another monitor of the plant said last of its alarms, where nothing else is left of it.

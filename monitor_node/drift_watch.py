@@ -51,7 +51,8 @@ class DriftWatch:
         self._keys = [
             keys.key(config.plant, keys.CHART, keys.chart_name(ParameterT2.name, signal)) for signal in self._outputs
         ]
-        self._until_next = ROWS
+        self.until_next = ROWS
+        """Rows until the next look: all that is remembered here."""
         self.wanted = told or bool(self._alarms)
         """Whether the models have to adapt at all."""
 
@@ -84,10 +85,10 @@ class DriftWatch:
             time_ns: of the row.
             predictors: as at the start.
         """
-        self._until_next -= 1
-        if self._until_next or not self.wanted:
+        self.until_next -= 1
+        if self.until_next or not self.wanted:
             return []
-        self._until_next = ROWS
+        self.until_next = ROWS
         publications: list[Publication] = []
         for signal, predictor, key in zip(self._outputs, predictors, self._keys, strict=True):
             found = predictor.drift()

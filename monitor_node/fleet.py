@@ -91,16 +91,16 @@ class FleetMonitor:
 
         Args:
             plant: its name.
-            state: of the monitor that watched it before; None: it is learned anew. One that cannot be used is noted,
-                and counts as none.
+            state: of the monitor that watched it before, as `Monitor.to_bytes` gives it; None: the plant is learned
+                anew. One that cannot be used is noted, and counts as none.
             now_ns: now.
         """
         monitor = Monitor(self._named(plant), now_ns, points=self._points, model=self._model)
         if state is not None:
             try:
-                monitor.alarms.from_bytes(state)
+                monitor.from_bytes(state)
             except InputError as error:
-                monitor.notes.append(f"the state of {plant} {error}; it is learned anew")
+                monitor.notes.append(f"the state that was stored {error}; the plant is learned anew")
                 state = None
         if state is None:
             monitor.go_on_from_alarms(self._heard.get(plant, {}).values())
@@ -115,7 +115,7 @@ class FleetMonitor:
         if monitor is None:
             return None
         self._in_charge(plant, False)
-        return monitor.alarms.to_bytes()
+        return monitor.to_bytes()
 
     def monitor(self, plant: str) -> Monitor:
         """The monitor of a plant.

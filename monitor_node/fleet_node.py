@@ -44,8 +44,9 @@ class FleetNode(FleetMonitor):
     """
 
     def __init__(self, config: MonitorConfig, fleet: FleetConfig, bus: Bus, start_ns: int) -> None:
-        if config.alarm_state_file is not None:
-            raise InputError("alarm_state_file holds the alarms of one plant; leave it out for a fleet")
+        for setting in ("alarm_state_file", "state_file"):
+            if getattr(config, setting) is not None:
+                raise InputError(f"{setting} holds what is known of one plant; leave it out for a fleet")
         self._bus = bus
         self._report_ns = start_ns
         self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"

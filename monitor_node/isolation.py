@@ -29,7 +29,7 @@ import numpy as np
 
 from monitor_node.isolation_bank import Bank
 from monitor_node.isolation_causes import CAUSES
-from monitor_node.isolation_fit import Fit, Fitter
+from monitor_node.isolation_fit import Fit, Fitter, WayState
 from monitor_node.isolation_hypothesis import Hypothesis
 from monitor_node.isolation_stretch import HUBER
 from monitor_node.isolation_ways import linearisable
@@ -106,6 +106,15 @@ class Isolation:
         """Forget all rows."""
         self._rows.clear()
         self._fitter.forget()
+
+    @property
+    def way(self) -> WayState | None:
+        """How far a fault has been followed: what is remembered beside the rows."""
+        return self._fitter.state
+
+    @way.setter
+    def way(self, state: WayState | None) -> None:
+        self._fitter.restore(state)
 
     def suspects(self, not_before_min: float = -inf) -> list[Suspect]:
         """The causes that come into question, likeliest first, and `UNKNOWN` among them.

@@ -10,7 +10,7 @@ same fault some rows later, the fit goes on from where it was.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from math import inf, log, pi, sqrt
 
 import numpy as np
@@ -19,6 +19,7 @@ from monitor_node.isolation_bank import Scan
 from monitor_node.isolation_hypothesis import SETTLED, Descent, Hypothesis
 from monitor_node.isolation_stretch import Stretch
 from monitor_node.isolation_window import Window
+from monitor_node.stored_state import StoredState
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.model import Array, ProcessModel
@@ -66,6 +67,34 @@ class Fit:
     onset_sd_min: float
     reached: float
     reached_sd: float
+
+
+class FitState(StoredState, frozen=True):
+    """A fit on the way: the fields of `Fit`, its hypothesis by cause and profile, without `w`."""
+
+    cause: str
+    profile: str
+    size: float
+    onset_min: float
+    gain: float
+    log_volume: float
+    size_sd: float
+    onset_sd_min: float
+    reached: float
+    reached_sd: float
+
+
+class WayState(StoredState, frozen=True):
+    """How far a large fault has been followed: the fields of `_Way`."""
+
+    stood_out_min: float
+    onset_min: float
+    until_min: float
+    first: bool
+    fits: list[FitState]
+
+
+_STORED = [item.name for item in fields(Fit) if item.name not in ("hypothesis", "w")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +151,32 @@ class Fitter:
     def forget(self) -> None:
         """Forget how far a fault has been followed."""
         self._way = None
+
+    @property
+    def state(self) -> WayState | None:
+        """How far a fault has been followed: all that is remembered from one question to the next."""
+        way = self._way
+        if way is None:
+            return None
+        fits = []
+        for fit in way.fits:
+            of = self.hypotheses[fit.hypothesis]
+            fits.append(FitState(of.effect.name, of.profile.name, **{name: getattr(fit, name) for name in _STORED}))
+        return WayState(way.stood_out_min, way.onset_min, way.until_min, way.first, fits)
+
+    def restore(self, state: WayState | None) -> None:
+        """Go on from where another was; a cause that is not known here is left behind."""
+        self.forget()
+        if state is None:
+            return
+        places = {(item.effect.name, item.profile.name): place for place, item in enumerate(self.hypotheses)}
+        fits = [
+            Fit(places[item.cause, item.profile], w=np.empty((0, 0)), **{name: getattr(item, name) for name in _STORED})
+            for item in state.fits
+            if (item.cause, item.profile) in places
+        ]
+        if fits:
+            self._way = _Way(state.stood_out_min, state.onset_min, state.until_min, state.first, fits)
 
     def fit(self, window: Window, early: Scan, whole: Scan) -> list[Fit]:
         """The causes that come into question, likeliest first; of a small fault, then those that are not fitted.

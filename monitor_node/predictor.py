@@ -11,20 +11,21 @@ of one; what is told of the models is in the signals' own units again.
 """
 
 from math import inf, isfinite, nan
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.charts.base import Judgement
-from monitor_node.charts.parameters import ParameterT2
+from monitor_node.charts.parameters import ParameterState, ParameterT2
 from monitor_node.drift import learn
-from monitor_node.identification.regressor import RegressorBuffer, Rows, rows_of
+from monitor_node.identification.recursion import RlsState
+from monitor_node.identification.regressor import BufferState, RegressorBuffer, Rows, rows_of
 from monitor_node.identification.rls import RecursiveLeastSquares
 from monitor_node.identification.structure import Scaling, Structure
 from monitor_node.sampling import TOLERANCE
+from monitor_node.stored_state import StoredState, packed, unpacked
 from monitor_node.training_record import checks_of
-from reactorwatch.contract.messages_pb2 import Parameter
+from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
 
 Array = NDArray[np.float64]
@@ -40,6 +41,30 @@ MOST_PUT_BY = 1000
 
 _BREAK = (-(2**63), nan, nan)
 """Stands between two rows of which the later does not follow the earlier."""
+
+
+class PredictorState(StoredState, frozen=True):
+    """All that a predictor remembers.
+
+    Attributes:
+        buffer: the rows that the next regressor needs.
+        rls: the model that adapts.
+        first_rows: that the scaling will be made from: doubles, input and output of each.
+        scaling: of the signals; None before it is known.
+        reference: its parameters, doubles; None while there is none.
+        told: of the reference: a `ModelSnapshot`; None if nobody will ask.
+        drift: the chart that compares the models; None: they are not compared.
+        drifted: what it said last.
+    """
+
+    buffer: BufferState
+    rls: RlsState
+    first_rows: bytes
+    scaling: Scaling | None
+    reference: bytes | None
+    told: bytes | None
+    drift: ParameterState | None
+    drifted: Judgement | None
 
 
 class ArxPredictor:
@@ -62,10 +87,45 @@ class ArxPredictor:
         self._scaling: Scaling | None = None
         self._scales = (0.0, 1.0, 0.0, 1.0)
         self._reference: Array | None = None
-        self._reference_model: dict[str, Any] | None = None
+        self._reference_model: ModelSnapshot | None = None
         self._fitted: Rows | None = None
         self._drift: ParameterT2 | None = None
         self._drifted: Judgement | None = None
+
+    @property
+    def state(self) -> PredictorState:
+        """A copy of all that is remembered. Rows that were put by are learned from first, which changes nothing."""
+        self.catch_up()
+        return PredictorState(
+            self._buffer.state,
+            self._rls.state,
+            packed(self._first_rows),
+            self._scaling,
+            None if self._reference is None else packed(self._reference),
+            None if self._reference_model is None else self._reference_model.SerializeToString(),
+            None if self._drift is None else self._drift.state,
+            self._drifted,
+        )
+
+    def restore(self, state: PredictorState) -> None:
+        """Go on, bit for bit, where a predictor of the same settings was when `state` was taken.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        if state.buffer.structure != self._structure:
+            raise ValueError(f"the state must be of {self._structure}, got {state.buffer.structure}")
+        self._buffer = RegressorBuffer.from_state(state.buffer)
+        self._rls = RecursiveLeastSquares.from_state(state.rls)
+        self._first_rows = [(first, second) for first, second in unpacked(state.first_rows, 2).tolist()]
+        if state.scaling is not None:
+            self._scale(state.scaling)
+        if state.reference is not None:
+            (self._reference,) = unpacked(state.reference, self._structure.parameters)
+        if state.told is not None:
+            self._reference_model = ModelSnapshot.FromString(state.told)
+        self._drift = None if state.drift is None else ParameterT2.from_state(state.drift)
+        self._drifted = state.drifted
 
     def update(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> float:
         """Take a row in.
@@ -129,7 +189,9 @@ class ArxPredictor:
             singular = np.linalg.svd(rows.regressors, compute_uv=False)
             condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else inf
             checks = checks_of(self._structure, time_min, inputs, outputs, residual)
-            self._reference_model = self._told(theta, covariance, condition, len(y), 1.0) | {"checks": checks}
+            self._reference_model = self._told(theta, covariance, condition, len(y), 1.0)
+            self._reference_model.reference = True
+            self._reference_model.checks.extend(checks)
         return residual
 
     def compare(self, arl0: float) -> None:
@@ -188,14 +250,18 @@ class ArxPredictor:
                 learn_row(regressor, scaled)
                 self._compare(regressor)
 
-    def adaptive(self) -> dict[str, Any] | None:
-        """The model that adapts, as the fields of a `ModelSnapshot`; None before it has learned anything."""
+    def adaptive(self) -> ModelSnapshot | None:
+        """The model that adapts, without a time; None before it has learned anything."""
         self.catch_up()
         return self._describe() if self._rls.rows else None
 
-    def reference(self) -> dict[str, Any] | None:
-        """The reference, likewise; None while there is none."""
-        return self._reference_model
+    def reference(self) -> ModelSnapshot | None:
+        """A copy of the reference, likewise; None while there is none."""
+        if self._reference_model is None:
+            return None
+        told = ModelSnapshot()
+        told.CopyFrom(self._reference_model)
+        return told
 
     def _learn_scaling(self, input_value: float, value: float) -> None:
         if not (isfinite(input_value) and isfinite(value)):
@@ -203,41 +269,44 @@ class ArxPredictor:
         self._first_rows.append((input_value, value))
         if len(self._first_rows) == SCALING_ROWS:
             rows = np.array(self._first_rows)
-            self._scaling = scaling = Scaling.of(rows[:, 0], rows[:, 1])
-            self._scales = (
-                scaling.input_centres[0],
-                scaling.input_spreads[0],
-                scaling.output_centres[0],
-                scaling.output_spreads[0],
-            )
+            self._scale(Scaling.of(rows[:, 0], rows[:, 1]))
             self._first_rows.clear()
 
-    def _describe(self) -> dict[str, Any]:
+    def _scale(self, scaling: Scaling) -> None:
+        self._scaling = scaling
+        self._scales = (
+            scaling.input_centres[0],
+            scaling.input_spreads[0],
+            scaling.output_centres[0],
+            scaling.output_spreads[0],
+        )
+
+    def _describe(self) -> ModelSnapshot:
         rls = self._rls
         return self._told(rls.parameters, rls.parameter_covariance, rls.condition, rls.rows, rls.forgetting)
 
     def _told(
         self, scaled: Array, scaled_covariance: Array, condition: float, rows: int, forgetting: float
-    ) -> dict[str, Any]:
+    ) -> ModelSnapshot:
         assert self._scaling is not None
         matrix, shift = self._scaling.undoing(self._structure)
         covariance = matrix @ scaled_covariance @ matrix.T
         values = matrix @ scaled + shift
         with np.errstate(invalid="ignore"):
             deviations = np.sqrt(np.diag(covariance))
-        return {
-            "structure": "arx",
-            "order": self._structure.output_lags,
-            "delay": self._structure.delay,
-            "parameters": [
+        return ModelSnapshot(
+            structure="arx",
+            order=self._structure.output_lags,
+            delay=self._structure.delay,
+            parameters=[
                 Parameter(name=name, value=value, sd=sd)
                 for name, value, sd in zip(self._structure.parameter_names(), values, deviations, strict=True)
             ],
-            "rows": rows,
-            "forgetting": forgetting,
-            "excitation": 1.0 / condition,
-            "condition": condition,
-        }
+            rows=rows,
+            forgetting=forgetting,
+            excitation=1.0 / condition,
+            condition=condition,
+        )
 
 
 def _following(rows: Rows, time_min: Array, history: int) -> Rows:

@@ -22,6 +22,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from monitor_node.stored_state import StoredState
+
 Array = NDArray[np.float64]
 
 LARGEST_ORDER = 6
@@ -161,6 +163,13 @@ def _sd_variance(error: Array, freedom: int) -> float:
     return max(independent, float(batches.var(ddof=1)) / (4.0 * mean**2 * BATCHES))
 
 
+class PrewhitenerState(StoredState, frozen=True):
+    """What was learned, and the last values, newest first."""
+
+    learned: Prewhitening
+    past: list[float]
+
+
 class Prewhitener:
     """Takes the predictable part out of a residual, value by value.
 
@@ -174,6 +183,18 @@ class Prewhitener:
         """The last values, newest first: all that it remembers."""
         self._expected = 0.0
         self._order, self._mean = len(learned.coefficients), learned.constant / learned.passed
+
+    @classmethod
+    def from_state(cls, state: PrewhitenerState) -> "Prewhitener":
+        """The one that goes on, bit for bit, where `state` was taken, between two values."""
+        whitener = cls(state.learned)
+        whitener.past.extend(state.past)
+        return whitener
+
+    @property
+    def state(self) -> PrewhitenerState:
+        """A copy of all that was learned and is remembered."""
+        return PrewhitenerState(self.learned, list(self.past))
 
     def expected(self) -> float:
         """What z is going to be as far as its past can tell; without a past that is long enough: its mean."""

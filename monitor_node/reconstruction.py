@@ -9,11 +9,19 @@ from collections.abc import Iterable, Sequence
 from math import isfinite, nan, sqrt
 
 from monitor_node.isolation_window import Row
-from reactorwatch.process.filter import Filter, NoiseLevels
+from monitor_node.stored_state import StoredState
+from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
 from reactorwatch.process.model import ProcessModel
 
 MARGIN_MIN = 1.0
 """So long before the onset that was found the sensor is left out already."""
+
+
+class ReconstructionState(StoredState, frozen=True):
+    """What is remembered: of the filter, and the newest input that was not missing; NaN before the first."""
+
+    filter: FilterState
+    last_input: float
 
 
 class Reconstruction:
@@ -36,6 +44,15 @@ class Reconstruction:
         self._input = nan
         for time_min, input_value, measured in rows:
             self._step(time_min, input_value, measured, right=time_min < onset_min - MARGIN_MIN)
+
+    @property
+    def state(self) -> ReconstructionState:
+        """All that is remembered."""
+        return ReconstructionState(self._filter.state, self._input)
+
+    def restore(self, state: ReconstructionState) -> None:
+        """Go on where another of the same sensor was when `state` was taken."""
+        self._filter.state, self._input = state.filter, state.last_input
 
     def update(self, time_min: float, input_value: float, measured: Sequence[float]) -> tuple[float, float]:
         """Take a row in.

@@ -13,8 +13,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
-from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.noise import tune
 from reactorwatch.records.record import MINUTE_NS
@@ -40,6 +41,31 @@ class Expected(NamedTuple):
     sd: Sequence[float]
 
 
+class ProcessReferenceState(StoredState, frozen=True, tag="process"):
+    """What a `ProcessReference` is and remembers.
+
+    Attributes:
+        noise: of the plant and its sensors.
+        filter: what it remembers.
+        last_input: the newest that was not missing.
+        guessed: whether it was missing since.
+        typical_sd: see `ProcessReference`.
+    """
+
+    noise: NoiseLevels
+    filter: FilterState
+    last_input: float
+    guessed: bool
+    typical_sd: list[float]
+
+
+class ArxReferenceState(StoredState, frozen=True, tag="arx"):
+    """What an `ArxReference` is: the range of the input in which it holds."""
+
+    low: float
+    high: float
+
+
 class Reference(Protocol):
     """What rows are expected by.
 
@@ -61,6 +87,10 @@ class Reference(Protocol):
 
     def restart(self) -> None:
         """Begin anew with the next row: the plant's clock was set, or it was away for long."""
+
+    @property
+    def state(self) -> ProcessReferenceState | ArxReferenceState:
+        """All that it is and remembers, but for its model."""
 
 
 class ProcessReference:
@@ -86,6 +116,30 @@ class ProcessReference:
         self._last_input, self._guessed = nan, False
         self.typical_sd = [1.0] * len(outputs)
         """Standard deviation of a residual by the filter, in the outputs' units, as it mostly was in the last `run`."""
+
+    @classmethod
+    def from_state(
+        cls, state: ProcessReferenceState, model: ProcessModel, outputs: tuple[str, ...]
+    ) -> "ProcessReference":
+        """The one that goes on, bit for bit, where `state` was taken.
+
+        Raises:
+            ValueError: the state is of another model.
+        """
+        reference = cls(model, outputs, state.noise)
+        if len(state.filter.inputs) not in (0, len(model.inputs)):
+            raise ValueError(f"the filter's state must have {len(model.inputs)} inputs, got {state.filter.inputs}")
+        reference._filter.state = state.filter
+        reference._last_input, reference._guessed = state.last_input, state.guessed
+        reference.typical_sd = list(state.typical_sd)
+        return reference
+
+    @property
+    def state(self) -> ProcessReferenceState:
+        """See `Reference`."""
+        return ProcessReferenceState(
+            self.noise, self._filter.state, self._last_input, self._guessed, list(self.typical_sd)
+        )
 
     def update(self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...]) -> Expected:
         """See `Reference`.
@@ -171,6 +225,18 @@ class ArxReference:
         self._low, self._high = low - margin, high + margin
         self.predictions: list[float] = []
         """Of the row that is to come, one an output."""
+
+    @classmethod
+    def from_state(cls, state: ArxReferenceState) -> "ArxReference":
+        """The one of that state."""
+        reference = cls(np.zeros(0))
+        reference._low, reference._high = state.low, state.high
+        return reference
+
+    @property
+    def state(self) -> ArxReferenceState:
+        """See `Reference`."""
+        return ArxReferenceState(self._low, self._high)
 
     def update(self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...]) -> Expected:
         """See `Reference`. Outside of what it was trained on, nothing can be said."""

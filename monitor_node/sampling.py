@@ -5,7 +5,7 @@ only then. A *gap* is more than two and a half periods, or a step back in time: 
 before is then too old to tell chance from change.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from statistics import median
 
 LEARN_FROM = 32  # spacings
@@ -38,6 +38,10 @@ class SamplingPeriod:
 
     def __init__(self) -> None:
         self.state = SamplingState()
+
+    def copied(self) -> SamplingState:
+        """A copy of all that is remembered."""
+        return replace(self.state, spacings_ns=list(self.state.spacings_ns))
 
     def follows(self, time_ns: int) -> bool:
         """Take a row in; whether it follows the one before it by one period."""

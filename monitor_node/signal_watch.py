@@ -11,9 +11,10 @@ from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import ChartAlarm, Explanation, SuspectedCause
 from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig
-from monitor_node.silence import NOTHING, Change, Silence
-from monitor_node.spike import Spike, spike_limit
-from monitor_node.stuck import Stuck
+from monitor_node.silence import NOTHING, Change, Silence, SilenceState
+from monitor_node.spike import Spike, SpikeState, spike_limit
+from monitor_node.stored_state import StoredState
+from monitor_node.stuck import Stuck, StuckState
 from reactorwatch.contract.codec import Publication
 
 PLANT = "plant"
@@ -24,6 +25,20 @@ STUCK_SENSOR = "stuck_sensor"
 READINGS, SENSOR = "readings", "sensor"
 
 FEWEST_FOR_SPIKES = 50
+
+
+class SignalsState(StoredState, frozen=True):
+    """All that was learned and is remembered of the signals of a plant.
+
+    Attributes:
+        silences: of the plant, of the input and of each output.
+        stuck: of each output; none before the training ends.
+        spikes: likewise; None for an output that is not judged.
+    """
+
+    silences: list[SilenceState]
+    stuck: list[StuckState]
+    spikes: list[SpikeState | None]
 
 
 class SignalWatch:
@@ -80,6 +95,37 @@ class SignalWatch:
             known = [size for size in residuals if isfinite(size)]
             enough = len(known) >= FEWEST_FOR_SPIKES
             self._spikes.append(Spike(spike_limit(known, arl0)) if enough else None)
+
+    # --- what survives a restart -----------------------------------------------------------------------------
+
+    @property
+    def state(self) -> SignalsState:
+        """A copy of all that is remembered; the alarms are the board's."""
+        return SignalsState(
+            [silence.state for silence in self._silences],
+            [stuck.state for stuck in self._stuck],
+            [None if spike is None else spike.state for spike in self._spikes],
+        )
+
+    def restore(self, state: SignalsState, now_ns: int) -> None:
+        """Go on where a watch with the same settings was when `state` was taken; after the board.
+
+        Args:
+            state: of the other watch.
+            now_ns: when the plant is listened to again.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        outputs = len(self._outputs)
+        counts = (len(state.silences) - 2, len(state.stuck) or outputs, len(state.spikes) or outputs)
+        if counts != (outputs,) * 3:
+            raise ValueError(f"the state must be of {outputs} outputs, got {counts}")
+        self._silences = [Silence.from_state(item) for item in state.silences]
+        self._silences[0].listen(now_ns)
+        self._stuck = [Stuck.from_state(item) for item in state.stuck]
+        self._spikes = [None if item is None else Spike.from_state(item) for item in state.spikes]
+        self._note_stuck()
 
     # --- rows ------------------------------------------------------------------------------------------------
 

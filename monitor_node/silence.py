@@ -151,6 +151,7 @@ class Silence:
         self._rows, self._receipts = Spacing(), Spacing()
         self._last_ns: int | None = None
         self._received_ns: int | None = None
+        self._listening = False
         self._steady_ns: float | None = None
         self.standing = False
 
@@ -207,10 +208,15 @@ class Silence:
 
     # --- in the time of receipt ------------------------------------------------------------------------------
 
+    def listen(self, now_ns: int) -> None:
+        """Begin to wait, after a stop, for what comes next; how long it takes is no spacing."""
+        self._received_ns, self._listening = now_ns, True
+
     def received(self, now_ns: int) -> None:
         """Note that something came, whatever it was. A clock that was set back is no spacing."""
         before_ns, self._received_ns = self._received_ns, now_ns
-        if before_ns is not None and now_ns >= before_ns:
+        listening, self._listening = self._listening, False
+        if before_ns is not None and now_ns >= before_ns and not listening:
             self._receipts.learn(min(now_ns - before_ns, self._patience_ns() or now_ns - before_ns))
 
     def due_ns(self) -> int | None:

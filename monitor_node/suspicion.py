@@ -14,10 +14,12 @@ from monitor_node.alarms import SuspectedCause
 from monitor_node.config import MonitorConfig
 from monitor_node.isolation import UNKNOWN, Isolation, Suspect
 from monitor_node.isolation_causes import CAUSES
+from monitor_node.isolation_fit import WayState
 from monitor_node.isolation_window import Row
-from monitor_node.reconstruction import Reconstruction
+from monitor_node.reconstruction import Reconstruction, ReconstructionState
 from monitor_node.references import ProcessReference, places
 from monitor_node.signal_watch import STUCK_SENSOR
+from monitor_node.stored_state import StoredState, packed, unpacked
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
@@ -35,6 +37,28 @@ CONVINCED = 0.5
 
 UNITS = {effect.name: effect.unit for effect in CAUSES}
 OUTPUTS = {effect.name: effect.output for effect in CAUSES if isinstance(effect, SensorEffect)}
+
+
+class SuspicionState(StoredState, frozen=True):
+    """All that is remembered.
+
+    Attributes:
+        rows: the newest, doubles: time in minutes, input, outputs of the model.
+        incident: that was looked at last.
+        since: rows since its first alarm; None: no alarm stands that has to be explained.
+        way: how far its fault has been followed.
+        output: whose sensor is, or was last, reconstructed.
+        cause: and why.
+        reconstruction: None: there is none.
+    """
+
+    rows: bytes
+    incident: int
+    since: int | None
+    way: WayState | None
+    output: str
+    cause: str
+    reconstruction: ReconstructionState | None
 
 
 class Suspicion:
@@ -56,6 +80,37 @@ class Suspicion:
         self._since: int | None = None
         self._reconstruction: Reconstruction | None = None
         self._output = self._cause = ""
+
+    @property
+    def state(self) -> SuspicionState:
+        """A copy of all that is remembered."""
+        return SuspicionState(
+            packed([(time_min, input_value, *measured) for time_min, input_value, measured in self._rows]),
+            self._incident,
+            self._since,
+            None if self._isolation is None else self._isolation.way,
+            self._output,
+            self._cause,
+            None if self._reconstruction is None else self._reconstruction.state,
+        )
+
+    def restore(self, state: SuspicionState) -> None:
+        """Go on where another of the same plant was when `state` was taken.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        model = self._reference.model
+        rows = unpacked(state.rows, 2 + len(model.outputs)).tolist()
+        self._rows.extend((row[0], row[1], row[2:]) for row in rows)
+        self._incident, self._since = state.incident, state.since
+        if state.way is not None:
+            self._compared().way = state.way
+        if state.reconstruction is not None:
+            self._reconstruct(state.output, state.cause, 0.0, ())
+            assert self._reconstruction is not None
+            self._reconstruction.restore(state.reconstruction)
+        self._output, self._cause = state.output, state.cause
 
     def update(
         self, time_ns: int, input_value: float, values: list[float], units: list[str], stuck: list[bool]

@@ -18,6 +18,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.predictor import ArxPredictor
 from monitor_node.prewhitening import Prewhitening, learn
 from monitor_node.references import ArxReference, ProcessReference, Reference, tuned
+from monitor_node.stored_state import StoredState, packed, packed_times, unpacked, unpacked_times
 from monitor_node.undisturbed import Undisturbed, undisturbed
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.process.model import ProcessModel
@@ -62,6 +63,20 @@ class Trained(NamedTuple):
     refused: str
 
 
+class TrainingState(StoredState, frozen=True):
+    """The rows of a training, and how many values of each output were there.
+
+    Attributes:
+        times_ns: of the rows, 64 bits each.
+        rows: doubles: the input and the outputs of each.
+        known: one count an output.
+    """
+
+    times_ns: bytes
+    rows: bytes
+    known: list[int]
+
+
 class Training:
     """The rows of a training.
 
@@ -77,6 +92,25 @@ class Training:
         self._predictors = predictors
         self._rows: deque[tuple[int, float, list[float]]] = deque(maxlen=MOST_ROWS)
         self._known = [0] * len(config.outputs)
+
+    @property
+    def state(self) -> TrainingState:
+        """A copy of all that it remembers."""
+        rows = [(input_value, *values) for _, input_value, values in self._rows]
+        return TrainingState(packed_times(row[0] for row in self._rows), packed(rows), list(self._known))
+
+    def restore(self, state: TrainingState) -> None:
+        """Go on where a training of the same settings was when `state` was taken.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        outputs = len(self._config.outputs)
+        times_ns, rows = unpacked_times(state.times_ns), unpacked(state.rows, 1 + outputs).tolist()
+        if len(times_ns) != len(rows) or len(state.known) != outputs:
+            raise ValueError(f"a training must have a time a row and {outputs} counts, got {len(times_ns)} times")
+        self._rows.extend((time_ns, row[0], row[1:]) for time_ns, row in zip(times_ns, rows, strict=True))
+        self._known = list(state.known)
 
     def add(self, time_ns: int, input_value: float, values: list[float]) -> None:
         """Take a row in.

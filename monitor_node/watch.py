@@ -16,15 +16,16 @@ from monitor_node.chart_watch import ChartWatch, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.drift_watch import DriftWatch
 from monitor_node.predictor import ArxPredictor
-from monitor_node.prewhitening import Prewhitener
-from monitor_node.references import ArxReference, ProcessReference, Reference
+from monitor_node.prewhitening import Prewhitener, Prewhitening
+from monitor_node.references import ArxReference, ArxReferenceState, ProcessReference, ProcessReferenceState, Reference
 from monitor_node.sampling import SamplingPeriod
 from monitor_node.signal_watch import SignalWatch
 from monitor_node.suspicion import Suspicion
 from monitor_node.training import MOST_REFUSALS, Trained, Training
+from monitor_node.watch_state import WatchedState, WatchState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Check, Estimate, ModelSnapshot
+from reactorwatch.contract.messages_pb2 import Check, Estimate
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.model import ProcessModel
@@ -44,6 +45,7 @@ class PlantWatch:
         InputError: the settings ask for the process model of a plant that it is not of.
 
     Attributes:
+        model: that the plant may be watched by; None: there is none.
         notes: what people are to be told, oldest first; whoever tells them empties it.
         rows_watched: rows that were judged.
         signals: the watch over the signals themselves.
@@ -55,7 +57,7 @@ class PlantWatch:
         self._config = config
         self._board = board
         self._points = points
-        self._model = _model(config, model)
+        self.model = _model(config, model)
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self.signals = SignalWatch(config, board)
@@ -74,6 +76,75 @@ class PlantWatch:
         self._begin_training(None)
         self.notes: list[str] = []
         self.rows_watched = 0
+
+    # --- what survives a restart -----------------------------------------------------------------------------
+
+    @property
+    def state(self) -> WatchState:
+        """A copy of all that is remembered, but for the alarms; between two rows."""
+        return WatchState(
+            self._sampling.copied(),
+            self.signals.state,
+            [predictor.state for predictor in self._predictors],
+            self._refusals,
+            self._began_ns,
+            self._training.state,
+            None if self._reference is None else self._watched(self._reference),
+        )
+
+    def _watched(self, reference: Reference) -> WatchedState:
+        return WatchedState(
+            reference.state,
+            [(check.name, check.result) for check in self._checks],
+            [whitener.state for whitener in self._whiteners],
+            self._charts.state,
+            None if self._suspicion is None else self._suspicion.state,
+            self._arl0,
+            list(self._withheld),
+            self.rows_watched,
+            self._drift.until_next,
+        )
+
+    def restore(self, state: WatchState, now_ns: int) -> None:
+        """Go on, bit for bit, where a watch with the same settings was when `state` was taken; after the board.
+
+        Args:
+            state: of the other watch.
+            now_ns: when the plant is listened to again.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        self._sampling.state = state.sampling
+        self.signals.restore(state.signals, now_ns)
+        for predictor, of_predictor in zip(self._predictors, state.predictors, strict=True):
+            predictor.restore(of_predictor)
+        self._refusals, self._began_ns = state.refusals, state.began_ns
+        self._training.restore(state.training)
+        watched = state.watched
+        if watched is None:
+            return
+        self._drift.until_next = watched.until_drift
+        self._checks = [Check(name=name, result=result) for name, result in watched.checks]
+        learned = [item.learned for item in watched.whiteners]
+        outputs = len(self._config.outputs)
+        if not len(learned) == len(watched.withheld) == outputs:
+            raise ValueError(f"the state must be of {outputs} outputs, got {len(learned)}")
+        self._judge_by(self._reference_of(watched.reference), learned, watched.arl0)
+        self._whiteners = [Prewhitener.from_state(item) for item in watched.whiteners]
+        self._charts.restore(watched.charts)
+        if (watched.suspicion is None) != (self._suspicion is None):
+            raise ValueError("the state must tell of the search for causes as it is set")
+        if self._suspicion is not None and watched.suspicion is not None:
+            self._suspicion.restore(watched.suspicion)
+        self._withheld, self.rows_watched = tuple(watched.withheld), watched.rows_watched
+
+    def _reference_of(self, state: ProcessReferenceState | ArxReferenceState) -> Reference:
+        if isinstance(state, ArxReferenceState):
+            return ArxReference.from_state(state)
+        if self.model is None:
+            raise ValueError("the state must be of a plant without a process model")
+        return ProcessReference.from_state(state, self.model, self._config.outputs)
 
     @property
     def watching(self) -> bool:
@@ -110,12 +181,12 @@ class PlantWatch:
             return told
         for key, predictor in zip(self._model_keys, self._predictors, strict=True):
             adaptive, reference = predictor.adaptive(), predictor.reference()
-            if adaptive is not None:
-                told.append(Publication(key, ModelSnapshot(time_ns=time_ns, reference=False, **adaptive)))
             if reference is not None:
-                snapshot = ModelSnapshot(time_ns=time_ns, reference=True, **reference)
-                snapshot.checks.extend(self._checks)
-                told.append(Publication(key, snapshot))
+                reference.checks.extend(self._checks)
+            for snapshot in (adaptive, reference):
+                if snapshot is not None:
+                    snapshot.time_ns = time_ns
+                    told.append(Publication(key, snapshot))
         return told
 
     # --- training --------------------------------------------------------------------------------------------
@@ -123,10 +194,10 @@ class PlantWatch:
     def _begin_training(self, time_ns: int | None) -> None:
         config = self._config
         self._began_ns = time_ns
-        self._predictors = [
+        self._predictors: list[ArxPredictor] = [
             ArxPredictor(config.order, config.delay, config.forgetting, described=self._points) for _ in config.outputs
         ]
-        self._training = Training(config, self._model, self._predictors)
+        self._training: Training = Training(config, self.model, self._predictors)
 
     def _train(
         self,
@@ -168,22 +239,25 @@ class PlantWatch:
                     publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
 
     def _start(self, trained: Trained) -> None:
-        config = self._config
-        period_ns = self._sampling.period_ns
-        self._arl0 = false_alarm_budget.share_arl0(
-            config.false_alarms_per_30_days, self._chance_alarms, period_ns / MINUTE_NS
+        arl0 = false_alarm_budget.share_arl0(
+            self._config.false_alarms_per_30_days, self._chance_alarms, self._sampling.period_ns / MINUTE_NS
         )
-        self._reference, self._checks = trained.reference, trained.checks
+        self._checks = trained.checks
+        self._judge_by(trained.reference, trained.learned, arl0)
         self._whiteners = [Prewhitener(item) for item in trained.learned]
-        self._whitened_sds = [item.sd for item in trained.learned]
-        reference = trained.reference
-        if config.isolation and isinstance(reference, ProcessReference) and reference.model.name == cstr().name:
-            self._suspicion = Suspicion(config, self._board, reference)  # its causes are those of the reactor
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
         self.notes += self._drift.start(self._predictors, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
+
+    def _judge_by(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
+        """From now on rows are judged by this reference."""
+        config = self._config
+        self._reference, self._arl0 = reference, arl0
+        self._whitened_sds = [item.sd for item in learned]
+        if config.isolation and isinstance(reference, ProcessReference) and reference.model.name == cstr().name:
+            self._suspicion = Suspicion(config, self._board, reference)  # its causes are those of the reactor
 
     # --- watching --------------------------------------------------------------------------------------------
 

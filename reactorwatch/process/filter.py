@@ -117,12 +117,14 @@ class FilterState(msgspec.Struct, frozen=True):
         inputs: of the last row.
         x: the state there.
         P: its covariance, row by row.
+        learned: whether, where there is no last row, something is known all the same of the states that never change.
     """
 
     time_min: float | None
     inputs: tuple[float, ...]
     x: tuple[float, ...]
     P: tuple[float, ...]
+    learned: bool = False
 
 
 class Filter:
@@ -193,12 +195,12 @@ class Filter:
     def state(self) -> FilterState:
         """Everything that it remembers."""
         memory = tuple(self._memory.tolist())
-        return FilterState(self._time_min, self._inputs, memory[: self._n_x], memory[self._n_x :])
+        return FilterState(self._time_min, self._inputs, memory[: self._n_x], memory[self._n_x :], self._learned)
 
     @state.setter
     def state(self, state: FilterState) -> None:
         self._time_min, self._inputs = state.time_min, state.inputs
-        self._learned = state.time_min is not None
+        self._learned = state.learned or state.time_min is not None
         self._memory[:] = [*state.x, *state.P]
 
     def update(

@@ -4,8 +4,8 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.shards import Crew, Shard, home
-from reactorwatch.contract.codec import Encoded, Publication, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmState, CommandReply, Health
+from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmState, CommandReply, Health, Sample
 from reactorwatch.errors import InputError
 
 from .fleets import PLANTS, QUICK, alone, fleet, of, row_by_row, run_of
@@ -157,3 +157,45 @@ def test_an_alarm_that_stands_is_not_raised_again_by_who_takes_over_and_is_clear
     monitor.on_alive(shard_token(home("b", 2)), False, 0)
     said = [item for message in run for item in monitor.on_message(message, 0)]
     assert [(key, event) for key, event, _ in alarms(said)] == [("reactor/b/alarm/ewma/T", "cleared")]
+
+
+@pytest.mark.parametrize("told_again", [0, 50])
+def test_with_the_state_of_who_died_no_alarm_is_lost_and_none_is_told_twice(
+    told_again: int, runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
+) -> None:
+    run, at_home = runs["b"], home("b", 2)
+    raised_ns = next(time_ns for _, _, time_ns in alarms(expected["b"]))
+    raised_at = next(place for place, item in enumerate(run) if Sample.FromString(item.payload).time_ns == raised_ns)
+    stored_at, died_at = raised_at - 90, raised_at + 30
+    first = fleet(shard=Shard(at_home, 2), name="first")
+    said = first.on_messages(run[:stored_at], 0)
+    state = first.monitor("b").to_bytes()
+    said += first.on_messages(run[stored_at:died_at], 0)
+    second = fleet(shard=Shard(3 - at_home, 2), name="second", stored=lambda _: state)
+    second.on_alive(shard_token(at_home), True, 0)
+    for publication in said:
+        second.on_message(encode(publication), 0)
+    second.on_alive(shard_token(at_home), False, 0)
+    said += second.on_messages(run[stored_at - told_again :], 0)  # what the plant remembers, then what comes
+    assert [item for item in of("b", said) if isinstance(item.message, Alarm)] == [
+        item for item in expected["b"] if isinstance(item.message, Alarm)
+    ]
+
+
+def test_a_state_that_cannot_be_used_is_told_and_the_plant_learned_anew() -> None:
+    monitor = fleet(stored=lambda _: b"rubbish")
+    monitor.on_alive("reactor/x/alive/plant", True, 0)
+    ((plant, line),) = monitor.reports(0)
+    assert plant == "x"
+    assert "learned anew" in line
+
+
+def test_what_is_released_can_be_adopted(
+    runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
+) -> None:
+    first, second, half = fleet(), fleet(), len(runs["b"]) // 2
+    said = first.on_messages(runs["b"][:half], 0)
+    second.adopt("b", first.release("b"), 0)
+    assert first.plants == []
+    said += second.on_messages(runs["b"][half:], 0)
+    assert of("b", said) == expected["b"]

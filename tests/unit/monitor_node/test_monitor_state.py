@@ -1,0 +1,254 @@
+"""A monitor that was stopped and goes on from its stored state says what it would have said, value for value."""
+
+import random
+from typing import Any, Literal
+
+import msgspec
+import pytest
+
+from monitor_node.config import ChartName, MonitorConfig
+from monitor_node.core import Monitor
+from monitor_node.monitor_state import MAGIC, OtherSettingsError
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, encode, encode_message
+from reactorwatch.contract.messages_pb2 import AlarmCommand, Health, ShelveAlarm
+from reactorwatch.errors import InputError
+from reactorwatch.process.cstr import cstr
+
+from .samples import PLANT, leaking_run, sample, samples
+
+ALL_CHARTS: tuple[ChartName, ...] = (
+    "shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe", "parameters",
+)  # fmt: skip
+CONFIG = MonitorConfig(training_min=60.0, charts=ALL_CHARTS)
+ONSET_MIN, END_MIN = 70.0, 90.0
+SIGNALS = 3
+
+
+@pytest.fixture(scope="module")
+def leak() -> list[Encoded]:
+    """The coolant leaks a tenth from minute 70 on, a sensor sticks, another has a spike, and samples are missing."""
+    time_min, columns = leaking_run(-0.1, ONSET_MIN, END_MIN, seed=3)
+    columns["T"][650] += 30.0
+    columns["C"][850:870] = columns["C"][850]
+    lost = random.Random(5)
+    return [message for message in samples(time_min, columns) if lost.random() > 0.01]
+
+
+def question(name: str, command: AlarmCommand | ShelveAlarm) -> Encoded:
+    payload, encoding = encode_message(command)
+    return Encoded(keys.key(PLANT, keys.COMMAND, name), payload, encoding)
+
+
+ACTS = {
+    2500: question("acknowledge", AlarmCommand(alarm="shewhart/T", by="Ada", comment="seen")),
+    2510: question("shelve", ShelveAlarm(alarm="ewma/T", by="Ada", minutes=7.0)),
+}
+"""What an operator does, by the number of the sample before it."""
+
+
+def run(monitor: Monitor, messages: list[Encoded], first: int, end: int) -> list[list[Encoded]]:
+    """What a monitor says because of each message, and of what the operator does then."""
+    said = []
+    for number in range(first, end):
+        told = list(monitor.on_message(messages[number], 0))
+        if number in ACTS:
+            reply, publications = monitor.on_command(ACTS[number], 0)
+            assert reply.accepted, reply.text
+            told += publications
+        said.append([encode(item) for item in told])
+    return said
+
+
+def stopped_at(
+    places: list[int], messages: list[Encoded], config: MonitorConfig, **settings: Any
+) -> list[list[Encoded]]:
+    """The same of a monitor that was stopped at each of the places and begun again from what it had stored."""
+    monitor, said, before = Monitor(config, 0, **settings), list[list[Encoded]](), 0
+    for place in [*places, len(messages)]:
+        said += run(monitor, messages, before, place)
+        stored, monitor, before = monitor.to_bytes(), Monitor(config, 0, **settings), place
+        monitor.from_bytes(stored)
+    return said
+
+
+@pytest.mark.parametrize("points", [True, False], ids=["with points", "without"])
+@pytest.mark.parametrize("reference", ["process", "arx", "auto"])
+def test_who_was_stopped_at_any_samples_says_the_same(
+    reference: Literal["process", "arx", "auto"], points: bool, leak: list[Encoded]
+) -> None:
+    """In training and watching, in an alarm, acknowledged and shelved, in the middle of a row."""
+    config = msgspec.structs.replace(CONFIG, reference=reference)
+    whole = run(Monitor(config, 0, points=points), leak, 0, len(leak))
+    places = [*sorted(random.Random(reference).sample(range(len(leak)), 12)), 2505, 2520, 2550]
+    again = stopped_at(sorted(places), leak, config, points=points)
+    differing = [number for number, (first, second) in enumerate(zip(whole, again, strict=True)) if first != second]
+    assert differing == []
+    events = {item.payload for told in whole for item in told if "/alarm/" in item.key}
+    assert len(events) > 3
+
+
+def test_a_state_that_was_gone_on_from_is_the_same_bytes(leak: list[Encoded]) -> None:
+    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
+    run(monitor, leak, 0, 2400)
+    again.from_bytes(monitor.to_bytes())
+    assert again.to_bytes() == monitor.to_bytes()
+
+
+def test_a_monitor_that_heard_nothing_yet_is_stored_and_restored() -> None:
+    again = Monitor(CONFIG, 0)
+    again.from_bytes(Monitor(CONFIG, 0).to_bytes())
+    assert again.phase == "waiting"
+
+
+def test_a_state_of_the_default_settings_takes_less_than_60_kilobytes(leak: list[Encoded]) -> None:
+    """Most of it are the rows of the training, and later those that a cause is looked for in."""
+    monitor, sizes = Monitor(MonitorConfig(training_min=60.0), 0), []
+    for first in range(0, len(leak), 100):
+        run(monitor, leak, first, min(first + 100, len(leak)))
+        sizes.append(len(monitor.to_bytes()))
+    assert max(sizes) < 60_000
+
+
+def wrong(stored: bytes) -> list[tuple[str, bytes, str]]:
+    """What is no state of ours, and what is said of it."""
+    damaged = bytearray(stored)
+    damaged[len(stored) // 2] ^= 1
+    newer = MAGIC + (2).to_bytes(2, "big") + stored[len(MAGIC) + 2 :]
+    return [
+        ("empty", b"", "is no state of a monitor: 0 bytes"),
+        ("foreign", b"\x89PNG and so on", "is no state of a monitor: 14 bytes"),
+        ("cut in its head", stored[: len(MAGIC) + 1], "is no state of a monitor"),
+        ("cut", stored[:-100], "is a damaged state of a monitor"),
+        ("a bit is another", bytes(damaged), "is a damaged state of a monitor"),
+        ("of another version", newer, "is the state of a monitor in version 2, this software reads 1"),
+    ]
+
+
+def test_what_is_no_state_is_refused_in_one_line_and_nothing_has_changed(leak: list[Encoded]) -> None:
+    monitor = Monitor(CONFIG, 0)
+    run(monitor, leak, 0, 2300)
+    stored = monitor.to_bytes()
+    other = Monitor(CONFIG, 0)
+    before = other.to_bytes()
+    for _, data, text in wrong(stored):
+        with pytest.raises(InputError, match=f"^{text}"):
+            other.from_bytes(data)
+        assert other.to_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("setting", "text"),
+    [
+        ({"training_min": 50.0}, "training_min was 60.0 and is 50.0"),
+        ({"plant": "other"}, "plant was 'cstr' and is 'other'"),
+        ({"outputs": ("T",)}, r"outputs was \['C', 'T'\] and is \['T'\]"),
+    ],
+)
+def test_a_state_of_other_settings_is_refused_and_the_difference_named(setting: dict[str, Any], text: str) -> None:
+    stored = Monitor(CONFIG, 0).to_bytes()
+    with pytest.raises(OtherSettingsError, match=f"^was learned with other settings: {text}$"):
+        Monitor(msgspec.structs.replace(CONFIG, **setting), 0).from_bytes(stored)
+
+
+def test_a_state_learned_with_other_equations_is_refused() -> None:
+    stored = Monitor(CONFIG, 0).to_bytes()
+    other = Monitor(CONFIG, 0, model=cstr().with_values({"K3": 1.01 * cstr().parameter("K3").value}))
+    with pytest.raises(OtherSettingsError, match="equations"):
+        other.from_bytes(stored)
+
+
+def test_where_and_how_often_it_is_stored_is_no_other_setting() -> None:
+    stored = Monitor(CONFIG, 0).to_bytes()
+    Monitor(msgspec.structs.replace(CONFIG, state_file="x", state_every_s=1.0, health_period_s=1.0), 0).from_bytes(
+        stored
+    )
+
+
+# --- what comes again ------------------------------------------------------------------------------------------------
+
+
+def duplicated(monitor: Monitor) -> int:
+    (publication,) = monitor.on_tick(1)
+    assert isinstance(publication.message, Health)
+    return publication.message.duplicated
+
+
+@pytest.mark.parametrize("rows_again", [5, 100, 800])
+def test_samples_that_were_heard_before_the_stop_are_counted_and_change_nothing(
+    rows_again: int, leak: list[Encoded]
+) -> None:
+    """The publisher tells its last rows again, many more than the alignment remembers."""
+    place = 2520
+    whole = run(Monitor(CONFIG, 0), leak, 0, len(leak))
+    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
+    run(monitor, leak, 0, place)
+    again.from_bytes(monitor.to_bytes())
+    first = place - SIGNALS * rows_again
+    assert [item for number in range(first, place) for item in again.on_message(leak[number], 0)] == []
+    assert run(again, leak, place, len(leak)) == whole[place:]
+    assert duplicated(again) == SIGNALS * rows_again
+
+
+def test_a_sample_that_was_missing_at_the_stop_is_taken_when_it_comes_again() -> None:
+    messages = list(samples(*leaking_run(0.0, 1.0, 3.0, seed=1)))
+    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
+    for message in messages[: SIGNALS * 20 + 2]:  # T of the last row is missing
+        monitor.on_message(message, 0)
+    again.from_bytes(monitor.to_bytes())
+    for message in messages[SIGNALS * 10 : SIGNALS * 21]:
+        again.on_message(message, 0)
+    assert again.rows == 21
+    assert duplicated(again) == SIGNALS * 10 + 2
+
+
+def test_a_plant_that_began_anew_meanwhile_is_heard(leak: list[Encoded]) -> None:
+    """Its clock was set back and it counts from 0: what it says of times that were heard has other numbers."""
+    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
+    run(monitor, leak, 0, 2300)
+    again.from_bytes(monitor.to_bytes())
+    rows = again.rows
+    assert again.last_ns is not None
+    begin_min = again.last_ns / 60e9 - 1.0
+    for row in range(50):
+        for signal, value in (("qc", 100.0), ("C", 0.1), ("T", 438.5)):
+            again.on_message(sample(signal, row, begin_min + row / 10, value), 0)
+    assert again.rows >= rows + 40
+
+
+def test_once_all_was_told_a_plant_that_repeats_itself_is_heard() -> None:
+    """A simulated plant that is started anew with the same clock publishes the same numbers at the same times."""
+    messages = list(samples(*leaking_run(0.0, 1.0, 20.0, seed=1)))
+    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
+    for message in messages:
+        monitor.on_message(message, 0)
+    again.from_bytes(monitor.to_bytes())
+    again.caught_up()
+    for message in messages:
+        again.on_message(message, 0)
+    assert again.rows == 2 * monitor.rows
+
+
+def test_a_plant_that_says_nothing_after_the_stop_is_silent(leak: list[Encoded]) -> None:
+    """It is waited for from the start on, as long as its receipts before the stop ask for."""
+    second = 1_000_000_000
+    monitor = Monitor(CONFIG, 0)
+    for number, message in enumerate(leak[:300]):
+        monitor.on_message(message, number * second)
+    again = Monitor(CONFIG, 10_000 * second)
+    again.from_bytes(monitor.to_bytes())
+    due_ns = again.next_tick_ns()
+    while due_ns < 10_000 * second + 3 * second:
+        again.on_tick(due_ns)
+        due_ns = again.next_tick_ns()
+    said = [item for tick in range(10_000, 10_020) for item in again.on_tick(tick * second)]
+    assert [item.key for item in said if "/alarm/" in item.key] == [keys.key(PLANT, keys.ALARM, "silence/plant")]
+
+
+def test_the_rows_of_a_fault_that_is_followed_go_on(leak: list[Encoded]) -> None:
+    """A state in the middle of an isolation remembers how far it has come: the suspects are the same, bit for bit."""
+    config = MonitorConfig(training_min=60.0)
+    whole = [item for told in run(Monitor(config, 0), leak, 0, len(leak)) for item in told if "/alarm/" in item.key]
+    places = [SIGNALS * place for place in (701, 712, 720, 735, 760)]
+    again = [item for told in stopped_at(places, leak, config) for item in told if "/alarm/" in item.key]
+    assert again == whole
