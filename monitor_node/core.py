@@ -8,13 +8,13 @@ plant follows from the samples and from what people said of its alarms, so a rep
 anything says the same, value for value.
 """
 
-from collections.abc import Iterable
-from math import isfinite
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_commands import obey
-from monitor_node.alignment import Aligner, Row
+from monitor_node.alignment import Aligner, Counts, Row
+from monitor_node.charts.base import LARGEST_VALUE
 from monitor_node.config import MonitorConfig
 from monitor_node.monitor_state import MonitorState, opened, sealed, settings_of
 from monitor_node.refusals import Refusals
@@ -34,6 +34,24 @@ HEARD_AGAIN_NS = 1_000_000
 """Samples nearer to each other are one sign of life: the signals of a row come together."""
 
 UNSPECIFIED, BAD = Quality.QUALITY_UNSPECIFIED, Quality.QUALITY_BAD  # looked up once, not at every sample
+
+
+class Receipt(NamedTuple):
+    """How messages came, by the clock of receipt.
+
+    Attributes:
+        start_ns: when the monitor was started.
+        heard_ns: of the newest sign of life that counted, see `HEARD_AGAIN_NS`.
+        received_ns: likewise, as the silence of the plant knows it; None: what comes next is the first.
+        lag_ns: the longest that a message has waited since health was told.
+        health_due_ns: when it is told next.
+    """
+
+    start_ns: int
+    heard_ns: int
+    received_ns: int | None
+    lag_ns: int
+    health_due_ns: int
 
 
 class Monitor:
@@ -115,7 +133,7 @@ class Monitor:
         if quality == UNSPECIFIED:
             self.refusals.add("payload", f"{signal}: the sample has no quality, so it is no Sample of ours")
             return []
-        if not isfinite(value):
+        if not abs(value) < LARGEST_VALUE:  # nor a number at all, perhaps
             self.refusals.add("not_finite", f"{signal} is {value} at {sample.time_ns} ns")
             return []
         if quality == BAD:
@@ -178,23 +196,7 @@ class Monitor:
 
     def to_bytes(self) -> bytes:
         """All that is remembered, between two messages: a monitor that goes on from it says the same, bit for bit."""
-        return sealed(
-            MonitorState(
-                self._learned_with(),
-                self._aligner.state,
-                self.alarms.to_bytes(),
-                self._watch.state,
-                self._units,
-                self._heard_from_ns,
-                self.first_ns,
-                self.last_ns,
-                self._watching_since_ns,
-                self._snapshot_due_ns,
-                self._received,
-                self._published,
-                self.refusals.by_reason,
-            )
-        )
+        return sealed(self._state(self._learned_with()))
 
     def from_bytes(self, data: bytes) -> None:
         """Go on from what `to_bytes` returned, of a monitor with the same settings.
@@ -206,7 +208,36 @@ class Monitor:
             InputError: the bytes are not that; everything is as before.
             OtherSettingsError: they are, but of a monitor with other settings; likewise.
         """
-        state = opened(data, self._learned_with())
+        self.restore(opened(data, self._learned_with()))
+
+    @property
+    def state(self) -> MonitorState:
+        """What `to_bytes` stores, without the settings: for this process. Parts of it are not copied."""
+        return self._state({})
+
+    def _state(self, settings: dict[str, Any]) -> MonitorState:
+        return MonitorState(
+            settings,
+            self._aligner.state,
+            self.alarms.to_bytes(),
+            self._watch.state,
+            self._units,
+            self._heard_from_ns,
+            self.first_ns,
+            self.last_ns,
+            self._watching_since_ns,
+            self._snapshot_due_ns,
+            self._received,
+            self._published,
+            self.refusals.by_reason,
+        )
+
+    def restore(self, state: MonitorState) -> None:
+        """Go on where a monitor with the same settings was when `state` was taken, see `from_bytes`.
+
+        Raises:
+            InputError: the state is damaged; everything is as before.
+        """
         board = AlarmBoard(self.config)
         try:
             watch = PlantWatch(self.config, board, points=self._points, model=self._model)
@@ -228,6 +259,11 @@ class Monitor:
             self._settings = settings_of(self.config, self._watch.model, points=self._points)
         return self._settings
 
+    @property
+    def is_catching_up(self) -> bool:
+        """Whether samples may come that were heard before a stop."""
+        return self._told_again is not None and not self._told_again.is_over
+
     def caught_up(self) -> None:
         """What was published before has all come: from now on no sample is one that was heard before a stop."""
         self._told_again = None
@@ -243,6 +279,18 @@ class Monitor:
         self.alarms.go_on_from(alarms)
         self._watch.signals.go_on_from_alarms()
 
+    @property
+    def receipt(self) -> Receipt:
+        """What a restart forgets: how messages came, by the clock."""
+        return Receipt(
+            self._start_ns, self._heard_ns, self._watch.signals.received_ns, self._lag_ns, self._health_due_ns
+        )
+
+    @receipt.setter
+    def receipt(self, receipt: Receipt) -> None:
+        self._start_ns, self._heard_ns, received_ns, self._lag_ns, self._health_due_ns = receipt
+        self._watch.signals.received_ns = received_ns
+
     # --- what others may ask ---------------------------------------------------------------------------------
 
     @property
@@ -251,6 +299,11 @@ class Monitor:
         if self.first_ns is None:
             return "waiting"
         return "training" if self._watching_since_ns is None else "watching"
+
+    @property
+    def model(self) -> ProcessModel | None:
+        """That the plant may be watched by; None: there is none."""
+        return self._watch.model
 
     @property
     def rows(self) -> int:
@@ -285,6 +338,14 @@ class Monitor:
 
     # --- rows ------------------------------------------------------------------------------------------------
 
+    def on_rows(self, rows: Iterable[Row]) -> list[Publication]:
+        """Judge rows that somebody else has lined up."""
+        publications: list[Publication] = []
+        for row in rows:
+            self._on_row(row, publications)
+        self._published += len(publications)
+        return publications
+
     def finish(self) -> list[Publication]:
         """Judge the rows that still wait for samples, as at the end of a record."""
         publications: list[Publication] = []
@@ -307,25 +368,62 @@ class Monitor:
             self._snapshot_due_ns = time_ns + self._snapshot_ns
 
     def _health(self, now_ns: int, phase: str) -> Publication:
-        counts = self._aligner.state.counts
-        health = Health(
-            time_ns=now_ns,
-            node=NODE,
-            version=__version__,
-            phase=phase,
-            uptime_s=(now_ns - self._start_ns) / 1e9,
+        health = health_of(
+            now_ns,
+            phase,
+            self._start_ns,
+            self._aligner.state.counts,
+            self.refusals.by_reason,
             received=self._received,
-            lost=counts.lost,
-            late=counts.late,
-            refused=self.refusals.total,
-            refused_by_reason=self.refusals.by_reason,
-            lag_ms=self._lag_ns / 1e6,
-            duplicated=counts.duplicated,
-            out_of_order=counts.out_of_order,
             published=self._published,
-            rows=counts.rows,
-            incomplete_rows=counts.incomplete_rows,
+            lag_ns=self._lag_ns,
             heard_from_ns=self._heard_from_ns,
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)
+
+
+def health_of(
+    now_ns: int,
+    phase: str,
+    start_ns: int,
+    counts: Counts,
+    refused: Mapping[str, int],
+    *,
+    received: int,
+    published: int,
+    lag_ns: int,
+    heard_from_ns: Mapping[str, int],
+) -> Health:
+    """How a plant's monitor does.
+
+    Args:
+        now_ns: the time.
+        phase: as `Monitor.phase`, or `stopped`.
+        start_ns: when it was started.
+        counts: of samples on their way into rows.
+        refused: counts by reason.
+        received: messages so far.
+        published: likewise.
+        lag_ns: the longest that one has waited.
+        heard_from_ns: by signal, the time of its first sample.
+    """
+    return Health(
+        time_ns=now_ns,
+        node=NODE,
+        version=__version__,
+        phase=phase,
+        uptime_s=(now_ns - start_ns) / 1e9,
+        received=received,
+        lost=counts.lost,
+        late=counts.late,
+        refused=sum(refused.values()),
+        refused_by_reason=refused,
+        lag_ms=lag_ns / 1e6,
+        duplicated=counts.duplicated,
+        out_of_order=counts.out_of_order,
+        published=published,
+        rows=counts.rows,
+        incomplete_rows=counts.incomplete_rows,
+        heard_from_ns=heard_from_ns,
+    )

@@ -19,6 +19,8 @@ import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.quiet_plants import QuietPlants
+from monitor_node.quiet_record import QuietForm
 from monitor_node.shards import Crew
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
@@ -28,6 +30,12 @@ from reactorwatch.process.model import ProcessModel
 
 PATIENCE_NS = 10_000_000_000
 """After the start: a shard of which nobody was seen by then is taken for gone."""
+
+LOOK_AGAIN_ROWS = 8
+"""After so many rows it is seen again whether a plant is quiet."""
+
+LOOK_AGAIN_NS = 250_000_000
+"""After messages, it is seen by then at the latest which plant is overdue."""
 
 State = bytes
 """All that a monitor remembers of a plant."""
@@ -62,7 +70,12 @@ class FleetMonitor:
     ) -> None:
         self._config, self._model, self._points = config, model, points
         self._crew, self._stored, self._in_charge = crew, stored, in_charge
-        Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
+        first = Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
+        form = None if points or first.model is None else QuietForm.of(config, first.model)
+        self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
+        self._quiet_due_ns = start_ns
+        self._look_at_row: dict[str, int] = {}  # of a plant with a monitor of its own: when to see whether it is quiet
+        self._notes: list[tuple[str, str]] = []
         self._patience_ns: int | None = start_ns + PATIENCE_NS
         self._monitors: dict[str, Monitor | None] = {}  # by plant; None: it is another's
         self._plants: dict[str, str] = {}  # by key of a sample
@@ -75,16 +88,21 @@ class FleetMonitor:
     @property
     def plants(self) -> list[str]:
         """Those that are watched here."""
-        return [plant for plant, monitor in self._monitors.items() if monitor is not None]
+        return [plant for plant, monitor in self._monitors.items() if monitor is not None or self._is_quiet(plant)]
+
+    @property
+    def quiet(self) -> list[str]:
+        """Those of them in which nothing happens just now."""
+        return [] if self._quiet is None else self._quiet.plants
 
     def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
         """A node of a plant, or another monitor of the fleet, came or went."""
-        if self._crew.note(token, is_alive=is_alive):
-            return self._share_out(now_ns)
         topic = keys.parse(token)
-        if topic is None or topic.kind != keys.ALIVE or not is_alive:
-            return []
-        return self._meet(topic.plant, now_ns)
+        if self._crew.note(token, is_alive=is_alive):
+            self._share_out(now_ns)
+        elif topic is not None and topic.kind == keys.ALIVE and is_alive:
+            self._meet(topic.plant, now_ns)
+        return []
 
     def adopt(self, plant: str, state: State | None, now_ns: int) -> None:
         """Begin to watch a plant.
@@ -110,7 +128,7 @@ class FleetMonitor:
 
     def release(self, plant: str) -> State | None:
         """Watch a plant no longer; returns its state, for who does. None: it was not watched here."""
-        monitor = self._monitors.get(plant)
+        monitor = self._alone(plant)
         self._monitors[plant] = None
         if monitor is None:
             return None
@@ -123,7 +141,7 @@ class FleetMonitor:
         Raises:
             InputError: it is not watched here.
         """
-        monitor = self._monitors.get(plant)
+        monitor = self._alone(plant)
         if monitor is None:
             raise InputError(f"plant {plant!r} is not watched here (there are: {', '.join(self.plants)})")
         return monitor
@@ -131,26 +149,26 @@ class FleetMonitor:
     def _named(self, plant: str) -> MonitorConfig:
         return msgspec.structs.replace(self._config, plant=plant)
 
-    def _meet(self, plant: str, now_ns: int) -> list[Publication]:
+    def _meet(self, plant: str, now_ns: int) -> None:
         """A plant that may be new."""
         if plant in self._monitors:
-            return []
+            return
         try:
             keys.checked_plant(plant)
         except ValueError:
-            return []
+            return
         self._monitors[plant] = None
-        return self._share_out(now_ns, [plant])
+        self._share_out(now_ns, [plant])
 
-    def _share_out(self, now_ns: int, plants: Iterable[str] | None = None) -> list[Publication]:
+    def _share_out(self, now_ns: int, plants: Iterable[str] | None = None) -> None:
         """Begin to watch what is ours now, and cease to watch what is not; all plants, if not told which."""
         for plant in list(self._monitors) if plants is None else plants:
             ours = self._crew.is_ours(plant)
-            if ours and self._monitors[plant] is None:
+            watched = self._monitors[plant] is not None or self._is_quiet(plant)
+            if ours and not watched:
                 self.adopt(plant, self._stored(plant), now_ns)
-            elif not ours and self._monitors[plant] is not None:
+            elif watched and not ours:
                 self.release(plant)
-        return []
 
     # --- what the loop calls ---------------------------------------------------------------------------------
 
@@ -159,34 +177,46 @@ class FleetMonitor:
         return self.on_messages([message], now_ns)
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
-        """Take in what was published, in its order."""
+        """Take in what was published, in the order of each plant."""
         publications: list[Publication] = []
         touched: set[str] = set()
+        if self._quiet:
+            publications, messages, given = self._quiet.on_messages(messages, now_ns)
+            for plant, monitor in given.items():
+                self._monitors[plant] = monitor
+                self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
+                touched.add(plant)
+            publications = self._new(publications)
         for message in messages:
-            plant = self._plants.get(message.key)
-            if plant is None:
-                topic = keys.parse(message.key)
-                if topic is None or topic.kind not in (keys.SAMPLE, keys.ALARM):
-                    continue
-                plant = topic.plant
-                publications += self._meet(plant, now_ns)
-                if topic.kind == keys.ALARM:
-                    self._hear(plant, message)
-                    continue
-                if plant in self._monitors:
-                    self._plants[message.key] = plant
-            monitor = self._monitors.get(plant)
-            if monitor is not None:
-                publications += self._new(plant, monitor.on_message(message, now_ns))
+            plant = self._plants.get(message.key) or self._plant_of(message, now_ns)
+            own = self._monitors.get(plant)
+            if own is not None:
+                publications += self._new(own.on_message(message, now_ns))
                 touched.add(plant)
         for plant in touched:
-            self._schedule(plant, self._monitors[plant])
+            own = self._monitors[plant]
+            if own is not None and not self._becomes_quiet(plant, own):
+                self._schedule(plant, own)
+        self._quiet_due_ns = min(self._quiet_due_ns, now_ns + LOOK_AGAIN_NS)
         return publications
+
+    def _plant_of(self, message: Encoded, now_ns: int) -> str:
+        """Whose sample it is; empty if it is none."""
+        topic = keys.parse(message.key)
+        if topic is None or topic.kind not in (keys.SAMPLE, keys.ALARM):
+            return ""
+        self._meet(topic.plant, now_ns)
+        if topic.kind == keys.ALARM:
+            self._hear(topic.plant, message)
+            return ""
+        if topic.plant in self._monitors:
+            self._plants[message.key] = topic.plant
+        return topic.plant
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """Let a person act on a plant's alarms; None: the plant is another's to answer for."""
         topic = keys.parse(question.key)
-        monitor = self._monitors.get(topic.plant) if topic is not None else None
+        monitor = self._alone(topic.plant) if topic is not None else None
         return (None, []) if monitor is None else monitor.on_command(question, now_ns)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
@@ -195,7 +225,12 @@ class FleetMonitor:
         if self._patience_ns is not None and now_ns >= self._patience_ns:
             self._patience_ns = None
             if self._crew.presume_gone():
-                publications += self._share_out(now_ns)
+                self._share_out(now_ns)
+        if self._quiet:
+            for plant in self._quiet.overdue(now_ns):
+                self._alone(plant)
+            publications += self._quiet.healths(now_ns)
+            self._quiet_due_ns = self._quiet.next_due_ns()
         while self._dues and self._dues[0][0] <= now_ns:
             due_ns, plant = heappop(self._dues)
             monitor = self._monitors.get(plant)
@@ -210,6 +245,8 @@ class FleetMonitor:
     def next_tick_ns(self) -> int:
         """When the first of the plants is due."""
         due_ns = self._dues[0][0] if self._dues else 2**63 - 1
+        if self._quiet:
+            due_ns = min(due_ns, self._quiet_due_ns)
         return due_ns if self._patience_ns is None else min(due_ns, self._patience_ns)
 
     @property
@@ -219,10 +256,13 @@ class FleetMonitor:
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the health of all for the last time."""
-        return [said for plant in self.plants for said in self.monitor(plant).on_stop(now_ns)]
+        said = [item for monitor in self._monitors.values() if monitor is not None for item in monitor.on_stop(now_ns)]
+        return said + (self._quiet.last_healths(now_ns) if self._quiet else [])
 
     def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
         """What people are to be told: plant and line."""
+        yield from self._notes
+        self._notes.clear()
         for plant, monitor in self._monitors.items():
             if monitor is None:
                 continue
@@ -233,6 +273,32 @@ class FleetMonitor:
                 yield plant, monitor.notes.pop(0)
 
     # --- within ----------------------------------------------------------------------------------------------
+
+    def _is_quiet(self, plant: str) -> bool:
+        return self._quiet is not None and plant in self._quiet
+
+    def _alone(self, plant: str) -> Monitor | None:
+        """The plant's own monitor, if it is watched here."""
+        if self._quiet is not None and plant in self._quiet:
+            monitor = self._monitors[plant] = self._quiet.give(plant)
+            self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
+            self._schedule(plant, monitor)
+        return self._monitors.get(plant)
+
+    def _becomes_quiet(self, plant: str, monitor: Monitor) -> bool:
+        """Hold a plant with the quiet ones, if it is one; whether it is."""
+        if self._quiet is None or monitor.rows < self._look_at_row.get(plant, 0):
+            return False
+        self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
+        if not self._quiet.take(plant, monitor):
+            return False
+        self._notes += [(plant, note) for note in monitor.notes]
+        self._monitors[plant] = None
+        del self._look_at_row[plant]
+        self._due_ns.pop(plant, None)
+        for key in [key for key, of in self._plants.items() if of == plant]:
+            del self._plants[key]
+        return True
 
     def _schedule(self, plant: str, monitor: Monitor | None) -> None:
         """Note when a plant is due, if that is earlier than known; if it is later, that is found when it comes up."""
@@ -245,7 +311,7 @@ class FleetMonitor:
 
     def _hear(self, plant: str, message: Encoded) -> None:
         """Note what another monitor says of an alarm."""
-        if self._monitors.get(plant) is not None:
+        if self._monitors.get(plant) is not None or self._is_quiet(plant):
             return  # it is our own voice
         try:
             alarm = decode(message.payload, message.encoding)
@@ -254,17 +320,15 @@ class FleetMonitor:
         if isinstance(alarm, Alarm):
             self._heard.setdefault(plant, {})[alarm.alarm] = alarm
 
-    def _new(self, plant: str, publications: list[Publication]) -> list[Publication]:
+    def _new(self, publications: list[Publication]) -> list[Publication]:
         """Those that the monitor before us has not said already."""
-        heard = self._heard.get(plant)
-        if not heard or not publications:
+        if not self._heard or not publications:
             return publications
-        return [item for item in publications if not _was_said(item, heard)]
+        return [item for item in publications if not self._was_said(item)]
 
-
-def _was_said(publication: Publication, heard: dict[str, Alarm]) -> bool:
-    alarm = publication.message
-    if not isinstance(alarm, Alarm):
-        return False
-    before = heard.get(alarm.alarm)
-    return before is not None and alarm.time_ns <= before.time_ns
+    def _was_said(self, publication: Publication) -> bool:
+        alarm, topic = publication.message, keys.parse(publication.key)
+        if not isinstance(alarm, Alarm) or topic is None:
+            return False
+        before = self._heard.get(topic.plant, {}).get(alarm.alarm)
+        return before is not None and alarm.time_ns <= before.time_ns

@@ -214,6 +214,15 @@ class SignalWatch:
         """Note that something came from the plant."""
         self._silences[0].received(now_ns)
 
+    @property
+    def received_ns(self) -> int | None:
+        """When something came last; None: what comes next is the first, or the first after a stop."""
+        return self._silences[0].received_ns
+
+    @received_ns.setter
+    def received_ns(self, received_ns: int | None) -> None:
+        self._silences[0].received_ns = received_ns
+
     def due_ns(self) -> int | None:
         """When to `check`, unless something comes before; None: there is nothing to wait for."""
         return self._silences[0].due_ns()

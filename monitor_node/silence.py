@@ -212,6 +212,15 @@ class Silence:
         """Begin to wait, after a stop, for what comes next; how long it takes is no spacing."""
         self._received_ns, self._listening = now_ns, True
 
+    @property
+    def received_ns(self) -> int | None:
+        """When something came last; None: what comes next makes no spacing."""
+        return None if self._listening else self._received_ns
+
+    @received_ns.setter
+    def received_ns(self, received_ns: int | None) -> None:
+        self._received_ns, self._listening = received_ns, False
+
     def received(self, now_ns: int) -> None:
         """Note that something came, whatever it was. A clock that was set back is no spacing."""
         before_ns, self._received_ns = self._received_ns, now_ns
