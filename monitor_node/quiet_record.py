@@ -24,7 +24,7 @@ from monitor_node.alarms import AlarmMemory
 from monitor_node.alignment import REMEMBERED, AlignmentState, Counts, Waiting
 from monitor_node.alignment import Sequence as Numbering
 from monitor_node.chart_watch import ChartsState, alarm_names
-from monitor_node.charts.base import SETTINGS, SignalState
+from monitor_node.charts.base import SignalState
 from monitor_node.charts.cusum import Cusum
 from monitor_node.charts.ewma import Ewma
 from monitor_node.charts.mewma import Mewma, MewmaState
@@ -245,7 +245,7 @@ class QuietForm:
         for kind in (Shewhart, Ewma, Cusum):
             if kind.name in charts.charts:
                 numbers = SignalState.from_bytes(charts.charts[kind.name]).numbers
-                p[kind.name][SETTINGS:] = np.frombuffer(numbers, dtype="<f8").reshape(-1, len(self.config.outputs))
+                p[kind.name] = np.frombuffer(numbers, dtype="<f8").reshape(-1, len(self.config.outputs))
         if Mewma.name in charts.charts:
             state = MewmaState.from_bytes(charts.charts[Mewma.name])
             p["mean"], p["covariance"], p["average"] = state.mean, state.covariance, state.average
@@ -363,7 +363,7 @@ class QuietForm:
                 weight, limit = self.config.mewma_weight, float(p["mewma_limit"])
                 charts[name] = MewmaState(mean, covariance, weight, limit, average).to_bytes()
             else:
-                numbers = p[name][SETTINGS:].astype("<f8").tobytes()
+                numbers = p[name].astype("<f8").tobytes()
                 charts[name] = SignalState(name, len(self.config.outputs), numbers).to_bytes()
         passed = [_whitener(p, place).learned.passed for place in range(len(self.config.outputs))]
         return ChartsState(charts, p["width"].tolist(), passed)

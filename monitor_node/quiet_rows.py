@@ -44,6 +44,7 @@ ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
 HEARD_AGAIN_NS = 1_000_000  # as in `core`
 
 _MINUTE_NS = int(MINUTE_NS)
+_MOST_NUMBERS = max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
 _STRETCH, _ORDER, _MEMORY, _LEARN_FROM = STRETCH, LARGEST_ORDER, MEMORY, LEARN_FROM
 
 
@@ -119,11 +120,11 @@ def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
         ("repeats", i, (outputs,)),
         ("steps", f, (outputs, _STRETCH)),  # oldest first
         ("stepped", np.int32, (outputs,)),
-        # charts, as columns of a bank, and their alarms
-        ("shewhart", f, (SETTINGS + Shewhart.numbers, outputs)),
+        # charts, as the columns of a bank without what comes in and goes out, and their alarms
+        ("shewhart", f, (Shewhart.numbers, outputs)),
         ("width", f, (outputs,)),
-        ("ewma", f, (SETTINGS + Ewma.numbers, outputs)),
-        ("cusum", f, (SETTINGS + Cusum.numbers, outputs)),
+        ("ewma", f, (Ewma.numbers, outputs)),
+        ("cusum", f, (Cusum.numbers, outputs)),
         ("average", f, (outputs,)),
         ("mean", f, (outputs,)),
         ("covariance", f, (outputs, outputs)),
@@ -392,22 +393,41 @@ def _each(p: Any, columns: Array, first: int, rules: Places, reach: float) -> bo
 
 
 @compiled
-def _charted(p: Any, e: Array, charts: Places, rules: Places, reach: float, weight: float) -> bool:
-    """Let the charts judge; whether none raises an alarm."""
+def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
+    """The columns of a bank, see `charts.base`: a new value for each chart."""
     for place in range(e.size):
-        p.shewhart[X, place] = p.ewma[X, place] = p.cusum[X, place] = e[place]
-        p.shewhart[PRESENT, place] = p.ewma[PRESENT, place] = p.cusum[PRESENT, place] = 1.0
+        columns[X, place], columns[PRESENT, place] = e[place], 1.0
+        for row in range(numbers.shape[0]):
+            columns[SETTINGS + row, place] = numbers[row, place]
+
+
+@compiled
+def _put_back(columns: Array, numbers: Array) -> None:
+    for row in range(numbers.shape[0]):
+        for place in range(numbers.shape[1]):
+            numbers[row, place] = columns[SETTINGS + row, place]
+
+
+@compiled
+def _charted(p: Any, e: Array, columns: Array, charts: Places, rules: Places, reach: float, weight: float) -> bool:
+    """Let the charts judge; whether none raises an alarm."""
     if charts[0] >= 0:
-        _judge_shewhart(p.shewhart)
-        if not _each(p, p.shewhart, charts[0], rules, reach):
+        _lay_out(columns, p.shewhart, e)
+        _judge_shewhart(columns)
+        _put_back(columns, p.shewhart)
+        if not _each(p, columns, charts[0], rules, reach):
             return False
     if charts[1] >= 0:
-        _judge_ewma(p.ewma)
-        if not _each(p, p.ewma, charts[1], rules, reach):
+        _lay_out(columns, p.ewma, e)
+        _judge_ewma(columns)
+        _put_back(columns, p.ewma)
+        if not _each(p, columns, charts[1], rules, reach):
             return False
     if charts[2] >= 0:
-        _judge_cusum(p.cusum)
-        if not _each(p, p.cusum, charts[2], rules, reach):
+        _lay_out(columns, p.cusum, e)
+        _judge_cusum(columns)
+        _put_back(columns, p.cusum)
+        if not _each(p, columns, charts[2], rules, reach):
             return False
     if charts[3] >= 0:
         squares = _move_mewma(p.average, e, p.mean, p.whitening, weight)
@@ -459,7 +479,7 @@ def judge(
         found: `ODD` for rows that are not to be judged here; filled with what each was.
     """
     outputs = row_values.shape[1] - 1
-    e = np.empty(outputs)
+    e, columns = np.empty(outputs), np.empty((SETTINGS + _MOST_NUMBERS, outputs))
     keeps = times.shape[1]
     for k in range(rows.size):
         slot = rows[k]
@@ -477,7 +497,7 @@ def judge(
                 z = (value - told[k, place]) / told[k, 2 * outputs + place]
                 e[place] = _whitened(p, place, z)
                 ordinary = ordinary and abs(e[place]) <= p.spike_limit[place] and abs(e[place]) < LARGEST_VALUE
-        if not (ordinary and _charted(p, e, charts, rules, reach, weight)):
+        if not (ordinary and _charted(p, e, columns, charts, rules, reach, weight)):
             found[k] = ODD
             plants[slot].odd = 1
             continue
