@@ -34,9 +34,6 @@ PATIENCE_NS = 10_000_000_000
 LOOK_AGAIN_ROWS = 8
 """After so many rows it is seen again whether a plant is quiet."""
 
-LOOK_AGAIN_NS = 250_000_000
-"""After messages, it is seen by then at the latest which plant is overdue."""
-
 State = bytes
 """All that a monitor remembers of a plant."""
 
@@ -73,7 +70,6 @@ class FleetMonitor:
         first = Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
         form = None if points or first.model is None else QuietForm.of(config, first.model)
         self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
-        self._quiet_due_ns = start_ns
         self._look_at_row: dict[str, int] = {}  # of a plant with a monitor of its own: when to see whether it is quiet
         self._notes: list[tuple[str, str]] = []
         self._patience_ns: int | None = start_ns + PATIENCE_NS
@@ -197,7 +193,6 @@ class FleetMonitor:
             own = self._monitors[plant]
             if own is not None and not self._becomes_quiet(plant, own):
                 self._schedule(plant, own)
-        self._quiet_due_ns = min(self._quiet_due_ns, now_ns + LOOK_AGAIN_NS)
         return publications
 
     def _plant_of(self, message: Encoded, now_ns: int) -> str:
@@ -230,7 +225,6 @@ class FleetMonitor:
             for plant in self._quiet.overdue(now_ns):
                 self._alone(plant)
             publications += self._quiet.healths(now_ns)
-            self._quiet_due_ns = self._quiet.next_due_ns()
         while self._dues and self._dues[0][0] <= now_ns:
             due_ns, plant = heappop(self._dues)
             monitor = self._monitors.get(plant)
@@ -246,7 +240,7 @@ class FleetMonitor:
         """When the first of the plants is due."""
         due_ns = self._dues[0][0] if self._dues else 2**63 - 1
         if self._quiet:
-            due_ns = min(due_ns, self._quiet_due_ns)
+            due_ns = min(due_ns, self._quiet.next_due_ns())
         return due_ns if self._patience_ns is None else min(due_ns, self._patience_ns)
 
     @property
@@ -258,6 +252,13 @@ class FleetMonitor:
         """Publish the health of all for the last time."""
         said = [item for monitor in self._monitors.values() if monitor is not None for item in monitor.on_stop(now_ns)]
         return said + (self._quiet.last_healths(now_ns) if self._quiet else [])
+
+    def copy(self, plant: str, name: str) -> None:
+        """Watch another plant that is, so far, like a quiet one: for trials with many plants."""
+        assert self._quiet is not None
+        self._quiet.copied(plant, name)
+        self._monitors[name] = None
+        self._in_charge(name, True)
 
     def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
         """What people are to be told: plant and line."""

@@ -27,6 +27,12 @@ log = structlog.get_logger()
 LINGER_S = 0.5
 """As for the monitor of one plant."""
 
+PASSING = (keys.HEALTH, keys.ALARM_KPIS)
+"""Told again and again of each plant; to remember them would take more than all else of a plant."""
+
+MOST_TOKENS = 200
+"""Plants for which a token is shown. Zenoh takes the longer for one the more there are: of 10,000, minutes."""
+
 REPORT_EVERY_NS = 10_000_000_000
 
 
@@ -48,6 +54,7 @@ class FleetNode(FleetMonitor):
             if getattr(config, setting) is not None:
                 raise InputError(f"{setting} holds what is known of one plant; leave it out for a fleet")
         self._bus = bus
+        self._shown: set[str] = set()
         self._report_ns = start_ns
         self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
         # The older of two with the same shard is in charge: names sort by the time of the start.
@@ -59,9 +66,11 @@ class FleetNode(FleetMonitor):
     def _show(self, plant: str, ours: bool) -> None:
         token = keys.key(plant, keys.ALIVE, NODE)
         log.info("watching" if ours else "no longer watching", plant=plant)
-        if ours:
+        if ours and len(self._shown) < MOST_TOKENS:
+            self._shown.add(token)
             self._bus.announce(token)
-        else:
+        elif token in self._shown:
+            self._shown.remove(token)
             self._bus.withdraw(token)
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
@@ -95,7 +104,7 @@ def run(config: MonitorConfig, fleet: FleetConfig, bus_config: BusConfig) -> Non
         InputError: settings that do not fit together, or that the bus cannot use.
     """
     with stop_on_signals() as stop:
-        bus = bus_zenoh.connect(bus_config, NODE, stop)
+        bus = bus_zenoh.connect(bus_config, NODE, stop, passing=PASSING, crowded=True)
         if bus is None:
             return
         try:

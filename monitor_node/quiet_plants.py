@@ -10,6 +10,8 @@ Held here are plants that are judged by the filter of a process model, with Shew
 by default; others keep their monitors.
 """
 
+from math import prod
+from mmap import mmap
 from typing import Any, NamedTuple
 
 import msgspec
@@ -36,8 +38,13 @@ from reactorwatch.records.record import MINUTE_NS
 FIRST_ROOM = 16
 """Plants that there is room for at first; it doubles."""
 
-MOST_HEALTHS = 100
+MOST_HEALTHS = 20
 """Plants whose health is told at a time, so that samples need not wait for thousands."""
+
+LOOK_AGAIN_NS = 250_000_000
+"""By then it is seen again which plants are overdue; samples that came meanwhile may have made it earlier."""
+
+NEVER_NS = 2**63 - 1
 
 _SAMPLE = encoding_of(Sample)
 
@@ -81,6 +88,8 @@ class QuietPlants:
         self._plants: Records
         self._times: NDArray[np.int32]
         self._ring: NDArray[np.float64]
+        self._health_due_ns: NDArray[np.int64] = np.empty(0, np.int64)
+        self._overdue_ns, self._looked_ns = NEVER_NS, 0  # when the first was overdue, and when that was seen
         self._room(FIRST_ROOM)
 
     def __contains__(self, plant: str) -> bool:
@@ -113,6 +122,7 @@ class QuietPlants:
             return False
         slot = self._slot(plant)
         self._plants[slot] = self._scratch[0]
+        self._health_due_ns[slot] = self._scratch[0]["health_due_ns"]
         p, count = self._plants[slot], len(rows.times_ns)
         p["unit_ns"], p["usual_ns"], p["kept"], p["head"] = spacings[0], usual_ns, count, count % self._form.keeps
         self._times[slot, :count], self._ring[slot, :count] = spacings[1], rows.values
@@ -136,8 +146,11 @@ class QuietPlants:
             name: of the other.
         """
         of, slot = self._slots[plant], self._slot(name)
-        self._plants[slot], self._rests[slot] = self._plants[of], self._rests[of]
+        rest = self._rests[of]
+        assert rest is not None
+        self._plants[slot], self._rests[slot] = self._plants[of], rest._replace(runs=bytes(bytearray(rest.runs)))
         self._times[slot], self._ring[slot] = self._times[of], self._ring[of]
+        self._health_due_ns[slot] = self._health_due_ns[of]
 
     def _slot(self, plant: str) -> int:
         if self._free:
@@ -155,13 +168,16 @@ class QuietPlants:
         return slot
 
     def _room(self, plants: int) -> None:
-        """Make room for so many; of what is not used yet the system keeps no memory."""
+        """Make room for so many."""
         form, before = self._form, len(self._names)
-        records, times = np.zeros(plants, form.record), np.zeros((plants, form.keeps), np.int32)
-        ring = np.zeros((plants, form.keeps, form.columns))
+        records, times = _zeros((plants,), form.record), _zeros((plants, form.keeps), np.dtype(np.int32))
+        ring = _zeros((plants, form.keeps, form.columns), np.dtype(np.float64))
         if before:
             records[:before], times[:before], ring[:before] = self._plants, self._times, self._ring
         self._plants, self._times, self._ring = records, times, ring
+        due_ns = np.full(plants, NEVER_NS)
+        due_ns[:before] = self._health_due_ns[:before]
+        self._health_due_ns = due_ns
 
     def _give(self, plant: str, waiting: list[Row]) -> Monitor:
         slot, self._used = self._slots.pop(plant), None
@@ -170,9 +186,11 @@ class QuietPlants:
         monitor = Monitor(msgspec.structs.replace(self._config, plant=plant), 0, points=False, model=self._model)
         monitor.restore(self._form.read(plant, p, rest, self._newest(slot), [row.time_ns for row in waiting]))
         monitor.caught_up()
-        monitor.receipt = Receipt(
-            *(int(p[name]) for name in ("start_ns", "heard_ns", "received_ns", "lag_ns", "health_due_ns"))
+        start_ns, heard_ns, received_ns, lag_ns = (
+            int(p[name]) for name in ("start_ns", "heard_ns", "received_ns", "lag_ns")
         )
+        monitor.receipt = Receipt(start_ns, heard_ns, received_ns, lag_ns, int(self._health_due_ns[slot]))
+        self._health_due_ns[slot] = NEVER_NS
         for signal in self._signals:
             del self._codes[keys.key(plant, keys.SAMPLE, signal)]
         self._plants[slot] = np.zeros(1, self._form.record)[0]
@@ -321,23 +339,22 @@ class QuietPlants:
 
     def overdue(self, now_ns: int) -> list[str]:
         """Plants of which nothing came for longer than is allowed."""
+        if now_ns < self._overdue_ns and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
+            return []
         due_ns = self._silent_from_ns()
+        self._overdue_ns, self._looked_ns = int(due_ns.min(initial=NEVER_NS)), now_ns
         return [self._names[slot] for slot in np.flatnonzero(due_ns <= now_ns).tolist()]
 
     def healths(self, now_ns: int) -> list[Publication]:
         """The health of plants' monitors where it is due; of so many at a time."""
         period_ns = int(self._config.health_period_s * 1e9)
-        used = self._places()
-        due = used[self._plants["health_due_ns"][used] <= now_ns][:MOST_HEALTHS]
-        self._plants["health_due_ns"][due] = now_ns + period_ns
+        due = np.flatnonzero(self._health_due_ns <= now_ns)[:MOST_HEALTHS]
+        self._health_due_ns[due] = now_ns + period_ns
         return [self._health(slot, now_ns, "watching") for slot in due.tolist()]
 
     def next_due_ns(self) -> int:
         """When the first of the plants is overdue, or a health due, as far as is known now."""
-        used = self._places()
-        if not used.size:
-            return 2**63 - 1
-        return int(min(self._plants["health_due_ns"][used].min(), self._silent_from_ns().min()))
+        return min(int(self._health_due_ns.min()), self._overdue_ns, self._looked_ns + LOOK_AGAIN_NS)
 
     def last_healths(self, now_ns: int) -> list[Publication]:
         """The health of all, when the monitor is stopped."""
@@ -391,3 +408,9 @@ class _Rows(NamedTuple):
     def of(self, which: slice | NDArray[np.bool_]) -> "_Rows":
         """Some of them."""
         return _Rows(self.slots[which], self.times_ns[which], self.values[which], self.turns[which])
+
+
+def _zeros(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
+    """An array of zeros, straight from the system: it keeps no memory of what is not used yet, nor of what was."""
+    count = prod(shape)
+    return np.frombuffer(mmap(-1, max(count, 1) * kind.itemsize), kind, count).reshape(shape)

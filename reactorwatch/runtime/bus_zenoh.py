@@ -21,9 +21,8 @@ import secrets
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +50,7 @@ FLUSH_WITHIN_S = 10.0
 HEARTBEAT_S = 0.5
 LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that who missed it can ask for it
 STUCK_S = 1.0
+GATHER_AGAIN_S = 0.005
 LARGEST_CHANNEL = 5 * MOST_GATHERED
 STREAM_PARTS = 3  # of a key: root, plant and kind
 
@@ -100,8 +100,16 @@ class _Key:
 class ZenohBus:
     """See `reactorwatch.runtime.bus.Bus`."""
 
-    def __init__(self, session: zenoh.Session, config: BusConfig) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        config: BusConfig,
+        passing: Collection[str] = (),
+        voice: zenoh.Session | None = None,
+    ) -> None:
         self._session = session
+        self._voice = voice or session  # by which all is done but listening to what is published
+        self._passing = frozenset(passing)
         self._config = config
         self._name = secrets.randbits(64)
         self._keys: dict[str, _Key] = {}
@@ -114,6 +122,9 @@ class ZenohBus:
 
     def publish(self, message: Encoded) -> None:
         """See `Bus`."""
+        if self._passing and message.key.split("/", STREAM_PARTS)[STREAM_PARTS - 1] in self._passing:
+            self._voice.put(message.key, message.payload, encoding=message.encoding)
+            return
         with self._publishing:
             key = self._keys.get(message.key)
             if key is None:
@@ -162,7 +173,8 @@ class ZenohBus:
         """See `Bus`.
 
         Zenoh calls a handler from a thread of its own, and each call waits for Python's lock. Here it puts what comes
-        into a channel, and one thread empties it: half the time a message.
+        into a channel, and one thread empties it: half the time a message. Having handed on what there was, it waits
+        for a moment before it looks again: where much comes, more comes together, and what is alone is not delayed.
         """
         delivery = self._delivery(key_expression, handler, on_gap)
         subscriber = self._listen(key_expression, zenoh.handlers.FifoChannel(LARGEST_CHANNEL))
@@ -187,6 +199,7 @@ class ZenohBus:
                     while len(samples) < MOST_GATHERED and (sample := subscriber.try_recv()) is not None:
                         samples.append(sample)
                     hand_on(samples)
+                    time.sleep(GATHER_AGAIN_S)
 
         threading.Thread(target=empty, name="gather", daemon=True).start()
         if delivery is not None:
@@ -249,7 +262,7 @@ class ZenohBus:
         again = zenoh.ext.RepliesConfig(congestion_control=zenoh.CongestionControl.BLOCK)
         drop = self._config.congestion == "drop"
         publisher = zenoh.ext.declare_advanced_publisher(
-            self._session,
+            self._voice,
             key,
             congestion_control=zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,
             cache=zenoh.ext.CacheConfig(self._config.cache_messages, replies_config=again),
@@ -268,13 +281,11 @@ class ZenohBus:
             )
             handler(ZenohRequest(query, question))
 
-        self._declared.append(self._session.declare_queryable(_spelled(key_expression), on_query))
+        self._declared.append(self._voice.declare_queryable(_spelled(key_expression), on_query))
 
     def ask(self, question: Encoded, timeout_s: float) -> list[Encoded]:
         """See `Bus`."""
-        replies = self._session.get(
-            question.key, payload=question.payload, encoding=question.encoding, timeout=timeout_s
-        )
+        replies = self._voice.get(question.key, payload=question.payload, encoding=question.encoding, timeout=timeout_s)
         answers = (reply.ok for reply in replies)
         return [
             Encoded(str(answer.key_expr), answer.payload.to_bytes(), str(answer.encoding))
@@ -284,7 +295,7 @@ class ZenohBus:
 
     def announce(self, key: str) -> None:
         """See `Bus`."""
-        self._tokens[key] = self._session.liveliness().declare_token(key)
+        self._tokens[key] = self._voice.liveliness().declare_token(key)
 
     def withdraw(self, key: str) -> None:
         """See `Bus`."""
@@ -297,7 +308,7 @@ class ZenohBus:
             handler(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         self._declared.append(
-            self._session.liveliness().declare_subscriber(_spelled(key_expression), on_token, history=True)
+            self._voice.liveliness().declare_subscriber(_spelled(key_expression), on_token, history=True)
         )
 
     def close(self) -> None:
@@ -310,24 +321,32 @@ class ZenohBus:
         """
         if self._published_at is not None:
             time.sleep(max(0.0, self._published_at + LAST_RECOVERY_S - time.monotonic()))
-        for _ in self._session.get(NOBODY, timeout=FLUSH_WITHIN_S):
+        for _ in self._voice.get(NOBODY, timeout=FLUSH_WITHIN_S):
             pass
         # Advanced ones may outlive the session otherwise, and hang the process (eclipse-zenoh/zenoh-python#624).
         for declared in (*self._declared, *self._tokens.values(), *(key.publisher for key in self._keys.values())):
             with contextlib.suppress(zenoh.ZError):
                 declared.undeclare()
         self._session.close()
+        if self._voice is not self._session:
+            self._voice.close()
         for delivery in self._deliveries:
             delivery.close()
 
 
-def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
+def connect(
+    config: BusConfig, node: str, stop: StopSignal, *, passing: Collection[str] = (), crowded: bool = False
+) -> ZenohBus | None:
     """Join the bus as a client, waiting for its router as long as it takes.
 
     Args:
         config: where the router is.
         node: who is waiting, for the log.
         stop: ends the waiting.
+        passing: kinds of which nothing is remembered, nor counted, when we publish them: what is told again and again
+            of thousands of plants. Who is cut off misses them.
+        crowded: whether we publish, or show tokens, on keys of hundreds of plants. A session looks through those it has
+            for each message that comes (a hundred make it four times slower), so another one listens then.
 
     Returns:
         The open bus; None if a stop was asked for before a router was there.
@@ -343,6 +362,7 @@ def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
     while not stop.is_set:
         try:
             session = zenoh.open(client)
+            voice = zenoh.open(client) if crowded else None
         except zenoh.ZError as error:
             if time.monotonic() - said_at >= SAY_AGAIN_S:
                 said_at = time.monotonic()
@@ -351,7 +371,7 @@ def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
             retry_s = min(2 * retry_s, LONGEST_RETRY_S)
             continue
         log.info("connected", node=node, endpoint=config.endpoint)
-        return ZenohBus(session, config)
+        return ZenohBus(session, config, passing, voice)
     return None
 
 
@@ -398,6 +418,10 @@ def router(config: BusConfig) -> ZenohBus:
         "listen/endpoints": [config.endpoint],
         "listen/timeout_ms": 0,
         "listen/exit_on_failure": True,
+        "connect/endpoints": list(config.routers),
+        "connect/retry": _RETRY,
+        "connect/timeout_ms": {"router": -1},
+        "connect/exit_on_failure": {"router": False},
         "scouting/multicast/enabled": False,
         **_STUCK,
     }
@@ -431,7 +455,6 @@ def router_from_file(path: Path) -> ZenohBus:
         raise InputError(f"router settings {path}: {_first_line(error)}") from error
 
 
-@lru_cache(maxsize=100_000)
 def _stream(key: str) -> str:
     """The stream that a key is in."""
     return "/".join(key.split("/", STREAM_PARTS)[:STREAM_PARTS])

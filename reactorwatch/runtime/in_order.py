@@ -62,7 +62,7 @@ class Gap(NamedTuple):
     noticed_ns: int
 
 
-@dataclass
+@dataclass(slots=True)
 class _Stream(Generic[Item]):
     expected: int | None = None
     newest: int = 0
