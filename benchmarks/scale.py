@@ -328,11 +328,11 @@ def row_of(plants: int) -> str:
         source = started("publish", endpoint, plants, KNOWN_ROWS + LATENCY_S // SIGNALS, plants)
         delays = told(source)
         live.kill()
-        p99 = np.percentile(delays["delays_ms"], 99) if delays["delays_ms"] else np.nan
+        p99 = f"{np.percentile(delays['delays_ms'], 99):9.1f} ms" if delays["delays_ms"] else f"{'–':>12}"
         size = f"{found['bytes'] / 1000:9.1f} kB" if plants >= 100 else f"{'–':>12}"
         return (
             f"{plants:7,} {found['core']:13,.0f} {rates['monitor']:13,.0f} {rates['bare']:13,.0f} "
-            f"{100 * rates['monitor'] / rates['bare']:6.0f} % {size} {p99:9.1f} ms "
+            f"{100 * rates['monitor'] / rates['bare']:6.0f} % {size} {p99} "
             f"({len(delays['delays_ms'])} of {delays['out']})"
         )
     finally:
