@@ -4,19 +4,21 @@ A plant is known from the moment when one of its nodes shows a liveliness token,
 ours to watch is the crew's question (see `shards`): one monitor watches all, or several share them, and take over from
 each other. What a plant's monitor says is the same, value for value, as if it were watched alone.
 
-Who takes a plant over, because the monitor that watched it is gone, goes on from that one's state if there is one
-(`adopt`). Without one the plant is learned anew, but its alarms are not forgotten: monitors of a fleet hear each
-other's alarms, so one that stands is not raised again, and it is cleared when it is over. With one, what the other had
-already said is left out when it is found again, so that no alarm is told twice.
+Who takes a plant over, because the monitor that watched it is gone, asks for its past: the state that was stored, if
+there is one, and what the plant still remembers to have said (`on_past`). With a state, what the other had already said
+is left out when it is found again, so that no alarm is told twice. Without one the plant is learned anew, but its
+alarms are not forgotten: monitors of a fleet hear each other's alarms, so one that stands is not raised again, and it
+is cleared when it is over.
 
 Nothing here reads a clock or does I/O.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from heapq import heappop, heappush
 
 import msgspec
 
+from monitor_node.arrivals import Arrivals, Past
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.quiet_plants import QuietPlants
@@ -34,6 +36,9 @@ PATIENCE_NS = 10_000_000_000
 LOOK_AGAIN_ROWS = 8
 """After so many rows it is seen again whether a plant is quiet."""
 
+MOST_PLANTS = 100_000
+"""A stranger may make up names of plants; there are no more than these."""
+
 State = bytes
 """All that a monitor remembers of a plant."""
 
@@ -47,7 +52,10 @@ class FleetMonitor:
         crew: who else watches plants of the fleet.
         model: as for `Monitor`.
         points: as for `Monitor`.
-        stored: the state of a plant that we begin to watch, as its monitor stored it; None: there is none.
+        ask_past: told a plant that is to be watched from now on, and whether another watched it until now; whether its
+            past will be told by `on_past`. If not, the plant is watched at once.
+        store: told the state of a plant that is another's from now on.
+        unusable: told a plant with a state that it cannot go on from, and why; returns what became of the state.
         in_charge: told when we begin to watch a plant (True), and when it is another's (False).
 
     Raises:
@@ -62,12 +70,17 @@ class FleetMonitor:
         *,
         model: ProcessModel | None = None,
         points: bool = False,
-        stored: Callable[[str], State | None] = lambda _: None,
+        ask_past: Callable[[str, bool], bool] = lambda _plant, _taken_over: False,
+        store: Callable[[str, State], None] = lambda _plant, _state: None,
+        unusable: Callable[[str, InputError], str] = lambda _plant, _why: "",
         in_charge: Callable[[str, bool], None] = lambda _plant, _ours: None,
     ) -> None:
         self._config, self._model, self._points = config, model, points
-        self._crew, self._stored, self._in_charge = crew, stored, in_charge
+        self._crew, self._in_charge = crew, in_charge
+        self._ask_past, self._store, self._unusable = ask_past, store, unusable
+        self._arrivals = Arrivals()
         first = Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
+        self._alarms = {alarm.alarm for alarm in first.alarms.all_alarms()}
         form = None if points or first.model is None else QuietForm.of(config, first.model)
         self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
         self._look_at_row: dict[str, int] = {}  # of a plant with a monitor of its own: when to see whether it is quiet
@@ -97,8 +110,19 @@ class FleetMonitor:
         if self._crew.note(token, is_alive=is_alive):
             self._share_out(now_ns)
         elif topic is not None and topic.kind == keys.ALIVE and is_alive:
-            self._meet(topic.plant, now_ns)
+            self.meet(topic.plant, now_ns)
         return []
+
+    def on_past(self, past: Past, now_ns: int) -> list[Publication]:
+        """Begin to watch a plant whose past was asked for, if it is still ours: judge that, and what came since."""
+        if past.plant not in self._arrivals:
+            return []
+        messages = self._arrivals.end(past.plant, past.messages)
+        self.adopt(past.plant, past.state, now_ns)
+        monitor = self.monitor(past.plant)
+        said = [item for message in messages for item in monitor.on_message(message, now_ns)]
+        monitor.caught_up()
+        return self._new(said)
 
     def adopt(self, plant: str, state: State | None, now_ns: int) -> None:
         """Begin to watch a plant.
@@ -114,7 +138,8 @@ class FleetMonitor:
             try:
                 monitor.from_bytes(state)
             except InputError as error:
-                monitor.notes.append(f"the state that was stored {error}; the plant is learned anew")
+                kept = self._unusable(plant, error)
+                monitor.notes.append(f"the state that was stored {error}; the plant is learned anew{kept}")
                 state = None
         if state is None:
             monitor.go_on_from_alarms(self._heard.get(plant, {}).values())
@@ -142,29 +167,58 @@ class FleetMonitor:
             raise InputError(f"plant {plant!r} is not watched here (there are: {', '.join(self.plants)})")
         return monitor
 
+    def state_of(self, plant: str) -> State:
+        """All that is remembered of a plant that is watched here."""
+        if self._quiet is not None and plant in self._quiet:
+            return self._quiet.state_of(plant)
+        return self.monitor(plant).to_bytes()
+
+    def received_of(self, plant: str) -> int | None:
+        """How many messages of a plant came; None: it is not watched here."""
+        if self._quiet is not None and plant in self._quiet:
+            return self._quiet.received_of(plant)
+        monitor = self._monitors.get(plant)
+        return None if monitor is None else monitor.received
+
+    def not_stored(self, plant: str) -> None:
+        """Count that what is remembered of a plant could not be stored."""
+        if self._quiet is not None and plant in self._quiet:
+            self._quiet.not_stored(plant)
+        elif (monitor := self._monitors.get(plant)) is not None:
+            monitor.not_stored += 1
+
     def _named(self, plant: str) -> MonitorConfig:
         return msgspec.structs.replace(self._config, plant=plant)
 
-    def _meet(self, plant: str, now_ns: int) -> None:
-        """A plant that may be new."""
-        if plant in self._monitors:
+    def meet(self, plant: str, now_ns: int) -> None:
+        """Know of a plant, if it is new."""
+        if plant in self._monitors or len(self._monitors) >= MOST_PLANTS:
             return
         try:
             keys.checked_plant(plant)
         except ValueError:
             return
         self._monitors[plant] = None
-        self._share_out(now_ns, [plant])
+        if self._crew.is_ours(plant):
+            self._arrive(plant, now_ns, taken_over=False)
 
-    def _share_out(self, now_ns: int, plants: Iterable[str] | None = None) -> None:
-        """Begin to watch what is ours now, and cease to watch what is not; all plants, if not told which."""
-        for plant in list(self._monitors) if plants is None else plants:
+    def _share_out(self, now_ns: int) -> None:
+        """Begin to watch what is ours now, and cease to watch what is not."""
+        for plant in list(self._monitors):
             ours = self._crew.is_ours(plant)
-            watched = self._monitors[plant] is not None or self._is_quiet(plant)
-            if ours and not watched:
-                self.adopt(plant, self._stored(plant), now_ns)
-            elif watched and not ours:
-                self.release(plant)
+            watched, arriving = self._monitors[plant] is not None or self._is_quiet(plant), plant in self._arrivals
+            if ours and not (watched or arriving):
+                self._arrive(plant, now_ns, taken_over=True)
+            elif arriving and not ours:
+                self._arrivals.end(plant)
+            elif watched and not ours and (state := self.release(plant)) is not None:
+                self._store(plant, state)
+
+    def _arrive(self, plant: str, now_ns: int, *, taken_over: bool) -> None:
+        if self._ask_past(plant, taken_over):
+            self._arrivals.begin(plant)
+        else:
+            self.adopt(plant, None, now_ns)
 
     # --- what the loop calls ---------------------------------------------------------------------------------
 
@@ -189,6 +243,8 @@ class FleetMonitor:
             if own is not None:
                 publications += self._new(own.on_message(message, now_ns))
                 touched.add(plant)
+            elif plant in self._arrivals:
+                self._arrivals.keep(plant, message)
         for plant in touched:
             own = self._monitors[plant]
             if own is not None and not self._becomes_quiet(plant, own):
@@ -200,7 +256,7 @@ class FleetMonitor:
         topic = keys.parse(message.key)
         if topic is None or topic.kind not in (keys.SAMPLE, keys.ALARM):
             return ""
-        self._meet(topic.plant, now_ns)
+        self.meet(topic.plant, now_ns)
         if topic.kind == keys.ALARM:
             self._hear(topic.plant, message)
             return ""
@@ -318,7 +374,7 @@ class FleetMonitor:
             alarm = decode(message.payload, message.encoding)
         except DecodeError:
             return
-        if isinstance(alarm, Alarm):
+        if isinstance(alarm, Alarm) and plant in self._monitors and alarm.alarm in self._alarms:
             self._heard.setdefault(plant, {})[alarm.alarm] = alarm
 
     def _new(self, publications: list[Publication]) -> list[Publication]:

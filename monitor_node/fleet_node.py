@@ -2,6 +2,7 @@
 
 import secrets
 import time
+from pathlib import Path
 
 import structlog
 
@@ -11,13 +12,17 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import NODE
 from monitor_node.fleet import FleetMonitor
 from monitor_node.fleet_config import FleetConfig
+from monitor_node.fleet_pasts import Pasts
+from monitor_node.fleet_states import FleetStates
+from monitor_node.monitor_state import OtherSettingsError
 from monitor_node.shards import Crew
+from monitor_node.state_file import DAMAGED, OTHER_SETTINGS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
-from reactorwatch.runtime.bus import Bus
+from reactorwatch.runtime.bus import Bus, matches
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.model_file import model_on_the_bus
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
@@ -35,9 +40,15 @@ MOST_TOKENS = 200
 
 REPORT_EVERY_NS = 10_000_000_000
 
+LOOK_EVERY_NS = 100_000_000
+"""For plants whose past was found, and for states that are to be stored."""
+
+MOST_STORED = 20
+"""Plants whose state is stored at a time: half a millisecond each. Of thousands, each is stored less often."""
+
 
 class FleetNode(FleetMonitor):
-    """A fleet's monitor that shows on the bus which plants it watches, and logs what an operator wants to read.
+    """A fleet's monitor as others see it: it shows which plants it watches, stores what it remembers of them, and logs.
 
     Args:
         config: how each plant is watched.
@@ -52,16 +63,43 @@ class FleetNode(FleetMonitor):
     def __init__(self, config: MonitorConfig, fleet: FleetConfig, bus: Bus, start_ns: int) -> None:
         for setting in ("alarm_state_file", "state_file"):
             if getattr(config, setting) is not None:
-                raise InputError(f"{setting} holds what is known of one plant; leave it out for a fleet")
+                raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
         self._bus = bus
+        self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
+        self._states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
+        self._pasts = Pasts(bus, self._states, lambda plant, line: log.warning(line, plant=plant))
+        self._every_ns = int(config.state_every_s * 1e9)
+        self._deaf = len(self.subscriptions)
+        self._changed: set[str] = set()  # plants of which an alarm changed since their state was stored
+        self._round: list[str] = []  # plants that are looked at next, whether something came of them
+        self._round_ns = self._look_ns = start_ns
+        self._stored_at: dict[str, int] = {}  # of each plant, how many messages had come when it was stored
+        self._said: dict[str, str] = {}
         self._shown: set[str] = set()
         self._report_ns = start_ns
-        self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
         # The older of two with the same shard is in charge: names sort by the time of the start.
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
         self.crew = Crew(self.expression, shards.parsed(fleet.shard), name)
         model = model_on_the_bus(config.model)
-        super().__init__(config, start_ns, self.crew, model=model, points=fleet.points, in_charge=self._show)
+        super().__init__(
+            config,
+            start_ns,
+            self.crew,
+            model=model,
+            points=fleet.points,
+            ask_past=self._find_past,
+            store=self._keep,
+            unusable=self._keep_aside,
+            in_charge=self._show,
+        )
+        for plant in self._states.plants if self._states is not None else []:
+            if matches(self.expression, f"{keys.ROOT}/{plant}"):
+                self.meet(plant, start_ns)
+
+    @property
+    def subscriptions(self) -> tuple[str, ...]:
+        """What it listens to."""
+        return keys.samples_of(self.expression), f"{self.expression}/{keys.ALARM}/**"
 
     def _show(self, plant: str, ours: bool) -> None:
         token = keys.key(plant, keys.ALIVE, NODE)
@@ -75,26 +113,108 @@ class FleetNode(FleetMonitor):
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; alarms are logged."""
-        return _logged(super().on_messages(messages, now_ns))
+        return self._noted(super().on_messages(messages, now_ns))
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
+        """See `FleetMonitor`; alarms are logged."""
+        reply, publications = super().on_command(question, now_ns)
+        return reply, self._noted(publications)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """See `FleetMonitor`; alarms, what was refused and what is to be told of trainings are logged."""
-        publications = _logged(super().on_tick(now_ns))
+        """See `FleetMonitor`; what is remembered is stored, and what is to be told of it is logged."""
+        publications: list[Publication] = []
+        if now_ns >= self._look_ns:
+            self._look_ns = now_ns + LOOK_EVERY_NS
+            self._store_due(now_ns)
+            for past in self._pasts.found():
+                publications += self._noted(self.on_past(past, now_ns))
+        publications += self._noted(super().on_tick(now_ns))
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + REPORT_EVERY_NS
             for plant, line in self.reports(now_ns):
                 log.warning(line, plant=plant)
         return publications
 
+    def next_tick_ns(self) -> int:
+        """See `FleetMonitor`; or when to look what is to be stored, and what was found."""
+        due_ns = super().next_tick_ns()
+        if self._states is None and not self._pasts.is_waiting:
+            return due_ns
+        return min(due_ns, self._look_ns)
 
-def _logged(publications: list[Publication]) -> list[Publication]:
-    for publication in publications:
-        alarm = publication.message
-        if isinstance(alarm, Alarm):
-            topic = keys.parse(publication.key)
-            plant = topic.plant if topic is not None else ""
-            log.info("alarm", plant=plant, alarm=alarm.alarm, change=alarm.event, by=alarm.by, text=alarm.text)
-    return publications
+    def listens(self) -> None:
+        """One of the subscriptions hands on what is published from now on."""
+        self._deaf -= 1
+        if not self._deaf:
+            self._pasts.begin()
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        """See `FleetMonitor`; all is stored for the last time."""
+        self._pasts.close()
+        if self._states is not None:
+            for plant in self.plants:
+                self._states.put(plant, self.state_of(plant))
+            self._states.close()
+            self._count_failures()
+        return super().on_stop(now_ns)
+
+    # --- what survives a restart -----------------------------------------------------------------------------
+
+    def _find_past(self, plant: str, taken_over: bool) -> bool:
+        if self._states is None and not taken_over:
+            return False
+        self._pasts.ask(plant)
+        return True
+
+    def _keep(self, plant: str, state: bytes) -> None:
+        if self._states is not None:
+            self._states.put(plant, state)
+
+    def _keep_aside(self, plant: str, why: InputError) -> str:
+        if self._states is None:
+            return ""
+        ending = OTHER_SETTINGS if isinstance(why, OtherSettingsError) else DAMAGED
+        return f", and the state kept as {self._states.keep_aside(plant, ending)}"
+
+    def _store_due(self, now_ns: int) -> None:
+        """Store plants of which an alarm changed, which has been told by now, and some of which something came."""
+        if self._states is None:
+            return
+        self._count_failures()
+        due = [plant for plant in self._changed if self.received_of(plant) is not None]
+        self._changed.clear()
+        if not self._round and not 0 <= now_ns - self._round_ns < self._every_ns:
+            self._round, self._round_ns = self.plants, now_ns
+        looked = 0
+        while self._round and looked < MOST_STORED and self._states.has_room:
+            plant, looked = self._round.pop(), looked + 1
+            if self.received_of(plant) not in (None, self._stored_at.get(plant)):
+                due.append(plant)
+        for plant in due:
+            self._states.put(plant, self.state_of(plant))
+            self._stored_at[plant] = self.received_of(plant) or 0
+
+    def _count_failures(self) -> None:
+        """Count what could not be stored, and say why, once."""
+        failures = self._states.failures() if self._states is not None else []
+        for plant, why in failures:
+            self.not_stored(plant)
+            self._stored_at.pop(plant, None)
+            if self._said.get(plant) != why:
+                self._said[plant] = why
+                log.warning(why, plant=plant)
+
+    def _noted(self, publications: list[Publication]) -> list[Publication]:
+        """Log alarms, and note that their plants are to be stored."""
+        for publication in publications:
+            alarm = publication.message
+            if isinstance(alarm, Alarm):
+                topic = keys.parse(publication.key)
+                plant = topic.plant if topic is not None else ""
+                self._changed.add(plant)
+                self._look_ns = 0  # as soon as it has been told
+                log.info("alarm", plant=plant, alarm=alarm.alarm, change=alarm.event, by=alarm.by, text=alarm.text)
+        return publications
 
 
 def run(config: MonitorConfig, fleet: FleetConfig, bus_config: BusConfig) -> None:
@@ -121,7 +241,8 @@ def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
         node,
         bus,
         stop,
-        subscriptions=(keys.samples_of(plants), f"{plants}/{keys.ALARM}/**"),
+        subscriptions=node.subscriptions,
+        on_told=node.listens,
         on_messages=node.on_messages,
         tokens=(node.crew.tokens, f"{plants}/{keys.ALIVE}/*"),
         on_alive=node.on_alive,

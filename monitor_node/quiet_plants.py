@@ -22,6 +22,7 @@ from monitor_node import quiet_rows
 from monitor_node.alignment import Counts, Row
 from monitor_node.config import MonitorConfig
 from monitor_node.core import LARGEST_SAMPLE, NODE, STALL_NS, USABLE, Monitor, Receipt, health_of
+from monitor_node.monitor_state import sealed, settings_of
 from monitor_node.quiet_record import COUNTS, NewestRows, QuietForm, Rest, kept_spacings
 from monitor_node.quiet_rows import NEW_MINUTE, Records
 from monitor_node.references import GATE
@@ -74,6 +75,7 @@ class QuietPlants:
 
     def __init__(self, form: QuietForm, config: MonitorConfig, model: ProcessModel) -> None:
         self._form, self._config, self._model = form, config, model
+        self._settings = settings_of(config, model, points=False)
         self._signals = (config.input, *config.outputs)
         self._slots: dict[str, int] = {}
         self._names: list[str] = []
@@ -133,6 +135,22 @@ class QuietPlants:
             cause=shared(rest.cause, rest.cause),
         )
         return True
+
+    def state_of(self, plant: str) -> bytes:
+        """What a monitor of a plant's own would store of it."""
+        slot = self._slots[plant]
+        rest = self._rests[slot]
+        assert rest is not None
+        state = self._form.read(plant, self._plants[slot], rest, self._newest(slot), [])
+        return sealed(msgspec.structs.replace(state, settings=self._settings | {"plant": plant}))
+
+    def received_of(self, plant: str) -> int:
+        """How many messages of a plant came."""
+        return int(self._plants["received"][self._slots[plant]])
+
+    def not_stored(self, plant: str) -> None:
+        """Count that what is remembered of a plant could not be stored."""
+        self._plants["not_stored"][self._slots[plant]] += 1
 
     def give(self, plant: str) -> Monitor:
         """Give a plant to a monitor of its own."""

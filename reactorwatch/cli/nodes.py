@@ -133,10 +133,11 @@ def monitor(
 
     tables, bus = _settings(config, endpoint)
     flags = {"plant": name, "training_min": training, "model": str(existing(model)) if model is not None else None}
-    if state is not None:
+    of_fleet = {"plants": plants, "shard": shard, "state": str(state) if state is not None else None}
+    fleet = section(FleetConfig, "fleet", tables, of_fleet)
+    if state is not None and fleet.plants is None:
         flags |= {"state_file": str(state / "monitor.state"), "alarm_state_file": str(state / "alarms.state")}
     config_of_monitor = section(MonitorConfig, "monitor", tables, flags)
-    fleet = section(FleetConfig, "fleet", tables, {"plants": plants, "shard": shard})
     if fleet.plants is not None:
         for option, given in (("--plant", name), ("--diagnose", diagnose)):
             if given is not None:

@@ -76,6 +76,9 @@ class Bus(Protocol):
     ) -> None:
         """As `subscribe`, of as many messages at a time as have come, up to about `MOST_GATHERED`."""
 
+    def recall(self, key_expression: str) -> list[Encoded]:
+        """What was published on the keys of whole streams lately and is still remembered, in its order."""
+
     def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
         """Call the handler, from a thread of the bus, with every question on matching keys."""
 
@@ -196,6 +199,10 @@ class MemoryBus:
         self.subscribe(
             key_expression, lambda message: handler([message]), on_gap=on_gap, history=history, on_told=on_told
         )
+
+    def recall(self, key_expression: str) -> list[Encoded]:
+        """See `Bus`; here nothing is remembered."""
+        return []
 
     def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
         """See `Bus`."""

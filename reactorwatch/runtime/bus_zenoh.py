@@ -38,7 +38,7 @@ from reactorwatch.runtime.bus import MOST_GATHERED, Request
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.delivery import Delivery, Numbered
 from reactorwatch.runtime.identity import ROUTER_FILES, TLS, client_settings
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.in_order import Gap, InOrder
 from reactorwatch.runtime.serve import StopSignal
 
 log = structlog.get_logger()
@@ -183,11 +183,10 @@ class ZenohBus:
         for a moment before it looks again: where much comes, more comes together, and what is alone is not delayed.
         """
         delivery = self._delivery(key_expression, handler, on_gap)
-        subscriber = self._listen(key_expression, zenoh.handlers.FifoChannel(LARGEST_CHANNEL))
+        # Of the channel alone: nobody could undeclare a subscriber that is just being asked.
+        channel = self._listen(key_expression, zenoh.handlers.FifoChannel(LARGEST_CHANNEL)).handler
 
-        def hand_on(samples: list[zenoh.Sample]) -> None:
-            now_ns = time.time_ns()
-            came = [_numbered(sample, now_ns) for sample in samples]
+        def hand_on(came: list[Numbered | Encoded]) -> None:
             others = (
                 [item if isinstance(item, Encoded) else item.message for item in came]
                 if delivery is None
@@ -201,12 +200,14 @@ class ZenohBus:
         def empty() -> None:
             with contextlib.suppress(zenoh.ZError):  # it is closed
                 while True:
-                    samples = [subscriber.recv()]
-                    room = MOST_GATHERED_BYTES - len(samples[0].payload)
-                    while len(samples) < MOST_GATHERED and room > 0 and (sample := subscriber.try_recv()) is not None:
-                        samples.append(sample)
-                        room -= len(sample.payload)
-                    hand_on(samples)
+                    sample, now_ns = channel.recv(), time.time_ns()
+                    came, room = list[Numbered | Encoded](), MOST_GATHERED_BYTES
+                    while sample is not None:
+                        item = _numbered(sample, now_ns)
+                        came.append(item)
+                        room -= len(item.payload if isinstance(item, Encoded) else item.message.payload)
+                        sample = channel.try_recv() if len(came) < MOST_GATHERED and room > 0 else None
+                    hand_on(came)
                     time.sleep(GATHER_AGAIN_S)
 
         threading.Thread(target=empty, name="gather", daemon=True).start()
@@ -254,6 +255,18 @@ class ZenohBus:
                 since_s = time.monotonic() - began + HEARTBEAT_S
         # In a thread of its own: the handler may wait for who called us.
         threading.Thread(target=delivery.begin, args=(on_told,), daemon=True).start()
+
+    def recall(self, key_expression: str) -> list[Encoded]:
+        """See `Bus`."""
+        order: InOrder[Encoded] = InOrder(gathering=True)
+        lately = f"_time=[now(-{self._config.history_s}s)..]"
+        with contextlib.suppress(zenoh.ZError):  # it is closed
+            for publisher, stream, number, message in self._remembered(key_expression, lately):
+                order.tell(publisher, stream, message.key, number, message)
+        told = list(order.gathered(0))
+        while (due_ns := order.due_ns()) is not None:  # what is missing is not waited for
+            told += order.overdue(due_ns)
+        return [item for item in told if isinstance(item, Encoded)]
 
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
         """What publishers remember of what they have published."""

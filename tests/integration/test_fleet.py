@@ -8,7 +8,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
+from typing import NamedTuple
 
+import msgspec
 import pytest
 import structlog
 
@@ -16,13 +18,13 @@ from monitor_node.fleet_config import FleetConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, ListAlarms
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal
-from tests.unit.monitor_node.fleets import QUICK, run_of
+from tests.unit.monitor_node.fleets import QUICK, alone, run_of
 
 WITHIN_S = 30.0
 PLANTS = ("alpha", "beta", "gamma", "delta")
@@ -72,16 +74,25 @@ def client(config: BusConfig) -> Iterator[ZenohBus]:
 
 
 @contextmanager
-def monitor(config: BusConfig, folder: Path, shard: str) -> Iterator[subprocess.Popen[bytes]]:
+def monitor(
+    config: BusConfig, folder: Path, shard: str, state: Path | None = None
+) -> Iterator[subprocess.Popen[bytes]]:
     """A monitor of a shard, as a process of its own, which is killed at the end if it still runs."""
-    settings = folder / f"{shard.replace('/', '-')}.toml"
-    write_settings(settings, {"bus": config, "monitor": QUICK, "fleet": FleetConfig(plants="reactor/*", shard=shard)})
-    command = [sys.executable, "-m", "reactorwatch", "monitor", "--config", str(settings)]
-    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+    with started(config, folder, shard, state) as process:
         try:
             yield process
         finally:
             process.kill()
+
+
+def started(config: BusConfig, folder: Path, shard: str, state: Path | None) -> subprocess.Popen[bytes]:
+    settings = folder / f"{shard.replace('/', '-')}.toml"
+    fleet = FleetConfig(plants="reactor/*", shard=shard, state=str(state) if state is not None else None)
+    watched = msgspec.structs.replace(QUICK, state_every_s=0.3, health_period_s=0.2)
+    write_settings(settings, {"bus": config, "monitor": watched, "fleet": fleet})
+    command = [sys.executable, "-m", "reactorwatch", "monitor", "--config", str(settings)]
+    with (folder / f"{settings.stem}.log").open("ab") as said:
+        return subprocess.Popen(command, stderr=said)
 
 
 def crew_is(bus: ZenohBus, count: int) -> Callable[[], None]:
@@ -156,6 +167,88 @@ def test_the_plants_of_a_monitor_that_is_killed_are_taken_over(bus_config: BusCo
         raised = set[str]()
         while len({name.split("/")[1] for name in raised if name}) < len(PLANTS):
             raised.add(alarms.get(timeout=WITHIN_S))
+
+
+class Told:
+    """The alarms of plants, and how many rows were judged, as monitors publish it."""
+
+    def __init__(self, bus: ZenohBus) -> None:
+        self.changes: dict[str, list[Change]] = {plant: [] for plant in PLANTS}
+        self._rows = dict.fromkeys(PLANTS, 0)
+        self._changed = threading.Condition()
+        bus.subscribe("reactor/*/alarm/**", self._hear)
+        bus.subscribe("reactor/*/health/monitor", self._hear)
+
+    def _hear(self, encoded: Encoded) -> None:
+        message, topic = decode(encoded.payload, encoded.encoding), keys.parse(encoded.key)
+        assert topic is not None
+        with self._changed:
+            if isinstance(message, Alarm):
+                self.changes[topic.plant].append(change(message))
+            elif isinstance(message, Health):
+                self._rows[topic.plant] = message.rows
+            self._changed.notify_all()
+
+    def wait_for(self, rows: int, changes: int = 0) -> None:
+        """Wait until so many rows of each plant were judged, and so many changes of alarms told in all."""
+        with self._changed:
+            assert self._changed.wait_for(
+                lambda: min(self._rows.values()) >= rows and sum(map(len, self.changes.values())) >= changes, WITHIN_S
+            ), (self._rows, self.changes)
+
+
+class Change(NamedTuple):
+    """What happens to an alarm."""
+
+    alarm: str
+    event: str
+    time_ns: int
+
+
+def change(alarm: Alarm) -> Change:
+    return Change(alarm.alarm, alarm.event, alarm.time_ns)
+
+
+KILLED_AT = (120, 280, 330)
+"""Rows: in training, watching, and while the alarms of the leak stand."""
+
+
+def test_kills_of_monitors_that_share_a_folder_neither_lose_an_alarm_nor_tell_one_twice(
+    bus_config: BusConfig, tmp_path: Path
+) -> None:
+    runs = {plant: run_of(plant, seed, leak_min=30.0, span_min=40.0) for seed, plant in enumerate(PLANTS, start=40)}
+    expected = {
+        plant: [change(item.message) for item in alone(plant, run) if isinstance(item.message, Alarm)]
+        for plant, run in runs.items()
+    }
+    (tmp_path / "states").mkdir()
+    processes = {shard: started(bus_config, tmp_path, f"{shard}/2", tmp_path / "states") for shard in (1, 2)}
+    with client(bus_config) as bus:
+        told, wait_for_both = Told(bus), crew_is(bus, 2)
+        wait_for_both()
+        try:
+            for row in range(len(runs["alpha"]) // 3):
+                for run in runs.values():
+                    for message in run[3 * row : 3 * row + 3]:
+                        bus.publish(message)
+                if row in KILLED_AT:
+                    told.wait_for(row)
+                    shard = 1 + KILLED_AT.index(row) % 2
+                    processes[shard].kill()
+                    processes[shard].wait()
+                    crew_is(bus, 1)()
+                    processes[shard] = started(bus_config, tmp_path, f"{shard}/2", tmp_path / "states")
+                    crew_is(bus, 2)()
+            told.wait_for(len(runs["alpha"]) // 3, sum(map(len, expected.values())))
+            for process in processes.values():
+                process.terminate()
+                assert process.wait(WITHIN_S) == 0
+        finally:
+            for process in processes.values():
+                process.kill()
+                process.wait()
+        assert all(expected.values())
+        assert told.changes == expected
 
 
 def _raised(message: Encoded) -> str:

@@ -1,7 +1,10 @@
 """The watch over a fleet: each plant is watched as if it were alone, by one monitor."""
 
+from collections.abc import Callable
+
 import pytest
 
+from monitor_node.arrivals import Past
 from monitor_node.config import MonitorConfig
 from monitor_node.shards import Crew, Shard, home
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
@@ -121,6 +124,16 @@ def test_shards_together_say_of_each_plant_what_one_monitor_says_once(
         assert of(plant, said) == expected[plant]
 
 
+def noting(asked: list[tuple[str, bool]]) -> Callable[[str, bool], bool]:
+    """Notes whose past is asked for, and promises that it will be told."""
+
+    def ask_past(plant: str, taken_over: bool) -> bool:
+        asked.append((plant, taken_over))
+        return True
+
+    return ask_past
+
+
 def shard_token(number: int) -> str:
     return Crew(PLANTS, Shard(number, 2), str(number)).token
 
@@ -171,23 +184,59 @@ def test_with_the_state_of_who_died_no_alarm_is_lost_and_none_is_told_twice(
     said = first.on_messages(run[:stored_at], 0)
     state = first.monitor("b").to_bytes()
     said += first.on_messages(run[stored_at:died_at], 0)
-    second = fleet(shard=Shard(3 - at_home, 2), name="second", stored=lambda _: state)
+    asked: list[tuple[str, bool]] = []
+    second = fleet(
+        shard=Shard(3 - at_home, 2),
+        name="second",
+        ask_past=noting(asked),
+    )
     second.on_alive(shard_token(at_home), True, 0)
     for publication in said:
         second.on_message(encode(publication), 0)
     second.on_alive(shard_token(at_home), False, 0)
-    said += second.on_messages(run[stored_at - told_again :], 0)  # what the plant remembers, then what comes
+    assert asked == [("b", True)]
+    second.on_messages(run[died_at - 5 : died_at + 3], 0)  # before the past is known
+    remembered = run[stored_at - told_again : died_at]
+    said += second.on_past(Past("b", state, remembered), 0)
+    said += second.on_messages(run[died_at + 3 :], 0)
     assert [item for item in of("b", said) if isinstance(item.message, Alarm)] == [
         item for item in expected["b"] if isinstance(item.message, Alarm)
     ]
 
 
-def test_a_state_that_cannot_be_used_is_told_and_the_plant_learned_anew() -> None:
-    monitor = fleet(stored=lambda _: b"rubbish")
-    monitor.on_alive("reactor/x/alive/plant", True, 0)
+def test_a_state_that_cannot_be_used_is_told_and_the_plant_learned_anew(runs: dict[str, list[Encoded]]) -> None:
+    asked: list[tuple[str, bool]] = []
+    monitor = fleet(ask_past=noting(asked), unusable=lambda plant, _: f"; {plant} is kept aside")
+    monitor.on_alive("reactor/a/alive/plant", True, 0)
+    assert (asked, monitor.plants) == ([("a", False)], [])
+    monitor.on_past(Past("a", b"rubbish", runs["a"][:30]), 0)
+    assert (monitor.plants, monitor.monitor("a").rows) == (["a"], 10)
     ((plant, line),) = monitor.reports(0)
-    assert plant == "x"
-    assert "learned anew" in line
+    assert plant == "a"
+    assert "learned anew; a is kept aside" in line
+
+
+def test_what_is_told_of_a_plant_that_is_anothers_by_then_is_passed_over() -> None:
+    at_home = home("a", 2)
+    monitor = fleet(shard=Shard(3 - at_home, 2), name="us", ask_past=lambda _plant, _taken_over: True)
+    monitor.on_alive(shard_token(at_home), True, 0)
+    monitor.on_alive("reactor/a/alive/plant", True, 0)
+    monitor.on_alive(shard_token(at_home), False, 0)
+    monitor.on_alive(shard_token(at_home), True, 0)
+    assert monitor.on_past(Past("a", None, []), 0) == []
+    assert monitor.plants == []
+
+
+def test_a_plant_that_is_given_back_is_stored(runs: dict[str, list[Encoded]]) -> None:
+    at_home, stored = home("a", 2), dict[str, bytes]()
+    monitor = fleet(shard=Shard(3 - at_home, 2), name="us", store=stored.__setitem__)
+    monitor.on_alive(shard_token(at_home), True, 0)
+    monitor.on_alive("reactor/a/alive/plant", True, 0)
+    monitor.on_alive(shard_token(at_home), False, 0)
+    monitor.on_messages(runs["a"][:30], 0)
+    state = monitor.state_of("a")
+    monitor.on_alive(shard_token(at_home), True, 0)
+    assert stored == {"a": state}
 
 
 def test_what_is_released_can_be_adopted(

@@ -228,6 +228,9 @@ def test_what_is_remembered_of_a_quiet_plant_is_what_its_own_monitor_remembers(c
         for message in run[begin : begin + 100]:
             own.on_message(message, now_ns)
     assert monitor.quiet == ["x"]
+    stored = Monitor(own.config, 0, points=False)
+    stored.from_bytes(monitor.state_of("x"))
+    assert comparable(stored.state).to_bytes() == comparable(own.state).to_bytes()
     again = monitor.monitor("x")
     assert monitor.quiet == []
     assert comparable(again.state).to_bytes() == comparable(own.state).to_bytes()

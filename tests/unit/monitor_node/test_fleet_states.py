@@ -1,0 +1,57 @@
+"""The folder of a fleet's states: each is there whole, or as it was before."""
+
+from pathlib import Path
+
+import pytest
+
+from monitor_node.fleet_states import FleetStates
+from reactorwatch.errors import InputError
+
+
+def test_what_was_put_is_there_when_it_is_closed_the_newest_of_each_plant(tmp_path: Path) -> None:
+    states = FleetStates(tmp_path)
+    for number in range(100):
+        states.put("a", b"%d" % number)
+        states.put("b", b"of b")
+    assert states.read("a") == b"99"
+    states.close()
+    again = FleetStates(tmp_path)
+    assert (again.plants, again.read("a"), again.read("b"), again.read("c")) == (["a", "b"], b"99", b"of b", None)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.state", "b.state"]
+    again.close()
+
+
+def test_what_cannot_be_written_is_told_and_what_was_there_is_still_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = FleetStates(tmp_path)
+    before.put("a", b"before")
+    before.close()
+
+    def full(_descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    states = FleetStates(tmp_path)
+    states.put("a", b"now")
+    states.close()
+    ((plant, why),) = states.failures()
+    assert plant == "a"
+    assert "No space left on device" in why
+    assert (tmp_path / "a.state").read_bytes() == b"before"
+
+
+def test_a_state_that_cannot_be_used_is_kept_under_another_name(tmp_path: Path) -> None:
+    (tmp_path / "a.state").write_bytes(b"rubbish")
+    states = FleetStates(tmp_path)
+    assert states.keep_aside("a", ".damaged") == "a.state.damaged"
+    assert states.plants == []
+    assert (tmp_path / "a.state.damaged").read_bytes() == b"rubbish"
+    states.close()
+
+
+@pytest.mark.parametrize("name", ["missing", "file"])
+def test_a_folder_that_is_none_is_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=f"state folder .*{name}"):
+        FleetStates(tmp_path / name)
