@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from reactorwatch.process.cstr import OPERATING_STATE, cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.cstr import OPERATING_STATE
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.process.profiles import CONSTANT, STEP
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process import by_hand
 from tests.unit.process.by_hand import Rates, balances, duty, nominal
+from tests.unit.process.effect_named import effect_of, extended
 
 TIMES: Array = np.round(np.arange(200.0) * 0.1, 9)
 FLOWS = np.repeat(np.random.default_rng(11).uniform(90, 111, 20), 10)
@@ -21,13 +20,6 @@ ERROR = np.array([2e-6, 2e-3])
 
 def run(rates: Rates, start: Array, flows: Array = FLOWS, time_min: Array = TIMES) -> Array:
     return by_hand.run(rates, start, time_min, flows)
-
-
-def extended(cause: str, size: float, base: ProcessModel | None = None, onset_min: float | None = None) -> ProcessModel:
-    effect = next(item for item in EFFECTS if item.name == cause)
-    profile = CONSTANT if onset_min is None else STEP
-    onset = {} if onset_min is None else {f"{cause}.onset": onset_min}
-    return effect.extend(base or cstr(), profile).with_values({f"{cause}.size": size, **onset})
 
 
 def outputs(model: ProcessModel) -> Array:
@@ -161,8 +153,7 @@ def test_a_sticking_valve_is_stamped_late_in_either_order() -> None:
 
 def test_two_lags_are_one_behind_the_other() -> None:
     model = extended("valve_lag", 0.3)
-    effect = next(item for item in EFFECTS if item.name == "valve_lag")
-    model = effect.extend(model).with_values({"valve_lag_2.size": 0.2})
+    model = effect_of("valve_lag").extend(model).with_values({"valve_lag_2.size": 0.2})
     truth = run(
         lambda t, x, qc: [*nominal(t, x, x[3]), (qc - x[2]) / 0.2, (x[2] - x[3]) / 0.3],
         np.array([*START, FLOWS[0], FLOWS[0]]),

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from reactorwatch.process.cstr import OPERATING_STATE, cstr
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.level_control import with_level_control
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process.by_hand import duty, run
+from tests.unit.process.effect_named import extended
 
 TIMES: Array = np.cumsum(np.append(0.0, np.random.default_rng(8).choice([0.05, 0.1, 0.2], 150)))
 FLOWS = np.repeat(np.random.default_rng(9).uniform(92, 108, 31), 5)[: TIMES.size]
@@ -27,11 +27,6 @@ def reactor(x: Array, qc: float, q: float = 100, V: float = 100, rate: float = 1
         q / V * (1.0 - C) - 7.2e10 * speed,
         q / V * (350 - T) + 1.44e13 * speed + 100 / V * duty(T, qc),
     ]
-
-
-def extended(cause: str, size: float, model: ProcessModel | None = None) -> ProcessModel:
-    effect = next(item for item in EFFECTS if item.name == cause)
-    return effect.extend(model or cstr()).with_values({f"{cause}.size": size})
 
 
 def simulated(cause: str, size: float) -> Array:
