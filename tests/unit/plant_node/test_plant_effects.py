@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as with_changes
 
-from plant_node.config import NoiseSd, PlantConfig
+from plant_node.config import PlantConfig
 from plant_node.controllers import LevelControl, TemperatureControl
 from plant_node.core import Plant
 from plant_node.record import simulate_record
@@ -17,8 +17,7 @@ from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.fault import parse_fault
 from tests.unit.plant_node.reactor import Reactor
-
-QUIET = NoiseSd(C=0, T=0)
+from tests.unit.plant_node.rows import QUIET
 
 
 def test_a_flow_that_is_stamped_late_has_acted_when_its_row_is_measured() -> None:
