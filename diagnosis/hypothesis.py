@@ -18,8 +18,8 @@ from diagnosis.courses import Course, Signal
 from diagnosis.run import Run
 from diagnosis.sized import HUBER, Sized, clipped
 from diagnosis.uncertain import last_state, offsets
-from reactorwatch.process.filter import Innovations
 from reactorwatch.process.filter_errors import Ways
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array
 
 SETTLED = 0.05

@@ -16,8 +16,9 @@ from diagnosis.wandering import Noise, first_rate_sd, learned, with_wandering
 from reactorwatch.compiled import compiled
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filled import Filled, filled
-from reactorwatch.process.filter import Filter, Innovations, NoiseLevels
+from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors, Ways
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.noise import tune_with
 
