@@ -4,7 +4,7 @@ Alarms change when samples come, when a person says so, and when a shelf's time 
 so what is said of alarms that nobody touched follows from the samples alone.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from math import isfinite
 from typing import Literal
 
@@ -13,7 +13,7 @@ from google.protobuf.message import DecodeError as ProtobufDecodeError
 
 from monitor_node.alarm_kpis import Counted, KpiCounter, KpiState
 from monitor_node.alarm_states import Event, State, fits
-from monitor_node.alarms import LAST_NS, AlarmMemory, ChartAlarm, Explanation, SuspectedCause, TimeNs
+from monitor_node.alarms import LAST_NS, AlarmMemory, ChartAlarm, Explanation, SuspectedCause, TimeNs, remembered
 from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig, PriorityName
 from monitor_node.incidents import Incident, Incidents
@@ -293,6 +293,23 @@ class AlarmBoard:
         self._kpis.state, self._told = state.kpis, told
         self._suspects = state.suspects
         self._kpi_minute, self._kpis_changed = state.kpi_minute, state.kpis_changed
+
+    def go_on_from(self, alarms: Iterable[Alarm]) -> None:
+        """Go on from what another monitor of the plant said last of its alarms, where nothing else is left of it.
+
+        Args:
+            alarms: the newest message of each. Those that are not declared here are left out, and so is what makes no
+                state of an alarm.
+        """
+        incident = self._incidents.state
+        for alarm in alarms:
+            memory = remembered(alarm)
+            if alarm.alarm in self._alarms and fits(memory.state, standing=memory.rule.standing):
+                self._alarms[alarm.alarm].memory = memory
+                if alarm.incident > incident.number or (alarm.incident == incident.number and alarm.first_in):
+                    incident.number, incident.first_in = alarm.incident, alarm.alarm
+                incident.changed_ns = max(incident.changed_ns, alarm.raised_ns, alarm.cleared_ns)
+        self._note()
 
     # --- within ----------------------------------------------------------------------------------------------
 

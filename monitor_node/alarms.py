@@ -89,6 +89,33 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
     comment: str = ""
 
 
+def remembered(alarm: Alarm) -> AlarmMemory:
+    """What a monitor remembered of an alarm when it said this of it, as far as the message tells."""
+    standing = alarm.raised_ns != 0 and alarm.cleared_ns == 0
+    return AlarmMemory(
+        state=next((state for state, told in STATES.items() if told == alarm.state), State.NORMAL),
+        rule=PersistenceState(standing=standing),
+        raised_ns=alarm.raised_ns,
+        cleared_ns=alarm.cleared_ns,
+        value=alarm.value,
+        limit=alarm.limit,
+        above=alarm.limit > 0.0,
+        unit=alarm.unit,
+        text=alarm.text,
+        contributions={item.signal: item.share for item in alarm.contributions},
+        suspects=[
+            SuspectedCause(**{field: getattr(item, field) for field in SuspectedCause.__struct_fields__})
+            for item in alarm.suspects
+        ],
+        incident=alarm.incident,
+        first_in=alarm.first_in,
+        shelved_ns=alarm.time_ns if alarm.shelved_until_ns else 0,
+        shelved_until_ns=alarm.shelved_until_ns,
+        by=alarm.by,
+        comment=alarm.comment,
+    )
+
+
 class Explanation(NamedTuple):
     """What an alarm says when it is raised.
 

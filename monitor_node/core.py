@@ -8,12 +8,13 @@ plant follows from the samples and from what people said of its alarms, so a rep
 anything says the same, value for value.
 """
 
+from collections.abc import Iterable, Mapping
 from math import isfinite
-from typing import Any
+from typing import Any, NamedTuple
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_commands import obey
-from monitor_node.alignment import Aligner, Row
+from monitor_node.alignment import Aligner, Counts, Row
 from monitor_node.config import MonitorConfig
 from monitor_node.monitor_state import MonitorState, opened, sealed, settings_of
 from monitor_node.refusals import Refusals
@@ -23,7 +24,7 @@ from monitor_node.watch import PlantWatch
 from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import CommandReply, Health, Quality, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, Quality, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -47,6 +48,32 @@ LARGEST_NUMBER = 2**62
 
 UNSPECIFIED, BAD = Quality.QUALITY_UNSPECIFIED, Quality.QUALITY_BAD  # looked up once, not at every sample
 USABLE = frozenset({Quality.QUALITY_GOOD, Quality.QUALITY_UNCERTAIN})
+
+
+class Receipt(NamedTuple):
+    """How messages came, by the clock of receipt.
+
+    Attributes:
+        start_ns: when the monitor was started.
+        heard_ns: of the newest sign of life that counted, see `HEARD_AGAIN_NS`.
+        received_ns: likewise, as the silence of the plant knows it; None: nothing has come.
+        counted_ns: of these, the one that the next spacing is counted from; None: what comes next is the first.
+        lag_ns: the longest that a message has waited since health was told.
+        health_due_ns: when it is told next.
+        ticked: whether the clock was looked at before.
+        stalls: how often that was more than a second late.
+        not_stored: how often what is remembered could not be stored.
+    """
+
+    start_ns: int
+    heard_ns: int
+    received_ns: int | None
+    counted_ns: int | None
+    lag_ns: int
+    health_due_ns: int
+    ticked: bool
+    stalls: int
+    not_stored: int
 
 
 class Monitor:
@@ -227,24 +254,7 @@ class Monitor:
 
     def to_bytes(self) -> bytes:
         """All that is remembered, between two messages: a monitor that goes on from it says the same, bit for bit."""
-        return sealed(
-            MonitorState(
-                self._learned_with(),
-                self._runs,
-                self._aligner.state,
-                self.alarms.to_bytes(),
-                self._watch.state,
-                self._units,
-                self._heard_from_ns,
-                self.first_ns,
-                self.last_ns,
-                self._watching_since_ns,
-                self._snapshot_due_ns,
-                self.received,
-                self._published,
-                self.refusals.by_reason,
-            )
-        )
+        return sealed(self._state(self._learned_with()))
 
     def from_bytes(self, data: bytes) -> None:
         """Go on from what `to_bytes` returned, of a monitor with the same settings.
@@ -256,7 +266,37 @@ class Monitor:
             InputError: the bytes are not that; everything is as before.
             OtherSettingsError: they are, but of a monitor with other settings; likewise.
         """
-        state = opened(data, self._learned_with())
+        self.restore(opened(data, self._learned_with()))
+
+    @property
+    def state(self) -> MonitorState:
+        """What `to_bytes` stores, without the settings: for this process. Parts of it are not copied."""
+        return self._state({})
+
+    def _state(self, settings: dict[str, Any]) -> MonitorState:
+        return MonitorState(
+            settings,
+            self._runs,
+            self._aligner.state,
+            self.alarms.to_bytes(),
+            self._watch.state,
+            self._units,
+            self._heard_from_ns,
+            self.first_ns,
+            self.last_ns,
+            self._watching_since_ns,
+            self._snapshot_due_ns,
+            self.received,
+            self._published,
+            self.refusals.by_reason,
+        )
+
+    def restore(self, state: MonitorState) -> None:
+        """Go on where a monitor with the same settings was when `state` was taken, see `from_bytes`.
+
+        Raises:
+            InputError: the state is damaged; everything is as before.
+        """
         board = AlarmBoard(self.config)
         try:
             watch = PlantWatch(self.config, board, points=self._points, model=self._model)
@@ -265,6 +305,7 @@ class Monitor:
         except ValueError as error:
             raise InputError(f"is no state of this software's monitor: {error}") from error
         self.alarms, self._watch = board, watch
+        self._runs = state.runs
         self._runs = state.runs
         self._aligner.state, self._told_again = state.alignment, ToldAgain(state.alignment)
         self._units, self._heard_from_ns = state.units, state.heard_from_ns
@@ -279,9 +320,48 @@ class Monitor:
             self._settings = settings_of(self.config, self._watch.model, points=self._points)
         return self._settings
 
+    @property
+    def is_catching_up(self) -> bool:
+        """Whether samples may come that were heard before a stop."""
+        return self._told_again is not None and not self._told_again.is_over
+
     def caught_up(self) -> None:
         """What was published before has all come: from now on no sample is one that was heard before a stop."""
         self._told_again = None
+
+    def go_on_from_alarms(self, alarms: Iterable[Alarm]) -> None:
+        """Go on from what another monitor of the plant said last of its alarms, where nothing else is left of it.
+
+        The plant is learned anew; meanwhile what stands stands, and is cleared when it is found to be over.
+
+        Args:
+            alarms: the newest message of each.
+        """
+        self.alarms.go_on_from(alarms)
+        self._watch.signals.go_on_from_alarms()
+
+    @property
+    def receipt(self) -> Receipt:
+        """What a restart forgets: how messages came, by the clock."""
+        received_ns, counted_ns = self._watch.signals.receipts_ns
+        return Receipt(
+            self._start_ns,
+            self._heard_ns,
+            received_ns,
+            counted_ns,
+            self._lag_ns,
+            self._health_due_ns,
+            self._ticked,
+            self._stalls,
+            self.not_stored,
+        )
+
+    @receipt.setter
+    def receipt(self, receipt: Receipt) -> None:
+        self._start_ns, self._heard_ns, self._lag_ns = receipt.start_ns, receipt.heard_ns, receipt.lag_ns
+        self._watch.signals.receipts_ns = receipt.received_ns, receipt.counted_ns
+        self._health_due_ns, self._ticked = receipt.health_due_ns, receipt.ticked
+        self._stalls, self.not_stored = receipt.stalls, receipt.not_stored
 
     # --- what others may ask ---------------------------------------------------------------------------------
 
@@ -291,6 +371,11 @@ class Monitor:
         if self.first_ns is None:
             return "waiting"
         return "training" if self._watching_since_ns is None else "watching"
+
+    @property
+    def model(self) -> ProcessModel | None:
+        """That the plant may be watched by; None: there is none."""
+        return self._watch.model
 
     @property
     def rows(self) -> int:
@@ -325,6 +410,14 @@ class Monitor:
 
     # --- rows ------------------------------------------------------------------------------------------------
 
+    def on_rows(self, rows: Iterable[Row]) -> list[Publication]:
+        """Judge rows that somebody else has lined up."""
+        publications: list[Publication] = []
+        for row in rows:
+            self._on_row(row, publications)
+        self._published += len(publications)
+        return publications
+
     def finish(self) -> list[Publication]:
         """Judge the rows that still wait for samples, as at the end of a record."""
         publications: list[Publication] = []
@@ -350,24 +443,15 @@ class Monitor:
             self._snapshot_due_ns = time_ns + self._snapshot_ns
 
     def _health(self, now_ns: int, phase: str) -> Publication:
-        counts = self._aligner.state.counts
-        health = Health(
-            time_ns=now_ns,
-            node=NODE,
-            version=__version__,
-            phase=phase,
-            uptime_s=(now_ns - self._start_ns) / 1e9,
+        health = health_of(
+            now_ns,
+            phase,
+            self._start_ns,
+            self._aligner.state.counts,
+            self.refusals.by_reason,
             received=self.received,
-            lost=counts.lost,
-            late=counts.late,
-            refused=self.refusals.total,
-            refused_by_reason=self.refusals.by_reason,
-            lag_ms=self._lag_ns / 1e6,
-            duplicated=counts.duplicated,
-            out_of_order=counts.out_of_order,
             published=self._published,
-            rows=counts.rows,
-            incomplete_rows=counts.incomplete_rows,
+            lag_ns=self._lag_ns,
             heard_from_ns=self._heard_from_ns,
             not_stored=self.not_stored,
             stalls=self._stalls,
@@ -387,3 +471,55 @@ def _unusable(signal: str, sample: Sample) -> tuple[str, str]:
     if sample.quality not in USABLE:
         return "bad_quality", f"{signal} has the quality {sample.quality}, which this version does not know"
     return "out_of_range", f"{signal} is {sample.value} at {sample.time_ns} ns: sizes must be below {LARGEST_VALUE:g}"
+
+
+def health_of(
+    now_ns: int,
+    phase: str,
+    start_ns: int,
+    counts: Counts,
+    refused: Mapping[str, int],
+    *,
+    received: int,
+    published: int,
+    lag_ns: int,
+    heard_from_ns: Mapping[str, int],
+    not_stored: int,
+    stalls: int,
+) -> Health:
+    """How a plant's monitor does.
+
+    Args:
+        now_ns: the time.
+        phase: as `Monitor.phase`, or `stopped`.
+        start_ns: when it was started.
+        counts: of samples on their way into rows.
+        refused: counts by reason.
+        received: messages so far.
+        published: likewise.
+        lag_ns: the longest that one has waited.
+        heard_from_ns: by signal, the time of its first sample.
+        not_stored: how often what is remembered could not be stored.
+        stalls: how often the clock was looked at more than a second late.
+    """
+    return Health(
+        time_ns=now_ns,
+        node=NODE,
+        version=__version__,
+        phase=phase,
+        uptime_s=(now_ns - start_ns) / 1e9,
+        received=received,
+        lost=counts.lost,
+        late=counts.late,
+        refused=sum(refused.values()),
+        refused_by_reason=refused,
+        lag_ms=lag_ns / 1e6,
+        duplicated=counts.duplicated,
+        out_of_order=counts.out_of_order,
+        published=published,
+        rows=counts.rows,
+        incomplete_rows=counts.incomplete_rows,
+        heard_from_ns=heard_from_ns,
+        not_stored=not_stored,
+        stalls=stalls,
+    )

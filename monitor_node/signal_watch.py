@@ -203,11 +203,25 @@ class SignalWatch:
         for stuck in self._stuck:
             stuck.restart()
 
+    def go_on_from_alarms(self) -> None:
+        """Take as silent what the alarms say is silent: the next sample ends it."""
+        for silence, alarm in zip(self._silences, self._silent, strict=True):
+            silence.standing = alarm.memory.rule.standing
+
     # --- the clock of receipt --------------------------------------------------------------------------------
 
     def received(self, now_ns: int) -> None:
         """Note that something came from the plant."""
         self._silences[0].received(now_ns)
+
+    @property
+    def receipts_ns(self) -> tuple[int | None, int | None]:
+        """When something came last, and from when the next spacing is counted; None: what comes next is the first."""
+        return self._silences[0].receipts_ns
+
+    @receipts_ns.setter
+    def receipts_ns(self, receipts_ns: tuple[int | None, int | None]) -> None:
+        self._silences[0].receipts_ns = receipts_ns
 
     def due_ns(self) -> int | None:
         """When to `check`, unless something comes before; None: there is nothing to wait for."""

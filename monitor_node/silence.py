@@ -219,6 +219,15 @@ class Silence:
         """Begin to wait, after a stop, for what comes next; how long it takes is no spacing."""
         self._received_ns, self._counted_ns = now_ns, None
 
+    @property
+    def receipts_ns(self) -> tuple[int | None, int | None]:
+        """When something came last, and from when the next spacing is counted; None: what comes next is the first."""
+        return self._received_ns, self._counted_ns
+
+    @receipts_ns.setter
+    def receipts_ns(self, receipts_ns: tuple[int | None, int | None]) -> None:
+        self._received_ns, self._counted_ns = receipts_ns
+
     def received(self, now_ns: int) -> None:
         """Note that something came, whatever it was. A clock that was set back is no spacing, nor is one in a burst."""
         before_ns, self._received_ns = self._counted_ns, now_ns

@@ -29,6 +29,11 @@ class ToldAgain:
         waiting = {time_ns: row.numbers for time_ns, row in state.pending.items()}
         self._numbers = {time_ns: list(numbers) for time_ns, numbers in (state.left | waiting).items()}
 
+    @property
+    def is_over(self) -> bool:
+        """Whether every signal has come beyond what was heard before."""
+        return not any(self._newest)
+
     def heard(self, index: int, time_ns: int, sequence: int) -> bool:
         """Whether it was heard before.
 

@@ -112,12 +112,22 @@ def monitor(
             show_default=False,
         ),
     ] = None,
+    plants: Annotated[
+        str | None,
+        typer.Option("--plants", help="Watch all of them: 'reactor/*', 'reactor/north_*'.", show_default=False),
+    ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option("--shard", help="With --plants: our part of them, such as 2/5 [1/1].", show_default=False),
+    ] = None,
 ) -> None:
-    """Watch a plant: predict its signals, raise alarms."""
+    """Watch a plant, or a fleet of them: predict signals, raise alarms."""
     from contextlib import nullcontext
 
+    from monitor_node import fleet_node
     from monitor_node.__main__ import run
     from monitor_node.config import MonitorConfig
+    from monitor_node.fleet_config import FleetConfig
     from reactorwatch.cli.supervise import diagnosing, diagnosis_settings
     from reactorwatch.runtime.config import LogConfig, section
 
@@ -126,6 +136,15 @@ def monitor(
     if state is not None:
         flags |= {"state_file": str(state / "monitor.state"), "alarm_state_file": str(state / "alarms.state")}
     config_of_monitor = section(MonitorConfig, "monitor", tables, flags)
+    fleet = section(FleetConfig, "fleet", tables, {"plants": plants, "shard": shard})
+    if fleet.plants is not None:
+        for option, given in (("--plant", name), ("--diagnose", diagnose)):
+            if given is not None:
+                raise InputError(f"{option} is for the monitor of one plant; leave it out with --plants")
+        fleet_node.run(config_of_monitor, fleet, bus)
+        return
+    if shard is not None:
+        raise InputError("--shard is a part of the plants that --plants names; give both")
     diagnosis = diagnosis_settings(tables, config_of_monitor, diagnose)
     with diagnosing(diagnosis, bus, section(LogConfig, "log", tables, {})) if diagnosis.out else nullcontext():
         run(config_of_monitor, bus, _metrics(tables))

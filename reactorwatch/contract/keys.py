@@ -29,6 +29,9 @@ LIST_RECORDER_ALARMS = "list_recorder_alarms"
 ACKNOWLEDGE_RECORDER = "acknowledge_recorder"
 """The recorder's commands; others than the monitor's, so that it is known whether each of the two is there."""
 
+FLEET = "@fleet"
+"""In place of a plant: what monitors that share a fleet tell each other. No plant is called so; no `*` reaches it."""
+
 _PLANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 
@@ -85,3 +88,57 @@ def parse(text: str) -> Topic | None:
     if len(parts) != 4 or parts[0] != ROOT or not all(parts):
         return None
     return Topic(*parts[1:])
+
+
+def fleet_token(fleet: str, of: str, number: str, name: str) -> str:
+    """The liveliness token of one of the monitors that share a fleet.
+
+    Args:
+        fleet: what they share, as one part of a key.
+        of: how many shards it has.
+        number: of the monitor's shard.
+        name: of the monitor.
+    """
+    return f"{ROOT}/{FLEET}/{ALIVE}/{fleet}/{of}/{number}/{name}"
+
+
+class FleetToken(NamedTuple):
+    """The token of a monitor of a fleet, taken apart; see `fleet_token`."""
+
+    fleet: str
+    of: str
+    number: str
+    name: str
+
+
+def parse_fleet_token(token: str) -> FleetToken | None:
+    """Take the token of a monitor of a fleet apart; None if it is not one.
+
+    >>> parse_fleet_token(fleet_token("0f", "5", "2", "a"))
+    FleetToken(fleet='0f', of='5', number='2', name='a')
+    """
+    root, _, rest = token.partition(f"/{FLEET}/{ALIVE}/")
+    parts = rest.split("/")
+    if root != ROOT or len(parts) != 4 or not all(parts):
+        return None
+    return FleetToken(*parts)
+
+
+def samples_of(plants: str) -> str:
+    """The key expression of the samples of all plants that an expression such as `reactor/*` is of."""
+    return f"{plants}/{SAMPLE}/**"
+
+
+def checked_plants(expression: str) -> str:
+    """The key expression of a set of plants, if it is one.
+
+    Raises:
+        ValueError: it is not `reactor/` and one name, in which `*` stands for any letters.
+    """
+    root, _, name = expression.partition("/")
+    if root != ROOT or not re.fullmatch(r"[A-Za-z0-9_.*-]+", name) or "**" in name:
+        raise ValueError(
+            f"plants must be {ROOT}/ and a name with or without '*', such as '{ROOT}/*' or '{ROOT}/north_*', "
+            f"got {expression!r}"
+        )
+    return expression

@@ -85,6 +85,12 @@ class FilterState(msgspec.Struct, frozen=True):
     learned: bool = False
 
 
+def variances(model: ProcessModel, noise: NoiseLevels) -> Array:
+    """Of the sensors and of the process in a minute, as the compiled rows take them, see `filter_step`."""
+    least = [LEAST_PROCESS_SD * state.scale for state in model.states]
+    return np.asarray(np.square(np.concatenate([noise.measurement_sd, np.maximum(noise.process_sd, least)])))
+
+
 class Filter:
     """Follows one plant. Not for two threads at once.
 
@@ -130,9 +136,7 @@ class Filter:
         if len(noise.process_sd) != n_x or not all(0 <= sd < inf for sd in noise.process_sd):
             raise ValueError(f"process_sd must be {n_x} numbers of at least 0, got {noise.process_sd}")
         self._noise = noise
-        least = [LEAST_PROCESS_SD * state.scale for state in self.model.states]
-        sds = np.concatenate([noise.measurement_sd, np.maximum(noise.process_sd, least)])
-        self._constants[len(self.model.parameters) :] = np.square(sds)
+        self._constants[len(self.model.parameters) :] = variances(self.model, noise)
 
     def change(self, changes: Mapping[str, float]) -> None:
         """From the next row on, these parameters differ from the model's values, and no others do.

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import lru_cache
 from queue import Empty, SimpleQueue
 from typing import Protocol
 
@@ -17,6 +18,9 @@ from google.protobuf.message import Message
 
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.runtime.in_order import Gap
+
+MOST_GATHERED = 2000
+"""Messages that are handed over together."""
 
 
 class Request(Protocol):
@@ -28,6 +32,9 @@ class Request(Protocol):
 
     def reply(self, message: Message) -> None:
         """Answer it; once."""
+
+    def leave(self) -> None:
+        """Leave the answer to others; instead of `reply`."""
 
 
 class Bus(Protocol):
@@ -58,6 +65,17 @@ class Bus(Protocol):
             on_told: called, from a thread of the bus and between the messages, when that has all come.
         """
 
+    def gather(
+        self,
+        key_expression: str,
+        handler: Callable[[list[Encoded]], None],
+        *,
+        on_gap: Callable[[Gap], None] | None = None,
+        history: bool = False,
+        on_told: Callable[[], None] | None = None,
+    ) -> None:
+        """As `subscribe`, of as many messages at a time as have come, up to about `MOST_GATHERED`."""
+
     def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
         """Call the handler, from a thread of the bus, with every question on matching keys."""
 
@@ -65,7 +83,10 @@ class Bus(Protocol):
         """All answers to a question that come within the time."""
 
     def announce(self, key: str) -> None:
-        """Show a liveliness token until this bus is closed, by whatever means."""
+        """Show a liveliness token until it is withdrawn, or this bus is closed, by whatever means."""
+
+    def withdraw(self, key: str) -> None:
+        """Show a token no longer that was announced here."""
 
     def watch_alive(self, key_expression: str, handler: Callable[[str, bool], None]) -> None:
         """Call the handler with (key, True) for tokens that are there or appear, (key, False) when they go."""
@@ -75,18 +96,35 @@ class Bus(Protocol):
 
 
 def matches(key_expression: str, key: str) -> bool:
-    """Whether a key is in a key expression: `*` stands for one part, `**` for any number of parts.
+    """Whether a key is in a key expression: `*` stands for letters of one part, `**` for any number of parts.
+
+    No `*` stands for a part that begins with `@`.
 
     >>> matches("reactor/*/sample/**", "reactor/cstr/sample/T"), matches("reactor/**", "reactor")
     (True, True)
+    >>> matches("reactor/**", "reactor/@fleet/alive/1")
+    False
     """
+    return _pattern(key_expression).fullmatch("/" + key) is not None
+
+
+@lru_cache(maxsize=256)
+def _pattern(key_expression: str) -> re.Pattern[str]:
     pattern = ""
     for part in key_expression.split("/"):
         if part == "**":
-            pattern += "(/[^/]+)*"
+            pattern += "(/[^/@][^/]*)*"
         else:
-            pattern += "/" + "[^/]*".join(re.escape(piece) for piece in part.split("*"))
-    return re.fullmatch(pattern, "/" + key) is not None
+            first, *others = part.split("*")
+            pattern += (
+                "/"
+                + re.escape(first)
+                + "".join(
+                    ("[^/]*" if first or number else "(?!@)[^/]*") + re.escape(piece)
+                    for number, piece in enumerate(others)
+                )
+            )
+    return re.compile(pattern)
 
 
 @dataclass(frozen=True)
@@ -94,11 +132,15 @@ class MemoryRequest:
     """A question within the process, and where its answers are gathered."""
 
     question: Encoded
-    answers: SimpleQueue[Encoded]
+    answers: SimpleQueue[Encoded | None]
 
     def reply(self, message: Message) -> None:
         """Answer it."""
         self.answers.put(Encoded(self.question.key, *encode_message(message)))
+
+    def leave(self) -> None:
+        """See `Request`."""
+        self.answers.put(None)
 
 
 @dataclass
@@ -141,31 +183,51 @@ class MemoryBus:
         if on_told is not None:
             on_told()
 
+    def gather(
+        self,
+        key_expression: str,
+        handler: Callable[[list[Encoded]], None],
+        *,
+        on_gap: Callable[[Gap], None] | None = None,
+        history: bool = False,
+        on_told: Callable[[], None] | None = None,
+    ) -> None:
+        """See `Bus`; here they come one by one."""
+        self.subscribe(
+            key_expression, lambda message: handler([message]), on_gap=on_gap, history=history, on_told=on_told
+        )
+
     def answer(self, key_expression: str, handler: Callable[[Request], None]) -> None:
         """See `Bus`."""
         with self._exchange.lock:
             self._exchange.answerers.append((self, key_expression, handler))
 
     def ask(self, question: Encoded, timeout_s: float) -> list[Encoded]:
-        """See `Bus`; returns as soon as all have answered who listen there."""
-        answers: SimpleQueue[Encoded] = SimpleQueue()
+        """See `Bus`; returns as soon as all have answered, or left it to others, who listen there."""
+        answers: SimpleQueue[Encoded | None] = SimpleQueue()
         with self._exchange.lock:
             answerers = list(self._exchange.answerers)
         handlers = [handler for _, expression, handler in answerers if matches(expression, question.key)]
         until = time.monotonic() + timeout_s
         for handler in handlers:
             handler(MemoryRequest(question, answers))
-        found: list[Encoded] = []
+        found: list[Encoded | None] = []
         with contextlib.suppress(Empty):
             while len(found) < len(handlers):
                 found.append(answers.get(timeout=max(0.0, until - time.monotonic())))
-        return found
+        return [answer for answer in found if answer is not None]
 
     def announce(self, key: str) -> None:
         """See `Bus`."""
         with self._exchange.lock:
             self._exchange.tokens.append((self, key))
             self._tell(key, alive=True)
+
+    def withdraw(self, key: str) -> None:
+        """See `Bus`."""
+        with self._exchange.lock:
+            self._exchange.tokens.remove((self, key))
+            self._tell(key, alive=False)
 
     def watch_alive(self, key_expression: str, handler: Callable[[str, bool], None]) -> None:
         """See `Bus`."""

@@ -21,7 +21,7 @@ import secrets
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from google.protobuf.message import Message
 from reactorwatch.contract.codec import LARGEST_PAYLOAD, Encoded, encode_message
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.access import MEMORY, NOBODY
-from reactorwatch.runtime.bus import Request
+from reactorwatch.runtime.bus import MOST_GATHERED, Request
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.delivery import Delivery, Numbered
 from reactorwatch.runtime.identity import ROUTER_FILES, TLS, client_settings
@@ -51,6 +51,9 @@ HEARTBEAT_S = 0.5
 LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that who missed it can ask for it
 STUCK_S = 1.0
 LONGEST_ENCODING = 1000
+GATHER_AGAIN_S = 0.005
+LARGEST_CHANNEL = 5 * MOST_GATHERED
+MOST_GATHERED_BYTES = 1 << 20
 STREAM_PARTS = 3  # of a key: root, plant and kind
 
 HISTORY_WITHIN_S = 10.0
@@ -83,6 +86,10 @@ class ZenohRequest:
         self.query.reply(self.question.key, payload, encoding=encoding)
         self.query.drop()
 
+    def leave(self) -> None:
+        """See `Request`: who asked waits until nobody holds his question any more."""
+        self.query.drop()
+
 
 @dataclass
 class _Key:
@@ -95,8 +102,16 @@ class _Key:
 class ZenohBus:
     """See `reactorwatch.runtime.bus.Bus`."""
 
-    def __init__(self, session: zenoh.Session, config: BusConfig) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        config: BusConfig,
+        passing: Collection[str] = (),
+        voice: zenoh.Session | None = None,
+    ) -> None:
         self._session = session
+        self._voice = voice or session  # by which all is done but listening to what is published
+        self._passing = frozenset(passing)
         self._config = config
         self._name = secrets.randbits(64)
         self._keys: dict[str, _Key] = {}
@@ -104,10 +119,14 @@ class ZenohBus:
         self._publishing = threading.Lock()  # what is numbered first goes out first
         self._published_at: float | None = None
         self._declared: list[Any] = []  # Zenoh undeclares what nobody holds
+        self._tokens: dict[str, Any] = {}
         self._deliveries: list[Delivery] = []
 
     def publish(self, message: Encoded) -> None:
         """See `Bus`."""
+        if self._passing and message.key.split("/", STREAM_PARTS)[STREAM_PARTS - 1] in self._passing:
+            self._voice.put(message.key, message.payload, encoding=message.encoding)
+            return
         with self._publishing:
             key = self._keys.get(message.key)
             if key is None:
@@ -128,48 +147,125 @@ class ZenohBus:
         on_told: Callable[[], None] | None = None,
     ) -> None:
         """See `Bus`."""
-        delivery = Delivery(handler, on_gap or _say_gap) if _is_of_whole_streams(key_expression) else None
+
+        def hand_on(messages: list[Encoded]) -> None:
+            for message in messages:
+                handler(message)
+
+        delivery = self._delivery(key_expression, hand_on, on_gap)
 
         def on_sample(sample: zenoh.Sample) -> None:
-            came = _numbered(sample)
-            if delivery is None or came is None:  # or it is of no publisher of ours
-                handler(_encoded(sample))
+            came = _numbered(sample, time.time_ns())
+            if delivery is None or isinstance(came, Encoded):  # or it is of no publisher of ours
+                handler(came if isinstance(came, Encoded) else came.message)
             else:
-                delivery.receive(came)
+                delivery.receive((came,))
 
-        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
-        self._declared.append(
-            zenoh.ext.declare_advanced_subscriber(self._session, key_expression, on_sample, recovery=recovery)
-        )
+        self._listen(key_expression, on_sample)
         if delivery is not None:
-            self._deliveries.append(delivery)
-            # The subscriber's own question for what was before left out keys that were being published on meanwhile.
-            for last in self._remembered(key_expression, "_max=1"):
-                delivery.tell_last(last)
-            if history:
-                began, since_s = time.monotonic(), self._config.history_s
-                for _ in range(MOST_ASKED):
-                    for came in self._remembered(key_expression, f"_time=[now(-{since_s}s)..]"):
-                        delivery.tell(came)
-                    if delivery.is_told():
-                        break
-                    since_s = time.monotonic() - began + HEARTBEAT_S
-            # In a thread of its own: the handler may wait for who called us.
-            threading.Thread(target=delivery.begin, args=(on_told,), daemon=True).start()
+            self._begin(delivery, key_expression, history=history, on_told=on_told)
         elif on_told is not None:
             on_told()
+
+    def gather(
+        self,
+        key_expression: str,
+        handler: Callable[[list[Encoded]], None],
+        *,
+        on_gap: Callable[[Gap], None] | None = None,
+        history: bool = False,
+        on_told: Callable[[], None] | None = None,
+    ) -> None:
+        """See `Bus`.
+
+        Zenoh calls a handler from a thread of its own, and each call waits for Python's lock. Here it puts what comes
+        into a channel, and one thread empties it: half the time a message. Having handed on what there was, it waits
+        for a moment before it looks again: where much comes, more comes together, and what is alone is not delayed.
+        """
+        delivery = self._delivery(key_expression, handler, on_gap)
+        subscriber = self._listen(key_expression, zenoh.handlers.FifoChannel(LARGEST_CHANNEL))
+
+        def hand_on(samples: list[zenoh.Sample]) -> None:
+            now_ns = time.time_ns()
+            came = [_numbered(sample, now_ns) for sample in samples]
+            others = (
+                [item if isinstance(item, Encoded) else item.message for item in came]
+                if delivery is None
+                else [item for item in came if isinstance(item, Encoded)]
+            )
+            if others:
+                handler(others)
+            if delivery is not None and len(others) < len(came):
+                delivery.receive(item for item in came if isinstance(item, Numbered))
+
+        def empty() -> None:
+            with contextlib.suppress(zenoh.ZError):  # it is closed
+                while True:
+                    samples = [subscriber.recv()]
+                    room = MOST_GATHERED_BYTES - len(samples[0].payload)
+                    while len(samples) < MOST_GATHERED and room > 0 and (sample := subscriber.try_recv()) is not None:
+                        samples.append(sample)
+                        room -= len(sample.payload)
+                    hand_on(samples)
+                    time.sleep(GATHER_AGAIN_S)
+
+        threading.Thread(target=empty, name="gather", daemon=True).start()
+        if delivery is not None:
+            self._begin(delivery, key_expression, history=history, on_told=on_told)
+        elif on_told is not None:
+            on_told()
+
+    def _delivery(
+        self,
+        key_expression: str,
+        handler: Callable[[list[Encoded]], None],
+        on_gap: Callable[[Gap], None] | None,
+    ) -> Delivery | None:
+        """What keeps the order of whole streams; None for less than that."""
+        if not _is_of_whole_streams(key_expression):
+            return None
+        delivery = Delivery(handler, on_gap or _say_gap)
+        self._deliveries.append(delivery)
+        return delivery
+
+    def _listen(self, key_expression: str, handler: Any) -> Any:
+        """Subscribe, with a callback or a channel."""
+        recovery = zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None)
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self._session, _spelled(key_expression), handler, recovery=recovery
+        )
+        self._declared.append(subscriber)
+        return subscriber
+
+    def _begin(
+        self, delivery: Delivery, key_expression: str, *, history: bool, on_told: Callable[[], None] | None
+    ) -> None:
+        """Ask for what was before, and let what comes go on."""
+        # The subscriber's own question for what was before left out keys that were being published on meanwhile.
+        for last in self._remembered(key_expression, "_max=1"):
+            delivery.tell_last(last)
+        if history:
+            began, since_s = time.monotonic(), self._config.history_s
+            for _ in range(MOST_ASKED):
+                for came in self._remembered(key_expression, f"_time=[now(-{since_s}s)..]"):
+                    delivery.tell(came)
+                if delivery.is_told():
+                    break
+                since_s = time.monotonic() - began + HEARTBEAT_S
+        # In a thread of its own: the handler may wait for who called us.
+        threading.Thread(target=delivery.begin, args=(on_told,), daemon=True).start()
 
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
         """What publishers remember of what they have published."""
         replies = self._session.get(
-            f"{key_expression}/{MEMORY}?{which}",
+            f"{_spelled(key_expression)}/{MEMORY}?{which}",
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=HISTORY_WITHIN_S,
         )
         for reply in replies:
-            came = _numbered(reply.ok) if reply.ok is not None else None
-            if came is not None:
+            came = _numbered(reply.ok, time.time_ns()) if reply.ok is not None else None
+            if isinstance(came, Numbered):
                 yield came
 
     def _declare(self, key: str) -> _Key:
@@ -179,7 +275,7 @@ class ZenohBus:
         again = zenoh.ext.RepliesConfig(congestion_control=zenoh.CongestionControl.BLOCK)
         drop = self._config.congestion == "drop"
         publisher = zenoh.ext.declare_advanced_publisher(
-            self._session,
+            self._voice,
             key,
             congestion_control=zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,
             cache=zenoh.ext.CacheConfig(self._config.cache_messages, replies_config=again),
@@ -197,13 +293,11 @@ class ZenohBus:
             question = Encoded(str(query.key_expr), data, str(query.encoding)[:LONGEST_ENCODING])
             handler(ZenohRequest(query, question))
 
-        self._declared.append(self._session.declare_queryable(key_expression, on_query))
+        self._declared.append(self._voice.declare_queryable(_spelled(key_expression), on_query))
 
     def ask(self, question: Encoded, timeout_s: float) -> list[Encoded]:
         """See `Bus`."""
-        replies = self._session.get(
-            question.key, payload=question.payload, encoding=question.encoding, timeout=timeout_s
-        )
+        replies = self._voice.get(question.key, payload=question.payload, encoding=question.encoding, timeout=timeout_s)
         answers = (reply.ok for reply in replies)
         return [
             Encoded(str(answer.key_expr), answer.payload.to_bytes(), str(answer.encoding))
@@ -213,7 +307,11 @@ class ZenohBus:
 
     def announce(self, key: str) -> None:
         """See `Bus`."""
-        self._declared.append(self._session.liveliness().declare_token(key))
+        self._tokens[key] = self._voice.liveliness().declare_token(key)
+
+    def withdraw(self, key: str) -> None:
+        """See `Bus`."""
+        self._tokens.pop(key).undeclare()
 
     def watch_alive(self, key_expression: str, handler: Callable[[str, bool], None]) -> None:
         """See `Bus`."""
@@ -221,7 +319,9 @@ class ZenohBus:
         def on_token(sample: zenoh.Sample) -> None:
             handler(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        self._declared.append(self._session.liveliness().declare_subscriber(key_expression, on_token, history=True))
+        self._declared.append(
+            self._voice.liveliness().declare_subscriber(_spelled(key_expression), on_token, history=True)
+        )
 
     def close(self) -> None:
         """See `Bus`.
@@ -233,24 +333,32 @@ class ZenohBus:
         """
         if self._published_at is not None:
             time.sleep(max(0.0, self._published_at + LAST_RECOVERY_S - time.monotonic()))
-        for _ in self._session.get(NOBODY, timeout=FLUSH_WITHIN_S):
+        for _ in self._voice.get(NOBODY, timeout=FLUSH_WITHIN_S):
             pass
         # Advanced ones may outlive the session otherwise, and hang the process (eclipse-zenoh/zenoh-python#624).
-        for declared in (*self._declared, *(key.publisher for key in self._keys.values())):
+        for declared in (*self._declared, *self._tokens.values(), *(key.publisher for key in self._keys.values())):
             with contextlib.suppress(zenoh.ZError):
                 declared.undeclare()
         self._session.close()
+        if self._voice is not self._session:
+            self._voice.close()
         for delivery in self._deliveries:
             delivery.close()
 
 
-def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
+def connect(
+    config: BusConfig, node: str, stop: StopSignal, *, passing: Collection[str] = (), crowded: bool = False
+) -> ZenohBus | None:
     """Join the bus as a client, waiting for its router as long as it takes.
 
     Args:
         config: where the router is.
         node: who is waiting, for the log.
         stop: ends the waiting.
+        passing: kinds of which nothing is remembered, nor counted, when we publish them: what is told again and again
+            of thousands of plants. Who is cut off misses them.
+        crowded: whether we publish, or show tokens, on keys of hundreds of plants. A session looks through those it has
+            for each message that comes (a hundred make it four times slower), so another one listens then.
 
     Returns:
         The open bus; None if a stop was asked for before a router was there.
@@ -266,6 +374,7 @@ def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
     while not stop.is_set:
         try:
             session = zenoh.open(client)
+            voice = zenoh.open(client) if crowded else None
         except zenoh.ZError as error:
             if time.monotonic() - said_at >= SAY_AGAIN_S:
                 said_at = time.monotonic()
@@ -274,7 +383,7 @@ def connect(config: BusConfig, node: str, stop: StopSignal) -> ZenohBus | None:
             retry_s = min(2 * retry_s, LONGEST_RETRY_S)
             continue
         log.info("connected", node=node, endpoint=config.endpoint)
-        return ZenohBus(session, config)
+        return ZenohBus(session, config, passing, voice)
     return None
 
 
@@ -321,6 +430,10 @@ def router(config: BusConfig) -> ZenohBus:
         "listen/endpoints": [config.endpoint],
         "listen/timeout_ms": 0,
         "listen/exit_on_failure": True,
+        "connect/endpoints": list(config.routers),
+        "connect/retry": _RETRY,
+        "connect/timeout_ms": {"router": -1},
+        "connect/exit_on_failure": {"router": False},
         "scouting/multicast/enabled": False,
         **_STUCK,
     }
@@ -359,12 +472,6 @@ def _stream(key: str) -> str:
     return "/".join(key.split("/", STREAM_PARTS)[:STREAM_PARTS])
 
 
-def _encoded(sample: zenoh.Sample) -> Encoded:
-    """A message that has just come."""
-    now_ns = time.time_ns()
-    return Encoded(str(sample.key_expr), _bytes(sample.payload), str(sample.encoding)[:LONGEST_ENCODING], now_ns)
-
-
 def _bytes(payload: zenoh.ZBytes) -> bytes:
     """A payload; one that is too large for any message of ours is cut to a size that still is, so that it is refused.
 
@@ -374,14 +481,22 @@ def _bytes(payload: zenoh.ZBytes) -> bytes:
     return data if len(data) <= LARGEST_PAYLOAD else data[: LARGEST_PAYLOAD + 1]
 
 
-def _numbered(sample: zenoh.Sample) -> Numbered | None:
-    """A message that has just come, as its publisher numbered it; None if it did not."""
-    numbered = sample.attachment.to_bytes() if sample.attachment is not None else b""
+def _numbered(sample: zenoh.Sample, now_ns: int) -> Numbered | Encoded:
+    """A message that has come, as its publisher numbered it; without a number if it did not."""
+    message = Encoded(str(sample.key_expr), _bytes(sample.payload), str(sample.encoding)[:LONGEST_ENCODING], now_ns)
+    attachment = sample.attachment
+    if attachment is None:
+        return message
+    numbered = attachment.to_bytes()
     if len(numbered) != _NUMBERED.size:
-        return None
+        return message
     publisher, number = _NUMBERED.unpack(numbered)
-    message = _encoded(sample)
     return Numbered(publisher, _stream(message.key), number, message)
+
+
+def _spelled(key_expression: str) -> str:
+    """As Zenoh writes it: a `*` that is only a part of a part is `$*` there."""
+    return "/".join(part if part in ("*", "**") else part.replace("*", "$*") for part in key_expression.split("/"))
 
 
 def _is_of_whole_streams(key_expression: str) -> bool:

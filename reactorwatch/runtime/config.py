@@ -19,7 +19,7 @@ import msgspec
 
 from reactorwatch.errors import InputError
 
-SECTIONS = ("bus", "plant", "monitor", "recorder", "replay", "diagnosis", "metrics", "log")
+SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log")
 """The tables that a file may hold."""
 
 _LAST_PORT = 65535
@@ -33,6 +33,8 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         endpoint: the router's address. Loopback unless asked otherwise.
+        routers: addresses of other routers that a router connects to, so that they form one bus; they may come later,
+            and come again. Of two routers it is enough that one names the other.
         congestion: what a publisher does when the network cannot take more: throw away (`drop`), and send again what is
             asked for; or wait (`block`), so that one stuck subscriber slows the others.
         cache_messages: how many messages on each key a publisher keeps for those that have not heard them: what a
@@ -45,6 +47,7 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     endpoint: str = "tcp/127.0.0.1:7447"
+    routers: tuple[str, ...] = ()
     congestion: Literal["block", "drop"] = "drop"
     cache_messages: int = 10_000
     history_s: float = 60.0

@@ -31,11 +31,11 @@ class Delivery:
     Nothing is handed on until `begin`.
 
     Args:
-        handler: gets the messages, one at a time.
+        handler: gets the messages that go on, as many at a time as there are.
         on_gap: gets told what never came.
     """
 
-    def __init__(self, handler: Callable[[Encoded], None], on_gap: Callable[[Gap], None]) -> None:
+    def __init__(self, handler: Callable[[list[Encoded]], None], on_gap: Callable[[Gap], None]) -> None:
         self._handler = handler
         self._on_gap = on_gap
         self._order: InOrder[Encoded] = InOrder(gathering=True, size=lambda item: len(item.payload))
@@ -44,14 +44,19 @@ class Delivery:
         self._thread = threading.Thread(target=self._give_up_when_due, name="delivery", daemon=True)
         self._thread.start()
 
-    def receive(self, came: Numbered) -> None:
-        """Take a message in, and hand on what may go on."""
+    def receive(self, came: Iterable[Numbered]) -> None:
+        """Take messages in, and hand on what may go on."""
         with self._changed:
-            waited = self._order.due_ns()
-            now_ns = time.monotonic_ns()
-            key = came.message.key
-            self._hand_on(self._order.arrive(came.publisher, came.stream, key, came.number, came.message, now_ns))
-            if self._order.due_ns() != waited:
+            order = self._order
+            waited, now_ns = order.due_ns(), time.monotonic_ns()
+            takes_next, going = order.takes_next, list[Encoded | Gap]()
+            for publisher, stream, number, message in came:
+                if takes_next(publisher, stream, message.key, number):
+                    going.append(message)
+                else:
+                    going += order.arrive(publisher, stream, message.key, number, message, now_ns)
+            self._hand_on(going)
+            if order.due_ns() != waited:
                 self._changed.notify()
 
     def tell_last(self, last: Numbered) -> None:
@@ -91,11 +96,17 @@ class Delivery:
             self._hand_on(self._order.overdue(due_ns))
 
     def _hand_on(self, items: Iterable[Encoded | Gap]) -> None:
+        together: list[Encoded] = []
         for item in items:
             if isinstance(item, Gap):
+                if together:
+                    self._handler(together)
+                    together = []
                 self._on_gap(item._replace(noticed_ns=time.time_ns()))
             else:
-                self._handler(item)
+                together.append(item)
+        if together:
+            self._handler(together)
 
     def _give_up_when_due(self) -> None:
         with self._changed:

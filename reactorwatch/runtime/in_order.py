@@ -66,7 +66,7 @@ class Gap(NamedTuple):
     noticed_ns: int
 
 
-@dataclass
+@dataclass(slots=True)
 class _Stream(Generic[Item]):
     expected: int | None = None
     newest: int = 0
@@ -113,7 +113,17 @@ class InOrder(Generic[Item]):
     def __init__(self, *, gathering: bool = False, size: Callable[[Item], int] = lambda _: 0) -> None:
         self._size = size
         self._streams: dict[tuple[int, str], _Stream[Item]] = {}
+        self._waiting: dict[tuple[int, str], _Stream[Item]] = {}  # all in which something waits; perhaps others
         self._gathering = gathering
+
+    def takes_next(self, publisher: int, stream: str, key: str, number: int) -> bool:
+        """Take a message in if it is the one that is expected, and nothing waits: it goes on. As nearly always."""
+        state = self._streams.get((publisher, stream))
+        if state is None or number != state.expected or state.held:
+            return False
+        state.keys[key] = number
+        state.expected = number + 1
+        return True
 
     def arrive(
         self, publisher: int, stream: str, key: str, number: int, item: Item, now_ns: int
@@ -148,6 +158,7 @@ class InOrder(Generic[Item]):
         if state.due_ns is None or number < state.newest:  # something begins to be waited for, or is being recovered
             state.due_ns = now_ns + patience_ns
             state.recovered_ns = now_ns
+            self._waiting[name] = state
         state.newest = max(state.newest, number)
         yield from self._contiguous(state)
         if state.is_full:
@@ -155,7 +166,7 @@ class InOrder(Generic[Item]):
 
     def overdue(self, now_ns: int) -> Iterator[Item | Gap]:
         """Yields what has waited for long enough."""
-        for name, state in self._streams.items():
+        for name, state in list(self._waiting.items()):
             if state.due_ns is None or now_ns < state.due_ns:
                 continue
             silent_until_ns = state.recovered_ns + RECOVERY_NS
@@ -225,7 +236,10 @@ class InOrder(Generic[Item]):
 
     def due_ns(self) -> int | None:
         """When to ask for what is overdue; None: nothing waits."""
-        return min((state.due_ns for state in self._streams.values() if state.due_ns is not None), default=None)
+        if not self._waiting:
+            return None
+        self._waiting = {name: state for name, state in self._waiting.items() if state.due_ns is not None}
+        return min((state.due_ns for state in self._waiting.values() if state.due_ns is not None), default=None)
 
     def _contiguous(self, state: _Stream[Item]) -> Iterator[Item]:
         while state.expected is not None and state.expected in state.held:
@@ -258,6 +272,7 @@ class InOrder(Generic[Item]):
         if state.held:
             first_ns = min(came for came, _ in state.held.values())
             state.due_ns = first_ns + PATIENCE_NS
+            self._waiting[name] = state
             state.recovered_ns = max(state.recovered_ns, first_ns)
         if lost:
             state.lost = [*state.lost, *lost][-MOST_LOST:]

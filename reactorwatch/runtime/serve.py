@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from queue import Empty, SimpleQueue
 from types import FrameType
-from typing import Protocol, TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
@@ -37,8 +37,8 @@ class Node(Protocol):
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Something was published on a key that the node listens to."""
 
-    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Somebody asked at one of the node's queryables."""
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
+        """Somebody asked at one of the node's queryables; None: the answer is another's to give."""
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """The moment named by `next_tick_ns` has come."""
@@ -54,26 +54,44 @@ class Node(Protocol):
         """The loop ends; last words."""
 
 
+class Token(NamedTuple):
+    """A liveliness token that came or went."""
+
+    key: str
+    is_alive: bool
+
+
 class _Told:
     """Stands in the inbox behind what was before."""
 
 
 _TOLD = _Told()
-_Item: TypeAlias = Encoded | Gap | Request | _Told
+_Item: TypeAlias = Encoded | list[Encoded] | Token | Gap | Request | _Told
 
 
 class _Weight:
-    """Bytes of payload in an inbox, counted by several threads."""
+    """Messages in an inbox, and the bytes of their payload, counted by several threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.total = 0
+        self._messages, self._bytes = 0, 0
 
     def add(self, item: _Item, sign: int) -> None:
         """Count an item that comes (1) or goes (-1)."""
         if isinstance(item, Encoded):
-            with self._lock:
-                self.total += sign * len(item.payload)
+            messages, payload = 1, len(item.payload)
+        elif isinstance(item, list):
+            messages, payload = len(item), sum(len(message.payload) for message in item)
+        else:
+            return
+        with self._lock:
+            self._messages += sign * messages
+            self._bytes += sign * payload
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for more."""
+        return self._messages >= LARGEST_INBOX or self._bytes >= LARGEST_INBOX_BYTES
 
 
 class StopSignal:
@@ -138,6 +156,9 @@ def serve(
     history: bool = False,
     on_gap: Callable[[Gap, int], list[Publication]] | None = None,
     on_told: Callable[[], None] | None = None,
+    on_messages: Callable[[list[Encoded], int], list[Publication]] | None = None,
+    tokens: tuple[str, ...] = (),
+    on_alive: Callable[[str, bool, int], list[Publication]] | None = None,
     commands: tuple[str, ...] = (),
     on_ready: Callable[[], None] | None = None,
     linger_s: float = 0.0,
@@ -153,6 +174,9 @@ def serve(
         history: whether those from before do, too, as far as they are remembered.
         on_gap: told, in its turn between the messages, what was published on them and never came, and what time it is.
         on_told: called, in its turn between the messages, when those from before have all come.
+        on_messages: gets the publications instead, as many at a time as have come, in their order.
+        tokens: key expressions of liveliness tokens ...
+        on_alive: ... that it is told of: the token, whether it came or went, and what time it is.
         commands: key expressions of queryables whose questions go to `node.on_command`.
         on_ready: called once the node listens.
         linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
@@ -165,22 +189,23 @@ def serve(
     stop.wakes(room.set)
 
     def receive(item: _Item) -> None:
-        while inbox.qsize() >= LARGEST_INBOX or weight.total >= LARGEST_INBOX_BYTES:
-            if stop.is_set or ended.is_set():
-                break
+        while weight.is_full and not (stop.is_set or ended.is_set()):
             room.clear()
             room.wait(LOOK_AGAIN_S)
         weight.add(item, 1)
         inbox.put(item)
 
     for expression in subscriptions:
-        bus.subscribe(
+        listen = bus.subscribe if on_messages is None else bus.gather
+        listen(
             expression,
             receive,
             on_gap=receive if on_gap is not None else None,
             history=history,
             on_told=(lambda: receive(_TOLD)) if on_told is not None else None,
         )
+    for expression in tokens:
+        bus.watch_alive(expression, lambda key, is_alive: inbox.put(Token(key, is_alive)))
     for expression in commands:
         bus.answer(expression, receive)
     if on_ready is not None:
@@ -196,6 +221,10 @@ def serve(
         weight.add(item, -1)
         if isinstance(item, Encoded):
             publish(node.on_message(item, clock.now_ns()))
+        elif isinstance(item, list):
+            publish(on_messages(item, clock.now_ns()) if on_messages is not None else [])
+        elif isinstance(item, Token):
+            publish(on_alive(item.key, item.is_alive, clock.now_ns()) if on_alive is not None else [])
         elif isinstance(item, _Told):
             if on_told is not None:
                 on_told()
@@ -203,6 +232,9 @@ def serve(
             publish(on_gap(item, clock.now_ns()) if on_gap is not None else [])
         else:
             reply, publications = node.on_command(item.question, clock.now_ns())
+            if reply is None:
+                item.leave()
+                return
             item.reply(reply)
             record = audit(item.question, reply, clock.now_ns())
             publish(publications if record is None else [*publications, record])
@@ -212,7 +244,8 @@ def serve(
         if wait_s <= 0:
             publish(node.on_tick(clock.now_ns()))
             wait_s = 0.0
-        for _ in range(BATCH):
+        handled = 0
+        while handled < BATCH:
             try:
                 item = inbox.get(timeout=min(wait_s, LONGEST_WAIT_S)) if wait_s > 0 else inbox.get_nowait()
             except Empty:
@@ -220,6 +253,7 @@ def serve(
             if item is None:
                 break
             handle(item)
+            handled += len(item) if isinstance(item, list) else 1
             wait_s = 0.0
         room.set()
     ended.set()

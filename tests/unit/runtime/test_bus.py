@@ -74,3 +74,20 @@ def test_a_token_is_seen_by_those_who_come_late_and_goes_with_its_bus() -> None:
     watcher.watch_alive("reactor/cstr/alive/*", lambda key, alive: seen.append((key, alive)))
     node.close()
     assert seen == [("reactor/cstr/alive/monitor", True), ("reactor/cstr/alive/monitor", False)]
+
+
+def test_who_leaves_the_answer_to_others_is_not_waited_for() -> None:
+    exchange = Exchange()
+    server, client = MemoryBus(exchange), MemoryBus(exchange)
+    server.answer("a/*", lambda request: request.leave())
+    server.answer("a/b", lambda request: request.reply(CommandReply(accepted=True, text="here")))
+    assert len(client.ask(Encoded("a/b", b"", ""), 3600.0)) == 1
+
+
+def test_a_token_can_be_withdrawn() -> None:
+    exchange, seen = Exchange(), list[tuple[str, bool]]()
+    node, watcher = MemoryBus(exchange), MemoryBus(exchange)
+    node.announce("reactor/x/alive/monitor")
+    watcher.watch_alive("reactor/*/alive/*", lambda key, alive: seen.append((key, alive)))
+    node.withdraw("reactor/x/alive/monitor")
+    assert seen == [("reactor/x/alive/monitor", True), ("reactor/x/alive/monitor", False)]

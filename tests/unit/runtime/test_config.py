@@ -65,7 +65,8 @@ def test_an_endpoint_that_is_none_is_refused(endpoint: str) -> None:
 
 
 def test_every_node_has_a_table() -> None:
-    assert set(SECTIONS) == {"bus", "plant", "monitor", "recorder", "replay", "diagnosis", "metrics", "log"}
+    nodes = {"bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log"}
+    assert set(SECTIONS) == nodes
 
 
 def test_settings_that_are_written_are_read_as_they_were(tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """Between a bus and who listens: one order, whichever thread it comes from, and nothing older than asked for."""
 
 import time
+from collections.abc import Callable
 from queue import SimpleQueue
 
 import pytest
@@ -19,6 +20,16 @@ def message(number: int) -> Numbered:
     return Numbered(1, "reactor/x/sample", number, sample)
 
 
+def each(heard: "SimpleQueue[Encoded | Gap]") -> Callable[[list[Encoded]], None]:
+    """Puts what is handed on together into a queue, one by one."""
+
+    def put(messages: list[Encoded]) -> None:
+        for message in messages:
+            heard.put(message)
+
+    return put
+
+
 def taken(heard: "SimpleQueue[Encoded | Gap]") -> list[str]:
     """The numbers that were handed on, so far."""
     items = [heard.get_nowait() for _ in range(heard.qsize())]
@@ -28,10 +39,10 @@ def taken(heard: "SimpleQueue[Encoded | Gap]") -> list[str]:
 def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(in_order, "PATIENCE_NS", 1_000_000)
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
-    delivery = Delivery(heard.put, heard.put)
+    delivery = Delivery(each(heard), heard.put)
     delivery.begin()
     for number in (0, 3):
-        delivery.receive(message(number))
+        delivery.receive([message(number)])
     items = [heard.get(timeout=WITHIN_S) for _ in range(3)]
     delivery.close()
     gap = items[1]
@@ -42,18 +53,18 @@ def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.Monke
 
 def test_what_waits_is_handed_on_when_the_bus_is_closed() -> None:
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
-    delivery = Delivery(heard.put, heard.put)
+    delivery = Delivery(each(heard), heard.put)
     delivery.begin()
     for number in (0, 3):
-        delivery.receive(message(number))
+        delivery.receive([message(number)])
     delivery.close()
     assert taken(heard) == ["0", "3"]
 
 
 def test_nothing_goes_on_before_it_is_known_what_was_before() -> None:
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
-    delivery = Delivery(heard.put, heard.put)
-    delivery.receive(message(9))
+    delivery = Delivery(each(heard), heard.put)
+    delivery.receive([message(9)])
     delivery.tell_last(message(8))
     delivery.tell(message(7))
     assert not delivery.is_told()

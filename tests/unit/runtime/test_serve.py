@@ -3,6 +3,8 @@
 import signal
 import threading
 import time
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -241,3 +243,78 @@ def test_signals_are_handled_as_before_once_the_context_is_left() -> None:
     with stop_on_signals():
         assert signal.getsignal(signal.SIGINT) != before[0]
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+
+
+class Gathering(MemoryBus):
+    """A bus that hands over whatever a test gives it."""
+
+    def gather(self, key_expression: str, handler: Callable[[list[Encoded]], None], **_others: Any) -> None:
+        self.hand_over = handler
+
+
+@pytest.mark.parametrize(("bound", "most"), [("LARGEST_INBOX", 100), ("LARGEST_INBOX_BYTES", 100_000)])
+def test_messages_that_come_together_are_bounded_likewise(
+    bound: str, most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(f"reactorwatch.runtime.serve.{bound}", most)
+    count, handled, ahead = 5000, [0], [0]
+    bus, stop, ready = Gathering(Exchange()), StopSignal(), threading.Event()
+
+    def on_messages(messages: list[Encoded], _now_ns: int) -> list[Publication]:
+        sum(range(20_000))
+        handled[0] += len(messages)
+        return []
+
+    thread = threading.Thread(
+        target=serve,
+        args=(Echo(), bus, stop),
+        kwargs={"subscriptions": ("in/**",), "on_messages": on_messages, "on_ready": ready.set},
+    )
+    thread.start()
+    assert ready.wait(10)
+    for number in range(0, count, 10):
+        bus.hand_over([Encoded(f"in/{number}", bytes(1000), "")] * 10)
+        ahead[0] = max(ahead[0], number + 10 - handled[0])
+    stop.set()
+    thread.join(60)
+    assert not thread.is_alive()
+    assert handled[0] == count
+    assert ahead[0] <= 100 + 20
+
+
+def test_messages_are_handed_over_together_in_their_order_and_tokens_as_they_come_and_go() -> None:
+    exchange, ready, stop = Exchange(), threading.Event(), StopSignal()
+    node, speaker = Echo(), MemoryBus(exchange)
+    heard, alive = list[str](), list[tuple[str, bool]]()
+
+    def on_messages(messages: list[Encoded], _now_ns: int) -> list[Publication]:
+        heard.extend(message.key for message in messages)
+        return []
+
+    def on_alive(token: str, is_alive: bool, _now_ns: int) -> list[Publication]:
+        alive.append((token, is_alive))
+        if not is_alive:
+            stop.set()
+        return []
+
+    thread = threading.Thread(
+        target=serve,
+        args=(node, MemoryBus(exchange), stop),
+        kwargs={
+            "subscriptions": ("in/**",),
+            "on_messages": on_messages,
+            "tokens": ("alive/*",),
+            "on_alive": on_alive,
+            "on_ready": ready.set,
+        },
+    )
+    thread.start()
+    assert ready.wait(WITHIN_S)
+    for number in range(1000):
+        speaker.publish(Encoded(f"in/{number}", b"", ""))
+    speaker.announce("alive/x")
+    speaker.withdraw("alive/x")
+    thread.join(WITHIN_S)
+    assert not thread.is_alive()
+    assert heard == [f"in/{number}" for number in range(1000)]
+    assert alive == [("alive/x", True), ("alive/x", False)]

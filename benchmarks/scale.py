@@ -1,0 +1,364 @@
+"""How many plants can one monitor watch? Live, through a real router, with 1 to 10,000 plants.
+
+A table with, for each number of plants:
+
+- samples a second that one core judges, with the filter of the reactor's equations for each plant and all univariate
+  charts and MEWMA, from their arrival to what is published; beside it a bare Zenoh subscriber in Python that only
+  counts the same messages, in the same run, and the ratio. A publisher sends as fast as it can. Seconds are those of
+  the processor's time, of all threads of the process, so that others on the machine do not count;
+- the same without the bus: from bytes to judgements;
+- memory a plant: how much more the process takes with all plants than with a hundredth of them;
+- from a sample to its alarm at one sample a second a plant, 99 of 100, as long as the clock says.
+
+The plants are copies of one that was trained, with names of their own; all are quiet but those that are given an alarm.
+What a plant costs that is not quiet is what it costs in a monitor of its own: see `backtest.py`.
+
+Goal: at least 100,000 samples a second, a fifth of the bare subscriber; the same cost from 100 to 10,000 plants; at
+most 20 kB a plant.
+"""
+
+import gc
+import json
+import logging
+import os
+import struct
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zenoh
+
+from monitor_node.config import MonitorConfig
+from monitor_node.fleet_config import FleetConfig
+from monitor_node.fleet_node import PASSING, FleetNode, watch
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encoding_of
+from reactorwatch.contract.messages_pb2 import Alarm, Sample
+from reactorwatch.runtime.bus_zenoh import connect, router
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.logs import configure
+from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.serve import StopSignal
+from recorder.player import samples_of
+
+SIZES = (1, 10, 100, 1000, 10_000)
+SIGNALS = 3
+LEARNED_ROWS = 900
+FAST_SAMPLES = 600_000
+LATENCY_S = 15
+IDLE_S = 10.0
+SHARING = 250  # plants that share a session
+KNOWN_ROWS = 2  # of each plant, after which the router knows its keys; the time is taken from then on
+OUT_EVERY = 50  # plants that are out in a row of the fleet, but at least one
+FLEET = "reactor/*"
+PATIENT = 1e6  # periods: between training and the first sample live a plant is no silent one
+FAST = MonitorConfig(training_min=20.0, charts=("shewhart", "ewma", "cusum", "mewma"), silence_periods=PATIENT)
+SHARP = MonitorConfig(
+    training_min=20.0,
+    charts=("shewhart",),
+    raise_count=1,
+    window=1,
+    clear_count=1,
+    isolation=False,
+    silence_periods=PATIENT,
+)
+"""One point out raises an alarm, one point back in clears it."""
+
+
+def record() -> list[Encoded]:
+    """What a plant publishes."""
+    return [encode(item) for item in samples_of(simulate_record(PlantConfig(seed=1), 3000), "p0")]
+
+
+def sized(count: int) -> int:
+    """Rows that every plant publishes as fast as it goes."""
+    return max(FAST_SAMPLES // (SIGNALS * count), 10) if count > 100 else 2000
+
+
+# --- processes that are measured ---------------------------------------------------------------------------------
+
+
+def alone_on_a_core(core: int) -> None:
+    """Stay on one core, if there are others for the rest."""
+    if (os.cpu_count() or 1) > 1:
+        os.sched_setaffinity(0, {core})
+
+
+def memory_bytes() -> int:
+    """What this process takes."""
+    gc.collect()
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+class Counting(FleetNode):
+    """A fleet's monitor that counts what it judges, and stops when it was all."""
+
+    def __init__(self, config: MonitorConfig, bus: Any, stop: StopSignal) -> None:
+        super().__init__(config, FleetConfig(plants=FLEET), bus, time.time_ns())
+        self._stop, self.samples, self.expected = stop, 0, -1
+        self.began_s = self.ended_s = 0.0
+        self.known = self.before = 0
+
+    def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
+        """See `FleetNode`."""
+        if self.samples < self.known:
+            self.began_s, self.before = time.process_time(), self.samples
+        said = super().on_messages(messages, now_ns)
+        self.samples += sum("/sample/" in message.key for message in messages)  # not its own alarms
+        self.ended_s = time.process_time()
+        if self.samples == self.expected:
+            self._stop.set()
+        return said
+
+    def learn(self, plants: int) -> int:
+        """Train one plant and copy it; returns what one of them takes, in bytes."""
+        messages = record()[: SIGNALS * LEARNED_ROWS]
+        start_ns = time.time_ns() - LEARNED_ROWS * 3 * 10**9
+        for row in range(LEARNED_ROWS):  # as if they had come one by one, a sample a second
+            for place in range(SIGNALS * row, SIGNALS * (row + 1)):
+                super().on_messages(messages[place : place + 1], start_ns + place * 10**9)
+        assert self.quiet == ["p0"]
+        few = max(plants // 100, 1)
+        for number in range(1, few):
+            self.copy("p0", f"p{number}")
+        before = memory_bytes()
+        for number in range(few, plants):
+            self.copy("p0", f"p{number}")
+        return (memory_bytes() - before) // max(plants - few, 1)
+
+
+def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
+    """Watch the fleet until so many samples have come, or until terminated."""
+    alone_on_a_core(0)
+    stop = StopSignal()
+    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, passing=PASSING, crowded=True)
+    assert bus is not None
+    node = Counting(SHARP if sharp else FAST, bus, stop)
+    core = 0.0 if sharp else without_bus(plants)
+    taken = node.learn(plants)
+    node.samples, node.expected, node.known = 0, expected, KNOWN_ROWS * SIGNALS * plants
+    serving = threading.Thread(target=watch, args=(node, bus, stop))
+    serving.start()
+    print("ready", flush=True)
+    last = -1
+    while serving.is_alive() and (
+        sharp or not node.known < node.samples == last
+    ):  # or what is missing does not come any more
+        last = node.samples
+        serving.join(IDLE_S)
+    told = {"samples": node.samples - node.before, "cpu_s": node.ended_s - node.began_s, "quiet": len(node.quiet)}
+    print(json.dumps(told | {"bytes": taken, "core": core}), flush=True)
+    os._exit(0)  # thousands of tokens need not be withdrawn one by one
+
+
+class Nowhere:
+    """A bus that nobody listens to."""
+
+    def announce(self, key: str) -> None:
+        """Show nothing."""
+
+
+def without_bus(plants: int) -> float:
+    """Samples a second from bytes to judgements."""
+    node = Counting(FAST, Nowhere(), StopSignal())
+    node.learn(plants)
+    messages = record()[SIGNALS * LEARNED_ROWS :]
+    fleet = [
+        item._replace(key=item.key.replace("/p0/", f"/p{number}/"), received_ns=1)
+        for row in range(max(60_000 // (SIGNALS * plants), 3) if plants > 100 else 200)
+        for number in range(plants)
+        for item in messages[SIGNALS * row : SIGNALS * (row + 1)]
+    ]
+    now_ns = time.time_ns()
+    node.on_messages(fleet[: SIGNALS * plants], now_ns)  # compiles
+    begin = time.process_time()
+    for place in range(SIGNALS * plants, len(fleet), 2000):
+        node.on_messages(fleet[place : place + 2000], now_ns + place)
+    return (len(fleet) - SIGNALS * plants) / (time.process_time() - begin)
+
+
+def bare(endpoint: str, expected: int, plants: int) -> None:
+    """Count what comes."""
+    alone_on_a_core(0)
+    bus = connect(BusConfig(endpoint=endpoint), "bare", StopSignal())
+    assert bus is not None
+    known = KNOWN_ROWS * SIGNALS * plants
+    session, done, times = bus._session, threading.Event(), [0.0, 0.0, 0.0]
+
+    def count(_sample: zenoh.Sample) -> None:
+        times[0] += 1
+        if times[0] == known:
+            times[1] = time.process_time()
+        if times[0] == expected:
+            times[2] = time.process_time()
+            done.set()
+
+    subscriber = session.declare_subscriber(keys.samples_of(FLEET), count)
+    print("ready", flush=True)
+    last = -1.0
+    while not done.wait(IDLE_S) and not known < times[0] == last:
+        last = times[0]
+    times[2] = times[2] or time.process_time()
+    print(json.dumps({"samples": times[0] - known, "cpu_s": times[2] - times[1]}), flush=True)
+    del subscriber
+    os._exit(0)
+
+
+# --- processes beside them ---------------------------------------------------------------------------------------
+
+
+def route(endpoint: str) -> None:
+    """Be the router."""
+    alone_on_a_core(1)
+    hub = router(BusConfig(endpoint=endpoint))
+    print("ready", flush=True)
+    threading.Event().wait()
+    del hub
+
+
+def publish(endpoint: str, plants: int, rows: int, per_s: float) -> None:
+    """Publish rows of all plants, as fast as it goes or at a pace, some of them far out in that case."""
+    alone_on_a_core(1)
+    bus = connect(BusConfig(endpoint=endpoint), "publisher", StopSignal())
+    assert bus is not None
+    numbered, encoding = struct.Struct("<QQ"), encoding_of(Sample)
+    signals = ("qc", "C", "T")
+    # A session takes the longer to declare a key the more it has; a real plant has one of its own.
+    buses = [connect(BusConfig(endpoint=endpoint), "publisher", StopSignal()) for _ in range(plants // SHARING + 1)]
+    publishers = [
+        [
+            buses[number // SHARING]._session.declare_publisher(  # type: ignore[union-attr]
+                keys.key(f"p{number}", keys.SAMPLE, signal),
+                encoding=encoding,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+            for signal in signals
+        ]
+        for number in range(plants)
+    ]
+    arrived: dict[tuple[str, int], float] = {}
+
+    def on_alarms(messages: list[Encoded]) -> None:
+        now = time.perf_counter()
+        for message in messages:
+            alarm = decode(message.payload, message.encoding)
+            if isinstance(alarm, Alarm) and alarm.alarm == "shewhart/T" and alarm.event == "raised":
+                arrived[message.key.split("/")[1], alarm.time_ns] = now
+
+    if per_s:
+        bus.gather(f"{FLEET}/{keys.ALARM}/**", on_alarms)
+    payloads = [item.payload for item in record()[SIGNALS * LEARNED_ROWS :]]
+    time.sleep(1.0)  # until the router knows all keys
+    sent: dict[tuple[str, int], float] = {}
+    begin, count = time.perf_counter(), 0
+    for row in range(rows):
+        if row == KNOWN_ROWS and per_s:
+            time.sleep(plants / 1000)  # until all of that has come
+            begin, count = time.perf_counter(), 0
+        out = set(np.random.default_rng(row).choice(plants, max(plants // OUT_EVERY, 1), replace=False).tolist())
+        for place in range(SIGNALS):
+            payload, time_ns, far = payloads[SIGNALS * row + place], 0, b""
+            if per_s and place == SIGNALS - 1 and row > KNOWN_ROWS and row % 3 == 1:
+                sample = Sample.FromString(payload)
+                sample.value += 100.0
+                far, time_ns = sample.SerializeToString(), sample.time_ns
+            for number in range(plants):
+                if per_s and row >= KNOWN_ROWS and (wait_s := begin + count / per_s - time.perf_counter()) > 0:
+                    time.sleep(wait_s)
+                which = far if far and number in out else payload
+                if which is far:
+                    sent[f"p{number}", time_ns] = time.perf_counter()
+                publishers[number][place].put(which, attachment=numbered.pack(number + 1, SIGNALS * row + place))
+                count += 1
+    deadline = time.perf_counter() + 5
+    while len(arrived) < len(sent) and time.perf_counter() < deadline:
+        time.sleep(0.01)
+    delays = [1e3 * (arrived[key] - since) for key, since in sent.items() if key in arrived]
+    print(json.dumps({"out": len(sent), "delays_ms": delays}), flush=True)
+    time.sleep(2.0 if not per_s else 0.0)  # what is on its way still goes
+    os._exit(0)
+
+
+# --- the table ---------------------------------------------------------------------------------------------------
+
+
+def started(*arguments: object) -> "subprocess.Popen[str]":
+    """This program as another process, when it says that it is ready."""
+    process = subprocess.Popen(
+        [sys.executable, __file__, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    if arguments[0] != "publish":
+        assert process.stdout.readline() == "ready\n", f"{arguments} did not start"
+    return process
+
+
+def told(process: "subprocess.Popen[str]") -> dict[str, Any]:
+    """What it says at its end."""
+    assert process.stdout is not None
+    found: dict[str, Any] = json.loads(process.stdout.readline())
+    return found
+
+
+def row_of(plants: int) -> str:
+    """Measure with so many plants."""
+    rows = sized(plants)
+    expected = plants * rows * SIGNALS
+    endpoint = free_endpoint()
+    hub = started("route", endpoint)
+    try:
+        rates = {}
+        for listener in ("bare", "monitor"):
+            arguments = (endpoint, expected, plants) if listener == "bare" else (endpoint, plants, expected, 0)
+            process = started(listener, *arguments)
+            source = started("publish", endpoint, plants, rows, 0)
+            found = told(process)
+            source.wait()
+            rates[listener] = found["samples"] / found["cpu_s"]
+        live = started("monitor", endpoint, plants, -1, 1)
+        source = started("publish", endpoint, plants, KNOWN_ROWS + LATENCY_S // SIGNALS, plants)
+        delays = told(source)
+        live.kill()
+        p99 = f"{np.percentile(delays['delays_ms'], 99):9.1f} ms" if delays["delays_ms"] else f"{'–':>12}"
+        size = f"{found['bytes'] / 1000:9.1f} kB" if plants >= 100 else f"{'–':>12}"
+        return (
+            f"{plants:7,} {found['core']:13,.0f} {rates['monitor']:13,.0f} {rates['bare']:13,.0f} "
+            f"{100 * rates['monitor'] / rates['bare']:6.0f} % {size} {p99} "
+            f"({len(delays['delays_ms'])} of {delays['out']})"
+        )
+    finally:
+        hub.kill()
+
+
+def main() -> None:
+    """Measure and print."""
+    configure(logging.WARNING)
+    if len(sys.argv) > 1 and sys.argv[1] in ("route", "publish", "monitor", "bare"):
+        command, endpoint, *numbers = sys.argv[1:]
+        if command == "route":
+            route(endpoint)
+        elif command == "publish":
+            publish(endpoint, int(numbers[0]), int(numbers[1]), float(numbers[2]))
+        elif command == "monitor":
+            monitor(endpoint, int(numbers[0]), int(numbers[1]), bool(int(numbers[2])))
+        else:
+            bare(endpoint, int(numbers[0]), int(numbers[1]))
+        return
+    print("samples a second of one core; p99 from sample to alarm at 1 sample/s a plant (alarms that came)")
+    print(f"{'plants':>7} {'without bus':>13} {'live':>13} {'bare':>13} {'ratio':>8} {'a plant':>12} {'p99':>12}")
+    for plants in [int(item) for item in sys.argv[1:]] or SIZES:
+        print(row_of(plants), flush=True)
+    print("goal: live >= 100,000 and >= 20 % of bare, the same from 100 to 10,000; <= 20 kB a plant")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,335 @@
+"""The watch over a fleet: any set of plants in one process, each with a state of its own.
+
+A plant is known from the moment when one of its nodes shows a liveliness token, or a sample of it comes. Whether it is
+ours to watch is the crew's question (see `shards`): one monitor watches all, or several share them, and take over from
+each other. What a plant's monitor says is the same, value for value, as if it were watched alone.
+
+Who takes a plant over, because the monitor that watched it is gone, goes on from that one's state if there is one
+(`adopt`). Without one the plant is learned anew, but its alarms are not forgotten: monitors of a fleet hear each
+other's alarms, so one that stands is not raised again, and it is cleared when it is over. With one, what the other had
+already said is left out when it is found again, so that no alarm is told twice.
+
+Nothing here reads a clock or does I/O.
+"""
+
+from collections.abc import Callable, Iterable, Iterator
+from heapq import heappop, heappush
+
+import msgspec
+
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from monitor_node.quiet_plants import QuietPlants
+from monitor_node.quiet_record import QuietForm
+from monitor_node.shards import Crew
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+from reactorwatch.errors import InputError
+from reactorwatch.process.model import ProcessModel
+
+PATIENCE_NS = 10_000_000_000
+"""After the start: a shard of which nobody was seen by then is taken for gone."""
+
+LOOK_AGAIN_ROWS = 8
+"""After so many rows it is seen again whether a plant is quiet."""
+
+State = bytes
+"""All that a monitor remembers of a plant."""
+
+
+class FleetMonitor:
+    """The monitors of many plants.
+
+    Args:
+        config: how each plant is watched; its name of a plant is passed over.
+        start_ns: now.
+        crew: who else watches plants of the fleet.
+        model: as for `Monitor`.
+        points: as for `Monitor`.
+        stored: the state of a plant that we begin to watch, as its monitor stored it; None: there is none.
+        in_charge: told when we begin to watch a plant (True), and when it is another's (False).
+
+    Raises:
+        InputError: settings that do not fit together.
+    """
+
+    def __init__(
+        self,
+        config: MonitorConfig,
+        start_ns: int,
+        crew: Crew,
+        *,
+        model: ProcessModel | None = None,
+        points: bool = False,
+        stored: Callable[[str], State | None] = lambda _: None,
+        in_charge: Callable[[str, bool], None] = lambda _plant, _ours: None,
+    ) -> None:
+        self._config, self._model, self._points = config, model, points
+        self._crew, self._stored, self._in_charge = crew, stored, in_charge
+        first = Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
+        form = None if points or first.model is None else QuietForm.of(config, first.model)
+        self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
+        self._look_at_row: dict[str, int] = {}  # of a plant with a monitor of its own: when to see whether it is quiet
+        self._notes: list[tuple[str, str]] = []
+        self._patience_ns: int | None = start_ns + PATIENCE_NS
+        self._monitors: dict[str, Monitor | None] = {}  # by plant; None: it is another's
+        self._plants: dict[str, str] = {}  # by key of a sample
+        self._heard: dict[str, dict[str, Alarm]] = {}  # by plant and name, the newest of what another said of an alarm
+        self._dues: list[tuple[int, str]] = []
+        self._due_ns: dict[str, int] = {}  # of each plant, the earliest that is in `_dues`
+
+    # --- who is watched --------------------------------------------------------------------------------------
+
+    @property
+    def plants(self) -> list[str]:
+        """Those that are watched here."""
+        return [plant for plant, monitor in self._monitors.items() if monitor is not None or self._is_quiet(plant)]
+
+    @property
+    def quiet(self) -> list[str]:
+        """Those of them in which nothing happens just now."""
+        return [] if self._quiet is None else self._quiet.plants
+
+    def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
+        """A node of a plant, or another monitor of the fleet, came or went."""
+        topic = keys.parse(token)
+        if self._crew.note(token, is_alive=is_alive):
+            self._share_out(now_ns)
+        elif topic is not None and topic.kind == keys.ALIVE and is_alive:
+            self._meet(topic.plant, now_ns)
+        return []
+
+    def adopt(self, plant: str, state: State | None, now_ns: int) -> None:
+        """Begin to watch a plant.
+
+        Args:
+            plant: its name.
+            state: of the monitor that watched it before, as `Monitor.to_bytes` gives it; None: the plant is learned
+                anew. One that cannot be used is noted, and counts as none.
+            now_ns: now.
+        """
+        monitor = Monitor(self._named(plant), now_ns, points=self._points, model=self._model)
+        if state is not None:
+            try:
+                monitor.from_bytes(state)
+            except InputError as error:
+                monitor.notes.append(f"the state that was stored {error}; the plant is learned anew")
+                state = None
+        if state is None:
+            monitor.go_on_from_alarms(self._heard.get(plant, {}).values())
+        self._monitors[plant] = monitor
+        self._in_charge(plant, True)
+        self._schedule(plant, monitor)
+
+    def release(self, plant: str) -> State | None:
+        """Watch a plant no longer; returns its state, for who does. None: it was not watched here."""
+        monitor = self._alone(plant)
+        self._monitors[plant] = None
+        if monitor is None:
+            return None
+        self._in_charge(plant, False)
+        return monitor.to_bytes()
+
+    def monitor(self, plant: str) -> Monitor:
+        """The monitor of a plant.
+
+        Raises:
+            InputError: it is not watched here.
+        """
+        monitor = self._alone(plant)
+        if monitor is None:
+            raise InputError(f"plant {plant!r} is not watched here (there are: {', '.join(self.plants)})")
+        return monitor
+
+    def _named(self, plant: str) -> MonitorConfig:
+        return msgspec.structs.replace(self._config, plant=plant)
+
+    def _meet(self, plant: str, now_ns: int) -> None:
+        """A plant that may be new."""
+        if plant in self._monitors:
+            return
+        try:
+            keys.checked_plant(plant)
+        except ValueError:
+            return
+        self._monitors[plant] = None
+        self._share_out(now_ns, [plant])
+
+    def _share_out(self, now_ns: int, plants: Iterable[str] | None = None) -> None:
+        """Begin to watch what is ours now, and cease to watch what is not; all plants, if not told which."""
+        for plant in list(self._monitors) if plants is None else plants:
+            ours = self._crew.is_ours(plant)
+            watched = self._monitors[plant] is not None or self._is_quiet(plant)
+            if ours and not watched:
+                self.adopt(plant, self._stored(plant), now_ns)
+            elif watched and not ours:
+                self.release(plant)
+
+    # --- what the loop calls ---------------------------------------------------------------------------------
+
+    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
+        """Take in what was published: a sample of a plant, or another monitor's alarm."""
+        return self.on_messages([message], now_ns)
+
+    def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
+        """Take in what was published, in the order of each plant."""
+        publications: list[Publication] = []
+        touched: set[str] = set()
+        if self._quiet:
+            publications, messages, given = self._quiet.on_messages(messages, now_ns)
+            for plant, monitor in given.items():
+                self._monitors[plant] = monitor
+                self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
+                touched.add(plant)
+            publications = self._new(publications)
+        for message in messages:
+            plant = self._plants.get(message.key) or self._plant_of(message, now_ns)
+            own = self._monitors.get(plant)
+            if own is not None:
+                publications += self._new(own.on_message(message, now_ns))
+                touched.add(plant)
+        for plant in touched:
+            own = self._monitors[plant]
+            if own is not None and not self._becomes_quiet(plant, own):
+                self._schedule(plant, own)
+        return publications
+
+    def _plant_of(self, message: Encoded, now_ns: int) -> str:
+        """Whose sample it is; empty if it is none."""
+        topic = keys.parse(message.key)
+        if topic is None or topic.kind not in (keys.SAMPLE, keys.ALARM):
+            return ""
+        self._meet(topic.plant, now_ns)
+        if topic.kind == keys.ALARM:
+            self._hear(topic.plant, message)
+            return ""
+        if topic.plant in self._monitors:
+            self._plants[message.key] = topic.plant
+        return topic.plant
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
+        """Let a person act on a plant's alarms; None: the plant is another's to answer for."""
+        topic = keys.parse(question.key)
+        monitor = self._alone(topic.plant) if topic is not None else None
+        return (None, []) if monitor is None else monitor.on_command(question, now_ns)
+
+    def on_tick(self, now_ns: int) -> list[Publication]:
+        """Publish the health of the plants' monitors where it is due, and silences of plants."""
+        publications: list[Publication] = []
+        if self._patience_ns is not None and now_ns >= self._patience_ns:
+            self._patience_ns = None
+            if self._crew.presume_gone():
+                self._share_out(now_ns)
+        if self._quiet:
+            for plant in self._quiet.overdue(now_ns):
+                self._alone(plant)
+            publications += self._quiet.healths(now_ns)
+        while self._dues and self._dues[0][0] <= now_ns:
+            due_ns, plant = heappop(self._dues)
+            monitor = self._monitors.get(plant)
+            if self._due_ns.get(plant) == due_ns:
+                del self._due_ns[plant]
+                if monitor is not None:
+                    if monitor.next_tick_ns() <= now_ns:
+                        publications += monitor.on_tick(now_ns)
+                    self._schedule(plant, monitor)
+        return publications
+
+    def next_tick_ns(self) -> int:
+        """When the first of the plants is due."""
+        due_ns = self._dues[0][0] if self._dues else 2**63 - 1
+        if self._quiet:
+            due_ns = min(due_ns, self._quiet.next_due_ns())
+        return due_ns if self._patience_ns is None else min(due_ns, self._patience_ns)
+
+    @property
+    def finished(self) -> bool:
+        """Never: a fleet is watched until the monitor is stopped."""
+        return False
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        """Publish the health of all for the last time."""
+        said = [item for monitor in self._monitors.values() if monitor is not None for item in monitor.on_stop(now_ns)]
+        return said + (self._quiet.last_healths(now_ns) if self._quiet else [])
+
+    def copy(self, plant: str, name: str) -> None:
+        """Watch another plant that is, so far, like a quiet one: for trials with many plants."""
+        assert self._quiet is not None
+        self._quiet.copied(plant, name)
+        self._monitors[name] = None
+        self._in_charge(name, True)
+
+    def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
+        """What people are to be told: plant and line."""
+        yield from self._notes
+        self._notes.clear()
+        for plant, monitor in self._monitors.items():
+            if monitor is None:
+                continue
+            refused = monitor.refusals.report(now_ns)
+            if refused is not None:
+                yield plant, refused
+            while monitor.notes:
+                yield plant, monitor.notes.pop(0)
+
+    # --- within ----------------------------------------------------------------------------------------------
+
+    def _is_quiet(self, plant: str) -> bool:
+        return self._quiet is not None and plant in self._quiet
+
+    def _alone(self, plant: str) -> Monitor | None:
+        """The plant's own monitor, if it is watched here."""
+        if self._quiet is not None and plant in self._quiet:
+            monitor = self._monitors[plant] = self._quiet.give(plant)
+            self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
+            self._schedule(plant, monitor)
+        return self._monitors.get(plant)
+
+    def _becomes_quiet(self, plant: str, monitor: Monitor) -> bool:
+        """Hold a plant with the quiet ones, if it is one; whether it is."""
+        if self._quiet is None or monitor.rows < self._look_at_row.get(plant, 0):
+            return False
+        self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
+        if not self._quiet.take(plant, monitor):
+            return False
+        self._notes += [(plant, note) for note in monitor.notes]
+        self._monitors[plant] = None
+        del self._look_at_row[plant]
+        self._due_ns.pop(plant, None)
+        for key in [key for key, of in self._plants.items() if of == plant]:
+            del self._plants[key]
+        return True
+
+    def _schedule(self, plant: str, monitor: Monitor | None) -> None:
+        """Note when a plant is due, if that is earlier than known; if it is later, that is found when it comes up."""
+        if monitor is None:
+            return
+        due_ns = monitor.next_tick_ns()
+        if due_ns < self._due_ns.get(plant, due_ns + 1):
+            self._due_ns[plant] = due_ns
+            heappush(self._dues, (due_ns, plant))
+
+    def _hear(self, plant: str, message: Encoded) -> None:
+        """Note what another monitor says of an alarm."""
+        if self._monitors.get(plant) is not None or self._is_quiet(plant):
+            return  # it is our own voice
+        try:
+            alarm = decode(message.payload, message.encoding)
+        except DecodeError:
+            return
+        if isinstance(alarm, Alarm):
+            self._heard.setdefault(plant, {})[alarm.alarm] = alarm
+
+    def _new(self, publications: list[Publication]) -> list[Publication]:
+        """Those that the monitor before us has not said already."""
+        if not self._heard or not publications:
+            return publications
+        return [item for item in publications if not self._was_said(item)]
+
+    def _was_said(self, publication: Publication) -> bool:
+        alarm, topic = publication.message, keys.parse(publication.key)
+        if not isinstance(alarm, Alarm) or topic is None:
+            return False
+        before = self._heard.get(topic.plant, {}).get(alarm.alarm)
+        return before is not None and alarm.time_ns <= before.time_ns

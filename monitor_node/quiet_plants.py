@@ -1,0 +1,419 @@
+"""Plants in which nothing happens, held as arrays: a record of numbers each, and a ring of their newest rows.
+
+A plant comes here from its monitor when it is past its training and at rest (`take`). Its samples are then lined up and
+its rows judged many at a time (see `quiet_rows`). As soon as something is out of the ordinary it goes back to a monitor
+of its own (`give`), which does not know that it ever was away: all that it would remember is put together from the
+record, and the row in question is its to judge. So what is said of a plant is the same, value for value, whoever
+watches it.
+
+Held here are plants that are judged by the filter of a process model, with Shewhart, EWMA, CUSUM and MEWMA charts, as
+by default; others keep their monitors.
+"""
+
+from math import prod
+from mmap import mmap
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from monitor_node import quiet_rows
+from monitor_node.alignment import Counts, Row
+from monitor_node.config import MonitorConfig
+from monitor_node.core import LARGEST_SAMPLE, NODE, STALL_NS, USABLE, Monitor, Receipt, health_of
+from monitor_node.quiet_record import COUNTS, NewestRows, QuietForm, Rest, kept_spacings
+from monitor_node.quiet_rows import NEW_MINUTE, Records
+from monitor_node.references import GATE
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication, encoding_of
+from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
+from reactorwatch.contract.sample_bytes import SampleColumns, sample_columns
+from reactorwatch.process.filter_record import LONGEST_ROW_MIN
+from reactorwatch.process.filter_step import row_function
+from reactorwatch.process.machine_code import RowCode
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import MINUTE_NS
+
+FIRST_ROOM = 16
+"""Plants that there is room for at first; it doubles."""
+
+MOST_HEALTHS = 20
+"""Plants whose health is told at a time, so that samples need not wait for thousands."""
+
+LOOK_AGAIN_NS = 250_000_000
+"""By then it is seen again which plants are overdue; samples that came meanwhile may have made it earlier."""
+
+NEVER_NS = 2**63 - 1
+
+_SAMPLE = encoding_of(Sample)
+
+
+class Taken(NamedTuple):
+    """What became of messages.
+
+    Attributes:
+        publications: what is to be published because of them.
+        others: those that were not taken, in their order: of no plant here, or for a monitor that was given back.
+        given: the monitors of plants that are quiet no longer; they have judged their rows up to the first of `others`.
+    """
+
+    publications: list[Publication]
+    others: list[Encoded]
+    given: dict[str, Monitor]
+
+
+class QuietPlants:
+    """Watches plants as long as nothing happens in them.
+
+    Args:
+        form: of their records.
+        config: of their monitors.
+        model: that their rows are expected by.
+    """
+
+    def __init__(self, form: QuietForm, config: MonitorConfig, model: ProcessModel) -> None:
+        self._form, self._config, self._model = form, config, model
+        self._signals = (config.input, *config.outputs)
+        self._slots: dict[str, int] = {}
+        self._names: list[str] = []
+        self._rests: list[Rest | None] = []
+        self._free: list[int] = []
+        self._codes: dict[str, int] = {}  # of a key of samples: slot times signals plus signal
+        self._rows = RowCode(row_function(model))
+        self._parameters = model.values()
+        self._scratch = np.zeros(1, form.record)
+        self._shared: dict[Any, Any] = {}  # parts of `Rest`, which are equal for many plants, are kept once
+        self._used: NDArray[np.int64] | None = None
+        self._plants: Records
+        self._times: NDArray[np.int32]
+        self._ring: NDArray[np.float64]
+        self._health_due_ns: NDArray[np.int64] = np.empty(0, np.int64)
+        self._overdue_ns, self._looked_ns = NEVER_NS, 0  # when the first was overdue, and when that was seen
+        self._room(FIRST_ROOM)
+
+    def __contains__(self, plant: str) -> bool:
+        return plant in self._slots
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    @property
+    def plants(self) -> list[str]:
+        """Those that are here."""
+        return list(self._slots)
+
+    # --- coming and going ------------------------------------------------------------------------------------
+
+    def take(self, plant: str, monitor: Monitor) -> bool:
+        """Take a plant over from its monitor, if it is quiet; returns whether it is.
+
+        Args:
+            plant: its name.
+            monitor: its; of no use afterwards if the plant was taken.
+        """
+        found = self._form.written(monitor, self._scratch)
+        if found is None:
+            return False
+        rest, rows = found
+        usual_ns = round(float(self._scratch[0]["period_ns"]))
+        spacings = kept_spacings(rows.times_ns, usual_ns)
+        if spacings is None:
+            return False
+        slot = self._slot(plant)
+        self._plants[slot] = self._scratch[0]
+        self._health_due_ns[slot] = self._scratch[0]["health_due_ns"]
+        p, count = self._plants[slot], len(rows.times_ns)
+        p["unit_ns"], p["usual_ns"], p["kept"], p["head"] = spacings[0], usual_ns, count, count % self._form.keeps
+        self._times[slot, :count], self._ring[slot, :count] = spacings[1], rows.values
+        shared = self._shared.setdefault
+        self._rests[slot] = rest._replace(
+            units=shared(rest.units, rest.units),
+            checks=shared(rest.checks, rest.checks),
+            cause=shared(rest.cause, rest.cause),
+        )
+        return True
+
+    def give(self, plant: str) -> Monitor:
+        """Give a plant to a monitor of its own."""
+        return self._give(plant, [])
+
+    def copied(self, plant: str, name: str) -> None:
+        """Begin to watch another plant that is, so far, like one that is here: for trials with many plants.
+
+        Args:
+            plant: the one that is here; no alarm of it ever came up.
+            name: of the other.
+        """
+        of, slot = self._slots[plant], self._slot(name)
+        rest = self._rests[of]
+        assert rest is not None
+        self._plants[slot], self._rests[slot] = self._plants[of], rest._replace(runs=bytes(bytearray(rest.runs)))
+        self._times[slot], self._ring[slot] = self._times[of], self._ring[of]
+        self._health_due_ns[slot] = self._health_due_ns[of]
+
+    def _slot(self, plant: str) -> int:
+        if self._free:
+            slot = self._free.pop()
+            self._names[slot] = plant
+        else:
+            slot = len(self._names)
+            if slot == len(self._plants):
+                self._room(2 * slot)
+            self._names.append(plant)
+            self._rests.append(None)
+        self._slots[plant], self._used = slot, None
+        for place, signal in enumerate(self._signals):
+            self._codes[keys.key(plant, keys.SAMPLE, signal)] = slot * len(self._signals) + place
+        return slot
+
+    def _room(self, plants: int) -> None:
+        """Make room for so many."""
+        form, before = self._form, len(self._names)
+        records, times = _zeros((plants,), form.record), _zeros((plants, form.keeps), np.dtype(np.int32))
+        ring = _zeros((plants, form.keeps, form.columns), np.dtype(np.float64))
+        if before:
+            records[:before], times[:before], ring[:before] = self._plants, self._times, self._ring
+        self._plants, self._times, self._ring = records, times, ring
+        due_ns = np.full(plants, NEVER_NS)
+        due_ns[:before] = self._health_due_ns[:before]
+        self._health_due_ns = due_ns
+
+    def _give(self, plant: str, waiting: list[Row]) -> Monitor:
+        slot, self._used = self._slots.pop(plant), None
+        p, rest = self._plants[slot], self._rests[slot]
+        assert rest is not None
+        monitor = Monitor(msgspec.structs.replace(self._config, plant=plant), 0, points=False, model=self._model)
+        monitor.restore(self._form.read(plant, p, rest, self._newest(slot), [row.time_ns for row in waiting]))
+        monitor.caught_up()
+        p["health_due_ns"] = self._health_due_ns[slot]
+        monitor.receipt = Receipt(*(p[name].item() for name in Receipt._fields))
+        self._health_due_ns[slot] = NEVER_NS
+        for signal in self._signals:
+            del self._codes[keys.key(plant, keys.SAMPLE, signal)]
+        self._plants[slot] = np.zeros(1, self._form.record)[0]
+        self._rests[slot], self._names[slot] = None, ""
+        self._free.append(slot)
+        return monitor
+
+    def _newest(self, slot: int) -> NewestRows:
+        p = self._plants[slot]
+        kept, head, keeps = int(p["kept"]), int(p["head"]), self._form.keeps
+        order = (head - kept + np.arange(kept)) % keeps
+        over = self._times[slot, order].astype(np.int64) * p["unit_ns"] + p["usual_ns"]
+        since = np.concatenate([[0], np.cumsum(over[:0:-1])])  # from each row to the newest, newest first
+        return NewestRows((p["last_ns"] - since)[::-1].tolist(), self._ring[slot, order])
+
+    # --- samples ---------------------------------------------------------------------------------------------
+
+    def on_messages(self, messages: list[Encoded], now_ns: int) -> Taken:
+        """Take in samples of the plants that are here, and leave the others."""
+        code_of = self._codes.get
+        codes = np.array(
+            [code_of(key, -1) if encoding == _SAMPLE else -1 for key, _, encoding, _ in messages], dtype=np.int32
+        )
+        if codes.max(initial=-1) < 0:
+            return Taken([], messages, {})
+        samples = sample_columns([payload if len(payload) <= LARGEST_SAMPLE else b"" for _, payload, _, _ in messages])
+        received_ns = np.array([message.received_ns for message in messages], dtype=np.int64)
+        rows, others = self._lined_up(codes, samples, received_ns, now_ns)
+        publications: list[Publication] = []
+        waiting = self._judged(rows, publications)
+        given: dict[str, Monitor] = {}
+        for code in codes[others].tolist():
+            if code >= 0:
+                waiting.setdefault(code // len(self._signals), [])
+        for slot, left in waiting.items():
+            plant = self._names[slot]
+            monitor = given[plant] = self._give(plant, left)
+            publications += monitor.on_rows(left)
+        return Taken(publications, [messages[place] for place in others.tolist()], given)
+
+    def _lined_up(
+        self, codes: NDArray[np.int32], samples: SampleColumns, received_ns: NDArray[np.int64], now_ns: int
+    ) -> tuple["_Rows", NDArray[np.int32]]:
+        """The rows that are complete, and the samples that are not taken."""
+        most = codes.size // len(self._signals) + min(codes.size, len(self._names))
+        rows = _Rows(
+            np.empty(most, np.int32),
+            np.empty(most, np.int64),
+            np.empty((most, len(self._signals))),
+            np.empty(most, np.int32),
+        )
+        others = np.empty(codes.size, np.int32)
+        good = np.isin(samples.quality, list(USABLE))
+        count, left_over = quiet_rows.take_samples(
+            self._plants,
+            codes,
+            samples.plain & good,
+            samples.time_ns,
+            samples.sequence,
+            samples.value,
+            samples.unit,
+            received_ns,
+            now_ns,
+            self._config.silence_periods,
+            int(self._form.least_s * 1e9),
+            self._form.remembered,
+            *rows,
+            others,
+        )
+        return rows.of(slice(count)), others[:left_over]
+
+    def _judged(self, rows: "_Rows", publications: list[Publication]) -> dict[int, list[Row]]:
+        """Judge rows; returns, by slot, those that are out of the ordinary, and all after them."""
+        waiting: dict[int, list[Row]] = {}
+        for number in range(int(rows.turns.max(initial=-1)) + 1):
+            each = rows.of(rows.turns == number)
+            found = self._turn(each)
+            for place in np.flatnonzero(found).tolist():
+                slot, time_ns = int(each.slots[place]), int(each.times_ns[place])
+                if found[place] == NEW_MINUTE:
+                    publications += self._figures(slot, time_ns)
+                else:
+                    waiting.setdefault(slot, []).append(Row(time_ns, tuple(each.values[place].tolist()), False))
+        self._plants["rows_in_batch"][rows.slots] = 0
+        return waiting
+
+    def _turn(self, rows: "_Rows") -> NDArray[np.int32]:
+        """Judge rows of different plants; what each was."""
+        form, count = self._form, rows.slots.size
+        times_min = np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns.tolist()])
+        after, told = self._rows.results(count)
+        noise = self._plants["variance"].shape[1]
+        memory, new = np.empty((count, after.shape[2])), np.empty((count, 3 + 2 * len(self._signals)))
+        constants, found = np.empty((count, self._parameters.size + noise)), np.empty(count, np.int32)
+        quiet_rows.prepare(
+            self._plants,
+            rows.slots,
+            rows.times_ns,
+            times_min,
+            rows.values,
+            self._parameters,
+            LONGEST_ROW_MIN,
+            GATE,
+            memory,
+            new,
+            constants,
+            found,
+        )
+        if count:
+            self._rows.fill(count, [memory, new, constants], [after, told])
+        quiet_rows.judge(
+            self._plants,
+            self._scratch,
+            self._times,
+            self._ring,
+            rows.slots,
+            rows.times_ns,
+            times_min,
+            rows.values,
+            after[:, 0, :],
+            told[:, 0, :],
+            self._config.silence_periods,
+            form.places,
+            form.rules,
+            1.0 - self._config.dead_band,
+            self._config.mewma_weight,
+            found,
+        )
+        return found
+
+    def _figures(self, slot: int, time_ns: int) -> list[Publication]:
+        """Tell the figures of a plant's alarms."""
+        rest = self._rests[slot]
+        assert rest is not None
+        if rest.board is not None:
+            publications = rest.board.end_row(time_ns)
+        else:
+            told = AlarmKpis()
+            told.CopyFrom(self._form.figures)
+            told.time_ns = time_ns
+            publications = [Publication(keys.key(self._names[slot], keys.ALARM_KPIS, NODE), told)]
+        self._plants["published"][slot] += len(publications)
+        return publications
+
+    # --- the clock -------------------------------------------------------------------------------------------
+
+    def overdue(self, now_ns: int) -> list[str]:
+        """Plants of which nothing came for longer than is allowed."""
+        if now_ns < self._overdue_ns and 0 <= now_ns - self._looked_ns < LOOK_AGAIN_NS:
+            return []
+        due_ns = self._silent_from_ns()
+        self._overdue_ns, self._looked_ns = int(due_ns.min(initial=NEVER_NS)), now_ns
+        return [self._names[slot] for slot in np.flatnonzero(due_ns <= now_ns).tolist()]
+
+    def healths(self, now_ns: int) -> list[Publication]:
+        """The health of plants' monitors where it is due; of so many at a time."""
+        period_ns = int(self._config.health_period_s * 1e9)
+        due = np.flatnonzero(self._health_due_ns <= now_ns)[:MOST_HEALTHS]
+        p = self._plants
+        p["stalls"][due] += (p["ticked"][due] != 0) & (now_ns - self._health_due_ns[due] > STALL_NS)
+        p["ticked"][due] = 1
+        self._health_due_ns[due] = now_ns + period_ns
+        return [self._health(slot, now_ns, "watching") for slot in due.tolist()]
+
+    def next_due_ns(self) -> int:
+        """When the first of the plants is overdue, or a health due, as far as is known now."""
+        return min(int(self._health_due_ns.min()), self._overdue_ns, self._looked_ns + LOOK_AGAIN_NS)
+
+    def last_healths(self, now_ns: int) -> list[Publication]:
+        """The health of all, when the monitor is stopped."""
+        return [self._health(slot, now_ns, "stopped") for slot in self._places().tolist()]
+
+    def _places(self) -> NDArray[np.int64]:
+        """The slots that have a plant."""
+        if self._used is None:
+            self._used = np.array(sorted(self._slots.values()), dtype=np.int64)
+        return self._used
+
+    def _silent_from_ns(self) -> NDArray[np.int64]:
+        """By slot, when it is too long since something came; never for a slot without a plant."""
+        return quiet_rows.silent_from(
+            self._plants[: len(self._names)], self._config.silence_periods, int(self._form.least_s * 1e9)
+        )
+
+    def _health(self, slot: int, now_ns: int, phase: str) -> Publication:
+        p, rest, plant = self._plants[slot], self._rests[slot], self._names[slot]
+        assert rest is not None
+        health = health_of(
+            now_ns,
+            phase,
+            int(p["start_ns"]),
+            Counts(**dict(zip(COUNTS, p["counts"].tolist(), strict=True))),
+            rest.refused or {},
+            received=int(p["received"]),
+            published=int(p["published"]),
+            lag_ns=int(p["lag_ns"]),
+            heard_from_ns=dict(zip(self._signals, p["heard_from_ns"].tolist(), strict=True)),
+            not_stored=int(p["not_stored"]),
+            stalls=int(p["stalls"]),
+        )
+        p["lag_ns"] = 0
+        return Publication(keys.key(plant, keys.HEALTH, NODE), health)
+
+
+class _Rows(NamedTuple):
+    """Rows of several plants.
+
+    Attributes:
+        slots: of their plants.
+        times_ns: their times.
+        values: input first, shape (rows, signals).
+        turns: how many rows of the same plant came before.
+    """
+
+    slots: NDArray[np.int32]
+    times_ns: NDArray[np.int64]
+    values: NDArray[np.float64]
+    turns: NDArray[np.int32]
+
+    def of(self, which: slice | NDArray[np.bool_]) -> "_Rows":
+        """Some of them."""
+        return _Rows(self.slots[which], self.times_ns[which], self.values[which], self.turns[which])
+
+
+def _zeros(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
+    """An array of zeros, straight from the system: it keeps no memory of what is not used yet, nor of what was."""
+    count = prod(shape)
+    return np.frombuffer(mmap(-1, max(count, 1) * kind.itemsize), kind, count).reshape(shape)

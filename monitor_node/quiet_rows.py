@@ -1,0 +1,564 @@
+"""Rows of many plants in which nothing happens, judged by compiled code.
+
+Most rows of most plants are alike: every signal has come, in its order; the filter predicts them; no chart's alarm is
+raised and no signal is suspicious. For these, all that a monitor remembers of a plant is one record of numbers, and one
+loop takes them from row to row. It does what `PlantWatch` does with such a row, operation by operation, so the numbers
+are the same bits; the charts' own kernels judge here as well.
+
+Whatever is out of the ordinary is not dealt with here. The record is then left as it was before the row, and the row is
+said to be *odd*: it is for the plant's own monitor (see `quiet_plants`).
+
+Odd are: a sample out of its order, that does not follow from those before it, of another unit or quality, or with a
+value, number or time that no plant has; a row after a gap;
+one by which the filter begins anew; a silence; equal readings beyond a sensor's limit; a residual that may be a spike;
+and a row that raises an alarm. Points beyond a limit that raise no alarm are ordinary, they are only remembered.
+"""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from monitor_node.charts.base import LARGEST_VALUE, LOWER, OUT, PRESENT, SETTINGS, STATISTIC, UPPER, X
+from monitor_node.charts.cusum import Cusum
+from monitor_node.charts.cusum import _judge as _judge_cusum
+from monitor_node.charts.ewma import Ewma
+from monitor_node.charts.ewma import _judge as _judge_ewma
+from monitor_node.charts.mewma import _move as _move_mewma
+from monitor_node.charts.shewhart import Shewhart
+from monitor_node.charts.shewhart import _judge as _judge_shewhart
+from monitor_node.core import HEARD_AGAIN_NS, LARGEST_NUMBER
+from monitor_node.core import LARGEST_VALUE as LARGEST_READING
+from monitor_node.prewhitening import LARGEST_ORDER
+from monitor_node.sample_run import ALIKE, TOLERANCE
+from monitor_node.sample_run import DEVIATIONS as RUN_DEVIATIONS
+from monitor_node.sample_run import MEMORY as RUN_MEMORY
+from monitor_node.sampling import LARGEST_GAP
+from monitor_node.silence import BURST, DEVIATIONS, LEARN_FROM, MEMORY
+from monitor_node.stuck import AT_REST, STRETCH
+from reactorwatch.compiled import compiled
+from reactorwatch.records.record import MINUTE_NS
+
+Records: TypeAlias = NDArray[np.void]
+Array: TypeAlias = NDArray[np.float64]
+Ints: TypeAlias = NDArray[np.int64]
+Places: TypeAlias = NDArray[np.int32]
+
+ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
+"""What a row was; in the second case the figures of the alarms are due, too."""
+
+_MINUTE_NS = int(MINUTE_NS)
+_MOST_NUMBERS = max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
+_STRETCH, _ORDER, _MEMORY, _LEARN_FROM = STRETCH, LARGEST_ORDER, MEMORY, LEARN_FROM
+
+
+def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
+    """The form of a plant's record.
+
+    Args:
+        outputs: how many are watched.
+        states: of its model.
+        alarms: how many its charts can raise.
+    """
+    signals, memory, noise = outputs + 1, states + states**2, outputs + states
+    f, i, u = np.float64, np.int64, np.uint64
+    columns: list[tuple[str, DTypeLike, tuple[int, ...]]] = [
+        # samples on their way into a row
+        ("expected", i, (signals,)),  # sequence numbers
+        ("unit", u, (signals,)),
+        ("run_spacing_ns", f, (signals,)),
+        ("run_deviation_ns", f, (signals,)),
+        ("heard_from_ns", i, (signals,)),
+        ("values", f, (signals,)),
+        ("pending_ns", i, ()),
+        ("left_ns", i, ()),  # time of the row that left last
+        ("have", np.int32, ()),  # which signals of the pending row have come, a bit each
+        ("left", np.int32, ()),  # rows that left and are remembered
+        ("rows_in_batch", np.int32, ()),
+        ("shut", np.int32, ()),  # from here on, samples are for the plant's own monitor
+        ("odd", np.int32, ()),  # likewise, rows
+        # counts and times
+        ("received", i, ()),
+        ("published", i, ()),
+        ("ticked", np.int32, ()),
+        ("stalls", np.int32, ()),
+        ("not_stored", i, ()),
+        ("counts", i, (7,)),
+        ("rows_watched", i, ()),
+        ("first_ns", i, ()),
+        ("watching_since_ns", i, ()),
+        ("began_ns", i, ()),
+        ("start_ns", i, ()),
+        ("lag_ns", i, ()),
+        ("heard_ns", i, ()),
+        ("health_due_ns", i, ()),
+        ("kpi_minute", i, ()),
+        ("arl0", f, ()),
+        # how rows and samples come
+        ("last_ns", i, ()),
+        ("period_ns", f, ()),
+        ("spacing_ns", i, ()),
+        ("received_ns", i, ()),
+        ("counted_ns", i, ()),
+        ("receipt_mean", f, ()),
+        ("receipt_deviation", f, ()),
+        ("receipt_count", np.int32, ()),
+        ("silence_count", np.int32, (signals + 1,)),
+        ("silence_mean", f, (signals + 1,)),
+        ("silence_deviation", f, (signals + 1,)),
+        # the filter
+        ("time_min", f, ()),
+        ("input", f, ()),
+        ("memory", f, (memory,)),
+        ("noise", f, (noise,)),  # standard deviations, of sensors and process
+        ("variance", f, (noise,)),
+        ("typical_sd", f, (outputs,)),
+        # prewhitening
+        ("order", np.int32, (outputs,)),
+        ("learned_rows", np.int32, (outputs,)),
+        ("constant", f, (outputs,)),
+        ("coefficients", f, (outputs, _ORDER)),
+        ("sigma", f, (outputs,)),
+        ("sigma_variance", f, (outputs,)),
+        ("passed_variance", f, (outputs,)),
+        ("past", f, (outputs, _ORDER)),
+        # spikes and stuck sensors; a limit that is infinite is none
+        ("spike_limit", f, (outputs,)),
+        ("equal_limit", f, (outputs,)),
+        ("quietest", f, (outputs,)),
+        ("last", f, (outputs,)),
+        ("repeats", i, (outputs,)),
+        ("steps", f, (outputs, _STRETCH)),  # oldest first
+        ("stepped", np.int32, (outputs,)),
+        # charts, as the columns of a bank without what comes in and goes out, and their alarms
+        ("shewhart", f, (Shewhart.numbers, outputs)),
+        ("width", f, (outputs,)),
+        ("ewma", f, (Ewma.numbers, outputs)),
+        ("cusum", f, (Cusum.numbers, outputs)),
+        ("average", f, (outputs,)),
+        ("mean", f, (outputs,)),
+        ("covariance", f, (outputs, outputs)),
+        ("whitening", f, (outputs, outputs)),
+        ("mewma_limit", f, ()),
+        ("recent", np.int32, (alarms,)),
+        ("in_a_row", np.int32, (alarms,)),
+        ("above", np.int32, (alarms,)),
+        # the newest rows, in a ring
+        ("kept", np.int32, ()),
+        ("head", np.int32, ()),  # where the next one goes
+        ("unit_ns", i, ()),  # that spacings are kept in
+        ("usual_ns", i, ()),  # spacing that is kept as 0
+    ]
+    return np.dtype([(name, kind, shape) for name, kind, shape in columns], align=True)
+
+
+@compiled
+def allowed_ns(limit: float, count: int, mean: float, deviation: float) -> int:
+    """As `Spacing.allowed_ns`; -1: too little is known."""
+    if count < _LEARN_FROM:
+        return -1
+    return int(limit * (mean + DEVIATIONS * deviation))
+
+
+@compiled
+def _follows(p: Any, signal: int, time_ns: int) -> bool:
+    """Take the sample with the number that comes next into the run of its signal; as `SampleRun` if none is held."""
+    spacing_ns = float(time_ns - p.left_ns)
+    off = spacing_ns - p.run_spacing_ns[signal]
+    if abs(off) <= ALIKE * p.run_spacing_ns[signal]:
+        return True
+    if abs(off) > TOLERANCE * p.run_spacing_ns[signal] + RUN_DEVIATIONS * p.run_deviation_ns[signal]:
+        return False
+    p.run_spacing_ns[signal] += off / RUN_MEMORY
+    p.run_deviation_ns[signal] += (abs(off) - p.run_deviation_ns[signal]) / RUN_MEMORY
+    return True
+
+
+@compiled
+def _heard(p: Any, now_ns: int, silence_limit: float, least_ns: int) -> None:
+    """Note that something came; as `Silence.received`."""
+    before_ns, p.received_ns = p.counted_ns, now_ns
+    spacing = now_ns - before_ns
+    if spacing < 0:
+        p.counted_ns = now_ns
+    elif p.receipt_count < _MEMORY or float(spacing) >= BURST * p.receipt_mean:
+        p.counted_ns = now_ns
+        patience = allowed_ns(silence_limit, p.receipt_count, p.receipt_mean, p.receipt_deviation)
+        if patience >= 0:
+            spacing = min(spacing, max(patience, least_ns))
+        p.receipt_count = min(p.receipt_count + 1, _MEMORY)
+        off = float(spacing) - p.receipt_mean
+        p.receipt_mean += off / p.receipt_count
+        if p.receipt_count > 1:
+            p.receipt_deviation += (abs(off) - p.receipt_deviation) / p.receipt_count
+
+
+@compiled
+def take_samples(
+    plants: Records,
+    codes: Places,
+    plain: NDArray[np.bool_],
+    time_ns: Ints,
+    sequence: Ints,
+    value: Array,
+    unit: NDArray[np.uint64],
+    received_ns: Ints,
+    now_ns: int,
+    silence_limit: float,
+    least_ns: int,
+    most_left: int,
+    rows: Places,
+    row_time_ns: Ints,
+    row_values: Array,
+    row_round: Places,
+    others: Places,
+) -> tuple[int, int]:
+    """Line samples up into rows.
+
+    Args:
+        plants: records, shape (plants,).
+        codes: of each sample its plant times the signals plus its signal; -1: it is for somebody else.
+        plain: whether each is a good one.
+        time_ns: of each.
+        sequence: of each.
+        value: of each.
+        unit: of each, its digest.
+        received_ns: when each came.
+        now_ns: the time.
+        silence_limit: periods.
+        least_ns: of receipt time without anything that are always allowed.
+        most_left: rows that left that are remembered.
+        rows: filled: the plant of each row.
+        row_time_ns: filled: its time.
+        row_values: filled: its values, input first.
+        row_round: filled: how many rows of its plant came before it in this batch.
+        others: filled: the samples that are for the plants' own monitors, or somebody else.
+
+    Returns:
+        How many rows, and how many such samples.
+    """
+    signals = row_values.shape[1]
+    whole = (1 << signals) - 1
+    count, left_over = 0, 0
+    for k in range(codes.size):
+        if codes[k] < 0:
+            others[left_over] = k
+            left_over += 1
+            continue
+        slot, signal = codes[k] // signals, codes[k] % signals
+        p = plants[slot]
+        bit = 1 << signal
+        fits = plain[k] and not p.shut and unit[k] == p.unit[signal] and abs(value[k]) < LARGEST_READING
+        fits = fits and sequence[k] == p.expected[signal] and not p.have & bit and time_ns[k] > p.left_ns
+        fits = fits and sequence[k] < LARGEST_NUMBER and abs(time_ns[k]) < LARGEST_NUMBER
+        fits = fits and (not p.have or time_ns[k] == p.pending_ns)
+        if not (fits and _follows(p, signal, time_ns[k])):
+            p.shut = 1
+            others[left_over] = k
+            left_over += 1
+            continue
+        p.received += 1
+        if received_ns[k] and now_ns - received_ns[k] > p.lag_ns:
+            p.lag_ns = now_ns - received_ns[k]
+        if now_ns >= p.heard_ns + HEARD_AGAIN_NS:
+            p.heard_ns = now_ns
+            _heard(p, now_ns, silence_limit, least_ns)
+        p.expected[signal] += 1
+        p.values[signal] = value[k]
+        p.pending_ns = time_ns[k]
+        p.have |= bit
+        if p.have == whole:
+            rows[count] = slot
+            row_time_ns[count] = time_ns[k]
+            for place in range(signals):
+                row_values[count, place] = p.values[place]
+            row_round[count] = p.rows_in_batch
+            p.rows_in_batch += 1
+            p.have = 0
+            p.left_ns = time_ns[k]
+            p.left = min(p.left + 1, most_left)
+            p.counts[0] += 1
+            count += 1
+    return count, left_over
+
+
+@compiled
+def prepare(
+    plants: Records,
+    rows: Places,
+    row_time_ns: Ints,
+    row_time_min: Array,
+    row_values: Array,
+    parameters: Array,
+    longest_row_min: float,
+    gate: float,
+    memory: Array,
+    new: Array,
+    constants: Array,
+    found: Places,
+) -> None:
+    """Lay out rows of different plants for the filter, see `filter_step.row_function`.
+
+    Args:
+        plants: records.
+        rows: the plant of each row; each plant once.
+        row_time_ns: its time.
+        row_time_min: the same in minutes.
+        row_values: its values, input first.
+        parameters: of the model.
+        longest_row_min: so soon after the row before two steps lead to it.
+        gate: see `references`.
+        memory: filled, shape (rows, numbers of the filter).
+        new: filled.
+        constants: filled.
+        found: filled: whether a row is `ODD`.
+    """
+    outputs = row_values.shape[1] - 1
+    for k in range(rows.size):
+        p = plants[rows[k]]
+        spacing = row_time_ns[k] - p.last_ns
+        step = 0.5 * (row_time_min[k] - p.time_min)
+        fits = not p.odd and spacing > 0 and float(spacing) <= LARGEST_GAP * p.period_ns
+        found[k] = ORDINARY if fits and step > 0.0 and 2.0 * step <= longest_row_min else ODD
+        for place in range(memory.shape[1]):
+            memory[k, place] = p.memory[place]
+        new[k, 0], new[k, 1], new[k, 2], new[k, 3], new[k, 4] = p.input, row_values[k, 0], row_time_min[k], step, step
+        for place in range(outputs):
+            new[k, 5 + place], new[k, 5 + outputs + place] = row_values[k, 1 + place], gate
+        for place in range(parameters.size):
+            constants[k, place] = parameters[place]
+        for place in range(p.variance.size):
+            constants[k, parameters.size + place] = p.variance[place]
+
+
+@compiled
+def _hear(p: Any, spacing: int, limit: float) -> bool:
+    """Look for silence; whether there is none."""
+    for place in range(p.silence_count.size):
+        count, mean, deviation = p.silence_count[place], p.silence_mean[place], p.silence_deviation[place]
+        if count == _MEMORY and deviation == 0.0 and float(spacing) == mean:
+            continue  # there is nothing to learn
+        allowed = allowed_ns(limit, count, mean, deviation)
+        if allowed >= 0 and spacing > allowed:
+            return False
+        count = min(count + 1, _MEMORY)
+        off = float(spacing) - mean
+        mean += off / count
+        if count > 1:
+            deviation += (abs(off) - deviation) / count
+        p.silence_count[place], p.silence_mean[place], p.silence_deviation[place] = count, mean, deviation
+    return True
+
+
+@compiled
+def _step(p: Any, place: int, size: float) -> None:
+    if p.stepped[place] == _STRETCH:
+        for k in range(_STRETCH - 1):
+            p.steps[place, k] = p.steps[place, k + 1]
+        p.steps[place, _STRETCH - 1] = size
+    else:
+        p.steps[place, p.stepped[place]] = size
+        p.stepped[place] += 1
+
+
+@compiled
+def _moves(p: Any, place: int, value: float) -> bool:
+    """Count equal readings; whether the sensor is not stuck."""
+    if value == p.last[place]:
+        p.repeats[place] += 1
+        total = 0.0
+        for k in range(p.stepped[place]):
+            total += p.steps[place, k]
+        moved = p.stepped[place] == _STRETCH and total / _STRETCH >= AT_REST * p.quietest[place]
+        return not (moved and p.repeats[place] + 1.0 > p.equal_limit[place])
+    for _ in range(min(p.repeats[place], _STRETCH)):
+        _step(p, place, 0.0)
+    p.repeats[place] = 0
+    _step(p, place, abs(value - p.last[place]))
+    p.last[place] = value
+    return True
+
+
+@compiled
+def _whitened(p: Any, place: int, z: float) -> float:
+    """As `Prewhitener.update`."""
+    expected = p.constant[place]
+    for k in range(p.order[place]):
+        expected += p.coefficients[place, k] * p.past[place, k]
+    for k in range(_ORDER - 1, 0, -1):
+        p.past[place, k] = p.past[place, k - 1]
+    p.past[place, 0] = z
+    return float((z - expected) / p.sigma[place])
+
+
+@compiled
+def _noted(
+    p: Any,
+    alarm: int,
+    out: bool,
+    statistic: float,
+    centre: float,
+    lower: float,
+    upper: float,
+    rules: Places,
+    reach: float,
+) -> bool:
+    """Follow the rule of an alarm that does not stand; whether it is not raised. As `ChartAlarm.judge`."""
+    if not (out or p.recent[alarm]):
+        return True
+    p.recent[alarm] = ((p.recent[alarm] << 1) | (1 if out else 0)) & rules[alarm, 1]
+    off = statistic - centre
+    back_in = off <= reach * (upper - centre) if p.above[alarm] else off >= reach * (lower - centre)
+    p.in_a_row[alarm] = p.in_a_row[alarm] + 1 if back_in and not out else 0
+    ones, bits = 0, p.recent[alarm]
+    while bits:
+        ones += bits & 1
+        bits >>= 1
+    return not (out and ones >= rules[alarm, 0])
+
+
+@compiled
+def _each(p: Any, columns: Array, first: int, rules: Places, reach: float) -> bool:
+    """Take in what the charts of the outputs, of one kind, have said; whether they raise no alarm."""
+    for place in range(columns.shape[1]):
+        said = columns[STATISTIC, place], columns[STATISTIC + 1, place], columns[LOWER, place], columns[UPPER, place]
+        if not _noted(p, first + place, columns[OUT, place] > 0.0, said[0], said[1], said[2], said[3], rules, reach):
+            return False
+    return True
+
+
+@compiled
+def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
+    """The columns of a bank, see `charts.base`: a new value for each chart."""
+    for place in range(e.size):
+        columns[X, place], columns[PRESENT, place] = e[place], 1.0
+        for row in range(numbers.shape[0]):
+            columns[SETTINGS + row, place] = numbers[row, place]
+
+
+@compiled
+def _put_back(columns: Array, numbers: Array) -> None:
+    for row in range(numbers.shape[0]):
+        for place in range(numbers.shape[1]):
+            numbers[row, place] = columns[SETTINGS + row, place]
+
+
+@compiled
+def _charted(p: Any, e: Array, columns: Array, charts: Places, rules: Places, reach: float, weight: float) -> bool:
+    """Let the charts judge; whether none raises an alarm."""
+    if charts[0] >= 0:
+        _lay_out(columns, p.shewhart, e)
+        _judge_shewhart(columns)
+        _put_back(columns, p.shewhart)
+        if not _each(p, columns, charts[0], rules, reach):
+            return False
+    if charts[1] >= 0:
+        _lay_out(columns, p.ewma, e)
+        _judge_ewma(columns)
+        _put_back(columns, p.ewma)
+        if not _each(p, columns, charts[1], rules, reach):
+            return False
+    if charts[2] >= 0:
+        _lay_out(columns, p.cusum, e)
+        _judge_cusum(columns)
+        _put_back(columns, p.cusum)
+        if not _each(p, columns, charts[2], rules, reach):
+            return False
+    if charts[3] >= 0:
+        squares = _move_mewma(p.average, e, p.mean, p.whitening, weight)
+        if squares < 0.0:
+            return False
+        statistic = squares * (2.0 - weight) / weight
+        out = statistic > p.mewma_limit
+        return _noted(p, charts[3], out, statistic, float(e.size), 0.0, p.mewma_limit, rules, reach)
+    return True
+
+
+@compiled
+def judge(
+    plants: Records,
+    scratch: Records,
+    times: Places,
+    ring: Array,
+    rows: Places,
+    row_time_ns: Ints,
+    row_time_min: Array,
+    row_values: Array,
+    after: Array,
+    told: Array,
+    silence_limit: float,
+    charts: Places,
+    rules: Places,
+    reach: float,
+    weight: float,
+    found: Places,
+) -> None:
+    """Judge rows of different plants, which the filter has predicted.
+
+    Args:
+        plants: records; those of ordinary rows go on.
+        scratch: one record, to work in.
+        times: of the newest rows, the spacing before each, see `record_type`; shape (plants, rows kept).
+        ring: their values, shape (plants, rows kept, signals); without columns if causes are not looked for.
+        rows: the plant of each row; each plant once.
+        row_time_ns: its time.
+        row_time_min: the same in minutes.
+        row_values: its values, input first.
+        after: what the filter remembers after it.
+        told: what it said.
+        silence_limit: periods.
+        charts: of Shewhart, EWMA, CUSUM and MEWMA, the place of the first alarm; -1: there is no such chart.
+        rules: of each alarm of a chart, how many points out raise it, and a bit for each that is looked at.
+        reach: how near to the centre is back in.
+        weight: of the MEWMA chart.
+        found: `ODD` for rows that are not to be judged here; filled with what each was.
+    """
+    outputs = row_values.shape[1] - 1
+    e, columns = np.empty(outputs), np.empty((SETTINGS + _MOST_NUMBERS, outputs))
+    keeps = times.shape[1]
+    for k in range(rows.size):
+        slot = rows[k]
+        ordinary = found[k] == ORDINARY and told[k, told.shape[1] - 1] != 0.0
+        scratch[0] = plants[slot]
+        p = scratch[0]
+        spacing = row_time_ns[k] - p.last_ns
+        over = spacing - p.usual_ns
+        ordinary = ordinary and over % p.unit_ns == 0 and abs(over // p.unit_ns) < 2**31
+        ordinary = ordinary and _hear(p, spacing, silence_limit)
+        if ordinary:
+            for place in range(outputs):
+                value = row_values[k, 1 + place]
+                ordinary = ordinary and _moves(p, place, value)
+                z = (value - told[k, place]) / told[k, 2 * outputs + place]
+                e[place] = _whitened(p, place, z)
+                ordinary = ordinary and abs(e[place]) <= p.spike_limit[place] and abs(e[place]) < LARGEST_VALUE
+        if not (ordinary and _charted(p, e, columns, charts, rules, reach, weight)):
+            found[k] = ODD
+            plants[slot].odd = 1
+            continue
+        p.last_ns, p.spacing_ns = row_time_ns[k], spacing
+        p.time_min, p.input = row_time_min[k], row_values[k, 0]
+        for place in range(after.shape[1]):
+            p.memory[place] = after[k, place]
+        p.rows_watched += 1
+        times[slot, p.head] = over // p.unit_ns
+        for place in range(ring.shape[2]):
+            ring[slot, p.head, place] = row_values[k, place]
+        p.head = p.head + 1 if p.head + 1 < keeps else 0
+        p.kept = min(p.kept + 1, keeps)
+        minute = row_time_ns[k] // _MINUTE_NS
+        found[k] = ORDINARY if minute == p.kpi_minute else NEW_MINUTE
+        p.kpi_minute = minute
+        plants[slot] = scratch[0]
+
+
+@compiled
+def silent_from(plants: Records, silence_limit: float, least_ns: int) -> Ints:
+    """When it is too long since something came from each plant, as `Silence.due_ns`; never where there is none."""
+    found = np.empty(plants.size, np.int64)
+    for slot in range(plants.size):
+        p = plants[slot]
+        patience = allowed_ns(silence_limit, p.receipt_count, p.receipt_mean, p.receipt_deviation)
+        known = patience >= 0 and p.silence_count[0] >= _LEARN_FROM
+        found[slot] = p.received_ns + max(patience, least_ns) if known else np.int64(2**63 - 1)
+    return found

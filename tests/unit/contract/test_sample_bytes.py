@@ -1,0 +1,63 @@
+"""Samples read from their bytes by compiled code: what protobuf reads, or nothing."""
+
+from math import inf, nan
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
+from reactorwatch.contract.sample_bytes import sample_columns, unit_digest
+
+SAMPLES = st.builds(
+    Sample,
+    time_ns=st.integers(-(2**63), 2**63 - 1),
+    sequence=st.integers(0, 2**62),
+    value=st.floats(),
+    unit=st.text(max_size=200),
+    quality=st.sampled_from([0, 1, 2, 3]),
+)
+
+
+@given(st.lists(SAMPLES, max_size=5))
+def test_what_protobuf_wrote_is_read_as_it_was(samples: list[Sample]) -> None:
+    found = sample_columns([sample.SerializeToString() for sample in samples])
+    assert found.plain.all()
+    assert found.time_ns.tolist() == [sample.time_ns for sample in samples]
+    assert found.sequence.tolist() == [sample.sequence for sample in samples]
+    assert found.unit.tolist() == [unit_digest(sample.unit) for sample in samples]
+    assert found.quality.tolist() == [sample.quality for sample in samples]
+    np.testing.assert_array_equal(found.value, [sample.value for sample in samples])
+
+
+@given(st.binary(max_size=60))
+def test_of_any_bytes_only_what_protobuf_reads_the_same_is_taken(data: bytes) -> None:
+    found = sample_columns([data])
+    if found.plain[0]:
+        sample = Sample.FromString(data)
+        np.testing.assert_array_equal(found.value, [sample.value])
+        assert (found.time_ns[0], found.sequence[0]) == (sample.time_ns, sample.sequence)
+        assert found.quality[0] == sample.quality or sample.quality not in Quality.values()
+
+
+@pytest.mark.parametrize("value", [0.0, -0.0, nan, inf, 1e-310])
+def test_each_value_is_itself(value: float) -> None:
+    (found,) = sample_columns([Sample(value=value).SerializeToString()]).value
+    assert np.float64(found).tobytes() == np.float64(value).tobytes()
+
+
+def test_a_field_that_a_later_version_adds_is_left_to_protobuf() -> None:
+    later = Sample(time_ns=1, value=2.0).SerializeToString() + bytes([0x30, 0x01])
+    assert not sample_columns([later]).plain[0]
+
+
+def test_half_a_sample_is_left_to_protobuf() -> None:
+    whole = Sample(time_ns=1, value=2.0, unit="K", quality=Quality.QUALITY_GOOD).SerializeToString()
+    cuts = [whole[:end] for end in range(1, len(whole))]
+    plain = sample_columns(cuts).plain.tolist()
+    assert plain == [end in (9, 18, 21) for end in range(1, len(whole))]  # between two fields
+
+
+def test_another_message_is_no_plain_sample_unless_its_bytes_are_one() -> None:
+    assert not sample_columns([Alarm(time_ns=1, alarm="ewma/T", text="x").SerializeToString()]).plain[0]

@@ -1,0 +1,52 @@
+"""Fleets that a test makes: plants, monitors, and what each plant's own monitor would have said."""
+
+from collections.abc import Iterable
+
+import msgspec
+
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from monitor_node.fleet import FleetMonitor
+from monitor_node.shards import WHOLE, Crew, Shard
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import Health
+
+from .samples import leaking_run, samples
+
+PLANTS = "reactor/*"
+QUICK = MonitorConfig(training_min=20.0, isolation=False)
+
+
+def of_plant(plant: str, messages: Iterable[Encoded]) -> list[Encoded]:
+    """The messages of another plant."""
+    return [message._replace(key=message.key.replace("reactor/cstr/", f"reactor/{plant}/")) for message in messages]
+
+
+def run_of(plant: str, seed: int, *, leak_min: float | None = None, span_min: float = 40.0) -> list[Encoded]:
+    """What a plant publishes; with a leak of a fifth from a minute on, or without."""
+    size = 0.0 if leak_min is None else -0.2
+    return of_plant(plant, samples(*leaking_run(size, leak_min or 1.0, span_min, seed)))
+
+
+def row_by_row(runs: Iterable[list[Encoded]]) -> list[Encoded]:
+    """The runs of plants that run at the same time: a row of the first, a row of the second, and so on."""
+    rows = zip(*([run[at : at + 3] for at in range(0, len(run), 3)] for run in runs), strict=True)
+    return [message for each in rows for row in each for message in row]
+
+
+def fleet(config: MonitorConfig = QUICK, shard: Shard = WHOLE, name: str = "a", **others: object) -> FleetMonitor:
+    """A monitor of all plants, or of a shard."""
+    return FleetMonitor(config, 0, Crew(PLANTS, shard, name), **others)  # type: ignore[arg-type]
+
+
+def alone(plant: str, messages: Iterable[Encoded], config: MonitorConfig = QUICK) -> list[Publication]:
+    """What the plant's own monitor says."""
+    monitor = Monitor(msgspec.structs.replace(config, plant=plant), 0, points=False)
+    return [said for message in messages for said in monitor.on_message(message, 0)]
+
+
+def of(plant: str, said: Iterable[Publication]) -> list[Publication]:
+    """What was said of a plant, without how its monitor does."""
+    begin = f"{keys.ROOT}/{plant}/"
+    return [item for item in said if item.key.startswith(begin) and not isinstance(item.message, Health)]

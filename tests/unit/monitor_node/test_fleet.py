@@ -1,0 +1,201 @@
+"""The watch over a fleet: each plant is watched as if it were alone, by one monitor."""
+
+import pytest
+
+from monitor_node.config import MonitorConfig
+from monitor_node.shards import Crew, Shard, home
+from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmState, CommandReply, Health, Sample
+from reactorwatch.errors import InputError
+
+from .fleets import PLANTS, QUICK, alone, fleet, of, row_by_row, run_of
+
+SECOND_NS = 1_000_000_000
+
+
+def alarms(said: list[Publication]) -> list[tuple[str, str, int]]:
+    return [(i.key, i.message.event, i.message.time_ns) for i in said if isinstance(i.message, Alarm)]
+
+
+@pytest.fixture(scope="module")
+def runs() -> dict[str, list[Encoded]]:
+    """Three plants; one leaks."""
+    return {"a": run_of("a", 1), "b": run_of("b", 2, leak_min=30.0), "c": run_of("c", 3)}
+
+
+@pytest.fixture(scope="module")
+def expected(runs: dict[str, list[Encoded]]) -> dict[str, list[Publication]]:
+    return {plant: alone(plant, run) for plant, run in runs.items()}
+
+
+def test_each_plant_is_watched_as_if_it_were_alone(
+    runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
+) -> None:
+    monitor = fleet()
+    said = [item for message in row_by_row(runs.values()) for item in monitor.on_message(message, 0)]
+    assert alarms(expected["b"])
+    for plant in runs:
+        assert of(plant, said) == expected[plant]
+
+
+def test_many_messages_together_say_what_each_would_alone(
+    runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
+) -> None:
+    monitor, messages, said = fleet(), row_by_row(runs.values()), list[Publication]()
+    for begin in range(0, len(messages), 700):
+        said += monitor.on_messages(messages[begin : begin + 700], 0)
+    for plant in runs:
+        assert of(plant, said) == expected[plant]
+
+
+def test_a_plant_is_watched_as_soon_as_a_node_of_it_is_alive() -> None:
+    shown: list[tuple[str, bool]] = []
+    monitor = fleet(in_charge=lambda plant, ours: shown.append((plant, ours)))
+    monitor.on_alive("reactor/x/alive/plant", True, 0)
+    assert monitor.plants == ["x"]
+    assert shown == [("x", True)]
+
+
+def test_a_plant_whose_node_goes_is_still_watched() -> None:
+    monitor = fleet()
+    monitor.on_alive("reactor/x/alive/plant", True, 0)
+    monitor.on_alive("reactor/x/alive/plant", False, 1)
+    assert monitor.plants == ["x"]
+
+
+@pytest.mark.parametrize("key", ["weather/x/sample/T", "reactor/x/health/plant", "reactor/@fleet/sample/T"])
+def test_what_is_no_sample_of_a_plant_makes_no_plant(key: str) -> None:
+    monitor = fleet()
+    assert monitor.on_message(Encoded(key, b"", ""), 0) == []
+    assert monitor.plants == []
+
+
+def test_the_health_of_each_plants_monitor_is_told() -> None:
+    monitor = fleet()
+    for plant in ("x", "y"):
+        monitor.on_alive(f"reactor/{plant}/alive/plant", True, 0)
+    told = [item.key for item in monitor.on_tick(SECOND_NS) if isinstance(item.message, Health)]
+    assert sorted(told) == ["reactor/x/health/monitor", "reactor/y/health/monitor"]
+    assert monitor.next_tick_ns() == SECOND_NS + int(QUICK.health_period_s * 1e9)
+
+
+def test_a_plant_that_falls_silent_is_told_of_while_others_go_on(runs: dict[str, list[Encoded]]) -> None:
+    monitor = fleet()
+    for number in range(200):  # rows
+        now_ns = number * SECOND_NS
+        for plant in ("a", "c") if number < 100 else ("c",):
+            monitor.on_messages(runs[plant][3 * number : 3 * number + 3], now_ns)
+        silent = [item for item in monitor.on_tick(now_ns) if isinstance(item.message, Alarm)]
+        if silent:
+            break
+    assert [item.key for item in silent] == ["reactor/a/alarm/silence/plant"]
+    assert number > 100
+
+
+def test_a_command_goes_to_its_plant_and_to_who_watches_it(runs: dict[str, list[Encoded]]) -> None:
+    monitor = fleet(shard=Shard(home("a", 2), 2))
+    payload, encoding = encode_message(AlarmCommand(alarm="ewma/T", by="Ada", comment="seen"))
+    monitor.on_messages(runs["a"][:3] + runs["a"][3:6], 0)
+    reply, _ = monitor.on_command(Encoded("reactor/a/command/comment", payload, encoding), 0)
+    assert isinstance(reply, CommandReply)
+    assert reply.accepted
+    theirs = next(name for name in map(str, range(99)) if home(name, 2) != home("a", 2))
+    assert monitor.on_command(Encoded(f"reactor/{theirs}/command/comment", payload, encoding), 0) == (None, [])
+
+
+def test_settings_that_make_no_monitor_are_refused_before_there_is_a_plant() -> None:
+    with pytest.raises(InputError, match="reference"):
+        fleet(config=MonitorConfig(outputs=("pressure",), priorities={}, reference="process"))
+
+
+# --- sharing -----------------------------------------------------------------------------------------------------
+
+
+def test_shards_together_say_of_each_plant_what_one_monitor_says_once(
+    runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
+) -> None:
+    monitors = [fleet(shard=Shard(number, 3), name=str(number)) for number in (1, 2, 3)]
+    said = [item for message in row_by_row(runs.values()) for each in monitors for item in each.on_message(message, 0)]
+    assert sorted(plant for each in monitors for plant in each.plants) == ["a", "b", "c"]
+    for plant in runs:
+        assert of(plant, said) == expected[plant]
+
+
+def shard_token(number: int) -> str:
+    return Crew(PLANTS, Shard(number, 2), str(number)).token
+
+
+def test_plants_of_a_shard_that_is_gone_are_taken_over_and_given_back() -> None:
+    at_home = home("a", 2)
+    monitor = fleet(shard=Shard(3 - at_home, 2), name="us")
+    monitor.on_alive(shard_token(at_home), True, 0)
+    monitor.on_alive("reactor/a/alive/plant", True, 0)
+    assert monitor.plants == []
+    monitor.on_alive(shard_token(at_home), False, 0)
+    assert monitor.plants == ["a"]
+    monitor.on_alive(shard_token(at_home), True, 0)
+    assert monitor.plants == []
+
+
+def test_a_shard_that_never_came_is_taken_over_after_a_while() -> None:
+    monitor = fleet(shard=Shard(3 - home("a", 2), 2))
+    monitor.on_alive("reactor/a/alive/plant", True, 0)
+    monitor.on_tick(9 * SECOND_NS)
+    assert monitor.plants == []
+    monitor.on_tick(10 * SECOND_NS)
+    assert monitor.plants == ["a"]
+
+
+def test_an_alarm_that_stands_is_not_raised_again_by_who_takes_over_and_is_cleared_when_it_is_over() -> None:
+    run = run_of("b", 2)
+    monitor = fleet(shard=Shard(3 - home("b", 2), 2))
+    state = AlarmState.ALARM_STATE_UNACKNOWLEDGED
+    standing = Alarm(time_ns=1, alarm="ewma/T", state=state, raised_ns=1, incident=4, first_in=True, limit=1.0)
+    payload, encoding = encode_message(standing)
+    monitor.on_alive(shard_token(home("b", 2)), True, 0)
+    monitor.on_message(Encoded("reactor/b/alarm/ewma/T", payload, encoding), 0)
+    monitor.on_alive(shard_token(home("b", 2)), False, 0)
+    said = [item for message in run for item in monitor.on_message(message, 0)]
+    assert [(key, event) for key, event, _ in alarms(said)] == [("reactor/b/alarm/ewma/T", "cleared")]
+
+
+@pytest.mark.parametrize("told_again", [0, 50])
+def test_with_the_state_of_who_died_no_alarm_is_lost_and_none_is_told_twice(
+    told_again: int, runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
+) -> None:
+    run, at_home = runs["b"], home("b", 2)
+    raised_ns = next(time_ns for _, _, time_ns in alarms(expected["b"]))
+    raised_at = next(place for place, item in enumerate(run) if Sample.FromString(item.payload).time_ns == raised_ns)
+    stored_at, died_at = raised_at - 90, raised_at + 30
+    first = fleet(shard=Shard(at_home, 2), name="first")
+    said = first.on_messages(run[:stored_at], 0)
+    state = first.monitor("b").to_bytes()
+    said += first.on_messages(run[stored_at:died_at], 0)
+    second = fleet(shard=Shard(3 - at_home, 2), name="second", stored=lambda _: state)
+    second.on_alive(shard_token(at_home), True, 0)
+    for publication in said:
+        second.on_message(encode(publication), 0)
+    second.on_alive(shard_token(at_home), False, 0)
+    said += second.on_messages(run[stored_at - told_again :], 0)  # what the plant remembers, then what comes
+    assert [item for item in of("b", said) if isinstance(item.message, Alarm)] == [
+        item for item in expected["b"] if isinstance(item.message, Alarm)
+    ]
+
+
+def test_a_state_that_cannot_be_used_is_told_and_the_plant_learned_anew() -> None:
+    monitor = fleet(stored=lambda _: b"rubbish")
+    monitor.on_alive("reactor/x/alive/plant", True, 0)
+    ((plant, line),) = monitor.reports(0)
+    assert plant == "x"
+    assert "learned anew" in line
+
+
+def test_what_is_released_can_be_adopted(
+    runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
+) -> None:
+    first, second, half = fleet(), fleet(), len(runs["b"]) // 2
+    said = first.on_messages(runs["b"][:half], 0)
+    second.adopt("b", first.release("b"), 0)
+    assert first.plants == []
+    said += second.on_messages(runs["b"][half:], 0)
+    assert of("b", said) == expected["b"]
