@@ -11,6 +11,7 @@ Times are minutes of the plant. The numbers of a course are written as its profi
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 from math import atan2, hypot, pi
 from typing import ClassVar, NamedTuple
 
@@ -95,7 +96,15 @@ class Course(ABC):
         return {"size": unit_of_size, "phase": "rad"}.get(name, "min")
 
     def basis(self, shape: Array) -> Signal:
-        """The functions as signals, shape (rows, coefficients)."""
+        """The functions as signals, shape (rows, coefficients), without gaps in memory."""
+        return self._formed(shape) if self.numbers else self._only
+
+    @cached_property
+    def _only(self) -> Signal:
+        """Of a course whose functions no number shapes."""
+        return self._formed(np.empty(0))
+
+    def _formed(self, shape: Array) -> Signal:
         value, area = self.functions(shape)
         over_row = np.append(np.diff(area, axis=0) / self._step[:, None], value[-1:], axis=0)
         return Signal(over_row, value)
@@ -114,6 +123,8 @@ class Course(ABC):
             differences: of the numbers, from which theirs come; at least those of `numbers`.
         """
         basis = self.basis(theta[self.coefficients :])
+        if not self.numbers:
+            return basis
         columns = [basis]
         for place, (number, difference) in enumerate(
             zip(self.numbers, differences, strict=True), start=self.coefficients

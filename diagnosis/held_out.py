@@ -17,7 +17,7 @@ from diagnosis.run import Run
 from diagnosis.search import Explained
 from diagnosis.sized import Sized
 from diagnosis.uncertain import beginning_with
-from reactorwatch.process.filter import Innovations
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator

@@ -18,8 +18,8 @@ from diagnosis.courses import Course, Signal
 from diagnosis.run import Run
 from diagnosis.sized import HUBER, Sized, clipped
 from diagnosis.uncertain import last_state, offsets
-from reactorwatch.process.filter import Innovations
 from reactorwatch.process.filter_errors import Ways
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array
 
 SETTLED = 0.05
@@ -101,7 +101,8 @@ class Hypothesis:
             if not np.any(g) or not np.max(np.abs(g)) < _RUNAWAY:
                 break
             weights = HUBER / np.maximum(np.abs(w), HUBER)
-            information, gradient = (g * weights[:, None]).T @ g + self._least_information(), g.T @ (weights * w)
+            weighted = g * np.sqrt(weights)[:, None]
+            information, gradient = weighted.T @ weighted + self._least_information(), g.T @ (weights * w)
             scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
             information, gradient = information / np.outer(scale, scale), gradient / scale
             before = best

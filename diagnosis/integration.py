@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from diagnosis.run import Run
-from reactorwatch.process.filter import Innovations
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array, ProcessModel
 

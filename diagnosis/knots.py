@@ -43,7 +43,7 @@ def best_resolved(run: Run, hypothesis: Hypothesis, fit: Fit, place: int) -> tup
     for count in range(FEWEST_KNOTS, MOST_KNOTS + 1):
         on_grid = _on_grid(grid, count)
         a = on_grid.T @ sought
-        theta = np.asarray(np.linalg.solve(on_grid.T @ information @ on_grid, a), dtype=np.float64)
+        theta = np.asarray(np.linalg.lstsq(on_grid.T @ information @ on_grid, a, rcond=1e-12)[0], dtype=np.float64)
         promised.append((count * log(run.values) - float(a @ theta), theta))
     _, theta = min(promised, key=lambda item: item[0])
     return Free(run.time_min, theta.size), theta

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from diagnosis.run import Run, doubt_of
 from reactorwatch.process.doubt import Doubt
-from reactorwatch.process.filter import Innovations
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array
 
 

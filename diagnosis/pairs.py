@@ -210,6 +210,8 @@ class PairSearch:
                 for lead in search.chosen(leads, EXCHANGED, least):
                     knots = best.hypothesis.courses[place].coefficients
                     item = self._fitted(_with(best, place, lead, knots), EXCHANGE_STEPS)
+                    if isinstance(lead.course, Free) and item.bic < best.bic + IN_QUESTION:
+                        item = search.resolved(item, EXCHANGE_STEPS)
                     if item.bic < best.bic + NEAR_BEST:
                         keep(known, self._fitted(_parts(item), scan=lead.effect.jumps))
             best = min(known.values(), key=_bic)

@@ -38,6 +38,8 @@ _WELL_INSIDE = 0.6
 EDGE_ROWS = 5
 """Nearer to the ends of the record no onset is looked for."""
 
+_INNER = slice(EDGE_ROWS, -EDGE_ROWS)
+
 
 @dataclass(frozen=True, eq=False)
 class Lead:
@@ -76,6 +78,7 @@ class Screen:
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run) -> None:
         self._model, self._run, self.effects = model, run, tuple(effects)
+        self._errors: dict[Sized, FilterErrors] = {}
         names = model.state_names
         self.direct = tuple(effect for effect in effects if effect.extend(model).state_names == names)
         self.with_memory = tuple(effect for effect in effects if effect not in self.direct)
@@ -140,60 +143,67 @@ class Screen:
     def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit, effects: Sequence[Effect]) -> Ways:
         """Of some effects about the run of a filter."""
         if sized.is_plain and all(effect in self.direct for effect in sized.effects):
-            return self._ways_among_all(sized, signals, fit, effects)
-        extended = sized.model
-        of_rates, of_outputs = [], []
-        for effect in effects:
-            own = sized.size_symbols(effect)
-            if own is None:
-                extended = effect.extend(extended)
-                own = (extended.parameters[-1].symbol,) * 2
-            of_rates.append(own[0])
-            of_outputs.append(own[1])
-        errors = FilterErrors(extended, sized.levels, of_rates, of_outputs)
+            errors, inputs = self._among_all(sized, signals)
+        else:
+            errors, inputs = self._beside(sized), sized.inputs(self._run, signals)
+        errors = errors.with_noise(sized.levels)
         errors.changes = sized.noise.times
-        return ways_between(errors, self._run, sized.inputs(self._run, signals), fit.found, sized.used(self._run))
-
-    def _ways_among_all(self, sized: Sized, signals: Sequence[Signal], fit: Fit, effects: Sequence[Effect]) -> Ways:
-        """Likewise, from one model with all direct effects in it: it is compiled once, whatever is in the filter."""
-        of_all = with_size_inputs(self._model, self.direct)
-        nothing = np.zeros(self._run.time_min.size)
-        by_effect = dict(zip(sized.effects, signals, strict=True))
-        inputs = of_all.inputs(
-            self._run.known_inputs, [by_effect.get(effect, Signal(nothing, nothing)) for effect in self.direct]
-        )
-        errors = of_all.errors.with_noise(sized.levels)
         ways = ways_between(errors, self._run, inputs, fit.found, sized.used(self._run))
         columns = [self.direct.index(effect) for effect in effects]
         return Ways(ways.F, ways.G[:, :, columns], ways.H, ways.D[:, :, columns], ways.K, ways.L_inverse, ways.w)
 
+    def _among_all(self, sized: Sized, signals: Sequence[Signal]) -> tuple[FilterErrors, Array]:
+        """A model with all direct effects in it, and its inputs: it is compiled once, whatever is in the filter."""
+        of_all = with_size_inputs(self._model, self.direct)
+        nothing = np.zeros(self._run.time_min.size)
+        by_effect = dict(zip(sized.effects, signals, strict=True))
+        sizes = [by_effect.get(effect, Signal(nothing, nothing)) for effect in self.direct]
+        return of_all.errors, of_all.inputs(self._run.known_inputs, sizes)
+
+    def _beside(self, sized: Sized) -> FilterErrors:
+        """A filter's model with all direct effects beside those that are in it."""
+        if sized not in self._errors:
+            extended = sized.model
+            of_rates, of_outputs = [], []
+            for effect in self.direct:
+                own = sized.size_symbols(effect)
+                if own is None:
+                    extended = effect.extend(extended)
+                    own = (extended.parameters[-1].symbol,) * 2
+                of_rates.append(own[0])
+                of_outputs.append(own[1])
+            self._errors[sized] = FilterErrors(extended, sized.levels, of_rates, of_outputs)
+        return self._errors[sized]
+
     def _set_in(self, ways: Ways, effects: Sequence[Effect]) -> list[Lead]:
         """Constants, steps, ramps and decays."""
         times, leads = self._run.time_min[1:-1], []
-        beta = self._beta
-        left_of_span = self._step.end_min - times
-        found = signatures.onsets(ways, beta, np.ones_like(beta), 0.5 * beta)
-        inner = slice(EDGE_ROWS, -EDGE_ROWS)
+        constants = self._run.span_min * np.array(DECAYS)
+        found = signatures.onsets(ways, *self._onset_laws(constants))
         for cause, effect in enumerate(effects):
             size, gain = _best(found.step_a[:, cause], found.step_b[:, cause], effect)
             leads.append(Lead(effect, self._constant, size[:1], float(gain[0])))
-            place = EDGE_ROWS + int(np.argmax(gain[inner]))
+            place = EDGE_ROWS + int(np.argmax(gain[_INNER]))
             leads.append(Lead(effect, self._step, np.array([size[place], times[place]]), float(gain[place])))
-            # From the slope of a ramp to the size that it has in the end.
-            ends, b = found.other_a[:, cause] / left_of_span, found.other_b[:, cause] / left_of_span**2
-            size, gain = _best(ends, b, effect)
-            place = EDGE_ROWS + int(np.argmax(gain[inner]))
+            left_of_span = self._step.end_min - times  # from the slope of a ramp to the size that it has in the end
+            ends = found.other_a[0, :, cause] / left_of_span
+            size, gain = _best(ends, found.other_b[0, :, cause] / left_of_span**2, effect)
+            place = EDGE_ROWS + int(np.argmax(gain[_INNER]))
             leads.append(Lead(effect, self._ramp, np.array([size[place], times[place]]), float(gain[place])))
-        for share in DECAYS:
-            constant = share * self._run.span_min
-            gamma = np.exp(-beta / constant)
-            found = signatures.onsets(ways, 1.0 - gamma, gamma, 1.0 - (1.0 - gamma) * constant / beta)
-            for cause, effect in enumerate(effects):
-                size, gain = _best(found.other_a[:, cause], found.other_b[:, cause], effect)
+            for number, constant in enumerate(constants.tolist(), start=1):
+                size, gain = _best(found.other_a[number, :, cause], found.other_b[number, :, cause], effect)
                 place = int(np.argmax(gain[:-EDGE_ROWS]))
                 theta = np.array([size[place], times[place], constant])
                 leads.append(Lead(effect, self._decay, self._decay.limited(theta, -np.inf, np.inf), float(gain[place])))
         return leads
+
+    def _onset_laws(self, constants: Array) -> tuple[Array, Array, Array]:
+        """Of a ramp and of decays, what `signatures.onsets` takes."""
+        step = self._beta
+        left = np.exp(-step / constants[:, None])
+        beta = np.vstack([step, 1.0 - left])
+        mean = np.vstack([0.5 * step, 1.0 - (1.0 - left) * constants[:, None] / step])
+        return beta, np.vstack([np.ones_like(step), left]), mean
 
     def swinging(self, ways: Ways, effects: Sequence[Effect]) -> list[Lead]:
         """The best sine of each cause whose ways these are."""
@@ -218,8 +228,8 @@ class Screen:
             # A row feels the mean of the sine from its time to the next one.
             turn = np.exp(-0.5j * angle * self._period_min) * np.sinc(frequency[inner] * self._period_min)
             total = felt * turn + seen
-            g = signatures.shown(ways, cause, np.ascontiguousarray(both[0][1:-1]), np.ascontiguousarray(both[1][2:]))
-            b = 0.5 * np.sum(g**2, axis=(0, 1)).reshape(KNOWN_PERIODS, 2).sum(axis=1)
+            squares = np.diag(signatures.products(ways, cause, both[0][1:-1], both[1][2:])[1])
+            b = 0.5 * squares.reshape(KNOWN_PERIODS, 2).sum(axis=1)
             b_of = np.exp(np.interp(np.log(1.0 / frequency[inner]), np.log(known), np.log(np.maximum(b, 1e-300))))
             gain = np.abs(total) ** 2 / b_of
             best = int(np.argmax(gain))
@@ -233,8 +243,7 @@ class Screen:
         over_row, at_row = (np.ascontiguousarray(item) for item in course.basis(shape))
         leads = []
         for cause, effect in enumerate(effects):
-            g = signatures.shown(ways, cause, over_row[1:-1], at_row[2:]).reshape(-1, course.coefficients)
-            a, b = g.T @ ways.w.ravel(), g.T @ g
+            a, b = signatures.products(ways, cause, over_row[1:-1], at_row[2:])
             if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
                 continue
             # What is there to one side alone stays there. Of the rest see `_possible`.

@@ -225,7 +225,7 @@ class Search:
     def settle(self, best: Explained) -> None:
         """Take the noise that a hypothesis needs for that of all."""
         signals = best.hypothesis.signals(best.fit)
-        self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd)
+        self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd, self.noise)
 
     def _settled_anew(self, best: Explained) -> bool:
         """Whether another noise goes with its numbers than with the rougher ones it was found with; then it holds."""

@@ -13,10 +13,12 @@ from diagnosis.late_output import Moved, gathered, moved
 from diagnosis.run import Run, doubt_of
 from diagnosis.size_inputs import SizedModel, with_size_inputs
 from diagnosis.wandering import Noise, first_rate_sd, learned, with_wandering
+from reactorwatch.compiled import compiled
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filled import Filled, filled
-from reactorwatch.process.filter import Filter, Innovations, NoiseLevels
+from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors, Ways
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.noise import tune_with
 
@@ -124,13 +126,14 @@ class Sized:
         good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0) & (found.conditional_sd < _CLUELESS * least)
         begins = [int(np.argmax(np.any(known, axis=1))), *run.breaks]
         known[begins] = unseen[begins] = False
-        w = np.where(known & ~good, LOST, np.where(known, found.whitened, np.nan))
         # What was true before the beginning counts as expected: a longer delay must neither gain nor lose by it.
-        spread = np.log(np.where(known & good, found.conditional_sd, np.where(unseen, least, 1.0)))
-        return loss_of(w) + float(np.sum(spread)), w, found
+        loss, w = _judged(known, unseen, good, found.whitened, found.conditional_sd, least)
+        return float(loss), w, found
 
-    def tuned(self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float]) -> Noise:
-        """The noise under which the run is likeliest with these deviations."""
+    def tuned(
+        self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float], nearby: Noise | None = None
+    ) -> Noise:
+        """The noise under which the run is likeliest with these deviations; the search may begin nearby."""
         rows, _ = self._laid_out(run, signals)
         times = self._noise.times
         # It begins anew with a short memory: a model that lacks something makes it seem long, and there it would stay.
@@ -138,7 +141,15 @@ class Sized:
             f"{item.output}.noise": first_rate_sd(item.scale, self._period_min) for item in self._noise.wandering
         }
         found, times = tune_with(
-            self.model, rows.time_min, rows.inputs, rows.measured, smallest_sd, tuple(times), first_sd, rows.doubt
+            self.model,
+            rows.time_min,
+            rows.inputs,
+            rows.measured,
+            smallest_sd,
+            tuple(times),
+            first_sd,
+            rows.doubt,
+            self._levels_of(nearby) if nearby is not None and not nearby.wandering else None,
         )
         of_sensors = len(found.process_sd) - len(times)
         wandering = learned(self._noise.wandering, found.process_sd[of_sensors:], times, self._period_min)
@@ -199,6 +210,31 @@ def ways_between(errors: FilterErrors, run: Run, inputs: Array, found: Innovatio
 def clipped(w: Array) -> Array:
     """Whitened innovations without what is missing and what is far off."""
     return np.asarray(np.clip(np.nan_to_num(w), -HUBER, HUBER))
+
+
+@compiled
+def _judged(
+    known: NDArray[np.bool_],
+    unseen: NDArray[np.bool_],
+    good: NDArray[np.bool_],
+    whitened: Array,
+    sd: Array,
+    least: Array,
+) -> tuple[float, Array]:
+    """Loss and whitened innovations, in one pass: it is done as often as a filter runs."""
+    w = np.full(whitened.shape, np.nan)
+    losses = spread = 0.0
+    for row in range(whitened.shape[0]):
+        for output in range(whitened.shape[1]):
+            if known[row, output]:
+                value = whitened[row, output] if good[row, output] else LOST
+                if good[row, output]:
+                    spread += np.log(sd[row, output])
+                w[row, output], size = value, abs(value)
+                losses += 0.5 * size * size if size < HUBER else HUBER * (size - 0.5 * HUBER)
+            elif unseen[row, output]:
+                spread += np.log(least[output])
+    return losses + spread, w
 
 
 def loss_of(w: Array) -> float:

@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.errors import InputError
-from reactorwatch.process.filter import Innovations
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array, Parameter, ProcessModel, parameter, variable
 
 _OFF, _BEGIN = ".off", ".begin"

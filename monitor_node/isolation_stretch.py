@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from monitor_node.isolation_window import Window
-from reactorwatch.process.filter import Filter, FilterState, Innovations
+from reactorwatch.process.filter import Filter, FilterState
 from reactorwatch.process.filter_record import FilterRecord
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array
 
 HUBER = 4.0

@@ -1,4 +1,4 @@
-"""The files of a recorder: the one that it writes, those that it has written, and what a killed one left behind.
+"""The files of a recorder: the one that it writes, and those that it has written or found (see `remains`).
 
 What is written, and when a file is flushed or a new one begun, is decided elsewhere (`filing`, `head`, `black_box`,
 `retention`); here it is done.
@@ -8,6 +8,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -27,15 +28,12 @@ from recorder.entry import Entry
 from recorder.gaps import GAP, to_metadata
 from recorder.mcap_scan import Scan, Stored, Wanted
 from recorder.mcap_writer import NUMBER, RecordingWriter, check_free, part_of
-from recorder.part_file import PART, PartFile, is_held, left_behind
-from recorder.recover import origin, recover
+from recorder.part_file import PART, PartFile
+from recorder.remains import damaged, make_whole, remains_of
 from recorder.retention import Finished, Limits, to_delete
 from recorder.series import Series
 
 log = structlog.get_logger()
-
-DAMAGED = ".damaged"
-"""The ending of a file left behind from which not all could be recovered: it is kept as long as a recording is."""
 
 
 class RecordingFiles:
@@ -74,7 +72,7 @@ class RecordingFiles:
         self._last_ns = 0
         self._abandoned: list[Path] = []
         first = series.first(datetime.now(UTC))
-        self._left = [] if not series.folder.is_dir() else _left_behind(series)
+        self._left = [] if not series.folder.is_dir() else remains_of(series)
         for copy in self._black_boxes.half_made():
             copy.unlink(missing_ok=True)
         if not self._left:
@@ -93,7 +91,7 @@ class RecordingFiles:
     def recover_left_behind(self) -> None:
         """Have what a killed recorder left behind made whole, while recording goes on."""
         for part in self._left:
-            self._chores.add(f"recovering {part}", lambda part=part: self._recover(part))  # type: ignore[misc]
+            self._chores.add(f"recovering {part}", partial(make_whole, part))
         self._left = []
 
     def begin(self, head: Iterable[Entry], now_ns: int) -> Path:
@@ -119,7 +117,7 @@ class RecordingFiles:
             self._writer.write(entry)
         log.info("recording", file=str(path))
         for part in self._abandoned:
-            self._chores.add(f"recovering {part}", lambda part=part: self._recover(part))  # type: ignore[misc]
+            self._chores.add(f"recovering {part}", partial(make_whole, part))
         self._abandoned = []
         return path
 
@@ -242,33 +240,6 @@ class RecordingFiles:
             return []
         return [path for path in self._series.folder.iterdir() if self._series.owns(path.name) and path.is_file()]
 
-    def _damaged(self) -> list[Path]:
-        ending = PART + DAMAGED
-        there = self._series.folder.glob(f"*{ending}")
-        return [path for path in there if self._series.owns(path.name.removesuffix(ending))]
-
-    def _recover(self, part: Path) -> None:
-        """Make a file whole that was left behind. It is deleted only if nothing but its end is missing."""
-        with left_behind(part):
-            path = part.with_name(part.name.removesuffix(PART))
-            if path.exists() and not _is_of(path, part):
-                path = path.with_name(f"{path.stem}-recovered{path.suffix}")
-            if _is_empty(part):
-                part.unlink()
-                log.info("nothing was in it yet", file=str(part))
-                return
-            try:
-                saved = recover(part, path)
-            except InputError as error:
-                part.rename(part.with_name(part.name + DAMAGED))
-                log.warning("nothing recovered", why=str(error))
-                return
-            if saved.only_cut_off:
-                part.unlink()
-            else:
-                part.rename(part.with_name(part.name + DAMAGED))
-            log.info("recovered", file=str(path), messages=saved.messages, lost=saved.lost)
-
     def _black_box(self, stretch: Stretch) -> None:
         path = self._black_boxes.new(stretch)
         raised = datetime.fromtimestamp(stretch.raised_ns / 1e9, UTC)
@@ -289,7 +260,7 @@ class RecordingFiles:
 
     def _delete_oldest(self, now_ns: int, needed_since_ns: int | None) -> None:
         finished = []
-        for path in (*self._finished(), *self._damaged()):
+        for path in (*self._finished(), *damaged(self._series)):
             told = path.stat()
             finished.append(Finished(path, told.st_size, told.st_mtime_ns))
         for path in to_delete(finished, self.size_bytes, self._limits, now_ns, needed_since_ns):
@@ -301,40 +272,3 @@ def is_alarm(topic: str) -> bool:
     """Whether a topic is that of an alarm."""
     parsed = keys.parse(topic)
     return parsed is not None and parsed.kind == keys.ALARM
-
-
-def _is_empty(part: Path) -> bool:
-    """Whether a file was left behind before anything that it received was handed over."""
-    try:
-        scan = Scan(part)
-        return not any(True for _ in scan) and not scan.orphans and all(damage.cut_off for damage in scan.damages)
-    except InputError:
-        return part.stat().st_size == 0
-
-
-def _is_of(path: Path, part: Path) -> bool:
-    """Whether a file was recovered from another, by a recorder that was killed before it could delete that one."""
-    try:
-        return origin(path) == origin(part) != {}
-    except InputError:
-        return False
-
-
-def _left_behind(series: Series) -> list[Path]:
-    """What killed recorders left behind.
-
-    Raises:
-        InputError: the file that was asked for by name is being written by another recorder.
-    """
-    found = []
-    for part in sorted(series.folder.glob(f"*{PART}")):
-        name = part.name.removesuffix(PART)
-        if series.owns(name):
-            if not is_held(part):
-                found.append(part)
-            elif not series.dated:
-                raise InputError(f"recording {part.with_name(name)}: {part} is being written by another recorder")
-    for copy in series.folder.glob(f".{series.stem}*.tmp{PART}"):
-        if not is_held(copy):
-            copy.unlink(missing_ok=True)  # it was being made when its maker was killed
-    return found

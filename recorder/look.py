@@ -14,8 +14,9 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
 from recorder.gaps import GAP, from_metadata
 from recorder.mcap_chunks import metadata_records
-from recorder.mcap_file import METADATA, ZERO_NS, read_messages, read_metadata, recordings_in
+from recorder.mcap_file import ZERO_NS, read_messages, read_metadata, recordings_in
 from recorder.mcap_scan import Scan
+from recorder.mcap_writer import own_metadata
 from recorder.overview import Overview, overview
 
 
@@ -49,7 +50,7 @@ def look_over(path: Path) -> Look:
         return Look(found, metadata, _zero_ns(metadata, found.first_sample_ns), (), gaps_in(path))
     scan = Scan(path)
     found = overview(stored.entry for stored in scan)
-    metadata = next((record.metadata for record in scan.metadata if record.name == METADATA), {})
+    metadata = own_metadata(scan.metadata)
     damages = [str(damage) for damage in scan.damages]
     if scan.orphans:
         damages.append(f"{scan.orphans} messages of channels that are described nowhere")

@@ -27,6 +27,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
+from reactorwatch.records.reading import reading
 from recorder.entry import Entry
 
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the summary offsets, CRC
@@ -56,13 +57,9 @@ def read_summary(path: Path) -> Summary:
     Raises:
         InputError: the file is not there, is no MCAP file, is cut off, or its index is damaged.
     """
-    try:
+    with reading(path):
         size = path.stat().st_size
         stream = path.open("rb")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     with stream:
         magic = stream.read(len(MCAP0_MAGIC))
         if not magic:

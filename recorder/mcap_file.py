@@ -27,11 +27,11 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS, UNITS, Record
 from recorder.entry import Entry
 from recorder.mcap_chunks import entries, is_in_order, metadata_records, read_summary, sorted_entries, span_ns
-from recorder.mcap_writer import METADATA, RecordingWriter
+from recorder.mcap_writer import RecordingWriter, own_metadata
 from recorder.measurement import measured
 from recorder.turns import in_turn
 
-__all__ = ["METADATA", "RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
+__all__ = ["RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
 
 ZERO_NS = "zero_ns"
 
@@ -120,8 +120,7 @@ def read_metadata(path: Path) -> dict[str, str]:
     Raises:
         InputError: as `read_messages`.
     """
-    first = recordings_in(path)[0]
-    return next((record.metadata for record in metadata_records(first) if record.name == METADATA), {})
+    return own_metadata(metadata_records(recordings_in(path)[0]))
 
 
 def read_record(path: Path, plant: str | None = None) -> Record:

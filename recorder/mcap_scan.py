@@ -21,6 +21,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
+from reactorwatch.records.reading import reading
 from recorder.entry import Entry
 from recorder.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, channel_of, read_summary
 
@@ -102,16 +103,11 @@ class Scan:
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
         self._sure: set[tuple[type, int]] = set()  # channels and schemas that a checksum vouches for
-        try:
-            with path.open("rb") as stream:
-                self._size = os.fstat(stream.fileno()).st_size
-                if not self._size:
-                    raise InputError(f"{path}: expected an MCAP recording, got an empty file")
-                self._bytes = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-        except FileNotFoundError as error:
-            raise InputError(f"{path}: there is no such file") from error
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        with reading(path), path.open("rb") as stream:
+            self._size = os.fstat(stream.fileno()).st_size
+            if not self._size:
+                raise InputError(f"{path}: expected an MCAP recording, got an empty file")
+            self._bytes = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
         self._start = len(MCAP0_MAGIC)
         if self._bytes[: self._start] != MCAP0_MAGIC:
             chunk = self._next_chunk(0)

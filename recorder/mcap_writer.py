@@ -1,14 +1,14 @@
 """Writing recordings as MCAP files; the bytes are those of `mcap_stream`."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
-from mcap.records import Channel
+from mcap.records import Channel, Metadata
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from reactorwatch import __version__
@@ -233,6 +233,11 @@ def check_free(path: Path) -> None:
             f"recording {path}: {part} was left by a recorder that was killed; "
             f"`reactorwatch recover {part}` saves what is whole in it"
         )
+
+
+def own_metadata(records: Iterable[Metadata]) -> dict[str, str]:
+    """What this software wrote about the origin of a file, among all that programs did; empty if it wrote nothing."""
+    return next((record.metadata for record in records if record.name == METADATA), {})
 
 
 @cache

@@ -14,7 +14,7 @@ from pathlib import Path
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from recorder.mcap_scan import Damage, Scan
-from recorder.mcap_writer import METADATA, RecordingWriter
+from recorder.mcap_writer import METADATA, RecordingWriter, own_metadata
 
 RECOVERED = "recovered"
 """In our metadata of a recovered file: what could not be read."""
@@ -99,4 +99,4 @@ def origin(path: Path) -> dict[str, str]:
     """
     scan = Scan(path)
     next(iter(scan), None)
-    return next((record.metadata for record in scan.metadata if record.name == METADATA), {})
+    return own_metadata(scan.metadata)

@@ -58,12 +58,11 @@ def shelve(
     json: Json = False,
 ) -> None:
     """Put an alarm out of sight for a time."""
-    if alarm.startswith(f"{RECORDING}/"):
-        raise InputError(f"alarm {alarm} is the recorder's own, and can be acknowledged and nothing else")
     from reactorwatch.contract.messages_pb2 import ShelveAlarm
 
+    node, told = _addressed(alarm, "shelve")
     command = ShelveAlarm(alarm=alarm, by=by, comment=comment, minutes=minutes)
-    _show(ask(MONITOR, config, endpoint, name, timeout, "shelve", command), json=json)
+    _show(ask(node, config, endpoint, name, timeout, told, command), json=json)
 
 
 def _register(word: str, command: str, description: str) -> None:
@@ -81,12 +80,8 @@ def _register(word: str, command: str, description: str) -> None:
     ) -> None:
         from reactorwatch.contract.messages_pb2 import AlarmCommand
 
+        node, told = _addressed(alarm, command)
         asked = AlarmCommand(alarm=alarm, by=by, comment=comment)
-        node, told = MONITOR, command
-        if alarm.startswith(f"{RECORDING}/"):
-            if command != "acknowledge":
-                raise InputError(f"alarm {alarm} is the recorder's own, and can be acknowledged and nothing else")
-            node, told = RECORDER, ACKNOWLEDGE_RECORDER
         _show(ask(node, config, endpoint, name, timeout, told, asked), json=json)
 
     alarms.command(word, help=description)(act)
@@ -102,6 +97,19 @@ for _word, _command, _description in (
     ("comment", "comment", "Say something about an alarm, with --comment."),
 ):
     _register(_word, _command, _description)
+
+
+def _addressed(alarm: str, command: str) -> tuple[str, str]:
+    """The node that an alarm is of, and the command as that node knows it.
+
+    Raises:
+        InputError: it is the recorder's own alarm, and the command another than to acknowledge.
+    """
+    if not alarm.startswith(f"{RECORDING}/"):
+        return MONITOR, command
+    if command != "acknowledge":
+        raise InputError(f"alarm {alarm} is the recorder's own, and can be acknowledged and nothing else")
+    return RECORDER, ACKNOWLEDGE_RECORDER
 
 
 def _show(reply: "CommandReply", *, json: bool) -> None:

@@ -42,20 +42,16 @@ def ask(
         InputError: no router within the time, or the node refuses.
         NoAnswerError: no such node within the time.
     """
-    import logging
     import threading
 
+    from reactorwatch.cli.onlooker import begin
     from reactorwatch.contract import keys
     from reactorwatch.contract.codec import Encoded, decode, encode_message
     from reactorwatch.contract.messages_pb2 import CommandReply
     from reactorwatch.runtime.bus_zenoh import connect
-    from reactorwatch.runtime.config import BusConfig, read_settings, section
-    from reactorwatch.runtime.logs import configure
     from reactorwatch.runtime.serve import StopSignal
 
-    configure(logging.WARNING)
-    tables = read_settings(config)
-    bus_config = section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    tables, bus_config = begin(config, endpoint)
     try:
         plant = keys.checked_plant(plant or str(tables.get(node, {}).get("plant") or "cstr"))
     except ValueError as error:

@@ -20,6 +20,7 @@ from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.sources import stands_for
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.jobs import Failed, in_order, workers
 
 SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
@@ -172,10 +173,7 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> None:
     Raises:
         InputError: the folder cannot be made or written to.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {folder}: the folder cannot be made: {error.strerror}") from error
+    make_folder(folder, "--out")
     said = {"files": len(rows), "failed": sum(bool(row["error"]) for row in rows), "results": list(rows)}
     table = io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")

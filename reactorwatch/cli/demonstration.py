@@ -25,6 +25,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample
 from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.logs import configure
@@ -142,11 +143,7 @@ def _new_folder(out: Path | None) -> Path:
     folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"--out {folder}: is there already and not empty; choose another, or remove it")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {folder}: the folder cannot be made: {error.strerror}") from error
-    return folder
+    return make_folder(folder, "--out")
 
 
 def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folder: Path, plant: PlantConfig) -> bool:

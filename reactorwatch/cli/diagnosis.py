@@ -17,11 +17,11 @@ from diagnosis.uncertain import stated
 from reactorwatch.cli.diagnosis_drawing import write_drawing
 from reactorwatch.cli.options import existing_recording
 from reactorwatch.cli.sources import process_model, record, signals_of
-from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.csv_file import write_csv
+from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 
@@ -120,12 +120,8 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     Raises:
         InputError: the folder cannot be made or written to.
     """
-    folder = case.folder
-    assert folder is not None
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {folder}: the folder cannot be made: {error.strerror}") from error
+    assert case.folder is not None
+    folder = make_folder(case.folder, "--out")
     catalogue, on_the_bus = effects_of(case.model), case.model.name == PLANT
     files = (str(case.file), str(folder / MODEL), str(folder / EXPERIMENT))
     page = as_page(diagnosis, case.model, catalogue, *files, on_the_bus=on_the_bus)

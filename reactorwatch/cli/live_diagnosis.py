@@ -22,6 +22,7 @@ from reactorwatch.cli.after_alarm import AfterAlarm, Asked, DiagnosisConfig
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.entry import main
@@ -77,11 +78,7 @@ class Diagnoses:
 
     def _written(self, asked: Asked) -> Path:
         """The folder with the samples in it."""
-        folder = self._free_folder(asked.raised_ns)
-        try:
-            folder.mkdir(parents=True)
-        except OSError as error:
-            raise InputError(f"{folder}: the folder cannot be made: {error.strerror}") from error
+        folder = make_folder(self._free_folder(asked.raised_ns), may_exist=False)
         about = {"plant": self._config.plant, "alarm": asked.alarm, "raised_ns": str(asked.raised_ns)}
         with replacing(folder / RECORDING) as temporary, RecordingWriter(temporary, about) as writer:
             for time_ns, item in asked.samples:

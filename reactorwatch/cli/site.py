@@ -83,20 +83,14 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Check a deployment from here: one line a check, with the cure. Ends with 0 if all is well, 1 if not."""
-    import logging
     from datetime import UTC, datetime
 
     import msgspec
 
     from reactorwatch.cli.doctor import examine
-    from reactorwatch.runtime.config import BusConfig, read_settings, section
-    from reactorwatch.runtime.logs import configure
-    from recorder.config import RecorderConfig
+    from reactorwatch.cli.onlooker import begin_beside_recorder
 
-    configure(logging.WARNING)
-    tables = read_settings(config)
-    bus = section(BusConfig, "bus", tables, {"endpoint": endpoint})
-    recorder = section(RecorderConfig, "recorder", tables, {"plant": name})
+    bus, recorder = begin_beside_recorder(config, endpoint, name)
     out = Path(recorder.out)
     folder = out.parent if out.suffix == ".mcap" else out
     is_well = True
@@ -123,16 +117,9 @@ def status(
     as_json: Json = False,
 ) -> None:
     """Show plants, nodes, rates and alarms as they are now, until stopped."""
-    import logging
-
+    from reactorwatch.cli.onlooker import begin_beside_recorder
     from reactorwatch.cli.status import run
-    from reactorwatch.runtime.config import BusConfig, read_settings, section
-    from reactorwatch.runtime.logs import configure
-    from recorder.config import RecorderConfig
 
-    configure(logging.WARNING)
-    tables = read_settings(config)
-    bus = section(BusConfig, "bus", tables, {"endpoint": endpoint})
-    plant = section(RecorderConfig, "recorder", tables, {"plant": name}).plant
+    bus, recorder = begin_beside_recorder(config, endpoint, name)
     # a certificate is for one plant, and what it may not read it gets nothing of
-    run(bus, plant if name is not None or bus.ca is not None else None, seconds, once=once, as_json=as_json)
+    run(bus, recorder.plant if name is not None or bus.ca is not None else None, seconds, once=once, as_json=as_json)

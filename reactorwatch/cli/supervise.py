@@ -17,6 +17,7 @@ from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.joining import VIEWER, Joining, heard_by, joining, open_router, write_node_settings
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.errors import InputError
+from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.model_file import read_extended_model
@@ -127,10 +128,7 @@ def _write_down(
     nodes: Sequence[str],
 ) -> dict[str, Path]:
     """Write the whole settings where the recordings will be, named after the moment as they are; each node's file."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {out}: the folder cannot be made: {error.strerror}") from error
+    make_folder(out, "--out")
     recorder = msgspec.structs.replace(recorder, out=str(out))
     settings = file_for(recorder, datetime.now(UTC)).with_suffix(".toml")
     about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **others}), **recorder.about}

@@ -39,13 +39,8 @@ def view(
 
     # before Rerun is imported: that a viewer is gone ends this command, and is no error of its connection's
     os.environ.setdefault("RUST_LOG", "off")
-    from reactorwatch.runtime.config import BusConfig, read_settings, section
-    from reactorwatch.runtime.logs import configure
-    from recorder.config import RecorderConfig
+    from reactorwatch.cli.onlooker import begin_beside_recorder
     from recorder.dashboard.live import Shown, show
 
-    configure(logging.INFO)
-    tables = read_settings(config)
-    bus = section(BusConfig, "bus", tables, {"endpoint": endpoint})
-    plant = section(RecorderConfig, "recorder", tables, {"plant": name}).plant
-    show(plant, bus, Shown(web=web, bind=bind, port=port), typer.echo)
+    bus, recorder = begin_beside_recorder(config, endpoint, name, logging.INFO)
+    show(recorder.plant, bus, Shown(web=web, bind=bind, port=port), typer.echo)

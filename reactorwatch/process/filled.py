@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.doubt import Doubt
-from reactorwatch.process.filter import LONGEST_GAP_MIN, Innovations
+from reactorwatch.process.filter import LONGEST_GAP_MIN
 from reactorwatch.process.filter_record import LONGEST_ROW_MIN
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array
 
 

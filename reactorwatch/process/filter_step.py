@@ -30,7 +30,7 @@ def row_function(model: ProcessModel) -> ca.Function:
     new: [inputs of the row before, inputs, time of the row, first step, second step, measured, limits]; NaN is a value
     that is missing, and a limit is how many standard deviations off a value may be to correct the state.
     told: [prediction, residual, its standard deviations, whitened residual, what that was divided by, 1 if all went
-    well]; see `filter.Innovations`.
+    well]; see `innovations.Innovations`.
     """
     n_u, n_y = len(model.inputs), len(model.outputs)
     memory, new, constants = _symbols(model, 2 * n_u + 3 + 2 * n_y)

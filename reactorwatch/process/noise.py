@@ -107,6 +107,7 @@ def tune_with(
     learned: Sequence[str],
     first_sd: Mapping[str, float],
     doubt: Doubt | None = None,
+    nearby: NoiseLevels | None = None,
 ) -> tuple[NoiseLevels, dict[str, float]]:
     """The noise levels, and positive parameters of the model, under which a record is likeliest.
 
@@ -119,9 +120,11 @@ def tune_with(
         learned: names of the parameters; the search begins at their values.
         first_sd: by name of a state, its process noise to begin with, where it is not one of those that move alike.
         doubt: ways on which nobody knows when inputs changed; None: there are none.
+        nearby: noise levels that may be near; where they are likelier than what the first rows say, the search begins
+            there.
     """
     smallest = np.asarray(smallest_sd, dtype=float)
-    return _Tuning(model, time_min, inputs, measured, smallest, learned, first_sd, doubt).found()
+    return _Tuning(model, time_min, inputs, measured, smallest, learned, first_sd, doubt).found(nearby)
 
 
 class _Tuning:
@@ -154,11 +157,13 @@ class _Tuning:
         self._first = np.maximum([rough_sensor_sd(column) for column in measured.T], smallest_sd)
         self._filter = Filter(model, NoiseLevels(tuple(self._first.tolist()), (0.0,) * len(model.states)))
 
-    def found(self) -> tuple[NoiseLevels, dict[str, float]]:
+    def found(self, nearby: NoiseLevels | None) -> tuple[NoiseLevels, dict[str, float]]:
         """The best noise levels, and the best values of what else was to be learned."""
         best = self._climbed(self._without_outliers(self._begun()))
         if self._rows > FIRST_ROWS:
             self._take(self._rows)
+            starts = [best.theta] + ([self._near(nearby)] if nearby is not None else [])
+            best = min((self._tried(theta) for theta in starts), key=lambda trial: trial.loss)
             best = self._climbed(self._without_outliers(best))
         for index in self._of_states:
             theta = best.theta.copy()
@@ -168,6 +173,12 @@ class _Tuning:
                 best = without
         theta = self._stepped(best, range(self._n_y)).theta
         return self._levels(theta), self._changes(theta)
+
+    def _near(self, levels: NoiseLevels) -> Array:
+        """Theta there, with noise in every state: out of none no step leads."""
+        sensors = np.maximum(np.log(levels.measurement_sd), self._lowest[: self._n_y])
+        states = np.maximum(np.array(levels.process_sd)[self._states], SHARES[-1] * self._scales)
+        return np.concatenate([sensors, np.log(states), np.log([item.value for item in self._learned])])
 
     def _take(self, rows: int) -> None:
         """Go on with so many rows from the beginning."""

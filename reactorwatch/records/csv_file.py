@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.reading import reading
 from reactorwatch.records.record import UNITS, Record
 
 _MINUTES_PER_UNIT = {"time_min": 1.0, "time_s": 60.0}  # divided by, so that 7 s is the same 7/60 min everywhere
@@ -84,14 +85,11 @@ def write_csv(path: Path, record: Record) -> None:
 
 
 def _text(path: Path) -> str:
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file") from error
-    except IsADirectoryError as error:
-        raise InputError(f"{path}: expected a CSV file, got a folder") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    with reading(path):
+        try:
+            data = path.read_bytes()
+        except IsADirectoryError as error:
+            raise InputError(f"{path}: expected a CSV file, got a folder") from error
     if data.startswith(_MCAP_MAGIC):
         raise InputError(f"{path}: expected a CSV file, got an MCAP recording; give it the ending .mcap")
     if b"\0" in data:

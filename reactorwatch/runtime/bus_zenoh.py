@@ -57,7 +57,7 @@ MOST_GATHERED_BYTES = 1 << 20
 STREAM_PARTS = 3  # of a key: root, plant and kind
 
 HISTORY_WITHIN_S = 10.0
-MOST_ASKED = 4  # times for what was before; what was published while the answers came may be missing
+MOST_ASKED = 12  # times for what was before; on a busy machine answers push out what is published meanwhile
 
 _NUMBERED = struct.Struct("<QQ")  # who published it, and its number in the stream
 

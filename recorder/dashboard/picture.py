@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.loopback import free_port
 from recorder.dashboard.viewer import viewer
 
@@ -70,10 +71,7 @@ def render_tabs(
     Raises:
         InputError: as `render_png`; or the folder cannot be made.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: the folder cannot be made: {error.strerror}") from error
+    make_folder(folder)
     found: list[Path] = []
     deadline = time.monotonic() + deadline_s
     with _Studio.opened(rrd, width, height, deadline) as studio:

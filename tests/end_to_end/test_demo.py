@@ -18,7 +18,8 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Estimate, Faul
 from reactorwatch.records.record import to_time_ns
 from recorder.mcap_file import read_messages
 
-REACTORWATCH = str(Path(sys.executable).with_name("reactorwatch"))
+from .conftest import REACTORWATCH
+
 B = TypeVar("B", bound=Message)
 ONSET_MIN, SPAN_MIN = 150.0, 200.0
 

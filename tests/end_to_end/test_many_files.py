@@ -23,7 +23,7 @@ from tests.cluster import dask_cluster
 
 from .conftest import PATIENCE_S, REACTORWATCH, Command
 
-FILES = 5
+FILES, MORE_FILES = 5, 16
 
 HEARS_CTRL_C = (
     "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
@@ -115,9 +115,13 @@ def test_options_that_cannot_be_meant_are_told_once_and_not_for_each_file(folder
         assert not (folder / "nothing").exists()
 
 
-def test_a_process_that_is_killed_meanwhile_costs_no_result(folder: Path) -> None:
-    arguments = [REACTORWATCH, "diagnose", "run-?.csv", "--json", "--jobs", "2"]
-    with subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=folder) as running:
+def test_a_process_that_is_killed_meanwhile_costs_no_result(folder: Path, tmp_path: Path) -> None:
+    for number in range(MORE_FILES):  # more than is done before we look
+        shutil.copy(folder / "run-0.csv", tmp_path / f"run-{number:02}.csv")
+    arguments = [REACTORWATCH, "diagnose", "run-*.csv", "--json", "--jobs", "2"]
+    with subprocess.Popen(
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    ) as running:
         assert running.stdout is not None
         assert running.stderr is not None
         first = running.stdout.readline()
@@ -126,7 +130,7 @@ def test_a_process_that_is_killed_meanwhile_costs_no_result(folder: Path) -> Non
         complaints = running.stderr.read()
     assert (running.returncode, complaints) == (0, "")
     said = [json.loads(line) for line in (first + rest).splitlines()]
-    assert [item["file"] for item in said] == [f"run-{number}.csv" for number in range(FILES)]
+    assert [item["file"] for item in said] == [f"run-{number:02}.csv" for number in range(MORE_FILES)]
 
 
 def test_ctrl_c_ends_all_processes_and_says_nothing(folder: Path, tmp_path: Path) -> None:

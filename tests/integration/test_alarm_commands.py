@@ -20,7 +20,8 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from tests.unit.monitor_node.samples import leaking_run, samples
 
-REACTORWATCH = str(Path(sys.executable).with_name("reactorwatch"))
+from ..end_to_end.conftest import REACTORWATCH
+
 WITHIN_S = 60.0
 END_MIN = 140.0
 

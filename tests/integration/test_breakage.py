@@ -33,9 +33,7 @@ def run(tmp_path: Path) -> Iterator[LiveRun]:
 
 def test_a_monitor_that_was_frozen_hears_later_what_it_missed(run: LiveRun) -> None:
     """Stopped for longer than its patience with the plant, while it watches."""
-    run.start("recorder")
-    monitor = run.start("monitor")
-    plant = run.start("plant")
+    monitor, plant = run.start_all()
     run.wait_until(18.0)
     monitor.send_signal(signal.SIGSTOP)
     run.wait_until(36.0)
@@ -43,14 +41,11 @@ def test_a_monitor_that_was_frozen_hears_later_what_it_missed(run: LiveRun) -> N
     run.end(plant)
     assert run.health.stalls > 0
     assert run.health.lost == 0
-    assert run.expected_alarms()
     assert run.recorded_alarms() == run.expected_alarms()
 
 
 def test_a_plant_that_is_frozen_is_silent_until_it_goes_on(run: LiveRun) -> None:
-    run.start("recorder")
-    run.start("monitor")
-    plant = run.start("plant")
+    _, plant = run.start_all()
     run.wait_until(20.0)
     plant.send_signal(signal.SIGSTOP)
     run.wait(lambda: [alarm.event for alarm in run.alarms if alarm.alarm == SILENCE][-1:] == ["raised"])
@@ -58,21 +53,17 @@ def test_a_plant_that_is_frozen_is_silent_until_it_goes_on(run: LiveRun) -> None
     run.wait(lambda: [alarm.event for alarm in run.alarms if alarm.alarm == SILENCE][-1:] == ["cleared"])
     run.end(plant)
     assert run.health.lost == 0
-    assert run.expected_alarms()
     assert run.recorded_alarms() == run.expected_alarms()
 
 
 def test_a_router_that_is_killed_and_started_again_costs_no_alarm(run: LiveRun) -> None:
-    run.start("recorder")
-    run.start("monitor")
-    plant = run.start("plant")
+    _, plant = run.start_all()
     for minute in (8.0, 20.0):
         run.wait_until(minute)
         run.router.kill()
         run.router.restart()
     run.end(plant)
     assert run.health.lost == 0
-    assert run.expected_alarms()
     assert run.recorded_alarms() == run.expected_alarms()
 
 
@@ -107,9 +98,7 @@ def memory_mb(process: "subprocess.Popen[bytes]") -> float:
 
 
 def test_a_flood_of_garbage_and_of_large_payloads_is_refused_and_takes_no_memory(run: LiveRun) -> None:
-    run.start("recorder")
-    monitor = run.start("monitor")
-    plant = run.start("plant")
+    monitor, plant = run.start_all()
     run.wait_until(17.0)
     before_mb = memory_mb(monitor)
     flood(run.config)
@@ -117,15 +106,12 @@ def test_a_flood_of_garbage_and_of_large_payloads_is_refused_and_takes_no_memory
     assert memory_mb(monitor) < before_mb + 300.0
     run.end(plant)
     assert run.health.refused_by_reason["payload"] > 0
-    assert run.expected_alarms()
     assert run.recorded_alarms() == run.expected_alarms()
 
 
 def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun, tmp_path: Path) -> None:
     """It has a clock of its own, and lives for the middle half of the run."""
-    run.start("recorder")
-    run.start("monitor")
-    plant = run.start("plant")
+    _, plant = run.start_all()
     other = msgspec.structs.replace(run.plant, seed=99, zero_ns=0, duration_min=0.5 * DURATION_MIN, wait_for=())
     settings = tmp_path / "other.toml"
     write_settings(settings, {"bus": run.config, "plant": other})
@@ -134,5 +120,4 @@ def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun, tmp_path: Path
     assert second.wait(WITHIN_S) == 0
     run.end(plant)
     assert run.health.refused_by_reason["out_of_place"] > 300
-    assert run.expected_alarms()
     assert run.recorded_alarms() == run.expected_alarms()

@@ -5,7 +5,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,22 +24,15 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.site import make_site
 
+from ..end_to_end.conftest import REACTORWATCH
 from .site import WITHIN_S, Site, make, settings
 
-REACTORWATCH = str(Path(sys.executable).with_name("reactorwatch"))
 SHORTLY_S = 0.3
 """For what never comes."""
 
 
 def now() -> datetime.datetime:
     return datetime.datetime.now(datetime.UTC)
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    opened = Site(tmp_path / "site")
-    yield opened
-    opened.close()
 
 
 @contextmanager

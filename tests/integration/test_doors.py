@@ -7,7 +7,6 @@ sent before has come through: a session that leaves has a question answered by t
 import json
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -25,13 +24,6 @@ from .site import WITHIN_S, OneAttempt, Site, make, settings
 SAMPLE = "reactor/cstr/sample/T"
 ALARM = "application/protobuf;reactorwatch.v1.AlarmCommand"
 OTHERS = ("cstr/monitor", "cstr/recorder", "cstr/operator", "cstr/engineer", "cstr/viewer", "other/plant")
-
-
-@pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
-    opened = Site(tmp_path / "site")
-    yield opened
-    opened.close()
 
 
 def sample(payload: bytes) -> Encoded:

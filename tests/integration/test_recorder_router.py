@@ -5,7 +5,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
@@ -27,10 +27,10 @@ from recorder.config import RecorderConfig, ReplayConfig
 from recorder.entry import Entry
 from recorder.mcap_file import RecordingWriter, read_messages
 from recorder.replay import replay
+from tests.running import WITHIN_S, running
 from tests.unit.recorder import golden
 
 ALIVE = "reactor/cstr/alive/recorder"
-WITHIN_S = 20.0
 LINGER_S = 1.0  # a machine busy with other tests may fall silent for longer than the default
 
 
@@ -55,19 +55,6 @@ def client(config: BusConfig) -> Iterator[ZenohBus]:
     assert bus is not None
     yield bus
     bus.close()
-
-
-@contextmanager
-def running(work: Callable[[], object], stop: StopSignal) -> Iterator[None]:
-    """Something in a thread, which is asked to stop at the end and must then end."""
-    thread = threading.Thread(target=work)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join(WITHIN_S)
-    assert not thread.is_alive()
 
 
 def wait_alive(bus: ZenohBus) -> None:

@@ -2,8 +2,6 @@
 
 import json
 import subprocess
-import sys
-from pathlib import Path
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Health
@@ -11,32 +9,27 @@ from reactorwatch.runtime.bus_zenoh import connect_now, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 
+from ..end_to_end.conftest import REACTORWATCH
 from .site import Site
-
-REACTORWATCH = str(Path(sys.executable).with_name("reactorwatch"))
 
 
 def status(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([REACTORWATCH, "status", *arguments], capture_output=True, text=True, check=False)
 
 
-def test_a_viewer_sees_the_nodes_and_the_alarms_of_its_plant(tmp_path: Path) -> None:
-    site = Site(tmp_path / "site")
-    try:
-        monitor, other = site.join("cstr/monitor"), site.join("other/plant")
-        other.announce("reactor/other/alive/plant")
-        monitor.announce("reactor/cstr/alive/monitor")
-        standing = Alarm(time_ns=1, alarm="ewma/T", state=AlarmState.ALARM_STATE_UNACKNOWLEDGED)
-        monitor.answer(
-            "reactor/cstr/command/list_alarms",
-            lambda request: request.reply(CommandReply(accepted=True, alarms=[standing])),
-        )
-        health = Health(time_ns=1, node="monitor", phase="watching")
-        monitor.publish(encode(Publication("reactor/cstr/health/monitor", health)))
-        settings = str(site.folder / "cstr" / "viewer" / "settings.toml")
-        done = status("--config", settings, "--json", "--seconds", "0.5")
-    finally:
-        site.close()
+def test_a_viewer_sees_the_nodes_and_the_alarms_of_its_plant(site: Site) -> None:
+    monitor, other = site.join("cstr/monitor"), site.join("other/plant")
+    other.announce("reactor/other/alive/plant")
+    monitor.announce("reactor/cstr/alive/monitor")
+    standing = Alarm(time_ns=1, alarm="ewma/T", state=AlarmState.ALARM_STATE_UNACKNOWLEDGED)
+    monitor.answer(
+        "reactor/cstr/command/list_alarms",
+        lambda request: request.reply(CommandReply(accepted=True, alarms=[standing])),
+    )
+    health = Health(time_ns=1, node="monitor", phase="watching")
+    monitor.publish(encode(Publication("reactor/cstr/health/monitor", health)))
+    settings = str(site.folder / "cstr" / "viewer" / "settings.toml")
+    done = status("--config", settings, "--json", "--seconds", "0.5")
     assert done.returncode == 0, done.stderr
     (plant,) = json.loads(done.stdout)["plants"]
     assert plant["plant"] == "cstr"

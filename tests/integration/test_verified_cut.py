@@ -4,7 +4,6 @@ import contextlib
 import json
 import threading
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -25,25 +24,12 @@ from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal, serve
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
+from tests.running import WITHIN_S, running
 
-WITHIN_S = 60.0
 PLANT = PlantConfig(
     seed=5, speed=600.0, duration_min=60.0, faults=("coolant_flow:step:-0.08@30min",), wait_for=("monitor", "recorder")
 )
 MONITOR = MonitorConfig(training_min=15.0)
-
-
-@contextlib.contextmanager
-def running(work: Callable[[], object], stop: StopSignal) -> Iterator[None]:
-    """Something in a thread; it is asked to stop at the end and must then end."""
-    thread = threading.Thread(target=work)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join(WITHIN_S)
-    assert not thread.is_alive()
 
 
 def watch(bus_config: BusConfig, stop: StopSignal) -> None:

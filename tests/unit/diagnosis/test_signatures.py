@@ -69,22 +69,25 @@ def test_backwards_sums_are_those_of_the_signatures(name: str, run: Run) -> None
     step = np.diff(run.time_min[1:])
     constant = 12.0
     gamma = np.exp(-step / constant)
-    ramps = signatures.onsets(ways, step, np.ones_like(step), 0.5 * step)
-    decays = signatures.onsets(ways, 1 - gamma, gamma, 1 - (1 - gamma) * constant / step)
+    beta, mean = np.stack([step, 1 - gamma]), np.stack([0.5 * step, 1 - (1 - gamma) * constant / step])
+    set_in = signatures.onsets(ways, beta, np.stack([np.ones_like(step), gamma]), mean)
     over_row, at_row = signatures.sought(ways)
     end_min = float(run.time_min[-1])
     for row in (0, 100, 400):
         onset_min = float(run.time_min[row + 1])
         for course, shape, a, b in (
-            (Step(run.time_min), [onset_min + 1e-9], ramps.step_a, ramps.step_b),
-            (Ramp(run.time_min), [onset_min], ramps.other_a, ramps.other_b),
-            (Decay(run.time_min), [onset_min, constant], decays.other_a, decays.other_b),
+            (Step(run.time_min), [onset_min + 1e-9], set_in.step_a, set_in.step_b),
+            (Ramp(run.time_min), [onset_min], set_in.other_a[0], set_in.other_b[0]),
+            (Decay(run.time_min), [onset_min, constant], set_in.other_a[1], set_in.other_b[1]),
         ):
             size = end_min - onset_min if isinstance(course, Ramp) else 1.0  # the sums are those of a slope of 1
             felt, seen = course.basis(np.array(shape))
             g = size * signatures.shown(ways, 0, felt[1:-1], seen[2:])[:, :, 0]
             assert a[row, 0] == pytest.approx(np.sum(ways.w * g), rel=1e-5, abs=1e-6 * abs(np.sum(np.abs(ways.w * g))))
             assert b[row, 0] == pytest.approx(np.sum(g * g), rel=1e-5)
+            of_w, of_g = signatures.products(ways, 0, size * felt[1:-1], size * seen[2:])
+            assert of_w[0] == pytest.approx(np.sum(ways.w * g), rel=1e-9, abs=1e-12 * np.sum(np.abs(ways.w * g)))
+            assert of_g[0, 0] == pytest.approx(np.sum(g * g), rel=1e-12)
             adjoint = size * (over_row[:, 0] @ felt[1:-1, 0] + at_row[:, 0] @ seen[2:, 0])
             assert adjoint == pytest.approx(np.sum(ways.w * g), rel=1e-6, abs=1e-9 * np.sum(np.abs(ways.w * g)))
 

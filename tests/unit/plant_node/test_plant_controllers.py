@@ -11,29 +11,21 @@ from scipy.optimize import brentq
 
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.controllers import GAIN, TemperatureControl
-from plant_node.core import Plant, Row
+from plant_node.core import Plant
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.runtime.config import section
 from tests.unit.plant_node.reactor import Reactor, coolant_for, resting
+from tests.unit.plant_node.rows import QUIET, column, rows
 
-QUIET = NoiseSd(C=0.0, T=0.0, qc=0.0)
 PERIOD_MIN = 0.1
 FLOWS = (85.0, 90.0, 95.0, 100.0, 103.41, 105.0, 108.0, 111.0)
 
 
 def plant(control: TemperatureControl, **settings: Any) -> Plant:
     return plant_from(PlantConfig(temperature_control=control, **{"noise_sd": QUIET, **settings}))
-
-
-def rows(of: Plant, count: int) -> list[Row]:
-    return [of.next_row() for _ in range(count)]
-
-
-def column(found: list[Row], signal: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    return np.array([row.readings[signal] for row in found])
 
 
 def at(flow_l_min: float, gain_l_min_K: float = GAIN) -> TemperatureControl:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from plant_node.config import NoiseSd, PlantConfig, Resolution
-from plant_node.core import Plant, Row
+from plant_node.core import Plant
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
@@ -19,21 +19,12 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import Record
-
-QUIET = NoiseSd(C=0.0, T=0.0, qc=0.0)
+from tests.unit.plant_node.rows import QUIET, column, rows
 
 
 def plant(model: ProcessModel | None = None, **settings: object) -> Plant:
     values: dict[str, object] = {"noise_sd": QUIET, "scenario": "constant", **settings}
     return plant_from(PlantConfig(**values), model)  # type: ignore[arg-type]
-
-
-def rows(of: Plant, count: int) -> list[Row]:
-    return [of.next_row() for _ in range(count)]
-
-
-def column(found: list[Row], signal: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    return np.array([row.readings[signal] for row in found])
 
 
 def test_same_seed_gives_the_same_rows_bit_for_bit() -> None:

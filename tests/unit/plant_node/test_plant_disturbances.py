@@ -19,8 +19,8 @@ from reactorwatch.process.cstr import cstr
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.steady_state import steady_states
+from tests.unit.plant_node.rows import QUIET
 
-QUIET = NoiseSd(C=0.0, T=0.0, qc=0.0)
 ROWS = 4000
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from plant_node.config import NoiseSd, PlantConfig
+from plant_node.config import PlantConfig
 from plant_node.controllers import LevelControl, TemperatureControl
 from plant_node.core import Plant, Row
 from plant_node.record import plant_from
@@ -14,8 +14,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
 from tests.unit.plant_node.reactor import Reactor, resting
-
-QUIET = NoiseSd(C=0.0, T=0.0, qc=0.0)
+from tests.unit.plant_node.rows import QUIET
 
 
 def plant(gain_per_min: float | None = 2.0, **settings: Any) -> Plant:

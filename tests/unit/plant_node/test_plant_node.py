@@ -24,6 +24,7 @@ from reactorwatch.contract.messages_pb2 import (
 )
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.serve import StopSignal
+from tests.running import WITHIN_S, running
 
 START_NS = 1_700_000_000_000_000_000
 SECOND_NS = 1_000_000_000
@@ -283,20 +284,14 @@ def test_it_waits_for_the_nodes_it_was_told_of_and_serves_commands_while_it_runs
     operator.subscribe("reactor/cstr/sample/*", lambda message: first_sample.set())
     operator.subscribe("reactor/cstr/fault/coolant_flow", lambda message: leak_told.set())
     node = PlantNode(plant_from(config), config, lambda text: None)
-    thread = threading.Thread(target=serve_plant, args=(node, config, bus, stop))
-    thread.start()
-    try:
-        assert plant_alive.wait(20)
+    with running(lambda: serve_plant(node, config, bus, stop), stop):
+        assert plant_alive.wait(WITHIN_S)
         assert not first_sample.is_set()
         monitor.announce("reactor/cstr/alive/monitor")
-        assert first_sample.wait(20)
+        assert first_sample.wait(WITHIN_S)
         question = InjectFault(specification="coolant_flow:step:-0.05")
         operator.ask(Encoded("reactor/cstr/command/inject_fault", *encode_message(question)), 1.0)
-        assert leak_told.wait(20)
-    finally:
-        stop.set()
-        thread.join(20)
-    assert not thread.is_alive()
+        assert leak_told.wait(WITHIN_S)
 
 
 def test_asked_to_stop_while_it_waits_it_stops() -> None:
@@ -308,10 +303,6 @@ def test_asked_to_stop_while_it_waits_it_stops() -> None:
     operator.subscribe("reactor/**", heard.append)
     operator.watch_alive("reactor/cstr/alive/plant", lambda key, is_alive: alive.set())
     node = PlantNode(plant_from(config), config, lambda text: None)
-    thread = threading.Thread(target=serve_plant, args=(node, config, bus, stop))
-    thread.start()
-    assert alive.wait(20)
-    stop.set()
-    thread.join(20)
-    assert not thread.is_alive()
+    with running(lambda: serve_plant(node, config, bus, stop), stop):
+        assert alive.wait(WITHIN_S)
     assert [item.key for item in heard] == ["reactor/cstr/health/plant"]

@@ -12,7 +12,8 @@ from reactorwatch.process.cstr import cstr
 from reactorwatch.process.doubt import Doubt, early_share, variance_of
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.filled import filled
-from reactorwatch.process.filter import Filter, Innovations, NoiseLevels
+from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.noise import tune_with
 

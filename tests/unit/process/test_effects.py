@@ -16,6 +16,7 @@ from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE, PROFILES, RAMP, STEP, Profile, free_profile
 from reactorwatch.process.simulate import Simulator
+from tests.unit.process.effect_named import effect_of
 
 SHAPE = {"onset": 1.2, "end": 3.4, "time_constant": 0.5, "period": 2.5, "phase": 0.4}  # on samples, where min
 SHAPE |= {"time_1": 1.2, "value_1": 0.0, "time_2": 2.5, "value_2": 1.0, "time_3": 4.1, "value_3": -0.4}
@@ -142,14 +143,14 @@ def test_heat_transfer_is_k3() -> None:
     ],
 )
 def test_effects_on_a_constant_are_that_constant_changed(cause: str, changes: dict[str, float]) -> None:
-    effect = next(item for item in EFFECTS if item.name == cause)
+    effect = effect_of(cause)
     found = Simulator(effect.extend(cstr())).run(TIMES, FLOWS, START, {f"{cause}.size": 0.02}).states
     np.testing.assert_allclose(found, Simulator(cstr()).run(TIMES, FLOWS, START, changes).states, rtol=1e-12)
 
 
 def test_heat_loss_is_newton_s_cooling_to_the_surroundings() -> None:
     """With neither reaction nor coolant: dT/dt = q/V (Tf - T) - m (T - 298), whose solution is an exponential."""
-    effect = next(item for item in EFFECTS if item.name == "heat_loss")
+    effect = effect_of("heat_loss")
     model = effect.extend(cstr()).with_values({"k0": 0.0, "K1": 0.0, "K2": 0.0, "heat_loss.size": 0.5})
     rest = (350.0 + 0.5 * 298.0) / 1.5
     found = Simulator(model).run(TIMES, FLOWS, START).outputs[:, 1]
@@ -159,7 +160,7 @@ def test_heat_loss_is_newton_s_cooling_to_the_surroundings() -> None:
 def test_effects_on_the_analyser_change_what_it_shows_and_nothing_else() -> None:
     nominal = Simulator(cstr()).run(TIMES, FLOWS, START)
     for cause, factor, shift in (("concentration_bias", 1.0, 0.01), ("concentration_gain", 1.01, 0.0)):
-        effect = next(item for item in EFFECTS if item.name == cause)
+        effect = effect_of(cause)
         run = Simulator(effect.extend(cstr())).run(TIMES, FLOWS, START, {f"{cause}.size": 0.01})
         np.testing.assert_array_equal(run.states, nominal.states)
         np.testing.assert_array_equal(run.outputs[:, 1], nominal.outputs[:, 1])
@@ -168,7 +169,7 @@ def test_effects_on_the_analyser_change_what_it_shows_and_nothing_else() -> None
 
 def test_profiles_go_in_time_as_they_say() -> None:
     """Read off the bias of the thermometer, which is the profile itself."""
-    bias = next(item for item in EFFECTS if item.name == "temperature_bias")
+    bias = effect_of("temperature_bias")
     since = np.maximum(TIMES - 1.2, 0)
     on = TIMES >= 1.2
     expected = {

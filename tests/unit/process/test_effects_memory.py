@@ -1,17 +1,15 @@
 """Effects that bring memory along, against their physics written out by hand and integrated by scipy."""
 
-from collections.abc import Callable
-from math import exp
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from reactorwatch.process.cstr import OPERATING_STATE, cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.cstr import OPERATING_STATE
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.process.profiles import CONSTANT, STEP
 from reactorwatch.process.simulate import Simulator
+from tests.unit.process import by_hand
+from tests.unit.process.by_hand import Rates, balances, duty, nominal
+from tests.unit.process.effect_named import effect_of, extended
 
 TIMES: Array = np.round(np.arange(200.0) * 0.1, 9)
 FLOWS = np.repeat(np.random.default_rng(11).uniform(90, 111, 20), 10)
@@ -19,38 +17,9 @@ START = np.array(OPERATING_STATE)
 ERROR = np.array([2e-6, 2e-3])
 """mol/l and K: a hundredth of what the sensors' noise is, or less."""
 
-Rates = Callable[[float, Array, float], list[float]]
-
-
-def duty(T: float, qc: float) -> float:
-    return 0.01 * qc * (1 - exp(-700 / qc)) * (350 - T)
-
-
-def reactor(x: Array, cooling: float) -> list[float]:
-    """The balances as the literature has them, the cooling duty given."""
-    C, T = x[:2].tolist()
-    speed = C * exp(-1e4 / T)
-    return [1.0 - C - 7.2e10 * speed, 350 - T + 1.44e13 * speed + cooling]
-
 
 def run(rates: Rates, start: Array, flows: Array = FLOWS, time_min: Array = TIMES) -> Array:
-    """States at the times, the flow of each holding until the next."""
-    states = [start]
-    for begin, end, qc in zip(time_min[:-1], time_min[1:], flows[:-1], strict=True):
-        found = solve_ivp(rates, (begin, end), states[-1], args=(qc,), method="DOP853", rtol=1e-10, atol=1e-11)
-        states.append(found.y[:, -1])
-    return np.array(states)
-
-
-def nominal(t: float, x: Array, qc: float) -> list[float]:
-    return reactor(x, duty(x[1], qc))
-
-
-def extended(cause: str, size: float, base: ProcessModel | None = None, onset_min: float | None = None) -> ProcessModel:
-    effect = next(item for item in EFFECTS if item.name == cause)
-    profile = CONSTANT if onset_min is None else STEP
-    onset = {} if onset_min is None else {f"{cause}.onset": onset_min}
-    return effect.extend(base or cstr(), profile).with_values({f"{cause}.size": size, **onset})
+    return by_hand.run(rates, start, time_min, flows)
 
 
 def outputs(model: ProcessModel) -> Array:
@@ -61,7 +30,7 @@ def outputs(model: ProcessModel) -> Array:
 @pytest.mark.parametrize("m", [0.1, 0.7])
 def test_the_duty_of_a_slow_jacket_follows_its_static_value(m: float) -> None:
     truth = run(
-        lambda t, x, qc: [*reactor(x, x[2]), (duty(x[1], qc) - x[2]) / m],
+        lambda t, x, qc: [*balances(x, x[2]), (duty(x[1], qc) - x[2]) / m],
         np.array([*START, duty(START[1], FLOWS[0])]),
     )
     assert np.all(np.abs(outputs(extended("jacket_lag", m)) - truth[:, :2]) < ERROR)
@@ -126,7 +95,7 @@ def test_an_analyser_shows_what_was_there(m: float, rms: float, worst: float) ->
 @pytest.mark.parametrize("m", [0.003, 0.03])
 def test_lags_below_the_step_of_the_integrator_are_right_to_half_the_noise_of_the_sensors(cause: str, m: float) -> None:
     if cause == "jacket_lag":
-        first, rates = duty(START[1], FLOWS[0]), lambda t, x, qc: [*reactor(x, x[2]), (duty(x[1], qc) - x[2]) / m]
+        first, rates = duty(START[1], FLOWS[0]), lambda t, x, qc: [*balances(x, x[2]), (duty(x[1], qc) - x[2]) / m]
     elif cause == "valve_lag":
         first, rates = FLOWS[0], lambda t, x, qc: [*nominal(t, x, x[2]), (qc - x[2]) / m]
     else:
@@ -148,7 +117,7 @@ def test_a_lag_that_sets_in_right_after_the_flow_has_jumped_begins_with_what_is_
     def rates(t: float, x: Array, qc: float) -> list[float]:
         cooling = x[2] if cause == "jacket_lag" else duty(x[1], x[2] if cause == "valve_lag" else qc)
         followed = {"jacket_lag": duty(x[1], qc), "valve_lag": qc}.get(cause, x[1])
-        return [*reactor(x, cooling), (followed - x[2]) / m]
+        return [*balances(x, cooling), (followed - x[2]) / m]
 
     times = np.append(5.03, TIMES[row + 1 :])
     after = run(rates, np.array([*x, first]), FLOWS[row:], times)[1:, [0, 2] if cause == "temperature_lag" else [0, 1]]
@@ -162,7 +131,7 @@ def test_a_jacket_lags_behind_the_coolant_that_flows_in_either_order(first: str)
     second = "coolant_flow" if first == "jacket_lag" else "jacket_lag"
     found = outputs(extended(second, sizes[second], extended(first, sizes[first])))
     truth = run(
-        lambda t, x, qc: [*reactor(x, x[2]), (duty(x[1], 0.95 * qc) - x[2]) / 0.3],
+        lambda t, x, qc: [*balances(x, x[2]), (duty(x[1], 0.95 * qc) - x[2]) / 0.3],
         np.array([*START, duty(START[1], 0.95 * FLOWS[0])]),
     )
     assert np.all(np.abs(found - truth[:, :2]) < ERROR)
@@ -184,8 +153,7 @@ def test_a_sticking_valve_is_stamped_late_in_either_order() -> None:
 
 def test_two_lags_are_one_behind_the_other() -> None:
     model = extended("valve_lag", 0.3)
-    effect = next(item for item in EFFECTS if item.name == "valve_lag")
-    model = effect.extend(model).with_values({"valve_lag_2.size": 0.2})
+    model = effect_of("valve_lag").extend(model).with_values({"valve_lag_2.size": 0.2})
     truth = run(
         lambda t, x, qc: [*nominal(t, x, x[3]), (qc - x[2]) / 0.2, (x[2] - x[3]) / 0.3],
         np.array([*START, FLOWS[0], FLOWS[0]]),

@@ -1,25 +1,22 @@
 """Effects against the physics written out by hand and integrated by scipy, to a tolerance far below ours."""
 
-from collections.abc import Callable
 from math import exp
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
 from reactorwatch.process.cstr import OPERATING_STATE, cstr
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.level_control import with_level_control
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
+from tests.unit.process.by_hand import duty, run
+from tests.unit.process.effect_named import extended
 
 TIMES: Array = np.cumsum(np.append(0.0, np.random.default_rng(8).choice([0.05, 0.1, 0.2], 150)))
 FLOWS = np.repeat(np.random.default_rng(9).uniform(92, 108, 31), 5)[: TIMES.size]
 START = np.array(OPERATING_STATE)
 ERROR = np.array([2e-6, 2e-3])
 """mol/l and K: a hundredth of what the sensors' noise is, or less."""
-
-Rates = Callable[[float, Array, float], list[float]]
 
 
 def reactor(x: Array, qc: float, q: float = 100, V: float = 100, rate: float = 1.0) -> list[float]:
@@ -28,22 +25,8 @@ def reactor(x: Array, qc: float, q: float = 100, V: float = 100, rate: float = 1
     speed = rate * C * exp(-1e4 / T)
     return [
         q / V * (1.0 - C) - 7.2e10 * speed,
-        q / V * (350 - T) + 1.44e13 * speed + 0.01 * (100 / V) * qc * (1 - exp(-700 / qc)) * (350 - T),
+        q / V * (350 - T) + 1.44e13 * speed + 100 / V * duty(T, qc),
     ]
-
-
-def run(rates: Rates, start: Array, time_min: Array, flows: Array) -> Array:
-    """States at the given times, the flow of each holding until the next."""
-    states = [start]
-    for begin, end, qc in zip(time_min[:-1], time_min[1:], flows[:-1], strict=True):
-        found = solve_ivp(rates, (begin, end), states[-1], args=(qc,), method="DOP853", rtol=1e-11, atol=1e-12)
-        states.append(found.y[:, -1])
-    return np.array(states)
-
-
-def extended(cause: str, size: float, model: ProcessModel | None = None) -> ProcessModel:
-    effect = next(item for item in EFFECTS if item.name == cause)
-    return effect.extend(model or cstr()).with_values({f"{cause}.size": size})
 
 
 def simulated(cause: str, size: float) -> Array:

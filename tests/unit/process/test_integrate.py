@@ -12,22 +12,14 @@ from reactorwatch.process.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.effects.heat_transfer import HeatTransfer
 from reactorwatch.process.integrate import SimulationError, Stepper, step_grid, symbolic_step
-from reactorwatch.process.model import Array
 from reactorwatch.process.profiles import STEP
-
-
-def reactor(_time_min: float, state: Array, coolant_flow: float) -> list[float]:
-    """The equations a second time, by hand."""
-    C, T = state
-    rate = C * np.exp(-1e4 / T)
-    cooling = 0.01 * coolant_flow * (1 - np.exp(-700 / coolant_flow))
-    return [1 - C - 7.2e10 * rate, 350 - T + 1.44e13 * rate + cooling * (350 - T)]
+from tests.unit.process.by_hand import nominal
 
 
 def test_observed_order_is_five() -> None:
     """Halving the step divides the error by 2^5, over a swing after a jump of the coolant flow."""
     span, start = 0.8, np.array([0.08, 441.0])
-    exact = solve_ivp(reactor, (0, span), start, "DOP853", args=(95.0,), rtol=1e-13, atol=1e-13).y[:, -1]
+    exact = solve_ivp(nominal, (0, span), start, "DOP853", args=(95.0,), rtol=1e-13, atol=1e-13).y[:, -1]
     model = cstr()
     step = ArrayFunction(symbolic_step(model))
     x, u, p, _, _, h = step.arguments
@@ -44,7 +36,7 @@ def test_observed_order_is_five() -> None:
 
 def test_error_estimate_is_no_smaller_than_the_error() -> None:
     start, h = np.array([0.08, 441.0]), 0.1
-    exact = solve_ivp(reactor, (0, h), start, "DOP853", args=(95.0,), rtol=1e-13, atol=1e-13).y[:, -1]
+    exact = solve_ivp(nominal, (0, h), start, "DOP853", args=(95.0,), rtol=1e-13, atol=1e-13).y[:, -1]
     model = cstr()
     after, estimate = symbolic_step(model)(start, 95.0, model.values(), 0, 0, h)
     error = np.max(np.abs(np.array(after).ravel() - exact) / [0.1, 10.0])
@@ -55,7 +47,7 @@ def test_stepper_finds_its_way_through_an_ignition() -> None:
     """Almost without coolant the reactor ignites within minutes, and its time constants shrink to seconds."""
     model = cstr()
     start = np.array([0.9, 372.0])
-    exact = solve_ivp(reactor, (0, 3), start, "DOP853", args=(5.0,), rtol=1e-12, atol=1e-12).y[:, -1]
+    exact = solve_ivp(nominal, (0, 3), start, "DOP853", args=(5.0,), rtol=1e-12, atol=1e-12).y[:, -1]
     assert exact[1] > 530
     found = Stepper(model).advance(start, np.array([5.0]), model.values(), 0.0, 3.0)
     assert np.all(np.abs(found - exact) <= [1e-6, 1e-3])

@@ -11,6 +11,7 @@ from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states
+from tests.unit.process.effect_named import effect_of
 
 START = np.array(OPERATING_STATE)
 MEMORY = tuple(effect for effect in EFFECTS if effect.extend(cstr()).at_rest)
@@ -116,7 +117,7 @@ def test_a_short_start_is_one_with_the_memory_at_rest(effect: Effect) -> None:
 
 
 def test_a_start_that_is_neither_whole_nor_without_memory_is_refused() -> None:
-    model = next(effect for effect in EFFECTS if effect.name == "valve_lag").extend(cstr())
+    model = effect_of("valve_lag").extend(cstr())
     with pytest.raises(ValueError, match=r"^start must be 3 finite numbers \(.*\), got \[1\.\]$"):
         Simulator(model).run(np.arange(2.0), np.full(2, 100.0), np.ones(1))
 

@@ -14,6 +14,7 @@ from reactorwatch.process.model import Array
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.csv_file import read_csv
+from tests.unit.process.by_hand import nominal
 
 START = np.array(OPERATING_STATE)
 
@@ -21,14 +22,6 @@ START = np.array(OPERATING_STATE)
 @pytest.fixture(scope="module")
 def simulator() -> Simulator:
     return Simulator(cstr())
-
-
-def reactor(_time_min: float, state: Array, coolant_flow: float) -> list[float]:
-    """The equations a second time, by hand."""
-    C, T = state
-    rate = C * np.exp(-1e4 / T)
-    cooling = 0.01 * coolant_flow * (1 - np.exp(-700 / coolant_flow))
-    return [1 - C - 7.2e10 * rate, 350 - T + 1.44e13 * rate + cooling * (350 - T)]
 
 
 def independent(time_min: Array, flows: Array, method: Literal["LSODA", "DOP853"]) -> Array:
@@ -39,7 +32,7 @@ def independent(time_min: Array, flows: Array, method: Literal["LSODA", "DOP853"
         if last > first:
             part = slice(first, last + 1)
             run = solve_ivp(
-                reactor,
+                nominal,
                 (time_min[first], time_min[last]),
                 states[-1],
                 method,

@@ -18,6 +18,7 @@ from recorder.entry import Entry
 from recorder.files import RecordingFiles
 from recorder.mcap_file import read_messages
 from recorder.node import RecorderNode
+from tests.running import WITHIN_S, running
 from tests.unit.recorder import golden
 
 SECOND = 10**9
@@ -45,16 +46,13 @@ def test_all_that_is_published_is_in_the_file_in_order_and_health_is_in_it_once(
         with writer:
             serve(node, MemoryBus(exchange), stop, subscriptions=(keys.EVERYTHING,), on_ready=ready.set)
 
-    thread = threading.Thread(target=run)
-    thread.start()
-    assert ready.wait(10)
     plant = MemoryBus(exchange)
     published = [encode(publication) for publication in golden.publications()]
-    for message in published:
-        plant.publish(message)
-    plant.publish(Encoded("elsewhere/x", b"", ""))
-    stop.set()
-    thread.join(10)
+    with running(run, stop):
+        assert ready.wait(WITHIN_S)
+        for message in published:
+            plant.publish(message)
+        plant.publish(Encoded("elsewhere/x", b"", ""))
     entries = list(read_messages(tmp_path / "run.mcap"))
     own = [entry for entry in entries if entry.key == "reactor/cstr/health/recorder"]
     others = [entry for entry in entries if entry not in own]

@@ -20,8 +20,7 @@ from reactorwatch.contract.messages_pb2 import (
 from reactorwatch.runtime.audit import audit
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.serve import StopSignal, serve
-
-WITHIN_S = 10.0
+from tests.running import WITHIN_S, running
 
 
 def asked(name: str, command: Message) -> Encoded:
@@ -98,19 +97,11 @@ def test_a_node_s_loop_publishes_the_record_after_the_answer() -> None:
         recorded.set()
 
     MemoryBus(exchange).subscribe("reactor/cstr/audit/**", on_record)
-    thread = threading.Thread(
-        target=serve,
-        args=(Obedient(), MemoryBus(exchange), stop),
-        kwargs={"commands": ("reactor/cstr/command/pause",), "on_ready": ready.set},
-    )
-    thread.start()
-    try:
+    bus, command = MemoryBus(exchange), "reactor/cstr/command/pause"
+    with running(lambda: serve(Obedient(), bus, stop, commands=(command,), on_ready=ready.set), stop):
         assert ready.wait(WITHIN_S)
         MemoryBus(exchange).ask(asked("pause", ReplayCommand(by="Anna")), WITHIN_S)
         assert recorded.wait(WITHIN_S)
-    finally:
-        stop.set()
-        thread.join(WITHIN_S)
     record = decode(heard[0].payload, heard[0].encoding)
     assert isinstance(record, Audit)
     assert (record.by, record.text) == ("Anna", "done")

@@ -12,9 +12,9 @@ from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply, Health
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+from tests.running import WITHIN_S, running
 
 FAR = 10**19
-WITHIN_S = 10.0
 
 
 class Echo:
@@ -50,6 +50,19 @@ class Echo:
         return [Publication("out/stop", Health(time_ns=now_ns))]
 
 
+def listening(node: Echo, exchange: Exchange) -> threading.Thread:
+    """The loop of a node that is finished some day; it hears already."""
+    ready = threading.Event()
+    thread = threading.Thread(
+        target=serve,
+        args=(node, MemoryBus(exchange), StopSignal()),
+        kwargs={"subscriptions": ("in/**",), "on_ready": ready.set},
+    )
+    thread.start()
+    assert ready.wait(WITHIN_S)
+    return thread
+
+
 def test_a_node_that_is_finished_ends_the_loop_with_its_last_words() -> None:
     exchange, said = Exchange(), list[str]()
     MemoryBus(exchange).subscribe("out/*", lambda message: said.append(message.key))
@@ -60,14 +73,8 @@ def test_a_node_that_is_finished_ends_the_loop_with_its_last_words() -> None:
 
 def test_every_message_is_handed_over_in_order() -> None:
     exchange = Exchange()
-    node, speaker, ready = Echo(messages=5000), MemoryBus(exchange), threading.Event()
-    thread = threading.Thread(
-        target=serve,
-        args=(node, MemoryBus(exchange), StopSignal()),
-        kwargs={"subscriptions": ("in/**",), "on_ready": ready.set},
-    )
-    thread.start()
-    assert ready.wait(10)
+    node, speaker = Echo(messages=5000), MemoryBus(exchange)
+    thread = listening(node, exchange)
     for number in range(5000):
         speaker.publish(Encoded(f"in/{number}", b"", ""))
     thread.join(20)
@@ -77,18 +84,10 @@ def test_every_message_is_handed_over_in_order() -> None:
 
 def test_a_question_is_answered_by_the_loop_of_the_node_while_who_asked_waits() -> None:
     exchange, stop, ready = Exchange(), StopSignal(), threading.Event()
-    thread = threading.Thread(
-        target=serve,
-        args=(Echo(), MemoryBus(exchange), stop),
-        kwargs={"commands": ("command/*",), "on_ready": ready.set},
-    )
-    thread.start()
-    try:
+    bus = MemoryBus(exchange)
+    with running(lambda: serve(Echo(), bus, stop, commands=("command/*",), on_ready=ready.set), stop):
         assert ready.wait(WITHIN_S)
         (answer,) = MemoryBus(exchange).ask(Encoded("command/say", b"heard", ""), WITHIN_S)
-    finally:
-        stop.set()
-        thread.join(WITHIN_S)
     assert CommandReply.FromString(answer.payload).text == "heard"
 
 
@@ -107,14 +106,8 @@ def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(
             handled[0] += 1
             return super().on_message(message, now_ns)
 
-    node, speaker, ready = Slow(messages=count), MemoryBus(exchange), threading.Event()
-    thread = threading.Thread(
-        target=serve,
-        args=(node, MemoryBus(exchange), StopSignal()),
-        kwargs={"subscriptions": ("in/**",), "on_ready": ready.set},
-    )
-    thread.start()
-    assert ready.wait(10)
+    node, speaker = Slow(messages=count), MemoryBus(exchange)
+    thread = listening(node, exchange)
     for number in range(count):
         speaker.publish(Encoded(f"in/{number}", bytes(1000), ""))
         ahead[0] = max(ahead[0], number + 1 - handled[0])
@@ -165,15 +158,9 @@ def test_lingering_hears_what_comes_within_it() -> None:
 
 def test_a_node_that_is_finished_holds_nobody_up_who_still_publishes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("reactorwatch.runtime.serve.LARGEST_INBOX", 10)
-    exchange, ready = Exchange(), threading.Event()
+    exchange = Exchange()
     node, speaker = Echo(messages=5), MemoryBus(exchange)
-    serving = threading.Thread(
-        target=serve,
-        args=(node, MemoryBus(exchange), StopSignal()),
-        kwargs={"subscriptions": ("in/*",), "on_ready": ready.set},
-    )
-    serving.start()
-    assert ready.wait(WITHIN_S)
+    serving = listening(node, exchange)
 
     def speak() -> None:
         for _ in range(1000):
@@ -224,15 +211,10 @@ def test_a_question_is_answered_by_the_node() -> None:
 
     asked = Question()
     bus = MemoryBus(exchange)
-    thread = threading.Thread(
-        target=serve, args=(node, bus, stop), kwargs={"commands": ("command/*",), "on_ready": ready.set}
-    )
-    thread.start()
-    assert ready.wait(10)
-    exchange.answerers[0][2](asked)  # type: ignore[arg-type]
-    assert answered.wait(10)
-    stop.set()
-    thread.join(20)
+    with running(lambda: serve(node, bus, stop, commands=("command/*",), on_ready=ready.set), stop):
+        assert ready.wait(WITHIN_S)
+        exchange.answerers[0][2](asked)  # type: ignore[arg-type]
+        assert answered.wait(WITHIN_S)
     assert asked.answer == CommandReply(accepted=True, text="hello")
 
 

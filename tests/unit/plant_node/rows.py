@@ -1,0 +1,17 @@
+"""Rows of a plant, and what is read in them; a plant whose sensors have no noise."""
+
+import numpy as np
+
+from plant_node.config import NoiseSd
+from plant_node.core import Plant, Row
+from reactorwatch.process.model import Array
+
+QUIET = NoiseSd(C=0.0, T=0.0, qc=0.0)
+
+
+def rows(of: Plant, count: int) -> list[Row]:
+    return [of.next_row() for _ in range(count)]
+
+
+def column(found: list[Row], signal: str) -> Array:
+    return np.array([row.readings[signal] for row in found])
