@@ -211,6 +211,25 @@ def change(alarm: Alarm) -> Change:
     return Change(alarm.alarm, alarm.event, alarm.time_ns)
 
 
+def test_what_is_told_again_and_again_waits_on_new_keys_if_there_were_many_lately(
+    bus_config: BusConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.MOST_NEW_KEYS", 2)
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.NEW_KEYS_A_S", 0)
+    heard: SimpleQueue[str] = SimpleQueue()
+    bus = bus_zenoh.connect(bus_config, "test", StopSignal(), passing=("health",))
+    with client(bus_config) as listener:
+        assert bus is not None
+        listener.subscribe("reactor/*/*/monitor", lambda message: heard.put(message.key))
+        for _ in range(2):
+            for plant in "abc":
+                bus.publish(Encoded(f"reactor/{plant}/health/monitor", b"", ""))
+        bus.publish(Encoded("reactor/a/alarm/monitor", b"", ""))
+        keys_heard = [heard.get(timeout=WITHIN_S) for _ in range(5)]
+        bus.close()
+    assert keys_heard == [*["reactor/a/health/monitor", "reactor/b/health/monitor"] * 2, "reactor/a/alarm/monitor"]
+
+
 KILLED_AT = (120, 280, 330)
 """Rows: in training, watching, and while the alarms of the leak stand."""
 

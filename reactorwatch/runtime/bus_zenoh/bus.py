@@ -35,6 +35,8 @@ log = structlog.get_logger()
 FLUSH_WITHIN_S = 10.0
 HEARTBEAT_S = 0.5
 LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that who missed it can ask for it
+MOST_NEW_KEYS, NEW_KEYS_A_S = 1000, 100
+"""Of what is told again and again: keys that are declared at once, and in each second after that."""
 GATHER_AGAIN_S = 0.005
 LARGEST_CHANNEL = 5 * MOST_GATHERED
 MOST_GATHERED_BYTES = 1 << 20
@@ -82,6 +84,8 @@ class ZenohBus:
         self._session = session
         self._voice = voice or session  # by which all is done but listening to what is published
         self._passing = frozenset(passing)
+        self._passing_keys: dict[str, zenoh.Publisher] = {}
+        self._new_keys, self._new_keys_at = float(MOST_NEW_KEYS), time.monotonic()  # that may be declared now
         self._config = config
         self._name = secrets.randbits(64)
         self._keys: dict[str, _Key] = {}
@@ -95,7 +99,7 @@ class ZenohBus:
     def publish(self, message: Encoded) -> None:
         """See `Bus`."""
         if self._passing and message.key.split("/", STREAM_PARTS)[STREAM_PARTS - 1] in self._passing:
-            self._voice.put(message.key, message.payload, encoding=message.encoding)
+            self._pass_on(message)
             return
         with self._publishing:
             key = self._keys.get(message.key)
@@ -106,6 +110,22 @@ class ZenohBus:
             attachment = NUMBERED.pack(self._name, number)
             key.publisher.put(message.payload, encoding=message.encoding, attachment=attachment)
             self._published_at = time.monotonic()
+
+    def _pass_on(self, message: Encoded) -> None:
+        """Publish what is told again and again; on a new key only if there were not too many of those lately.
+
+        A router with 30,000 keys takes 5 ms for what comes on one that was not declared, and 2 ms for a declaration.
+        """
+        publisher = self._passing_keys.get(message.key)
+        if publisher is None:
+            now_s = time.monotonic()
+            self._new_keys = min(self._new_keys + NEW_KEYS_A_S * (now_s - self._new_keys_at), MOST_NEW_KEYS)
+            self._new_keys_at = now_s
+            if self._new_keys < 1:
+                return
+            self._new_keys -= 1
+            publisher = self._passing_keys[message.key] = self._voice.declare_publisher(message.key)
+        publisher.put(message.payload, encoding=message.encoding)
 
     def subscribe(
         self,
