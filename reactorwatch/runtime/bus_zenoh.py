@@ -225,7 +225,7 @@ class ZenohBus:
         """What keeps the order of whole streams; None for less than that."""
         if not _is_of_whole_streams(key_expression):
             return None
-        delivery = Delivery(handler, on_gap or _say_gap)
+        delivery = Delivery(handler, on_gap or _say_gap, self._asked_again)
         self._deliveries.append(delivery)
         return delivery
 
@@ -267,6 +267,14 @@ class ZenohBus:
         while (due_ns := order.due_ns()) is not None:  # what is missing is not waited for
             told += order.overdue(due_ns)
         return [item for item in told if isinstance(item, Encoded)]
+
+    def _asked_again(self, stream: str, since_s: float) -> list[Numbered]:
+        """What publishers remember of a stream."""
+        try:
+            return list(self._remembered(f"{stream}/**", f"_time=[now(-{since_s + 2 * HEARTBEAT_S}s)..]"))
+        except zenoh.ZError as error:  # the bus is being closed, for instance
+            log.info("cannot ask for what is missing", stream=stream, why=_first_line(error))
+            return []
 
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
         """What publishers remember of what they have published."""
