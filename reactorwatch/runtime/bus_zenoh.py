@@ -57,7 +57,8 @@ MOST_GATHERED_BYTES = 1 << 20
 STREAM_PARTS = 3  # of a key: root, plant and kind
 
 HISTORY_WITHIN_S = 10.0
-MOST_ASKED = 12  # times for what was before; on a busy machine answers push out what is published meanwhile
+LONGEST_WAY_S = 5.0  # that a message takes to us; what is missing was published so much before what came instead of it
+MOST_ASKED = 4  # times for what was before; what was published while the answers came may be missing
 
 _NUMBERED = struct.Struct("<QQ")  # who published it, and its number in the stream
 
@@ -271,7 +272,7 @@ class ZenohBus:
     def _asked_again(self, stream: str, since_s: float) -> list[Numbered]:
         """What publishers remember of a stream."""
         try:
-            return list(self._remembered(f"{stream}/**", f"_time=[now(-{since_s + 2 * HEARTBEAT_S}s)..]"))
+            return list(self._remembered(f"{stream}/**", f"_time=[now(-{since_s + LONGEST_WAY_S}s)..]"))
         except zenoh.ZError as error:  # the bus is being closed, for instance
             log.info("cannot ask for what is missing", stream=stream, why=_first_line(error))
             return []
