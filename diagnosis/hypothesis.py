@@ -16,7 +16,7 @@ import numpy as np
 from diagnosis import signatures
 from diagnosis.courses import Course, Signal
 from diagnosis.run import Run
-from diagnosis.sized import HUBER, Sized, clipped
+from diagnosis.sized import HUBER, Known, Sized, clipped
 from diagnosis.uncertain import last_state, offsets
 from reactorwatch.process.filter_errors import Ways
 from reactorwatch.process.innovations import Innovations
@@ -74,13 +74,21 @@ class Hypothesis:
         """How many numbers are fitted."""
         return sum(course.freedom for course in self.courses)
 
-    def at(self, run: Run, theta: Sequence[Array]) -> Fit:
-        """The nearest possible numbers, and what they make of the run."""
+    def at(self, run: Run, theta: Sequence[Array], like: Fit | None = None) -> Fit:
+        """The nearest possible numbers, and what they make of the run.
+
+        Args:
+            run: the record.
+            theta: of each effect.
+            like: with other numbers and the noise that holds now; until theirs make a difference the filter runs alike.
+        """
         theta = tuple(
             course.limited(numbers, effect.lower, effect.upper)
             for course, numbers, effect in zip(self.courses, theta, self.sized.effects, strict=True)
         )
-        loss, w, found = self.sized.follow(run, self._signals(theta))
+        signals = self._signals(theta)
+        known = None if like is None else Known(like.found, _alike(signals, self._signals(like.theta)))
+        loss, w, found = self.sized.follow(run, signals, known)
         return Fit(theta, loss, w, found)
 
     def fit(self, run: Run, start: Sequence[Array], steps: int = MOST_STEPS) -> Fit:
@@ -259,3 +267,12 @@ class Hypothesis:
             moved.append(numbers + change[begin : begin + numbers.size])
             begin += numbers.size
         return moved
+
+
+def _alike(one: Sequence[Signal], other: Sequence[Signal]) -> int:
+    """How many rows there are before the first in which any deviation differs."""
+    rows = len(one[0].at_row)
+    differs = np.zeros(rows, dtype=np.bool_)
+    for mine, theirs in zip(one, other, strict=True):
+        differs |= (mine.over_row != theirs.over_row) | (mine.at_row != theirs.at_row)
+    return int(np.argmax(differs)) if differs.any() else rows

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -16,7 +17,7 @@ from diagnosis.wandering import Noise, first_rate_sd, learned, with_wandering
 from reactorwatch.compiled import compiled
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filled import Filled, filled
-from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors, Ways
 from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array, ProcessModel
@@ -30,6 +31,18 @@ LOST = 100.0
 
 _CLUELESS = 1e6
 """Standard deviations of a sensor: a filter that is less sure of its prediction has lost the plant."""
+
+
+class Known(NamedTuple):
+    """A run of the filter that begins as another one does.
+
+    Attributes:
+        found: it.
+        rows: how many rows are the same.
+    """
+
+    found: Innovations
+    rows: int
 
 
 class Sized:
@@ -111,12 +124,17 @@ class Sized:
             run.known_inputs, [item for place, item in enumerate(signals) if place != self.late]
         )
 
-    def follow(self, run: Run, signals: Sequence[Signal]) -> tuple[float, Array, Innovations]:
-        """Loss, whitened innovations and the filter's run."""
+    def follow(
+        self, run: Run, signals: Sequence[Signal], begun: Known | None = None
+    ) -> tuple[float, Array, Innovations]:
+        """Loss, whitened innovations and the filter's run, of which the first rows may be known."""
         known, least = np.isfinite(run.measured), np.array(self.noise.measurement_sd)
         unseen = np.zeros_like(known)
         rows, by = self._laid_out(run, signals)
-        found = rows.of_record(self._filter.run(rows.time_min, rows.inputs, rows.measured, doubt=rows.doubt))
+        if begun is not None and by is None and rows.own.size == rows.time_min.size:
+            found = self._continued(rows, begun)
+        else:
+            found = rows.of_record(self._filter.run(rows.time_min, rows.inputs, rows.measured, doubt=rows.doubt))
         if by is not None and self.late is not None:
             output = self._output(self.late)
             found = gathered(found, by, output)
@@ -129,6 +147,21 @@ class Sized:
         # What was true before the beginning counts as expected: a longer delay must neither gain nor lose by it.
         loss, w = _judged(known, unseen, good, found.whitened, found.conditional_sd, least)
         return float(loss), w, found
+
+    def _continued(self, rows: Filled, begun: Known) -> Innovations:
+        """The filter's run from where a known one may not be followed further; the numbers are those of a whole run."""
+        last, (time_min, inputs, measured, doubt, _) = begun.rows - 1, rows
+        if last < 0 or not np.all(np.isfinite(begun.found.x[last])) or not np.all(np.isfinite(inputs[last])):
+            return self._filter.run(time_min, inputs, measured, doubt=doubt)
+        if begun.rows == time_min.size:
+            return begun.found
+        x, P = begun.found.x[last].tolist(), begun.found.P[last].ravel().tolist()
+        start = FilterState(float(time_min[last]), tuple(inputs[last].tolist()), tuple(x), tuple(P))
+        rest = slice(begun.rows, None)
+        later = None if doubt is None else doubt.of_rows(rest)
+        found = self._filter.run(time_min[rest], inputs[rest], measured[rest], start=start, doubt=later)
+        both = zip(begun.found, found, strict=True)
+        return Innovations(*(np.concatenate([known[: begun.rows], more]) for known, more in both))
 
     def tuned(
         self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float], nearby: Noise | None = None

@@ -11,6 +11,7 @@ given the levels that suit it, and its own path, in rounds.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from math import log
 
 import casadi as ca
@@ -32,8 +33,8 @@ from reactorwatch.process.model import ProcessModel
 MARGIN = 25.0
 """In BIC, over the best of the catalogue: a forcing may bend more."""
 
-FIRST_REDS, FIRST_LASTS_MIN = (0.001, 0.03, 0.3, 3.0), (3.0, 0.4, 20.0)
-"""Levels that are tried first: red noise in typical sizes of the effect, and how long it lasts, the usual first."""
+FIRST_REDS, FIRST_LASTS_MIN = (0.001, 0.03, 0.3, 3.0), (0.4, 3.0, 20.0)
+"""Levels that are tried first: red noise in typical sizes of the effect, and how long it lasts."""
 
 PLACES, FINALISTS = 5, 3
 """How many places are looked at more closely, and how many of them to the end."""
@@ -162,13 +163,10 @@ def _reference(model: ProcessModel, run: Run, nominal: Fit) -> Reference:
 
 def _first(forcing: Forcing, reference: Reference, run: Run, noise: NoiseLevels) -> _Trial:
     about = forcing.about(reference, run)
-    found = []
-    for clock in range(len(about.clocks)):
-        tried = (Levels(red, FIRST_LASTS_MIN[0], noise.measurement_sd, clock) for red in FIRST_REDS)
-        best = min(map(about.fit, tried), key=lambda item: item.loss)
-        others = (replace(best.levels, lasts_min=lasts_min) for lasts_min in FIRST_LASTS_MIN[1:])
-        found += [best, *map(about.fit, others)]
-    return _Trial(forcing, reference, min(found, key=lambda item: item.loss), reference.size)
+    tried = product(FIRST_REDS, FIRST_LASTS_MIN, range(len(about.clocks)))
+    fits = [about.fit(Levels(red, lasts_min, noise.measurement_sd, clock)) for red, lasts_min, clock in tried]
+    best = min(fits, key=lambda item: item.loss)
+    return _Trial(forcing, reference, best, reference.size)
 
 
 def _best_of_places(trials: Sequence[_Trial]) -> list[_Trial]:

@@ -3,10 +3,15 @@
 import threading
 import time
 from collections.abc import Callable, Iterable
+from itertools import islice
 from typing import NamedTuple
 
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.in_order import Gap, InOrder
+
+MOST_ASKED_FOR = 100
+"""Streams whose publishers are asked again at once: of more than that something is missing when a network broke down,
+and then there would be no end of it."""
 
 
 class Numbered(NamedTuple):
@@ -30,14 +35,24 @@ class Delivery:
 
     Nothing is handed on until `begin`.
 
+    Zenoh recovers what is missing of each key; but of a key that it has just begun to hear it was seen to leave out
+    some, and not to notice. So before anything is given up, its publisher is asked for it once more.
+
     Args:
         handler: gets the messages that go on, as many at a time as there are.
         on_gap: gets told what never came.
+        ask: what was published in a stream in the last so many seconds, as its publishers remember it.
     """
 
-    def __init__(self, handler: Callable[[list[Encoded]], None], on_gap: Callable[[Gap], None]) -> None:
+    def __init__(
+        self,
+        handler: Callable[[list[Encoded]], None],
+        on_gap: Callable[[Gap], None],
+        ask: Callable[[str, float], Iterable[Numbered]] = lambda _stream, _since_s: (),
+    ) -> None:
         self._handler = handler
         self._on_gap = on_gap
+        self._ask = ask
         self._order: InOrder[Encoded] = InOrder(gathering=True, size=lambda item: len(item.payload))
         self._changed = threading.Condition()
         self._closed = False
@@ -109,10 +124,19 @@ class Delivery:
             self._handler(together)
 
     def _give_up_when_due(self) -> None:
-        with self._changed:
-            while not self._closed:
-                due_ns, now_ns = self._order.due_ns(), time.monotonic_ns()
-                if due_ns is None or due_ns > now_ns:
+        asked_ns = 0
+        while True:
+            with self._changed:
+                now_ns, due_ns = time.monotonic_ns(), self._order.due_ns()
+                while not self._closed and (due_ns is None or due_ns > now_ns):
                     self._changed.wait(None if due_ns is None else (due_ns - now_ns) / 1e9)
-                else:
+                    now_ns, due_ns = time.monotonic_ns(), self._order.due_ns()
+                if self._closed:
+                    return
+                waiting = self._order.waiting(now_ns)
+                if all(since_ns <= asked_ns for since_ns in waiting.values()):
                     self._hand_on(self._order.overdue(now_ns))
+                    continue
+                asked_ns = now_ns
+            for stream, since_ns in islice(waiting.items(), MOST_ASKED_FOR):
+                self.receive(list(self._ask(stream, (now_ns - since_ns) / 1e9)))

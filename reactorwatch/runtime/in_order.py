@@ -242,6 +242,18 @@ class InOrder(Generic[Item]):
         self._waiting = {name: state for name, state in self._waiting.items() if state.due_ns is not None}
         return min((state.due_ns for state in self._waiting.values() if state.due_ns is not None), default=None)
 
+    def waiting(self, now_ns: int) -> dict[str, int]:
+        """The streams of which something is overdue, with when the first came that waits for it.
+
+        Not those of which nobody knows how they began: nothing is missing there.
+        """
+        found: dict[str, int] = {}
+        for (_, stream), state in self._waiting.items():
+            if state.due_ns is not None and state.due_ns <= now_ns and state.held and state.expected is not None:
+                since_ns = min(came_ns for came_ns, _ in state.held.values())
+                found[stream] = min(found.get(stream, since_ns), since_ns)
+        return found
+
     def _contiguous(self, state: _Stream[Item]) -> Iterator[Item]:
         while state.expected is not None and state.expected in state.held:
             yield self._released(state, state.expected)

@@ -20,6 +20,7 @@ from reactorwatch.runtime.bus_zenoh.messages import (
     LONGEST_ENCODING,
     NUMBERED,
     STREAM_PARTS,
+    first_line,
     is_of_whole_streams,
     numbered,
     payload_of,
@@ -42,6 +43,7 @@ LARGEST_CHANNEL = 5 * MOST_GATHERED
 MOST_GATHERED_BYTES = 1 << 20
 
 HISTORY_WITHIN_S = 10.0
+LONGEST_WAY_S = 5.0  # that a message takes to us; what is missing was published so much before what came instead of it
 MOST_ASKED = 4  # times for what was before; what was published while the answers came may be missing
 
 
@@ -215,7 +217,7 @@ class ZenohBus:
         """What keeps the order of whole streams; None for less than that."""
         if not is_of_whole_streams(key_expression):
             return None
-        delivery = Delivery(handler, on_gap or _say_gap)
+        delivery = Delivery(handler, on_gap or _say_gap, self._asked_again)
         self._deliveries.append(delivery)
         return delivery
 
@@ -257,6 +259,14 @@ class ZenohBus:
         while (due_ns := order.due_ns()) is not None:  # what is missing is not waited for
             told += order.overdue(due_ns)
         return [item for item in told if isinstance(item, Encoded)]
+
+    def _asked_again(self, stream: str, since_s: float) -> list[Numbered]:
+        """What publishers remember of a stream."""
+        try:
+            return list(self._remembered(f"{stream}/**", f"_time=[now(-{since_s + LONGEST_WAY_S}s)..]"))
+        except zenoh.ZError as error:  # the bus is being closed, for instance
+            log.info("cannot ask for what is missing", stream=stream, why=first_line(error))
+            return []
 
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
         """What publishers remember of what they have published."""

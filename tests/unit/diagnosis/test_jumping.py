@@ -34,3 +34,15 @@ def test_a_size_is_found_between_the_two_moves_that_it_lies_between() -> None:
     found = jumping.fitted(run, hypothesis, (np.array([1.5]),))
     assert found.loss <= truth.loss + 1e-6
     assert found.theta[0][0] == pytest.approx(4.0, abs=0.5)
+
+
+@pytest.mark.parametrize("onset_min", [0.0, 12.34, 99.95, 149.9])
+def test_a_filter_that_goes_on_where_a_later_onset_makes_no_difference_says_the_same(onset_min: float) -> None:
+    run = run_of("valve_stiction:step:6.0@50.23min", rows=1500)
+    hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
+    later = hypothesis.at(run, (np.array([6.0, 149.9]),))
+    numbers = (np.array([6.0, onset_min]),)
+    whole, rest = hypothesis.at(run, numbers), hypothesis.at(run, numbers, later)
+    assert rest.loss == whole.loss
+    for one, other in zip((rest.w, *rest.found), (whole.w, *whole.found), strict=True):
+        np.testing.assert_array_equal(one, other)

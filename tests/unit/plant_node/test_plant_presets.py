@@ -114,8 +114,8 @@ def test_an_unknown_preset_is_refused_with_the_valid_ones(table: dict[str, Any],
 def test_other_nodes_have_no_presets() -> None:
     with pytest.raises(
         InputError,
-        match=r"^settings \[bus\]: unknown key 'preset' \(valid: endpoint, congestion, cache_messages, history_s, "
-        r"ca, certificate, key\)$",
+        match=r"^settings \[bus\]: unknown key 'preset' \(valid: endpoint, routers, congestion, cache_messages, "
+        r"history_s, ca, certificate, key\)$",
     ):
         section(BusConfig, "bus", {"bus": {"preset": "fault-free"}}, {})
 

@@ -51,6 +51,32 @@ def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.Monke
     assert abs(gap.noticed_ns - time.time_ns()) < 3600 * SECOND
 
 
+def test_what_is_missing_is_asked_for_before_it_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(in_order, "PATIENCE_NS", 1_000_000)
+    heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
+    asked: list[tuple[str, float]] = []
+
+    def ask(stream: str, since_s: float) -> list[Numbered]:
+        asked.append((stream, since_s))
+        return [message(number) for number in (0, 1, 3)]
+
+    delivery = Delivery(each(heard), heard.put, ask)
+    delivery.begin()
+    delivery.receive([message(0)])
+    delivery.receive([message(3)])
+    items = [heard.get(timeout=WITHIN_S) for _ in range(4)]
+    delivery.close()
+    assert [item.payload.decode() if isinstance(item, Encoded) else item[2:5] for item in items] == [
+        "0",
+        "1",
+        (2, 2, 1),
+        "3",
+    ]
+    ((stream, since_s),) = asked
+    assert stream == "reactor/x/sample"
+    assert 0.0 < since_s < WITHIN_S
+
+
 def test_what_waits_is_handed_on_when_the_bus_is_closed() -> None:
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     delivery = Delivery(each(heard), heard.put)
