@@ -24,7 +24,7 @@ from reactorwatch.runtime.config import BusConfig
 PAUSE_S = 0.05
 AT_A_TIME = 10
 FLOOD = 20_000
-LARGE = 5
+LARGE = 2
 LARGE_BYTES = 10_000_000
 MADE_UP = 5
 """Names of plants that there are not. Each costs a monitor: a fleet meets whoever is heard of."""
