@@ -5,7 +5,7 @@ publishes garbage run for minutes. From a seed: a quarter of the plants get a la
 monitors and the router are killed and started again, links are cut for seconds, floods come. In the end every sample is
 accounted for, every fault was alarmed once, and memory is flat: see `findings`.
 
-    python -m benchmarks.soak [minutes] [plants] [seed]
+    python -m benchmarks.soak [minutes] [plants] [seed] [rows a second of each plant]
 """
 
 import contextlib
@@ -95,9 +95,10 @@ def main() -> int:
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else MINUTES
     plants = int(sys.argv[2]) if len(sys.argv) > 2 else PLANTS
     seed = int(sys.argv[3]) if len(sys.argv) > 3 else time.time_ns() % 1_000_000
-    plan = drawn(seed, plants, round(60.0 * minutes * ROWS_PER_S), ROWS_PER_S)
+    rows_per_s = float(sys.argv[4]) if len(sys.argv) > 4 else ROWS_PER_S
+    plan = drawn(seed, plants, round(60.0 * minutes * rows_per_s), rows_per_s)
     print(
-        f"seed {seed}: {plants} plants, {plan.rows} rows, {ROWS_PER_S:g} a second, {len(plan.blows)} blows", flush=True
+        f"seed {seed}: {plants} plants, {plan.rows} rows, {rows_per_s:g} a second, {len(plan.blows)} blows", flush=True
     )
     folder = Path(tempfile.mkdtemp(prefix="soak-"))
     findings = soak(plan, folder, tell=True)
