@@ -21,8 +21,8 @@ import msgspec
 from monitor_node.arrivals import Arrivals, Past
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.quiet_plants import QuietPlants
-from monitor_node.quiet_record import QuietForm
+from monitor_node.quiet.form import QuietForm
+from monitor_node.quiet.plants import QuietPlants
 from monitor_node.shards import Crew
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode

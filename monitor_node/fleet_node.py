@@ -9,7 +9,7 @@ import structlog
 from monitor_node import shards
 from monitor_node.alarm_commands import COMMANDS
 from monitor_node.config import MonitorConfig
-from monitor_node.core import NODE
+from monitor_node.core import NODE, Monitor
 from monitor_node.fleet import FleetMonitor
 from monitor_node.fleet_config import FleetConfig
 from monitor_node.fleet_pasts import Pasts
@@ -55,18 +55,23 @@ class FleetNode(FleetMonitor):
         fleet: which plants.
         bus: an open bus.
         start_ns: now.
+        states: where what is remembered of each plant is kept; None: nowhere.
 
     Raises:
-        InputError: a file that the settings name cannot be used, or one that can hold but one plant's state.
+        InputError: settings that do not fit together, or a model that cannot be used.
     """
 
-    def __init__(self, config: MonitorConfig, fleet: FleetConfig, bus: Bus, start_ns: int) -> None:
-        for setting in ("alarm_state_file", "state_file"):
-            if getattr(config, setting) is not None:
-                raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
+    def __init__(
+        self,
+        config: MonitorConfig,
+        fleet: FleetConfig,
+        bus: Bus,
+        start_ns: int,
+        states: FleetStates | None = None,
+    ) -> None:
         self._bus = bus
         self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
-        self._states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
+        self._states = states
         self._pasts = Pasts(bus, self._states, lambda plant, line: log.warning(line, plant=plant))
         self._every_ns = int(config.state_every_s * 1e9)
         self._deaf = len(self.subscriptions)
@@ -221,14 +226,19 @@ def run(config: MonitorConfig, fleet: FleetConfig, bus_config: BusConfig) -> Non
     """Watch the plants until SIGINT or SIGTERM.
 
     Raises:
-        InputError: settings that do not fit together, or that the bus cannot use.
+        InputError: settings that do not fit together, or that the bus cannot use; a folder where nothing can be stored.
     """
+    for setting in ("alarm_state_file", "state_file"):
+        if getattr(config, setting) is not None:
+            raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
+    Monitor(config, 0, points=fleet.points, model=model_on_the_bus(config.model))  # or they make none
+    states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
     with stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop, passing=PASSING, crowded=True)
         if bus is None:
             return
         try:
-            watch(FleetNode(config, fleet, bus, time.time_ns()), bus, stop)
+            watch(FleetNode(config, fleet, bus, time.time_ns(), states), bus, stop)
         finally:
             bus.close()
 

@@ -42,6 +42,7 @@ class FleetStates:
         except InputError as error:
             if not is_full(error):
                 raise InputError(f"state folder {folder}: {error}") from error
+        # A daemon: who does not `close` has nothing to write.
         self._thread = threading.Thread(target=self._write_what_waits, name="states", daemon=True)
         self._thread.start()
 

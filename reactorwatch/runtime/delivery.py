@@ -66,7 +66,7 @@ class Delivery:
             waited, now_ns = order.due_ns(), time.monotonic_ns()
             takes_next, going = order.takes_next, list[Encoded | Gap]()
             for publisher, stream, number, message in came:
-                if takes_next(publisher, stream, message.key, number):
+                if takes_next(publisher, stream, message.key, number, now_ns):
                     going.append(message)
                 else:
                     going += order.arrive(publisher, stream, message.key, number, message, now_ns)

@@ -41,9 +41,10 @@ MOST_LOST = 100_000
 MOST_HELD = 1_000_000
 MOST_HELD_BYTES = 256 << 20
 """Messages of a stream that may wait, and their payload; with more, what is missing is given up."""
-MOST_STREAMS = 10_000
+MOST_STREAMS = 100_000
 MOST_KEYS = 10_000
-"""Streams, and keys of a stream, that are remembered. A publisher that is started anew is another stream."""
+"""Streams, and keys of a stream, that are remembered. A publisher that is started anew is another stream, so is each
+plant of a fleet."""
 
 
 class Gap(NamedTuple):
@@ -116,13 +117,13 @@ class InOrder(Generic[Item]):
         self._waiting: dict[tuple[int, str], _Stream[Item]] = {}  # all in which something waits; perhaps others
         self._gathering = gathering
 
-    def takes_next(self, publisher: int, stream: str, key: str, number: int) -> bool:
+    def takes_next(self, publisher: int, stream: str, key: str, number: int, now_ns: int) -> bool:
         """Take a message in if it is the one that is expected, and nothing waits: it goes on. As nearly always."""
         state = self._streams.get((publisher, stream))
         if state is None or number != state.expected or state.held:
             return False
-        state.keys[key] = number
-        state.expected = number + 1
+        state.note(key, number)
+        state.expected, state.heard_ns = number + 1, now_ns
         return True
 
     def arrive(

@@ -95,8 +95,8 @@ def started(config: BusConfig, folder: Path, shard: str, state: Path | None) -> 
         return subprocess.Popen(command, stderr=said)
 
 
-def crew_is(bus: ZenohBus, count: int) -> Callable[[], None]:
-    """Wait until so many monitors of the fleet are there."""
+def crew_of(bus: ZenohBus) -> Callable[[int], None]:
+    """Waits until so many monitors of the fleet are there."""
     there, changed = set[str](), threading.Condition()
 
     def on_token(key: str, is_alive: bool) -> None:
@@ -106,7 +106,7 @@ def crew_is(bus: ZenohBus, count: int) -> Callable[[], None]:
 
     bus.watch_alive(f"{keys.ROOT}/{keys.FLEET}/**", on_token)
 
-    def wait() -> None:
+    def wait(count: int) -> None:
         with changed:
             assert changed.wait_for(lambda: len(there) == count, WITHIN_S), there
 
@@ -118,7 +118,7 @@ def test_plants_are_discovered_by_their_tokens_and_by_their_samples(bus_config: 
         watchers, health = Watchers(), SimpleQueue[str]()
         bus.watch_alive("reactor/*/alive/monitor", watchers.on_token)
         bus.subscribe("reactor/*/health/monitor", lambda message: health.put(message.key))
-        crew_is(bus, 1)()
+        crew_of(bus)(1)
         bus.announce("reactor/alpha/alive/plant")
         watchers.wait_for({"alpha"})
         bus.publish(run_of("beta", 1, span_min=1.0)[0])
@@ -132,7 +132,8 @@ def test_one_monitor_answers_a_command_and_that_of_the_plant(bus_config: BusConf
     with client(bus_config) as bus, monitor(bus_config, tmp_path, "1/2"), monitor(bus_config, tmp_path, "2/2"):
         watchers = Watchers()
         bus.watch_alive("reactor/*/alive/monitor", watchers.on_token)
-        crew_is(bus, 2)()
+        crew_are = crew_of(bus)
+        crew_are(2)
         for plant in PLANTS:
             bus.announce(f"reactor/{plant}/alive/plant")
         watchers.wait_for(set(PLANTS))
@@ -151,7 +152,8 @@ def test_the_plants_of_a_monitor_that_is_killed_are_taken_over(bus_config: BusCo
     ):
         watchers = Watchers()
         bus.watch_alive("reactor/*/alive/monitor", watchers.on_token)
-        crew_is(bus, 2)()
+        crew_are = crew_of(bus)
+        crew_are(2)
         for plant in PLANTS:
             bus.announce(f"reactor/{plant}/alive/plant")
         watchers.wait_for(set(PLANTS))
@@ -159,7 +161,7 @@ def test_the_plants_of_a_monitor_that_is_killed_are_taken_over(bus_config: BusCo
         bus.subscribe("reactor/*/alarm/**", lambda message: alarms.put(_raised(message)))
         second.send_signal(signal.SIGKILL)
         second.wait()
-        crew_is(bus, 1)()
+        crew_are(1)
         watchers.wait_for(set(PLANTS))
         for plant in PLANTS:
             for message in run_of(plant, 2, leak_min=30.0, span_min=35.0):
@@ -209,6 +211,25 @@ def change(alarm: Alarm) -> Change:
     return Change(alarm.alarm, alarm.event, alarm.time_ns)
 
 
+def test_what_is_told_again_and_again_waits_on_new_keys_if_there_were_many_lately(
+    bus_config: BusConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.MOST_NEW_KEYS", 2)
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.NEW_KEYS_A_S", 0)
+    heard: SimpleQueue[str] = SimpleQueue()
+    bus = bus_zenoh.connect(bus_config, "test", StopSignal(), passing=("health",))
+    with client(bus_config) as listener:
+        assert bus is not None
+        listener.subscribe("reactor/*/*/monitor", lambda message: heard.put(message.key))
+        for _ in range(2):
+            for plant in "abc":
+                bus.publish(Encoded(f"reactor/{plant}/health/monitor", b"", ""))
+        bus.publish(Encoded("reactor/a/alarm/monitor", b"", ""))
+        keys_heard = [heard.get(timeout=WITHIN_S) for _ in range(5)]
+        bus.close()
+    assert keys_heard == [*["reactor/a/health/monitor", "reactor/b/health/monitor"] * 2, "reactor/a/alarm/monitor"]
+
+
 KILLED_AT = (120, 280, 330)
 """Rows: in training, watching, and while the alarms of the leak stand."""
 
@@ -224,8 +245,8 @@ def test_kills_of_monitors_that_share_a_folder_neither_lose_an_alarm_nor_tell_on
     (tmp_path / "states").mkdir()
     processes = {shard: started(bus_config, tmp_path, f"{shard}/2", tmp_path / "states") for shard in (1, 2)}
     with client(bus_config) as bus:
-        told, wait_for_both = Told(bus), crew_is(bus, 2)
-        wait_for_both()
+        told, crew_are = Told(bus), crew_of(bus)
+        crew_are(2)
         try:
             for row in range(len(runs["alpha"]) // 3):
                 for run in runs.values():
@@ -236,9 +257,9 @@ def test_kills_of_monitors_that_share_a_folder_neither_lose_an_alarm_nor_tell_on
                     shard = 1 + KILLED_AT.index(row) % 2
                     processes[shard].kill()
                     processes[shard].wait()
-                    crew_is(bus, 1)()
+                    crew_are(1)
                     processes[shard] = started(bus_config, tmp_path, f"{shard}/2", tmp_path / "states")
-                    crew_is(bus, 2)()
+                    crew_are(2)
             told.wait_for(len(runs["alpha"]) // 3, sum(map(len, expected.values())))
             for process in processes.values():
                 process.terminate()

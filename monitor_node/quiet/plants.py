@@ -1,30 +1,21 @@
-"""Plants in which nothing happens, held as arrays: a record of numbers each, and a ring of their newest rows.
+"""The quiet plants as a fleet sees them: they come and go, samples come in, and what is to be said goes out."""
 
-A plant comes here from its monitor when it is past its training and at rest (`take`). Its samples are then lined up and
-its rows judged many at a time (see `quiet_rows`). As soon as something is out of the ordinary it goes back to a monitor
-of its own (`give`), which does not know that it ever was away: all that it would remember is put together from the
-record, and the row in question is its to judge. So what is said of a plant is the same, value for value, whoever
-watches it.
-
-Held here are plants that are judged by the filter of a process model, with Shewhart, EWMA, CUSUM and MEWMA charts, as
-by default; others keep their monitors.
-"""
-
-from math import prod
-from mmap import mmap
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node import quiet_rows
 from monitor_node.alignment import Counts, Row
 from monitor_node.config import MonitorConfig
 from monitor_node.core import LARGEST_SAMPLE, NODE, STALL_NS, USABLE, Monitor, Receipt, health_of
 from monitor_node.monitor_state import sealed, settings_of
-from monitor_node.quiet_record import COUNTS, NewestRows, QuietForm, Rest, kept_spacings
-from monitor_node.quiet_rows import NEW_MINUTE, Records
+from monitor_node.quiet.form import QuietForm
+from monitor_node.quiet.lining_up import COUNTS
+from monitor_node.quiet.ring import kept_spacings
+from monitor_node.quiet.rows import NEW_MINUTE, judge, prepare
+from monitor_node.quiet.samples import silent_from, take_samples
+from monitor_node.quiet.slots import NEVER_NS, Slots
 from monitor_node.references import GATE
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
@@ -36,16 +27,11 @@ from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 
-FIRST_ROOM = 16
-"""Plants that there is room for at first; it doubles."""
-
 MOST_HEALTHS = 20
 """Plants whose health is told at a time, so that samples need not wait for thousands."""
 
 LOOK_AGAIN_NS = 250_000_000
 """By then it is seen again which plants are overdue; samples that came meanwhile may have made it earlier."""
-
-NEVER_NS = 2**63 - 1
 
 _SAMPLE = encoding_of(Sample)
 
@@ -77,33 +63,23 @@ class QuietPlants:
         self._form, self._config, self._model = form, config, model
         self._settings = settings_of(config, model, points=False)
         self._signals = (config.input, *config.outputs)
-        self._slots: dict[str, int] = {}
-        self._names: list[str] = []
-        self._rests: list[Rest | None] = []
-        self._free: list[int] = []
-        self._codes: dict[str, int] = {}  # of a key of samples: slot times signals plus signal
+        self._slots = Slots(form, self._signals)
         self._rows = RowCode(row_function(model))
         self._parameters = model.values()
         self._scratch = np.zeros(1, form.record)
         self._shared: dict[Any, Any] = {}  # parts of `Rest`, which are equal for many plants, are kept once
-        self._used: NDArray[np.int64] | None = None
-        self._plants: Records
-        self._times: NDArray[np.int32]
-        self._ring: NDArray[np.float64]
-        self._health_due_ns: NDArray[np.int64] = np.empty(0, np.int64)
         self._overdue_ns, self._looked_ns = NEVER_NS, 0  # when the first was overdue, and when that was seen
-        self._room(FIRST_ROOM)
 
     def __contains__(self, plant: str) -> bool:
-        return plant in self._slots
+        return plant in self._slots.of
 
     def __len__(self) -> int:
-        return len(self._slots)
+        return len(self._slots.of)
 
     @property
     def plants(self) -> list[str]:
         """Those that are here."""
-        return list(self._slots)
+        return list(self._slots.of)
 
     # --- coming and going ------------------------------------------------------------------------------------
 
@@ -122,14 +98,14 @@ class QuietPlants:
         spacings = kept_spacings(rows.times_ns, usual_ns)
         if spacings is None:
             return False
-        slot = self._slot(plant)
-        self._plants[slot] = self._scratch[0]
-        self._health_due_ns[slot] = self._scratch[0]["health_due_ns"]
-        p, count = self._plants[slot], len(rows.times_ns)
+        slot = self._slots.take(plant)
+        self._slots.plants[slot] = self._scratch[0]
+        self._slots.health_due_ns[slot] = self._scratch[0]["health_due_ns"]
+        p, count = self._slots.plants[slot], len(rows.times_ns)
         p["unit_ns"], p["usual_ns"], p["kept"], p["head"] = spacings[0], usual_ns, count, count % self._form.keeps
-        self._times[slot, :count], self._ring[slot, :count] = spacings[1], rows.values
+        self._slots.times[slot, :count], self._slots.ring[slot, :count] = spacings[1], rows.values
         shared = self._shared.setdefault
-        self._rests[slot] = rest._replace(
+        self._slots.rests[slot] = rest._replace(
             units=shared(rest.units, rest.units),
             checks=shared(rest.checks, rest.checks),
             cause=shared(rest.cause, rest.cause),
@@ -138,19 +114,18 @@ class QuietPlants:
 
     def state_of(self, plant: str) -> bytes:
         """What a monitor of a plant's own would store of it."""
-        slot = self._slots[plant]
-        rest = self._rests[slot]
-        assert rest is not None
-        state = self._form.read(plant, self._plants[slot], rest, self._newest(slot), [])
+        slot = self._slots.of[plant]
+        rest, rows = self._slots.rest(slot), self._slots.newest(slot)
+        state = self._form.read(plant, self._slots.plants[slot], rest, rows, [])
         return sealed(msgspec.structs.replace(state, settings=self._settings | {"plant": plant}))
 
     def received_of(self, plant: str) -> int:
         """How many messages of a plant came."""
-        return int(self._plants["received"][self._slots[plant]])
+        return int(self._slots.plants["received"][self._slots.of[plant]])
 
     def not_stored(self, plant: str) -> None:
         """Count that what is remembered of a plant could not be stored."""
-        self._plants["not_stored"][self._slots[plant]] += 1
+        self._slots.plants["not_stored"][self._slots.of[plant]] += 1
 
     def give(self, plant: str) -> Monitor:
         """Give a plant to a monitor of its own."""
@@ -163,70 +138,29 @@ class QuietPlants:
             plant: the one that is here; no alarm of it ever came up.
             name: of the other.
         """
-        of, slot = self._slots[plant], self._slot(name)
-        rest = self._rests[of]
-        assert rest is not None
-        self._plants[slot], self._rests[slot] = self._plants[of], rest._replace(runs=bytes(bytearray(rest.runs)))
-        self._times[slot], self._ring[slot] = self._times[of], self._ring[of]
-        self._health_due_ns[slot] = self._health_due_ns[of]
-
-    def _slot(self, plant: str) -> int:
-        if self._free:
-            slot = self._free.pop()
-            self._names[slot] = plant
-        else:
-            slot = len(self._names)
-            if slot == len(self._plants):
-                self._room(2 * slot)
-            self._names.append(plant)
-            self._rests.append(None)
-        self._slots[plant], self._used = slot, None
-        for place, signal in enumerate(self._signals):
-            self._codes[keys.key(plant, keys.SAMPLE, signal)] = slot * len(self._signals) + place
-        return slot
-
-    def _room(self, plants: int) -> None:
-        """Make room for so many."""
-        form, before = self._form, len(self._names)
-        records, times = _zeros((plants,), form.record), _zeros((plants, form.keeps), np.dtype(np.int32))
-        ring = _zeros((plants, form.keeps, form.columns), np.dtype(np.float64))
-        if before:
-            records[:before], times[:before], ring[:before] = self._plants, self._times, self._ring
-        self._plants, self._times, self._ring = records, times, ring
-        due_ns = np.full(plants, NEVER_NS)
-        due_ns[:before] = self._health_due_ns[:before]
-        self._health_due_ns = due_ns
+        of, slot = self._slots.of[plant], self._slots.take(name)
+        slots = self._slots
+        slots.plants[slot], slots.times[slot], slots.ring[slot] = slots.plants[of], slots.times[of], slots.ring[of]
+        slots.health_due_ns[slot] = slots.health_due_ns[of]
+        rest = slots.rest(of)
+        slots.rests[slot] = rest._replace(runs=bytes(bytearray(rest.runs)))
 
     def _give(self, plant: str, waiting: list[Row]) -> Monitor:
-        slot, self._used = self._slots.pop(plant), None
-        p, rest = self._plants[slot], self._rests[slot]
-        assert rest is not None
+        slot = self._slots.of[plant]
+        p, rows = self._slots.plants[slot], self._slots.newest(slot)
         monitor = Monitor(msgspec.structs.replace(self._config, plant=plant), 0, points=False, model=self._model)
-        monitor.restore(self._form.read(plant, p, rest, self._newest(slot), [row.time_ns for row in waiting]))
+        monitor.restore(self._form.read(plant, p, self._slots.rest(slot), rows, [row.time_ns for row in waiting]))
         monitor.caught_up()
-        p["health_due_ns"] = self._health_due_ns[slot]
+        p["health_due_ns"] = self._slots.health_due_ns[slot]
         monitor.receipt = Receipt(*(p[name].item() for name in Receipt._fields))
-        self._health_due_ns[slot] = NEVER_NS
-        for signal in self._signals:
-            del self._codes[keys.key(plant, keys.SAMPLE, signal)]
-        self._plants[slot] = np.zeros(1, self._form.record)[0]
-        self._rests[slot], self._names[slot] = None, ""
-        self._free.append(slot)
+        self._slots.leave(plant)
         return monitor
-
-    def _newest(self, slot: int) -> NewestRows:
-        p = self._plants[slot]
-        kept, head, keeps = int(p["kept"]), int(p["head"]), self._form.keeps
-        order = (head - kept + np.arange(kept)) % keeps
-        over = self._times[slot, order].astype(np.int64) * p["unit_ns"] + p["usual_ns"]
-        since = np.concatenate([[0], np.cumsum(over[:0:-1])])  # from each row to the newest, newest first
-        return NewestRows((p["last_ns"] - since)[::-1].tolist(), self._ring[slot, order])
 
     # --- samples ---------------------------------------------------------------------------------------------
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> Taken:
         """Take in samples of the plants that are here, and leave the others."""
-        code_of = self._codes.get
+        code_of = self._slots.codes.get
         codes = np.array(
             [code_of(key, -1) if encoding == _SAMPLE else -1 for key, _, encoding, _ in messages], dtype=np.int32
         )
@@ -242,7 +176,7 @@ class QuietPlants:
             if code >= 0:
                 waiting.setdefault(code // len(self._signals), [])
         for slot, left in waiting.items():
-            plant = self._names[slot]
+            plant = self._slots.names[slot]
             monitor = given[plant] = self._give(plant, left)
             publications += monitor.on_rows(left)
         return Taken(publications, [messages[place] for place in others.tolist()], given)
@@ -251,7 +185,7 @@ class QuietPlants:
         self, codes: NDArray[np.int32], samples: SampleColumns, received_ns: NDArray[np.int64], now_ns: int
     ) -> tuple["_Rows", NDArray[np.int32]]:
         """The rows that are complete, and the samples that are not taken."""
-        most = codes.size // len(self._signals) + min(codes.size, len(self._names))
+        most = codes.size // len(self._signals) + min(codes.size, len(self._slots.names))
         rows = _Rows(
             np.empty(most, np.int32),
             np.empty(most, np.int64),
@@ -260,8 +194,8 @@ class QuietPlants:
         )
         others = np.empty(codes.size, np.int32)
         good = np.isin(samples.quality, list(USABLE))
-        count, left_over = quiet_rows.take_samples(
-            self._plants,
+        count, left_over = take_samples(
+            self._slots.plants,
             codes,
             samples.plain & good,
             samples.time_ns,
@@ -290,7 +224,7 @@ class QuietPlants:
                     publications += self._figures(slot, time_ns)
                 else:
                     waiting.setdefault(slot, []).append(Row(time_ns, tuple(each.values[place].tolist()), False))
-        self._plants["rows_in_batch"][rows.slots] = 0
+        self._slots.plants["rows_in_batch"][rows.slots] = 0
         return waiting
 
     def _turn(self, rows: "_Rows") -> NDArray[np.int32]:
@@ -298,11 +232,11 @@ class QuietPlants:
         form, count = self._form, rows.slots.size
         times_min = np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns.tolist()])
         after, told = self._rows.results(count)
-        noise = self._plants["variance"].shape[1]
+        noise = self._slots.plants["variance"].shape[1]
         memory, new = np.empty((count, after.shape[2])), np.empty((count, 3 + 2 * len(self._signals)))
         constants, found = np.empty((count, self._parameters.size + noise)), np.empty(count, np.int32)
-        quiet_rows.prepare(
-            self._plants,
+        prepare(
+            self._slots.plants,
             rows.slots,
             rows.times_ns,
             times_min,
@@ -317,11 +251,11 @@ class QuietPlants:
         )
         if count:
             self._rows.fill(count, [memory, new, constants], [after, told])
-        quiet_rows.judge(
-            self._plants,
+        judge(
+            self._slots.plants,
             self._scratch,
-            self._times,
-            self._ring,
+            self._slots.times,
+            self._slots.ring,
             rows.slots,
             rows.times_ns,
             times_min,
@@ -339,16 +273,15 @@ class QuietPlants:
 
     def _figures(self, slot: int, time_ns: int) -> list[Publication]:
         """Tell the figures of a plant's alarms."""
-        rest = self._rests[slot]
-        assert rest is not None
+        rest = self._slots.rest(slot)
         if rest.board is not None:
             publications = rest.board.end_row(time_ns)
         else:
             told = AlarmKpis()
             told.CopyFrom(self._form.figures)
             told.time_ns = time_ns
-            publications = [Publication(keys.key(self._names[slot], keys.ALARM_KPIS, NODE), told)]
-        self._plants["published"][slot] += len(publications)
+            publications = [Publication(keys.key(self._slots.names[slot], keys.ALARM_KPIS, NODE), told)]
+        self._slots.plants["published"][slot] += len(publications)
         return publications
 
     # --- the clock -------------------------------------------------------------------------------------------
@@ -359,41 +292,34 @@ class QuietPlants:
             return []
         due_ns = self._silent_from_ns()
         self._overdue_ns, self._looked_ns = int(due_ns.min(initial=NEVER_NS)), now_ns
-        return [self._names[slot] for slot in np.flatnonzero(due_ns <= now_ns).tolist()]
+        return [self._slots.names[slot] for slot in np.flatnonzero(due_ns <= now_ns).tolist()]
 
     def healths(self, now_ns: int) -> list[Publication]:
         """The health of plants' monitors where it is due; of so many at a time."""
         period_ns = int(self._config.health_period_s * 1e9)
-        due = np.flatnonzero(self._health_due_ns <= now_ns)[:MOST_HEALTHS]
-        p = self._plants
-        p["stalls"][due] += (p["ticked"][due] != 0) & (now_ns - self._health_due_ns[due] > STALL_NS)
+        due = np.flatnonzero(self._slots.health_due_ns <= now_ns)[:MOST_HEALTHS]
+        p = self._slots.plants
+        p["stalls"][due] += (p["ticked"][due] != 0) & (now_ns - self._slots.health_due_ns[due] > STALL_NS)
         p["ticked"][due] = 1
-        self._health_due_ns[due] = now_ns + period_ns
+        self._slots.health_due_ns[due] = now_ns + period_ns
         return [self._health(slot, now_ns, "watching") for slot in due.tolist()]
 
     def next_due_ns(self) -> int:
         """When the first of the plants is overdue, or a health due, as far as is known now."""
-        return min(int(self._health_due_ns.min()), self._overdue_ns, self._looked_ns + LOOK_AGAIN_NS)
+        return min(int(self._slots.health_due_ns.min()), self._overdue_ns, self._looked_ns + LOOK_AGAIN_NS)
 
     def last_healths(self, now_ns: int) -> list[Publication]:
         """The health of all, when the monitor is stopped."""
-        return [self._health(slot, now_ns, "stopped") for slot in self._places().tolist()]
-
-    def _places(self) -> NDArray[np.int64]:
-        """The slots that have a plant."""
-        if self._used is None:
-            self._used = np.array(sorted(self._slots.values()), dtype=np.int64)
-        return self._used
+        return [self._health(slot, now_ns, "stopped") for slot in self._slots.used.tolist()]
 
     def _silent_from_ns(self) -> NDArray[np.int64]:
         """By slot, when it is too long since something came; never for a slot without a plant."""
-        return quiet_rows.silent_from(
-            self._plants[: len(self._names)], self._config.silence_periods, int(self._form.least_s * 1e9)
+        return silent_from(
+            self._slots.plants[: len(self._slots.names)], self._config.silence_periods, int(self._form.least_s * 1e9)
         )
 
     def _health(self, slot: int, now_ns: int, phase: str) -> Publication:
-        p, rest, plant = self._plants[slot], self._rests[slot], self._names[slot]
-        assert rest is not None
+        p, rest, plant = self._slots.plants[slot], self._slots.rest(slot), self._slots.names[slot]
         health = health_of(
             now_ns,
             phase,
@@ -429,9 +355,3 @@ class _Rows(NamedTuple):
     def of(self, which: slice | NDArray[np.bool_]) -> "_Rows":
         """Some of them."""
         return _Rows(self.slots[which], self.times_ns[which], self.values[which], self.turns[which])
-
-
-def _zeros(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
-    """An array of zeros, straight from the system: it keeps no memory of what is not used yet, nor of what was."""
-    count = prod(shape)
-    return np.frombuffer(mmap(-1, max(count, 1) * kind.itemsize), kind, count).reshape(shape)

@@ -14,10 +14,9 @@ one by which the filter begins anew; a silence; equal readings beyond a sensor's
 and a row that raises an alarm. Points beyond a limit that raise no alarm are ordinary, they are only remembered.
 """
 
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
 
 from monitor_node.charts.base import LARGEST_VALUE, LOWER, OUT, PRESENT, SETTINGS, STATISTIC, UPPER, X
 from monitor_node.charts.cusum import Cusum
@@ -27,259 +26,21 @@ from monitor_node.charts.ewma import _judge as _judge_ewma
 from monitor_node.charts.mewma import _move as _move_mewma
 from monitor_node.charts.shewhart import Shewhart
 from monitor_node.charts.shewhart import _judge as _judge_shewhart
-from monitor_node.core import HEARD_AGAIN_NS, LARGEST_NUMBER
-from monitor_node.core import LARGEST_VALUE as LARGEST_READING
 from monitor_node.prewhitening import LARGEST_ORDER
-from monitor_node.sample_run import ALIKE, TOLERANCE
-from monitor_node.sample_run import DEVIATIONS as RUN_DEVIATIONS
-from monitor_node.sample_run import MEMORY as RUN_MEMORY
+from monitor_node.quiet.layout import Array, Ints, Places, Records
+from monitor_node.quiet.samples import allowed_ns
 from monitor_node.sampling import LARGEST_GAP
-from monitor_node.silence import BURST, DEVIATIONS, LEARN_FROM, MEMORY
+from monitor_node.silence import MEMORY
 from monitor_node.stuck import AT_REST, STRETCH
 from reactorwatch.compiled import compiled
 from reactorwatch.records.record import MINUTE_NS
-
-Records: TypeAlias = NDArray[np.void]
-Array: TypeAlias = NDArray[np.float64]
-Ints: TypeAlias = NDArray[np.int64]
-Places: TypeAlias = NDArray[np.int32]
 
 ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
 """What a row was; in the second case the figures of the alarms are due, too."""
 
 _MINUTE_NS = int(MINUTE_NS)
 _MOST_NUMBERS = max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
-_STRETCH, _ORDER, _MEMORY, _LEARN_FROM = STRETCH, LARGEST_ORDER, MEMORY, LEARN_FROM
-
-
-def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
-    """The form of a plant's record.
-
-    Args:
-        outputs: how many are watched.
-        states: of its model.
-        alarms: how many its charts can raise.
-    """
-    signals, memory, noise = outputs + 1, states + states**2, outputs + states
-    f, i, u = np.float64, np.int64, np.uint64
-    columns: list[tuple[str, DTypeLike, tuple[int, ...]]] = [
-        # samples on their way into a row
-        ("expected", i, (signals,)),  # sequence numbers
-        ("unit", u, (signals,)),
-        ("run_spacing_ns", f, (signals,)),
-        ("run_deviation_ns", f, (signals,)),
-        ("heard_from_ns", i, (signals,)),
-        ("values", f, (signals,)),
-        ("pending_ns", i, ()),
-        ("left_ns", i, ()),  # time of the row that left last
-        ("have", np.int32, ()),  # which signals of the pending row have come, a bit each
-        ("left", np.int32, ()),  # rows that left and are remembered
-        ("rows_in_batch", np.int32, ()),
-        ("shut", np.int32, ()),  # from here on, samples are for the plant's own monitor
-        ("odd", np.int32, ()),  # likewise, rows
-        # counts and times
-        ("received", i, ()),
-        ("published", i, ()),
-        ("ticked", np.int32, ()),
-        ("stalls", np.int32, ()),
-        ("not_stored", i, ()),
-        ("counts", i, (7,)),
-        ("rows_watched", i, ()),
-        ("first_ns", i, ()),
-        ("watching_since_ns", i, ()),
-        ("began_ns", i, ()),
-        ("start_ns", i, ()),
-        ("lag_ns", i, ()),
-        ("heard_ns", i, ()),
-        ("health_due_ns", i, ()),
-        ("kpi_minute", i, ()),
-        ("arl0", f, ()),
-        # how rows and samples come
-        ("last_ns", i, ()),
-        ("period_ns", f, ()),
-        ("spacing_ns", i, ()),
-        ("received_ns", i, ()),
-        ("counted_ns", i, ()),
-        ("receipt_mean", f, ()),
-        ("receipt_deviation", f, ()),
-        ("receipt_count", np.int32, ()),
-        ("silence_count", np.int32, (signals + 1,)),
-        ("silence_mean", f, (signals + 1,)),
-        ("silence_deviation", f, (signals + 1,)),
-        # the filter
-        ("time_min", f, ()),
-        ("input", f, ()),
-        ("memory", f, (memory,)),
-        ("noise", f, (noise,)),  # standard deviations, of sensors and process
-        ("variance", f, (noise,)),
-        ("typical_sd", f, (outputs,)),
-        # prewhitening
-        ("order", np.int32, (outputs,)),
-        ("learned_rows", np.int32, (outputs,)),
-        ("constant", f, (outputs,)),
-        ("coefficients", f, (outputs, _ORDER)),
-        ("sigma", f, (outputs,)),
-        ("sigma_variance", f, (outputs,)),
-        ("passed_variance", f, (outputs,)),
-        ("past", f, (outputs, _ORDER)),
-        # spikes and stuck sensors; a limit that is infinite is none
-        ("spike_limit", f, (outputs,)),
-        ("equal_limit", f, (outputs,)),
-        ("quietest", f, (outputs,)),
-        ("last", f, (outputs,)),
-        ("repeats", i, (outputs,)),
-        ("steps", f, (outputs, _STRETCH)),  # oldest first
-        ("stepped", np.int32, (outputs,)),
-        # charts, as the columns of a bank without what comes in and goes out, and their alarms
-        ("shewhart", f, (Shewhart.numbers, outputs)),
-        ("width", f, (outputs,)),
-        ("ewma", f, (Ewma.numbers, outputs)),
-        ("cusum", f, (Cusum.numbers, outputs)),
-        ("average", f, (outputs,)),
-        ("mean", f, (outputs,)),
-        ("covariance", f, (outputs, outputs)),
-        ("whitening", f, (outputs, outputs)),
-        ("mewma_limit", f, ()),
-        ("recent", np.int32, (alarms,)),
-        ("in_a_row", np.int32, (alarms,)),
-        ("above", np.int32, (alarms,)),
-        # the newest rows, in a ring
-        ("kept", np.int32, ()),
-        ("head", np.int32, ()),  # where the next one goes
-        ("unit_ns", i, ()),  # that spacings are kept in
-        ("usual_ns", i, ()),  # spacing that is kept as 0
-    ]
-    return np.dtype([(name, kind, shape) for name, kind, shape in columns], align=True)
-
-
-@compiled
-def allowed_ns(limit: float, count: int, mean: float, deviation: float) -> int:
-    """As `Spacing.allowed_ns`; -1: too little is known."""
-    if count < _LEARN_FROM:
-        return -1
-    return int(limit * (mean + DEVIATIONS * deviation))
-
-
-@compiled
-def _follows(p: Any, signal: int, time_ns: int) -> bool:
-    """Take the sample with the number that comes next into the run of its signal; as `SampleRun` if none is held."""
-    spacing_ns = float(time_ns - p.left_ns)
-    off = spacing_ns - p.run_spacing_ns[signal]
-    if abs(off) <= ALIKE * p.run_spacing_ns[signal]:
-        return True
-    if abs(off) > TOLERANCE * p.run_spacing_ns[signal] + RUN_DEVIATIONS * p.run_deviation_ns[signal]:
-        return False
-    p.run_spacing_ns[signal] += off / RUN_MEMORY
-    p.run_deviation_ns[signal] += (abs(off) - p.run_deviation_ns[signal]) / RUN_MEMORY
-    return True
-
-
-@compiled
-def _heard(p: Any, now_ns: int, silence_limit: float, least_ns: int) -> None:
-    """Note that something came; as `Silence.received`."""
-    before_ns, p.received_ns = p.counted_ns, now_ns
-    spacing = now_ns - before_ns
-    if spacing < 0:
-        p.counted_ns = now_ns
-    elif p.receipt_count < _MEMORY or float(spacing) >= BURST * p.receipt_mean:
-        p.counted_ns = now_ns
-        patience = allowed_ns(silence_limit, p.receipt_count, p.receipt_mean, p.receipt_deviation)
-        if patience >= 0:
-            spacing = min(spacing, max(patience, least_ns))
-        p.receipt_count = min(p.receipt_count + 1, _MEMORY)
-        off = float(spacing) - p.receipt_mean
-        p.receipt_mean += off / p.receipt_count
-        if p.receipt_count > 1:
-            p.receipt_deviation += (abs(off) - p.receipt_deviation) / p.receipt_count
-
-
-@compiled
-def take_samples(
-    plants: Records,
-    codes: Places,
-    plain: NDArray[np.bool_],
-    time_ns: Ints,
-    sequence: Ints,
-    value: Array,
-    unit: NDArray[np.uint64],
-    received_ns: Ints,
-    now_ns: int,
-    silence_limit: float,
-    least_ns: int,
-    most_left: int,
-    rows: Places,
-    row_time_ns: Ints,
-    row_values: Array,
-    row_round: Places,
-    others: Places,
-) -> tuple[int, int]:
-    """Line samples up into rows.
-
-    Args:
-        plants: records, shape (plants,).
-        codes: of each sample its plant times the signals plus its signal; -1: it is for somebody else.
-        plain: whether each is a good one.
-        time_ns: of each.
-        sequence: of each.
-        value: of each.
-        unit: of each, its digest.
-        received_ns: when each came.
-        now_ns: the time.
-        silence_limit: periods.
-        least_ns: of receipt time without anything that are always allowed.
-        most_left: rows that left that are remembered.
-        rows: filled: the plant of each row.
-        row_time_ns: filled: its time.
-        row_values: filled: its values, input first.
-        row_round: filled: how many rows of its plant came before it in this batch.
-        others: filled: the samples that are for the plants' own monitors, or somebody else.
-
-    Returns:
-        How many rows, and how many such samples.
-    """
-    signals = row_values.shape[1]
-    whole = (1 << signals) - 1
-    count, left_over = 0, 0
-    for k in range(codes.size):
-        if codes[k] < 0:
-            others[left_over] = k
-            left_over += 1
-            continue
-        slot, signal = codes[k] // signals, codes[k] % signals
-        p = plants[slot]
-        bit = 1 << signal
-        fits = plain[k] and not p.shut and unit[k] == p.unit[signal] and abs(value[k]) < LARGEST_READING
-        fits = fits and sequence[k] == p.expected[signal] and not p.have & bit and time_ns[k] > p.left_ns
-        fits = fits and sequence[k] < LARGEST_NUMBER and abs(time_ns[k]) < LARGEST_NUMBER
-        fits = fits and (not p.have or time_ns[k] == p.pending_ns)
-        if not (fits and _follows(p, signal, time_ns[k])):
-            p.shut = 1
-            others[left_over] = k
-            left_over += 1
-            continue
-        p.received += 1
-        if received_ns[k] and now_ns - received_ns[k] > p.lag_ns:
-            p.lag_ns = now_ns - received_ns[k]
-        if now_ns >= p.heard_ns + HEARD_AGAIN_NS:
-            p.heard_ns = now_ns
-            _heard(p, now_ns, silence_limit, least_ns)
-        p.expected[signal] += 1
-        p.values[signal] = value[k]
-        p.pending_ns = time_ns[k]
-        p.have |= bit
-        if p.have == whole:
-            rows[count] = slot
-            row_time_ns[count] = time_ns[k]
-            for place in range(signals):
-                row_values[count, place] = p.values[place]
-            row_round[count] = p.rows_in_batch
-            p.rows_in_batch += 1
-            p.have = 0
-            p.left_ns = time_ns[k]
-            p.left = min(p.left + 1, most_left)
-            p.counts[0] += 1
-            count += 1
-    return count, left_over
+_STRETCH, _ORDER, _MEMORY = STRETCH, LARGEST_ORDER, MEMORY
 
 
 @compiled
@@ -550,15 +311,3 @@ def judge(
         found[k] = ORDINARY if minute == p.kpi_minute else NEW_MINUTE
         p.kpi_minute = minute
         plants[slot] = scratch[0]
-
-
-@compiled
-def silent_from(plants: Records, silence_limit: float, least_ns: int) -> Ints:
-    """When it is too long since something came from each plant, as `Silence.due_ns`; never where there is none."""
-    found = np.empty(plants.size, np.int64)
-    for slot in range(plants.size):
-        p = plants[slot]
-        patience = allowed_ns(silence_limit, p.receipt_count, p.receipt_mean, p.receipt_deviation)
-        known = patience >= 0 and p.silence_count[0] >= _LEARN_FROM
-        found[slot] = p.received_ns + max(patience, least_ns) if known else np.int64(2**63 - 1)
-    return found

@@ -1,0 +1,93 @@
+"""Between a record and what is remembered of samples on their way into rows."""
+
+import numpy as np
+
+from monitor_node.alignment import AlignmentState, Counts, Waiting
+from monitor_node.alignment import Sequence as Numbering
+from monitor_node.sample_run import MEMORY as FULL_RUN
+from monitor_node.sample_run import SampleRun
+
+COUNTS = ("rows", "incomplete_rows", "late", "duplicated", "out_of_order", "lost", "restarts")
+
+
+def is_in_order(alignment: AlignmentState) -> bool:
+    """Whether no sample is missing, and at most one row waits, the newest."""
+    left_ns, newest = alignment.newest_left_ns, alignment.newest_numbers
+    if alignment.restarted or left_ns is None or len(alignment.pending) > 1:
+        return False
+    pending_ns, waiting = next(iter(alignment.pending.items()), (left_ns, None))
+    if waiting is not None and pending_ns <= left_ns:
+        return False
+    for place, (before, numbering) in enumerate(zip(newest, alignment.sequences, strict=True)):
+        number = None if waiting is None else waiting.numbers[place]
+        last, last_ns = (before, left_ns) if number is None else (number, pending_ns)
+        if before is None or last is None or (number is not None and number != before + 1):
+            return False
+        if (numbering.expected, numbering.newest_ns) != (last + 1, last_ns):
+            return False
+    return True
+
+
+def run_on(runs: list[SampleRun], alignment: AlignmentState) -> bool:
+    """Whether no sample is held, the usual spacings are known, and the runs have come as far as the rows."""
+    return all(
+        not run.held
+        and run.spacings == FULL_RUN
+        and run.number is not None
+        and (run.number + 1, run.time_ns) == (numbering.expected, numbering.newest_ns)
+        for run, numbering in zip(runs, alignment.sequences, strict=True)
+    )
+
+
+def write_runs(p: np.void, runs: list[SampleRun]) -> None:
+    """Note the runs of the signals' samples, which have come as far as the rows."""
+    p["run_spacing_ns"] = [run.spacing_ns for run in runs]
+    p["run_deviation_ns"] = [run.deviation_ns for run in runs]
+
+
+def runs_of(p: np.void) -> list[SampleRun]:
+    """The runs of the signals' samples."""
+    runs: list[SampleRun] = []
+    for place in range(len(p["expected"])):
+        newest_ns = int(p["pending_ns"] if p["have"] >> place & 1 else p["left_ns"])
+        spacing_ns, deviation_ns = float(p["run_spacing_ns"][place]), float(p["run_deviation_ns"][place])
+        runs.append(SampleRun(int(p["expected"][place]) - 1, newest_ns, spacing_ns, deviation_ns, FULL_RUN))
+    return runs
+
+
+def write_alignment(p: np.void, alignment: AlignmentState) -> None:
+    """Note samples on their way into rows."""
+    p["expected"] = [numbering.expected or 0 for numbering in alignment.sequences]
+    p["left"], p["left_ns"] = len(alignment.left), alignment.newest_left_ns or 0
+    p["counts"] = [getattr(alignment.counts, name) for name in COUNTS]
+    for pending_ns, waiting in alignment.pending.items():
+        p["pending_ns"], p["values"] = pending_ns, waiting.values
+        p["have"] = sum(1 << place for place, number in enumerate(waiting.numbers) if number is not None)
+
+
+def alignment_of(p: np.void, times_ns: list[int]) -> AlignmentState:
+    """Samples on their way into rows.
+
+    Args:
+        p: record of the plant.
+        times_ns: of its rows that left, the newest last.
+    """
+    signals = range(len(p["expected"]))
+    have = [bool(p["have"] >> signal & 1) for signal in signals]
+    expected, pending_ns, left_ns = p["expected"].tolist(), int(p["pending_ns"]), int(p["left_ns"])
+    newest = [number - 1 - here for number, here in zip(expected, have, strict=True)]
+    kept = times_ns[-int(p["left"]) :]
+    left: dict[int, list[int | None]] = {
+        time_ns: [number - age for number in newest]
+        for age, time_ns in zip(range(len(kept) - 1, -1, -1), kept, strict=True)
+    }
+    pending = {}
+    if any(have):
+        values = [float(value) if here else float("nan") for value, here in zip(p["values"], have, strict=True)]
+        numbers = [number - 1 if here else None for number, here in zip(expected, have, strict=True)]
+        pending[pending_ns] = Waiting(values, numbers, have.count(False))
+    numbering = [
+        Numbering(number, pending_ns if here else left_ns) for number, here in zip(expected, have, strict=True)
+    ]
+    counts = Counts(**dict(zip(COUNTS, p["counts"].tolist(), strict=True)))
+    return AlignmentState(pending, left, left_ns, list(newest), numbering, False, counts)

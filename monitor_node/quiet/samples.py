@@ -1,0 +1,163 @@
+"""Samples of many plants lined up into rows by compiled code, as `SampleRun`, `Aligner` and `Silence` do it.
+
+A sample that is not good, or not the very one that comes next of its signal, shuts the record: that one and all after
+it are for the plant's own monitor.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monitor_node.core import HEARD_AGAIN_NS, LARGEST_NUMBER, LARGEST_VALUE
+from monitor_node.quiet.layout import Array, Ints, Places, Records
+from monitor_node.sample_run import ALIKE, TOLERANCE
+from monitor_node.sample_run import DEVIATIONS as RUN_DEVIATIONS
+from monitor_node.sample_run import MEMORY as RUN_MEMORY
+from monitor_node.silence import BURST, DEVIATIONS, LEARN_FROM, MEMORY
+from reactorwatch.compiled import compiled
+
+# Under names of this module: compiled code keeps them as they are now.
+_MEMORY, _LEARN_FROM = MEMORY, LEARN_FROM
+
+
+@compiled
+def allowed_ns(limit: float, count: int, mean: float, deviation: float) -> int:
+    """As `Spacing.allowed_ns`; -1: too little is known."""
+    if count < _LEARN_FROM:
+        return -1
+    return int(limit * (mean + DEVIATIONS * deviation))
+
+
+@compiled
+def _follows(p: Any, signal: int, time_ns: int) -> bool:
+    """Take the sample with the number that comes next into the run of its signal; as `SampleRun` if none is held."""
+    spacing_ns = float(time_ns - p.left_ns)
+    off = spacing_ns - p.run_spacing_ns[signal]
+    if abs(off) <= ALIKE * p.run_spacing_ns[signal]:
+        return True
+    if abs(off) > TOLERANCE * p.run_spacing_ns[signal] + RUN_DEVIATIONS * p.run_deviation_ns[signal]:
+        return False
+    p.run_spacing_ns[signal] += off / RUN_MEMORY
+    p.run_deviation_ns[signal] += (abs(off) - p.run_deviation_ns[signal]) / RUN_MEMORY
+    return True
+
+
+@compiled
+def _heard(p: Any, now_ns: int, silence_limit: float, least_ns: int) -> None:
+    """Note that something came; as `Silence.received`."""
+    before_ns, p.received_ns = p.counted_ns, now_ns
+    spacing = now_ns - before_ns
+    if spacing < 0:
+        p.counted_ns = now_ns
+    elif p.receipt_count < _MEMORY or float(spacing) >= BURST * p.receipt_mean:
+        p.counted_ns = now_ns
+        patience = allowed_ns(silence_limit, p.receipt_count, p.receipt_mean, p.receipt_deviation)
+        if patience >= 0:
+            spacing = min(spacing, max(patience, least_ns))
+        p.receipt_count = min(p.receipt_count + 1, _MEMORY)
+        off = float(spacing) - p.receipt_mean
+        p.receipt_mean += off / p.receipt_count
+        if p.receipt_count > 1:
+            p.receipt_deviation += (abs(off) - p.receipt_deviation) / p.receipt_count
+
+
+@compiled
+def take_samples(
+    plants: Records,
+    codes: Places,
+    plain: NDArray[np.bool_],
+    time_ns: Ints,
+    sequence: Ints,
+    value: Array,
+    unit: NDArray[np.uint64],
+    received_ns: Ints,
+    now_ns: int,
+    silence_limit: float,
+    least_ns: int,
+    most_left: int,
+    rows: Places,
+    row_time_ns: Ints,
+    row_values: Array,
+    row_round: Places,
+    others: Places,
+) -> tuple[int, int]:
+    """Line samples up into rows.
+
+    Args:
+        plants: records, shape (plants,).
+        codes: of each sample its plant times the signals plus its signal; -1: it is for somebody else.
+        plain: whether each is a good one.
+        time_ns: of each.
+        sequence: of each.
+        value: of each.
+        unit: of each, its digest.
+        received_ns: when each came.
+        now_ns: the time.
+        silence_limit: periods.
+        least_ns: of receipt time without anything that are always allowed.
+        most_left: rows that left that are remembered.
+        rows: filled: the plant of each row.
+        row_time_ns: filled: its time.
+        row_values: filled: its values, input first.
+        row_round: filled: how many rows of its plant came before it in this batch.
+        others: filled: the samples that are for the plants' own monitors, or somebody else.
+
+    Returns:
+        How many rows, and how many such samples.
+    """
+    signals = row_values.shape[1]
+    whole = (1 << signals) - 1
+    count, left_over = 0, 0
+    for k in range(codes.size):
+        if codes[k] < 0:
+            others[left_over] = k
+            left_over += 1
+            continue
+        slot, signal = codes[k] // signals, codes[k] % signals
+        p = plants[slot]
+        bit = 1 << signal
+        fits = plain[k] and not p.shut and unit[k] == p.unit[signal] and abs(value[k]) < LARGEST_VALUE
+        fits = fits and sequence[k] == p.expected[signal] and not p.have & bit and time_ns[k] > p.left_ns
+        fits = fits and sequence[k] < LARGEST_NUMBER and abs(time_ns[k]) < LARGEST_NUMBER
+        fits = fits and (not p.have or time_ns[k] == p.pending_ns)
+        if not (fits and _follows(p, signal, time_ns[k])):
+            p.shut = 1
+            others[left_over] = k
+            left_over += 1
+            continue
+        p.received += 1
+        if received_ns[k] and now_ns - received_ns[k] > p.lag_ns:
+            p.lag_ns = now_ns - received_ns[k]
+        if now_ns >= p.heard_ns + HEARD_AGAIN_NS:
+            p.heard_ns = now_ns
+            _heard(p, now_ns, silence_limit, least_ns)
+        p.expected[signal] += 1
+        p.values[signal] = value[k]
+        p.pending_ns = time_ns[k]
+        p.have |= bit
+        if p.have == whole:
+            rows[count] = slot
+            row_time_ns[count] = time_ns[k]
+            for place in range(signals):
+                row_values[count, place] = p.values[place]
+            row_round[count] = p.rows_in_batch
+            p.rows_in_batch += 1
+            p.have = 0
+            p.left_ns = time_ns[k]
+            p.left = min(p.left + 1, most_left)
+            p.counts[0] += 1
+            count += 1
+    return count, left_over
+
+
+@compiled
+def silent_from(plants: Records, silence_limit: float, least_ns: int) -> Ints:
+    """When it is too long since something came from each plant, as `Silence.due_ns`; never where there is none."""
+    found = np.empty(plants.size, np.int64)
+    for slot in range(plants.size):
+        p = plants[slot]
+        patience = allowed_ns(silence_limit, p.receipt_count, p.receipt_mean, p.receipt_deviation)
+        known = patience >= 0 and p.silence_count[0] >= _LEARN_FROM
+        found[slot] = p.received_ns + max(patience, least_ns) if known else np.int64(2**63 - 1)
+    return found

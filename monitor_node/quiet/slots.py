@@ -1,0 +1,112 @@
+"""The arrays of the quiet plants: a slot for each, which the next one gets when it goes."""
+
+from math import prod
+from mmap import mmap
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from monitor_node.quiet.form import QuietForm, Rest
+from monitor_node.quiet.layout import Records
+from monitor_node.quiet.ring import NewestRows, newest_rows
+from reactorwatch.contract import keys
+
+FIRST_ROOM = 16
+"""Plants that there is room for at first; it doubles."""
+
+NEVER_NS = 2**63 - 1
+
+
+class Slots:
+    """Where each plant is.
+
+    Args:
+        form: of their records.
+        signals: of each plant, the input first.
+
+    Attributes:
+        of: by plant, its slot.
+        names: by slot; empty where there is no plant.
+        rests: by slot.
+        codes: by key of a sample, the slot times the signals plus the signal.
+        plants: records.
+        times: rings of spacings, shape (slots, rows kept).
+        ring: rings of values, shape (slots, rows kept, columns).
+        health_due_ns: by slot; never for one without a plant.
+    """
+
+    def __init__(self, form: QuietForm, signals: tuple[str, ...]) -> None:
+        self._form, self._signals = form, signals
+        self.of: dict[str, int] = {}
+        self.names: list[str] = []
+        self.rests: list[Rest | None] = []
+        self._free: list[int] = []
+        self.codes: dict[str, int] = {}
+        self._used: NDArray[np.int64] | None = None
+        self.plants: Records
+        self.times: NDArray[np.int32]
+        self.ring: NDArray[np.float64]
+        self.health_due_ns: NDArray[np.int64] = np.empty(0, np.int64)
+        self._room(FIRST_ROOM)
+
+    def take(self, plant: str) -> int:
+        """A slot for a plant that comes."""
+        if self._free:
+            slot = self._free.pop()
+            self.names[slot] = plant
+        else:
+            slot = len(self.names)
+            if slot == len(self.plants):
+                self._room(2 * slot)
+            self.names.append(plant)
+            self.rests.append(None)
+        self.of[plant], self._used = slot, None
+        for place, signal in enumerate(self._signals):
+            self.codes[keys.key(plant, keys.SAMPLE, signal)] = slot * len(self._signals) + place
+        return slot
+
+    def leave(self, plant: str) -> None:
+        """A plant goes, and its slot is free."""
+        slot, self._used = self.of.pop(plant), None
+        self.health_due_ns[slot] = NEVER_NS
+        for signal in self._signals:
+            del self.codes[keys.key(plant, keys.SAMPLE, signal)]
+        self.plants[slot] = np.zeros(1, self._form.record)[0]
+        self.rests[slot], self.names[slot] = None, ""
+        self._free.append(slot)
+
+    @property
+    def used(self) -> NDArray[np.int64]:
+        """The slots that have a plant."""
+        if self._used is None:
+            self._used = np.array(sorted(self.of.values()), dtype=np.int64)
+        return self._used
+
+    def rest(self, slot: int) -> Rest:
+        """What is kept beside the record of a plant."""
+        rest = self.rests[slot]
+        assert rest is not None
+        return rest
+
+    def newest(self, slot: int) -> NewestRows:
+        """The newest rows of a plant."""
+        return newest_rows(self.plants[slot], self.times[slot], self.ring[slot])
+
+    def _room(self, plants: int) -> None:
+        """Make room for so many."""
+        form, before = self._form, len(self.names)
+        records, times = _zeros((plants,), form.record), _zeros((plants, form.keeps), np.dtype(np.int32))
+        ring = _zeros((plants, form.keeps, form.columns), np.dtype(np.float64))
+        if before:
+            records[:before], times[:before], ring[:before] = self.plants, self.times, self.ring
+        self.plants, self.times, self.ring = records, times, ring
+        due_ns = np.full(plants, NEVER_NS)
+        due_ns[:before] = self.health_due_ns[:before]
+        self.health_due_ns = due_ns
+
+
+def _zeros(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
+    """An array of zeros, straight from the system: it keeps no memory of what is not used yet, nor of what was."""
+    count = prod(shape)
+    return np.frombuffer(mmap(-1, max(count, 1) * kind.itemsize), kind, count).reshape(shape)

@@ -1,0 +1,171 @@
+"""Joining the bus, or being its router."""
+
+import json
+import re
+import threading
+import time
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import structlog
+import zenoh
+
+from reactorwatch.errors import InputError
+from reactorwatch.runtime.bus_zenoh.bus import ZenohBus
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.identity import ROUTER_FILES, TLS, client_settings
+from reactorwatch.runtime.serve import StopSignal
+
+log = structlog.get_logger()
+
+FIRST_RETRY_S = 0.1
+LONGEST_RETRY_S = 2.0
+SAY_AGAIN_S = 30.0
+STUCK_S = 1.0
+
+_STUCK = {"transport/link/tx/queue/congestion_control/block/wait_before_close": round(STUCK_S * 1e6)}
+_RETRY = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
+
+
+def connect(
+    config: BusConfig, node: str, stop: StopSignal, *, passing: Collection[str] = (), crowded: bool = False
+) -> ZenohBus | None:
+    """Join the bus as a client, waiting for its router as long as it takes.
+
+    Args:
+        config: where the router is.
+        node: who is waiting, for the log.
+        stop: ends the waiting.
+        passing: kinds of which nothing is remembered, nor counted, when we publish them: what is told again and again
+            of thousands of plants. Who is cut off misses them.
+        crowded: whether we publish, or show tokens, on keys of hundreds of plants. A session looks through those it has
+            for each message that comes (a hundred make it four times slower), so another one listens then.
+
+    Returns:
+        The open bus; None if a stop was asked for before a router was there.
+
+    Raises:
+        InputError: the endpoint is not one that Zenoh understands.
+    """
+    client = _client(config)
+    woken = threading.Event()
+    stop.wakes(woken.set)
+    retry_s = FIRST_RETRY_S
+    said_at = -SAY_AGAIN_S
+    while not stop.is_set:
+        try:
+            session = zenoh.open(client)
+            voice = zenoh.open(client) if crowded else None
+        except zenoh.ZError as error:
+            if time.monotonic() - said_at >= SAY_AGAIN_S:
+                said_at = time.monotonic()
+                log.info("waiting for a router", node=node, endpoint=config.endpoint, why=_first_line(error))
+            woken.wait(retry_s)
+            retry_s = min(2 * retry_s, LONGEST_RETRY_S)
+            continue
+        log.info("connected", node=node, endpoint=config.endpoint)
+        return ZenohBus(session, config, passing, voice)
+    return None
+
+
+def connect_now(config: BusConfig) -> ZenohBus:
+    """Join the bus as a client, if its router is there and lets us in.
+
+    Raises:
+        ConnectionError: it is not, or does not; with what Zenoh says.
+        InputError: the endpoint is not one that Zenoh understands.
+    """
+    try:
+        return ZenohBus(zenoh.open(_client(config)), config)
+    except zenoh.ZError as error:
+        raise ConnectionError(_first_line(error)) from error
+
+
+def _client(config: BusConfig) -> zenoh.Config:
+    settings = {
+        "mode": "client",
+        "connect/endpoints": [config.endpoint],
+        "connect/retry": _RETRY,
+        "connect/timeout_ms": 0,
+        "scouting/multicast/enabled": False,
+        "timestamping/enabled": True,  # by which the age of what was published is known
+        **_STUCK,
+        **client_settings(config),
+    }
+    return _checked(settings, config.endpoint)
+
+
+def router(config: BusConfig) -> ZenohBus:
+    """Be the router, in this process, until the bus is closed.
+
+    Raises:
+        InputError: nothing can listen at the endpoint: it is malformed or taken, or needs a router's certificate.
+    """
+    if config.ca is not None:
+        raise InputError(
+            f"no router can listen at {config.endpoint!r} with the certificate of a node; "
+            "name the site with --site, or start its router: `reactorwatch router SITE/router/router.json5`"
+        )
+    settings = {
+        "mode": "router",
+        "listen/endpoints": [config.endpoint],
+        "listen/timeout_ms": 0,
+        "listen/exit_on_failure": True,
+        "connect/endpoints": list(config.routers),
+        "connect/retry": _RETRY,
+        "connect/timeout_ms": {"router": -1},
+        "connect/exit_on_failure": {"router": False},
+        "scouting/multicast/enabled": False,
+        **_STUCK,
+    }
+    try:
+        session = zenoh.open(_checked(settings, config.endpoint))
+    except zenoh.ZError as error:
+        raise InputError(
+            f"no router can listen at {config.endpoint!r}: {_first_line(error)}; "
+            f"is another router running there? Choose another with --endpoint"
+        ) from error
+    return ZenohBus(session, config)
+
+
+def router_from_file(path: Path) -> ZenohBus:
+    """Be the router that a file of Zenoh's own settings describes, as `certify` writes it for a site.
+
+    Args:
+        path: the file, JSON5; files that it names are relative to its folder.
+
+    Raises:
+        InputError: it cannot be read or makes no sense, or nothing can listen where it says.
+    """
+    try:
+        config = zenoh.Config.from_file(str(path))
+        for name in ROUTER_FILES:
+            file = json.loads(config.get_json(f"{TLS}/{name}"))
+            if file is not None:
+                config.insert_json5(f"{TLS}/{name}", json.dumps(str(path.parent / file)))
+        return ZenohBus(zenoh.open(config), BusConfig())
+    except zenoh.ZError as error:
+        raise InputError(f"router settings {path}: {_first_line(error)}") from error
+
+
+def _configured(settings: dict[str, Any]) -> zenoh.Config:
+    config = zenoh.Config()
+    for path, value in settings.items():
+        config.insert_json5(path, json.dumps(value))
+    return config
+
+
+def _checked(settings: dict[str, Any], endpoint: str) -> zenoh.Config:
+    try:
+        return _configured(settings)
+    except zenoh.ZError as error:
+        raise InputError(
+            f"endpoint must be like 'tcp/127.0.0.1:7447', got {endpoint!r}: {_first_line(error)}"
+        ) from error
+
+
+def _first_line(error: Exception) -> str:
+    """What Zenoh says, without the places in its source where it said so."""
+    line = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return re.sub(r" at /\S+\.rs:\d+\.?", "", line).rstrip(". ")
