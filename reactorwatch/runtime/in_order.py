@@ -248,7 +248,7 @@ class InOrder(Generic[Item]):
         Not those of which nobody knows how they began: nothing is missing there.
         """
         found: dict[str, int] = {}
-        for (_, stream), state in self._streams.items():
+        for (_, stream), state in self._waiting.items():
             if state.due_ns is not None and state.due_ns <= now_ns and state.held and state.expected is not None:
                 since_ns = min(came_ns for came_ns, _ in state.held.values())
                 found[stream] = min(found.get(stream, since_ns), since_ns)

@@ -20,6 +20,7 @@ from reactorwatch.runtime.bus_zenoh.messages import (
     LONGEST_ENCODING,
     NUMBERED,
     STREAM_PARTS,
+    first_line,
     is_of_whole_streams,
     numbered,
     payload_of,
@@ -264,7 +265,7 @@ class ZenohBus:
         try:
             return list(self._remembered(f"{stream}/**", f"_time=[now(-{since_s + LONGEST_WAY_S}s)..]"))
         except zenoh.ZError as error:  # the bus is being closed, for instance
-            log.info("cannot ask for what is missing", stream=stream, why=str(error))
+            log.info("cannot ask for what is missing", stream=stream, why=first_line(error))
             return []
 
     def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:

@@ -1,5 +1,6 @@
 """Keys and messages as Zenoh has them, and as we have."""
 
+import re
 import struct
 
 import zenoh
@@ -49,3 +50,9 @@ def is_of_whole_streams(key_expression: str) -> bool:
     """Whether who listens to it hears all of any stream that it hears anything of."""
     *parts, last = key_expression.split("/")
     return last == "**" and len(parts) <= STREAM_PARTS
+
+
+def first_line(error: Exception) -> str:
+    """What Zenoh says, without the places in its source where it said so."""
+    line = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return re.sub(r" at /\S+\.rs:\d+\.?", "", line).rstrip(". ")

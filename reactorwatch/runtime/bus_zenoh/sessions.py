@@ -1,7 +1,6 @@
 """Joining the bus, or being its router."""
 
 import json
-import re
 import threading
 import time
 from collections.abc import Collection
@@ -13,6 +12,7 @@ import zenoh
 
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh.bus import ZenohBus
+from reactorwatch.runtime.bus_zenoh.messages import first_line
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.identity import ROUTER_FILES, TLS, client_settings
 from reactorwatch.runtime.serve import StopSignal
@@ -60,7 +60,7 @@ def connect(
         except zenoh.ZError as error:
             if time.monotonic() - said_at >= SAY_AGAIN_S:
                 said_at = time.monotonic()
-                log.info("waiting for a router", node=node, endpoint=config.endpoint, why=_first_line(error))
+                log.info("waiting for a router", node=node, endpoint=config.endpoint, why=first_line(error))
             woken.wait(retry_s)
             retry_s = min(2 * retry_s, LONGEST_RETRY_S)
             continue
@@ -79,7 +79,7 @@ def connect_now(config: BusConfig) -> ZenohBus:
     try:
         return ZenohBus(zenoh.open(_client(config)), config)
     except zenoh.ZError as error:
-        raise ConnectionError(_first_line(error)) from error
+        raise ConnectionError(first_line(error)) from error
 
 
 def _client(config: BusConfig) -> zenoh.Config:
@@ -123,7 +123,7 @@ def router(config: BusConfig) -> ZenohBus:
         session = zenoh.open(_checked(settings, config.endpoint))
     except zenoh.ZError as error:
         raise InputError(
-            f"no router can listen at {config.endpoint!r}: {_first_line(error)}; "
+            f"no router can listen at {config.endpoint!r}: {first_line(error)}; "
             f"is another router running there? Choose another with --endpoint"
         ) from error
     return ZenohBus(session, config)
@@ -146,7 +146,7 @@ def router_from_file(path: Path) -> ZenohBus:
                 config.insert_json5(f"{TLS}/{name}", json.dumps(str(path.parent / file)))
         return ZenohBus(zenoh.open(config), BusConfig())
     except zenoh.ZError as error:
-        raise InputError(f"router settings {path}: {_first_line(error)}") from error
+        raise InputError(f"router settings {path}: {first_line(error)}") from error
 
 
 def _configured(settings: dict[str, Any]) -> zenoh.Config:
@@ -161,11 +161,5 @@ def _checked(settings: dict[str, Any], endpoint: str) -> zenoh.Config:
         return _configured(settings)
     except zenoh.ZError as error:
         raise InputError(
-            f"endpoint must be like 'tcp/127.0.0.1:7447', got {endpoint!r}: {_first_line(error)}"
+            f"endpoint must be like 'tcp/127.0.0.1:7447', got {endpoint!r}: {first_line(error)}"
         ) from error
-
-
-def _first_line(error: Exception) -> str:
-    """What Zenoh says, without the places in its source where it said so."""
-    line = str(error).splitlines()[0] if str(error) else type(error).__name__
-    return re.sub(r" at /\S+\.rs:\d+\.?", "", line).rstrip(". ")

@@ -317,3 +317,20 @@ def test_keys_without_number_are_not_all_remembered(monkeypatch: pytest.MonkeyPa
     order = InOrder[int]()
     assert [item for number in range(100) for item in fed(order, [number], key=f"x{number}")] == list(range(100))
     assert len(order._streams[1, STREAM].keys) == 10
+
+
+def test_keys_without_number_are_not_all_remembered_on_the_fast_way_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(in_order, "MOST_KEYS", 10)
+    order = InOrder[int]()
+    assert fed(order, [0], key="x0") == [0]
+    assert all(order.takes_next(1, STREAM, f"x{number}", number, 0) for number in range(1, 100))
+    assert len(order._streams[1, STREAM].keys) == 10
+
+
+def test_the_one_that_goes_on_by_the_fast_way_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(in_order, "MOST_STREAMS", 100)
+    order = InOrder[int]()
+    assert fed(order, [0]) == [0]
+    for number in range(1, 1000):
+        assert order.takes_next(1, STREAM, "a", number, number)
+        assert fed(order, [0], now_ns=number, publisher=1 + number) == [0]

@@ -1,5 +1,6 @@
 """Monitors of a fleet on a real router: plants are discovered, and a monitor that dies is replaced."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -228,6 +229,36 @@ def test_what_is_told_again_and_again_waits_on_new_keys_if_there_were_many_latel
         keys_heard = [heard.get(timeout=WITHIN_S) for _ in range(5)]
         bus.close()
     assert keys_heard == [*["reactor/a/health/monitor", "reactor/b/health/monitor"] * 2, "reactor/a/alarm/monitor"]
+
+
+LARGE, MOST_MORE = 10_000_000, 200_000_000
+"""Bytes: of a payload, and that a monitor may take more when fifty such come as fast as they can."""
+
+
+def test_payloads_of_ten_megabytes_are_all_counted_and_take_no_room(bus_config: BusConfig, tmp_path: Path) -> None:
+    with client(bus_config) as bus, monitor(bus_config, tmp_path, "1/1") as process:
+        refused: SimpleQueue[int] = SimpleQueue()
+
+        def on_health(message: Encoded) -> None:
+            health = decode(message.payload, message.encoding)
+            assert isinstance(health, Health)
+            refused.put(health.refused_by_reason["too_large"])
+
+        bus.subscribe("reactor/*/health/monitor", on_health)
+        crew_of(bus)(1)
+        bus.publish(run_of("alpha", 1, span_min=1.0)[0])
+        assert refused.get(timeout=WITHIN_S) == 0
+        before, most = memory_bytes(process), 0
+        for number in range(50):
+            bus.publish(Encoded("reactor/alpha/sample/T", bytes(LARGE), f"x{number}"))
+            most = max(most, memory_bytes(process))
+        while refused.get(timeout=WITHIN_S) < 50:
+            most = max(most, memory_bytes(process))
+        assert most - before < MOST_MORE
+
+
+def memory_bytes(process: subprocess.Popen[bytes]) -> int:
+    return int(Path(f"/proc/{process.pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 KILLED_AT = (120, 280, 330)
