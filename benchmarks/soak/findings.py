@@ -7,8 +7,8 @@
   of it are rightly counted as late: a sample with a number and a time of long ago.)
 - **Alarms.** A fault is alarmed once if the first alarm of its plant comes up within `SOON_ROWS` of the onset, none
   does before, and no alarm of the plant is raised while it stands. A plant without a fault has no alarm. Silences of
-  the plant do not count in this: where a link is cut there is silence, and it is said; but each must be over in the
-  end.
+  the plant do not count in this: where a link is cut there is silence, and it is said; but each once, and it must be
+  over in the end.
 - **Nothing else.** What was said of alarms, silences apart, is what one monitor says that heard all and was never
   stopped: `backtest` on what the plants have published.
 - **Memory.** What a process took at most in the last third of the run is not above what it took at most in the
@@ -117,6 +117,8 @@ class Findings:
             yield f"{plant}: alarms without a fault: {', '.join(raised)}"
         for plant, changes in self.others.items():
             yield f"{plant}: not as undisturbed: {', '.join(changes)}"
+        if self.silences_told_twice:
+            yield f"{self.silences_told_twice} silences were told twice"
         if self.standing_silences:
             yield f"{self.standing_silences} silences stand"
         for name, grown in self.grown_mb.items():

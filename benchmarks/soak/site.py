@@ -55,7 +55,8 @@ class Lines:
         self._on_line = on_line
         self.lines: list[str] = []
         self._ended = False
-        threading.Thread(target=self._read, args=(process,), daemon=True).start()
+        self._thread = threading.Thread(target=self._read, args=(process,), daemon=True)
+        self._thread.start()
 
     def wait_for(self, condition: Callable[[list[str]], bool]) -> None:
         """Wait until what was said makes it so."""
@@ -63,13 +64,18 @@ class Lines:
             self._changed.wait_for(lambda: condition(self.lines) or self._ended, PATIENCE_S)
             assert condition(self.lines), f"said no more after {self.lines[-1:]}"
 
+    def close(self) -> None:
+        """Wait until a process that was ended says no more."""
+        self._thread.join()
+
     def _read(self, process: "subprocess.Popen[str]") -> None:
         assert process.stdout is not None
-        for line in process.stdout:
-            self._on_line(line)
-            with self._changed:
-                self.lines.append(line.rstrip("\n"))
-                self._changed.notify_all()
+        with process.stdout as said:
+            for line in said:
+                self._on_line(line)
+                with self._changed:
+                    self.lines.append(line.rstrip("\n"))
+                    self._changed.notify_all()
         with self._changed:
             self._ended = True
             self._changed.notify_all()
@@ -162,6 +168,10 @@ class Site:
         for process in processes:
             process.kill()
             process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+        for said in self._said.values():
+            said.close()
         for proxy in self._proxies:
             proxy.close()
         self.router.close()
