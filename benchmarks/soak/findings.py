@@ -10,7 +10,8 @@
   the plant do not count in this: where a link is cut there is silence, and it is said; but each once, and it must be
   over in the end.
 - **Nothing else.** What was said of alarms, silences apart, is what one monitor says that heard all and was never
-  stopped: `backtest` on what the plants have published.
+  stopped: `backtest` on what the plants have published. Of a plant of which something was counted as lost or late that
+  cannot be asked.
 - **Memory.** What a process took at most in the last third of the run is not above what it took at most in the
   second third by more than `GROWTH_MB`. A monitor that is started anew is the same process in this; both thirds hold
   times in which it watches the plants of the other, too.
@@ -205,7 +206,7 @@ def found(
     false_alarms: dict[str, list[str]] = {}
     others: dict[str, list[str]] = {}
     silences: list[tuple[str, str, str, int]] = []
-    for plant in plan.plants:
+    for plant, item in zip(plan.plants, told, strict=True):
         said = list(alarms.get(plant, ()))
         silences += [(item.event, plant, item.alarm, item.raised_ns) for item in said if item.alarm.startswith(SILENCE)]
         changes, fault = changes_of(said), plan.faults.get(plant)
@@ -214,7 +215,9 @@ def found(
                 false_alarms[plant] = [f"{change.alarm} {change.event}" for change in changes]
         elif (why := why_not_once(changes, zero_ns + fault.row * ROW_NS)) is not None:
             not_once[plant] = why
-        if different := _different(changes, undisturbed(plan, plant, zero_ns), zero_ns):
+        if not (item.lost or item.late) and (
+            different := _different(changes, undisturbed(plan, plant, zero_ns), zero_ns)
+        ):
             others[plant] = different
     end_ns = zero_ns + plan.rows * ROW_NS
     events = {
