@@ -1,6 +1,6 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study kills cuts fuzz pictures protobuf clean
+.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak pictures protobuf clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -54,6 +54,9 @@ cuts: $(READY) ## cut links and kill routers under load for up to 30 seconds, an
 
 fuzz: $(READY) ## 200,000 strange messages, commands, states and settings: nothing falls over, no alarm; two minutes
 	@$(BIN)/python benchmarks/fuzz.py
+
+soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10 PLANTS=200 SEED=): what is missing or told twice
+	@$(BIN)/python -m benchmarks.soak $(or $(MINUTES),10) $(or $(PLANTS),200) $(SEED)
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py

@@ -139,6 +139,11 @@ class Router:
         )
         self._process = self._start()
 
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._process.pid
+
     def kill(self) -> None:
         """End it as a crash does."""
         self._process.kill()

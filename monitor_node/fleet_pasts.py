@@ -2,6 +2,9 @@
 
 Who watched a plant until now may just be storing what it remembers, and its last words may be on their way; so a plant
 is asked for a moment after it has become ours.
+
+To a monitor that is cut off itself all others seem to be gone. It must not take their plants over: so it waits until it
+is connected again, and for those who are to be seen again then.
 """
 
 import threading
@@ -16,6 +19,10 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus import Bus
 
 SETTLE_S = 0.5
+RETURN_S = 2.0
+"""After we are back: by then those that the same router was gone for are, too."""
+
+LOOK_AGAIN_S = 0.1
 
 
 class Pasts:
@@ -32,6 +39,7 @@ class Pasts:
         self._asked: SimpleQueue[tuple[str, float] | None] = SimpleQueue()
         self._found: SimpleQueue[Past] = SimpleQueue()
         self._open = 0
+        self._ended = threading.Event()
 
     def begin(self) -> None:
         """Find those that were asked for, from now on: what is published from now on comes by itself."""
@@ -59,15 +67,26 @@ class Pasts:
 
     def close(self) -> None:
         """Ask for no more."""
+        self._ended.set()
         self._asked.put(None)
 
     def _find(self) -> None:
         while (asked := self._asked.get()) is not None:
             plant, not_before_s = asked
-            time.sleep(max(0.0, not_before_s - time.monotonic()))
+            self._ended.wait(max(0.0, not_before_s - time.monotonic()))
+            self._wait_for_the_others()
+            if self._ended.is_set():
+                return
             state = None
             try:
                 state = self._states.read(plant) if self._states is not None else None
             except InputError as error:
                 self._say(plant, str(error))
             self._found.put(Past(plant, state, self._bus.recall(keys.all_of(plant, keys.SAMPLE))))
+
+    def _wait_for_the_others(self) -> None:
+        """If we are cut off ourselves, wait until they are to be seen again."""
+        while not (self._bus.has_router or self._ended.is_set()):
+            while not (self._bus.has_router or self._ended.wait(LOOK_AGAIN_S)):
+                pass
+            self._ended.wait(RETURN_S)

@@ -76,6 +76,10 @@ class Bus(Protocol):
     ) -> None:
         """As `subscribe`, of as many messages at a time as have come, up to about `MOST_GATHERED`."""
 
+    @property
+    def has_router(self) -> bool:
+        """Whether a router is connected, without which a client reaches nobody, and sees nobody alive."""
+
     def recall(self, key_expression: str) -> list[Encoded]:
         """What was published on the keys of whole streams lately and is still remembered, in its order."""
 
@@ -199,6 +203,11 @@ class MemoryBus:
         self.subscribe(
             key_expression, lambda message: handler([message]), on_gap=on_gap, history=history, on_told=on_told
         )
+
+    @property
+    def has_router(self) -> bool:
+        """See `Bus`; here there is always the exchange."""
+        return True
 
     def recall(self, key_expression: str) -> list[Encoded]:
         """See `Bus`; here nothing is remembered."""

@@ -248,6 +248,14 @@ class ZenohBus:
         # In a thread of its own: the handler may wait for who called us.
         threading.Thread(target=delivery.begin, args=(on_told,), daemon=True).start()
 
+    @property
+    def has_router(self) -> bool:
+        """See `Bus`."""
+        try:
+            return bool(self._session.info.routers_zid())
+        except zenoh.ZError:  # it is closed
+            return False
+
     def recall(self, key_expression: str) -> list[Encoded]:
         """See `Bus`."""
         order: InOrder[Encoded] = InOrder(gathering=True)

@@ -1,0 +1,267 @@
+"""What came of a soak: is every sample accounted for, was every fault alarmed once, is memory flat?
+
+- **Samples.** A monitor puts each sample of a plant into a row, or counts it as lost (it never came, by its number) or
+  late (its row had been judged). The rows have three places each, of which one or two are empty in each incomplete
+  row. So samples that were published and are in no place must be no more than what was counted, and samples in places
+  no more than what was published; what exceeds that is unaccounted for. Garbage must be among what was refused. (A few
+  of it are rightly counted as late: a sample with a number and a time of long ago.)
+- **Alarms.** A fault is alarmed once if the first alarm of its plant comes up within `SOON_ROWS` of the onset, none
+  does before, and no alarm of the plant is raised while it stands. A plant without a fault has no alarm. Silences of
+  the plant do not count in this: where a link is cut there is silence, and it is said; but each once, and it must be
+  over in the end.
+- **Nothing else.** What was said of alarms, silences apart, is what one monitor says that heard all and was never
+  stopped: `backtest` on what the plants have published. Of a plant of which something was counted as lost or late that
+  cannot be asked.
+- **Memory.** What a process took at most in the last third of the run is not above what it took at most in the
+  second third by more than `GROWTH_MB`. A monitor that is started anew is the same process in this; both thirds hold
+  times in which it watches the plants of the other, too.
+"""
+
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import msgspec
+
+from benchmarks.soak.plan import PERIOD_MIN, Plan
+from benchmarks.soak.site import WATCH
+from monitor_node import backtest
+from plant_node.record import simulate_record
+from reactorwatch.contract.codec import encode
+from reactorwatch.contract.messages_pb2 import Alarm, Health
+from reactorwatch.records.record import MINUTE_NS
+from recorder.player import samples_of
+
+SIGNALS = 3
+SOON_ROWS = 20
+GROWTH_MB = 16.0
+SILENCE = "silence/"
+ROW_NS = round(PERIOD_MIN * MINUTE_NS)
+
+
+class Change(NamedTuple):
+    """What happened to an alarm."""
+
+    time_ns: int
+    alarm: str
+    event: str
+
+
+@dataclass(frozen=True)
+class Findings:
+    """What was found.
+
+    Attributes:
+        published: samples of all plants.
+        rows: that were judged.
+        incomplete: of them.
+        lost: samples that never came to who watched the plant then.
+        late: samples whose row had been judged.
+        unaccounted: by plant, if there are any, how many of its samples are neither in a row nor counted, or in a row
+            without having been published.
+        duplicated: samples that came again.
+        refused: by reason, all that was refused of the plants.
+        strange: messages that the stranger has published.
+        stalls: how often a monitor did not run for more than a second.
+        lag_ms: the longest that a message has waited in a monitor.
+        faults: in the plants.
+        alarmed_once: of them.
+        not_once: plants with a fault of which that cannot be said, and why.
+        false_alarms: plants without a fault, and what was raised.
+        others: changes of alarms that an undisturbed monitor does not tell, or that were not told though it does.
+        silences: of plants that were raised, but for those after the last row.
+        silences_told_twice: how often one that was known already was told as raised.
+        standing_silences: those that were not over in the end.
+        memory_mb: by process, the most it took in each third of the run.
+    """
+
+    published: int
+    rows: int
+    incomplete: int
+    lost: int
+    late: int
+    unaccounted: dict[str, str]
+    duplicated: int
+    refused: dict[str, int]
+    strange: int
+    stalls: int
+    lag_ms: float
+    faults: int
+    alarmed_once: int
+    not_once: dict[str, str]
+    false_alarms: dict[str, list[str]]
+    others: dict[str, list[str]]
+    silences: int
+    silences_told_twice: int
+    standing_silences: int
+    memory_mb: dict[str, tuple[float, float, float]]
+
+    @property
+    def grown_mb(self) -> dict[str, float]:
+        """By process, how much more it took in the last third than in the second."""
+        return {name: last - middle for name, (_, middle, last) in self.memory_mb.items()}
+
+    def broken(self, growth_mb: float = GROWTH_MB) -> Iterator[str]:
+        """What is not as it has to be.
+
+        Args:
+            growth_mb: by which a process may grow.
+        """
+        for plant, samples in self.unaccounted.items():
+            yield f"{plant}: samples unaccounted for: {samples}"
+        if not 0 < sum(self.refused.values()) <= self.strange:
+            yield f"{sum(self.refused.values())} messages were refused, of {self.strange} strange ones"
+        for plant, why in self.not_once.items():
+            yield f"{plant}: not alarmed once: {why}"
+        for plant, raised in self.false_alarms.items():
+            yield f"{plant}: alarms without a fault: {', '.join(raised)}"
+        for plant, changes in self.others.items():
+            yield f"{plant}: not as undisturbed: {', '.join(changes)}"
+        if self.silences_told_twice:
+            yield f"{self.silences_told_twice} silences were told twice"
+        if self.standing_silences:
+            yield f"{self.standing_silences} silences stand"
+        for name, grown in self.grown_mb.items():
+            if grown > growth_mb:
+                yield f"{name} grew by {grown:.1f} MB"
+
+
+def unaccounted(health: Health, rows: int) -> int:
+    """Samples of a plant that are neither in a row nor counted, or samples in rows that it did not publish.
+
+    Args:
+        health: of its monitor.
+        rows: that it has published.
+    """
+    places = SIGNALS * health.rows
+    fewest, most = places - (SIGNALS - 1) * health.incomplete_rows, places - health.incomplete_rows
+    missing, too_many = SIGNALS * rows - most, fewest - SIGNALS * rows
+    return max(missing - health.lost - health.late, too_many, 0)
+
+
+def changes_of(alarms: Sequence[Alarm]) -> list[Change]:
+    """What happened to the alarms of a plant, without silences."""
+    return [
+        Change(item.time_ns, item.alarm, item.event)
+        for item in alarms
+        if not item.alarm.startswith(SILENCE) and item.event in ("raised", "cleared")
+    ]
+
+
+def undisturbed(plan: Plan, plant: str, zero_ns: int) -> list[Change]:
+    """What a monitor says of a plant that heard all of it, and was never stopped."""
+    config = plan.plant(plant, zero_ns)
+    published = (encode(item) for item in samples_of(simulate_record(config), plant, zero_ns))
+    return changes_of(backtest.run(published, msgspec.structs.replace(WATCH, plant=plant)).alarm_messages)
+
+
+def why_not_once(changes: Sequence[Change], onset_ns: int) -> str | None:
+    """Why it cannot be said that a fault was alarmed once; None: it was."""
+    raised = [change for change in changes if change.event == "raised"]
+    if not raised:
+        return "no alarm"
+    first_ns = min(change.time_ns for change in raised)
+    if not onset_ns <= first_ns <= onset_ns + SOON_ROWS * ROW_NS:
+        return f"the first alarm is {(first_ns - onset_ns) / ROW_NS:.0f} rows from the onset"
+    standing: set[str] = set()
+    for change in changes:
+        if change.event == "raised" and change.alarm in standing:
+            return f"{change.alarm} is raised again while it stands"
+        (standing.add if change.event == "raised" else standing.discard)(change.alarm)
+    return None
+
+
+def found(
+    plan: Plan,
+    zero_ns: int,
+    alarms: Mapping[str, Sequence[Alarm]],
+    health: Mapping[str, Health],
+    lag_ms: float,
+    strange: int,
+    memory_mb: Mapping[str, Sequence[tuple[int, float]]],
+) -> Findings:
+    """Judge a soak.
+
+    Args:
+        plan: what happened.
+        zero_ns: the time of the plants' first row.
+        alarms: by plant, all that was heard.
+        health: by plant, what its monitor said last.
+        lag_ms: the longest.
+        strange: messages that the stranger has published.
+        memory_mb: by process, at which row how much it took.
+    """
+    told = [health.get(plant, Health()) for plant in plan.plants]
+    refused: Counter[str] = Counter()
+    missing: dict[str, str] = {}
+    for plant, item in zip(plan.plants, told, strict=True):
+        refused.update(dict(item.refused_by_reason))
+        if number := unaccounted(item, plan.rows):
+            missing[plant] = (
+                f"{number} ({item.rows} rows of {plan.rows}, {item.incomplete_rows} incomplete, "
+                f"{item.lost} lost, {item.late} late)"
+            )
+    not_once: dict[str, str] = {}
+    false_alarms: dict[str, list[str]] = {}
+    others: dict[str, list[str]] = {}
+    silences: list[tuple[str, str, str, int]] = []
+    for plant, item in zip(plan.plants, told, strict=True):
+        said = list(alarms.get(plant, ()))
+        silences += [(item.event, plant, item.alarm, item.raised_ns) for item in said if item.alarm.startswith(SILENCE)]
+        changes, fault = changes_of(said), plan.faults.get(plant)
+        if fault is None:
+            if changes:
+                false_alarms[plant] = [f"{change.alarm} {change.event}" for change in changes]
+        elif (why := why_not_once(changes, zero_ns + fault.row * ROW_NS)) is not None:
+            not_once[plant] = why
+        if not (item.lost or item.late) and (
+            different := _different(changes, undisturbed(plan, plant, zero_ns), zero_ns)
+        ):
+            others[plant] = different
+    end_ns = zero_ns + plan.rows * ROW_NS
+    events = {
+        event: [item for item in silences if item[0] == event and item[3] < end_ns] for event in ("raised", "cleared")
+    }
+    raised, over = ({item[1:] for item in events[event]} for event in ("raised", "cleared"))
+    return Findings(
+        published=SIGNALS * plan.rows * len(plan.plants),
+        rows=sum(item.rows for item in told),
+        incomplete=sum(item.incomplete_rows for item in told),
+        lost=sum(item.lost for item in told),
+        late=sum(item.late for item in told),
+        unaccounted=missing,
+        duplicated=sum(item.duplicated for item in told),
+        refused=dict(refused),
+        strange=strange,
+        stalls=sum(item.stalls for item in told),
+        lag_ms=lag_ms,
+        faults=len(plan.faults),
+        alarmed_once=len(plan.faults) - len(not_once),
+        not_once=not_once,
+        false_alarms=false_alarms,
+        others=others,
+        silences=len(raised),
+        silences_told_twice=len(events["raised"]) - len(raised),
+        standing_silences=len(raised - over),
+        memory_mb={name: _thirds(taken, plan.rows) for name, taken in memory_mb.items()},
+    )
+
+
+def _different(told: Sequence[Change], expected: Sequence[Change], zero_ns: int) -> list[str]:
+    """Changes that are in one of the two and not in the other, or more often."""
+    more, fewer = Counter(told) - Counter(expected), Counter(expected) - Counter(told)
+    return [
+        f"{sign}{change.alarm} {change.event} at row {(change.time_ns - zero_ns) // ROW_NS}"
+        for sign, changes in (("+", more), ("-", fewer))
+        for change in sorted(changes.elements())
+    ]
+
+
+def _thirds(taken: Sequence[tuple[int, float]], rows: int) -> tuple[float, float, float]:
+    """The most in each third of the run."""
+    most = [0.0, 0.0, 0.0]
+    for row, memory_mb in taken:
+        place = min(3 * row // rows, 2)
+        most[place] = max(most[place], memory_mb)
+    return most[0], most[1], most[2]

@@ -1,0 +1,169 @@
+"""What happens in a soak, all of it drawn from a seed: which plants get which fault, and what befalls all of them.
+
+Time is counted in rows of the plants, which all publish a row at the same time, so that a run is the same on a machine
+that is slow.
+"""
+
+import random
+from typing import Literal, NamedTuple
+
+from plant_node.config import PlantConfig
+from reactorwatch.errors import InputError
+
+PERIOD_MIN = 0.1
+TRAINING_ROWS = 200
+SETTLED_ROWS = 60
+"""After the training, before the first fault."""
+
+KNOWN_ROWS = 40
+"""After which a monitor knows how the plants count and time their samples; before, it takes whoever comes first."""
+
+LAST_ROWS = 40
+"""That are left after the last fault and the last blow."""
+
+FAULTY = 0.25
+"""Of the plants."""
+
+BLOW_EVERY_S = 25.0
+SHORTEST_S, LONGEST_S = 1.0, 6.0
+"""That a link is cut, or a process gone."""
+
+FAULTS = (
+    "coolant_flow:step:-0.2",
+    "coolant_flow:step:0.2",
+    "feed_temperature:step:10",
+    "feed_temperature:step:-10",
+    "feed_concentration:step:-0.1",
+    "feed_concentration:step:0.1",
+    "reaction_rate:step:-0.3",
+    "reaction_rate:step:0.3",
+    "coolant_temperature:step:10",
+    "coolant_temperature:step:-10",
+    "temperature_bias:step:5",
+    "temperature_bias:step:-5",
+    "concentration_bias:step:0.03",
+    "concentration_gain:step:0.3",
+    "reaction_heat:step:-0.1",
+    "feed_flow:step:0.15",
+    "activation_energy:step:0.01",
+    "heat_loss:step:0.05",
+)
+"""So large that alarms come up within five rows and stand for good; no operator would wait for a chart."""
+
+Kind = Literal["kill monitor", "cut monitor", "cut plants", "kill router", "flood"]
+Manner = Literal["closed", "stalled"]
+
+KINDS: tuple[tuple[Kind, Manner], ...] = (
+    ("kill monitor", "closed"),
+    ("cut monitor", "closed"),
+    ("cut monitor", "stalled"),
+    ("cut plants", "closed"),
+    ("cut plants", "stalled"),
+    ("kill router", "closed"),
+    ("flood", "closed"),
+)
+"""What befalls the processes. Each comes once before any comes again."""
+
+
+class Blow(NamedTuple):
+    """What befalls a process or a link.
+
+    Attributes:
+        row: of the plants, at which it comes.
+        kind: what it is.
+        manner: of a cut: closed, as when a machine is switched off, or stalled, as when a cable is pulled.
+        whom: which of the monitors.
+        rows: for how long.
+    """
+
+    row: int
+    kind: Kind
+    manner: Manner
+    whom: int
+    rows: int
+
+
+class Fault(NamedTuple):
+    """A fault in a plant: what, from which row on."""
+
+    specification: str
+    row: int
+
+
+class Plan(NamedTuple):
+    """What happens.
+
+    Attributes:
+        seed: that it was drawn from.
+        rows: that each plant publishes.
+        rows_per_s: at which pace.
+        plants: their names.
+        faults: by plant; most have none.
+        blows: in their order.
+    """
+
+    seed: int
+    rows: int
+    rows_per_s: float
+    plants: tuple[str, ...]
+    faults: dict[str, Fault]
+    blows: tuple[Blow, ...]
+
+    def plant(self, name: str, zero_ns: int) -> PlantConfig:
+        """How a plant is simulated.
+
+        Args:
+            name: its.
+            zero_ns: the time of its first row.
+        """
+        fault = self.faults.get(name)
+        return PlantConfig(
+            name=name,
+            period_min=PERIOD_MIN,
+            duration_min=self.rows * PERIOD_MIN,
+            seed=self.seed + self.plants.index(name),
+            zero_ns=zero_ns,
+            faults=(f"{fault.specification}@{fault.row * PERIOD_MIN:g}min",) if fault is not None else (),
+            health_period_s=3600.0,
+        )
+
+
+def drawn(seed: int, plants: int, rows: int, rows_per_s: float) -> Plan:
+    """A plan from a seed.
+
+    Args:
+        seed: of all that is drawn.
+        plants: how many.
+        rows: that each publishes.
+        rows_per_s: at which pace.
+
+    Raises:
+        InputError: too few rows for a training and a fault after it.
+    """
+    first = TRAINING_ROWS + SETTLED_ROWS
+    if rows <= first + LAST_ROWS:
+        raise InputError(
+            f"a soak must have more than {first + LAST_ROWS} rows of each plant, got {rows}; let it last longer"
+        )
+    draw = random.Random(seed)
+    names = tuple(f"p{number:03d}" for number in range(plants))
+    faults = {
+        name: Fault(draw.choice(FAULTS), draw.randrange(first, rows - LAST_ROWS))
+        for name in sorted(draw.sample(names, round(FAULTY * plants)))
+    }
+    count = max(len(KINDS), round(rows / rows_per_s / BLOW_EVERY_S))
+    share = (rows - LAST_ROWS) / (count + 1)  # the first of these is left in peace
+    kinds: list[tuple[Kind, Manner]] = []
+    while len(kinds) < count:
+        kinds += draw.sample(KINDS, len(KINDS))
+    blows = tuple(
+        Blow(
+            row=round((number + draw.uniform(0.0, 0.5)) * share),
+            kind=kind,
+            manner=manner,
+            whom=draw.randrange(2),
+            rows=round(draw.uniform(SHORTEST_S, LONGEST_S) * rows_per_s),
+        )
+        for number, (kind, manner) in enumerate(kinds[:count], start=1)
+    )
+    return Plan(seed, rows, rows_per_s, names, faults, blows)

@@ -1,0 +1,105 @@
+"""The plants of a soak, many in a process; started by `site`.
+
+They publish a row each, all at the same time, at their pace, and say which row that was. Lines that come in allow rows
+up to a number, so that whoever does something to the network is not overtaken. They stay when they have ended, for who
+has missed something; the end of the input ends them.
+"""
+
+import sys
+import threading
+import time
+
+import msgspec
+
+from benchmarks.link_cuts import connected
+from benchmarks.soak.plan import PERIOD_MIN, drawn
+from plant_node.node import PlantNode
+from plant_node.record import plant_from
+from reactorwatch.contract.codec import encode
+from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.runtime import logs
+from reactorwatch.runtime.config import BusConfig
+
+SHARING = 25
+"""Plants that share a session: it takes the longer for a message the more keys it has."""
+
+
+class Task(msgspec.Struct, frozen=True):
+    """What a process publishes.
+
+    Attributes:
+        seed: as for `drawn`.
+        plants: likewise.
+        rows: likewise.
+        rows_per_s: likewise.
+        part: which of the plants: this one and every `parts`-th after it.
+        parts: see there.
+        zero_ns: the time of the first row.
+        bus: where the router is.
+    """
+
+    seed: int
+    plants: int
+    rows: int
+    rows_per_s: float
+    part: int
+    parts: int
+    zero_ns: int
+    bus: BusConfig
+
+
+class Allowance:
+    """Up to which row may be published, as lines of the input tell."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._rows = 0
+        self.ended = threading.Event()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def wait_for(self, row: int) -> bool:
+        """Wait until a row is allowed; returns whether it is."""
+        with self._changed:
+            self._changed.wait_for(lambda: row < self._rows or self.ended.is_set())
+            return row < self._rows
+
+    def _read(self) -> None:
+        for line in sys.stdin:
+            with self._changed:
+                self._rows = int(line)
+                self._changed.notify_all()
+        with self._changed:
+            self.ended.set()
+            self._changed.notify_all()
+
+
+def publish(task: Task) -> None:
+    """Publish the rows of the plants, and stay until the input ends."""
+    plan = drawn(task.seed, task.plants, task.rows, task.rows_per_s)
+    names = plan.plants[task.part :: task.parts]
+    configs = [plan.plant(name, task.zero_ns) for name in names]
+    nodes = [PlantNode(plant_from(config), config, _nothing) for config in configs]
+    buses = [connected(task.bus) for _ in range(-(-len(nodes) // SHARING))]
+    allowance = Allowance()
+    print("ready", flush=True)
+    period_ns = round(PERIOD_MIN * MINUTE_NS)
+    due_s = time.monotonic()
+    for row in range(plan.rows):
+        if not allowance.wait_for(row):
+            return
+        due_s = max(due_s + 1.0 / plan.rows_per_s, time.monotonic() - 1.0)  # what it could not do in time it leaves
+        time.sleep(max(0.0, due_s - time.monotonic()))
+        for number, node in enumerate(nodes):
+            for publication in node.on_tick(task.zero_ns + row * period_ns):
+                buses[number // SHARING].publish(encode(publication))
+        print(row, flush=True)
+    allowance.ended.wait()
+
+
+def _nothing(_: str) -> None:
+    """The seed says what happens."""
+
+
+if __name__ == "__main__":
+    logs.configure()
+    publish(msgspec.json.decode(sys.argv[1], type=Task))

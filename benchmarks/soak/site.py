@@ -1,0 +1,252 @@
+"""The processes of a soak, and what befalls them.
+
+A router, two monitors that share the fleet and the folder of its states, two processes of plants, a stranger. The links
+of both monitors and of the second half of the plants go through proxies.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from benchmarks.link_cuts import Proxy, Router
+from benchmarks.soak import publisher, stranger
+from benchmarks.soak.plan import PERIOD_MIN, TRAINING_ROWS, Blow, Plan
+from monitor_node.config import MonitorConfig
+from monitor_node.fleet_config import FleetConfig
+from reactorwatch.cli.processes import write_settings
+from reactorwatch.contract import keys
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_endpoint
+
+ROOT = Path(__file__).parents[2]
+MONITORS = PARTS = 2
+FLEET = f"{keys.ROOT}/*"
+PATIENCE_S = 300.0
+KEPT_S = 60.0
+"""Of what was published each publisher keeps so much: longer than any blow lasts."""
+
+WATCH = MonitorConfig(
+    training_min=TRAINING_ROWS * PERIOD_MIN,
+    false_alarms_per_30_days=0.05,
+    isolation=False,
+    state_every_s=2.0,
+    health_period_s=2.0,
+)
+"""Of 200 plants in two hours of theirs, chance raises one alarm in fifty runs. Causes are not looked for: that takes a
+core for a second each, and is tested elsewhere."""
+
+
+class Lines:
+    """What a process says, line by line.
+
+    Args:
+        process: which.
+        on_line: told each, from a thread.
+    """
+
+    def __init__(self, process: "subprocess.Popen[str]", on_line: Callable[[str], None] = lambda _: None) -> None:
+        self._changed = threading.Condition()
+        self._on_line = on_line
+        self.lines: list[str] = []
+        self._ended = False
+        self._thread = threading.Thread(target=self._read, args=(process,), daemon=True)
+        self._thread.start()
+
+    def wait_for(self, condition: Callable[[list[str]], bool]) -> None:
+        """Wait until what was said makes it so."""
+        with self._changed:
+            self._changed.wait_for(lambda: condition(self.lines) or self._ended, PATIENCE_S)
+            assert condition(self.lines), f"said no more after {self.lines[-1:]}"
+
+    def close(self) -> None:
+        """Wait until a process that was ended says no more."""
+        self._thread.join()
+
+    def _read(self, process: "subprocess.Popen[str]") -> None:
+        assert process.stdout is not None
+        with process.stdout as said:
+            for line in said:
+                self._on_line(line)
+                with self._changed:
+                    self.lines.append(line.rstrip("\n"))
+                    self._changed.notify_all()
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+
+class Site:
+    """The processes, as long as the context lasts.
+
+    Args:
+        plan: what happens.
+        folder: for settings, states and what the monitors say.
+        zero_ns: the time of the plants' first row.
+    """
+
+    def __init__(self, plan: Plan, folder: Path, zero_ns: int) -> None:
+        self._plan, self._folder, self._zero_ns = plan, folder, zero_ns
+        (folder / "states").mkdir()
+        endpoint = free_endpoint()
+        self.bus = BusConfig(endpoint=endpoint, cache_messages=round(KEPT_S * plan.rows_per_s), history_s=KEPT_S)
+        self.router = Router(endpoint)
+        self._proxies = [Proxy(endpoint) for _ in range(MONITORS + 1)]
+        self._monitors: list[subprocess.Popen[bytes]] = []
+        self._plants: list[subprocess.Popen[str]] = []
+        self._stranger: subprocess.Popen[str] | None = None
+        self._said: dict[str, Lines] = {}
+        self.memory_mb: dict[str, list[tuple[int, float]]] = {}
+        """By process, at which row how much it takes."""
+
+    # --- start and end ---------------------------------------------------------------------------------------
+
+    def start_monitors(self) -> None:
+        """Start both."""
+        self._monitors = [self._monitor(number) for number in range(MONITORS)]
+
+    def start_plants(self) -> None:
+        """Start the plants, which wait for leave to publish, and the stranger."""
+        plan = self._plan
+        for part in range(PARTS):
+            bus = self._via(MONITORS) if part else self.bus
+            task = publisher.Task(
+                plan.seed, len(plan.plants), plan.rows, plan.rows_per_s, part, PARTS, self._zero_ns, bus
+            )
+            process = self._started(publisher, task)
+            self._plants.append(process)
+            self._said[f"plants {part + 1}"] = Lines(process, self._measure if part == 0 else lambda _: None)
+        task_of_stranger = stranger.Task(plan.seed, plan.plants, self._zero_ns, self.bus)
+        self._stranger = self._started(stranger, task_of_stranger)
+        self._said["stranger"] = Lines(self._stranger)
+        for said in self._said.values():
+            said.wait_for(lambda lines: bool(lines))
+
+    def allow(self, rows: int) -> None:
+        """Let the plants publish up to a row."""
+        for process in self._plants:
+            _tell(process, str(rows))
+
+    def wait_for_row(self, row: int) -> None:
+        """Wait until all plants have published it."""
+        for part in range(PARTS):
+            self._said[f"plants {part + 1}"].wait_for(lambda lines: lines[-1] != "ready" and int(lines[-1]) >= row)
+
+    @property
+    def row(self) -> int:
+        """That the first plants have published last."""
+        last = self._said["plants 1"].lines[-1]
+        return -1 if last == "ready" else int(last)
+
+    def begin_garbage(self) -> None:
+        """Have the stranger begin."""
+        assert self._stranger is not None
+        _tell(self._stranger, "begin")
+
+    def end_stranger(self) -> int:
+        """Have no more garbage published; returns how many messages it was."""
+        assert self._stranger is not None
+        assert self._stranger.stdin is not None
+        self._stranger.stdin.close()
+        self._stranger.wait(PATIENCE_S)
+        self._said["stranger"].wait_for(lambda lines: lines[-1].isdigit())
+        return int(self._said["stranger"].lines[-1])
+
+    def __enter__(self) -> "Site":
+        """The site itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End all of it."""
+        others = self._plants if self._stranger is None else [*self._plants, self._stranger]
+        processes: list[subprocess.Popen[Any]] = [*self._monitors, *others]
+        for process in processes:
+            process.kill()
+            process.wait()
+            if process.stdin is not None:
+                process.stdin.close()
+        for said in self._said.values():
+            said.close()
+        for proxy in self._proxies:
+            proxy.close()
+        self.router.close()
+
+    def _via(self, proxy: int) -> BusConfig:
+        return msgspec.structs.replace(self.bus, endpoint=self._proxies[proxy].endpoint)
+
+    def _monitor(self, number: int) -> "subprocess.Popen[bytes]":
+        fleet = FleetConfig(plants=FLEET, shard=f"{number + 1}/{MONITORS}", state=str(self._folder / "states"))
+        settings = self._folder / f"monitor{number + 1}.toml"
+        write_settings(settings, {"bus": self._via(number), "monitor": WATCH, "fleet": fleet})
+        command = [sys.executable, "-m", "reactorwatch", "monitor", "--config", str(settings)]
+        with settings.with_suffix(".log").open("ab") as said:
+            return subprocess.Popen(command, stderr=said)
+
+    def _started(self, module: Any, task: msgspec.Struct) -> "subprocess.Popen[str]":
+        command = [sys.executable, "-m", module.__name__, msgspec.json.encode(task).decode()]
+        return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT)
+
+    # --- what befalls them -----------------------------------------------------------------------------------
+
+    def suffer(self, blow: Blow, wait_for_crew: Callable[[int], None]) -> None:
+        """Strike a blow, and wait until all processes are there again.
+
+        Args:
+            blow: which.
+            wait_for_crew: waits until so many monitors show that they are there.
+        """
+        end = blow.row + blow.rows
+        self.allow(end + 1)
+        if blow.kind == "kill monitor":
+            self._monitors[blow.whom].kill()
+            self._monitors[blow.whom].wait()
+            wait_for_crew(MONITORS - 1)
+            self.wait_for_row(end)
+            self._monitors[blow.whom] = self._monitor(blow.whom)
+        elif blow.kind == "kill router":
+            self.router.kill()
+            self.wait_for_row(end)
+            self.router.restart()
+        elif blow.kind == "flood":
+            assert self._stranger is not None
+            floods = self._said["stranger"].lines.count("flooded")
+            _tell(self._stranger, "flood")
+            self._said["stranger"].wait_for(lambda lines: lines.count("flooded") > floods)
+        else:
+            with self._proxies[blow.whom if blow.kind == "cut monitor" else MONITORS].cut(blow.manner):
+                self.wait_for_row(end)
+        wait_for_crew(MONITORS)
+
+    # --- memory ----------------------------------------------------------------------------------------------
+
+    def _measure(self, line: str) -> None:
+        """Note what each process takes, at every row that the first plants publish."""
+        if not line.strip().isdigit():
+            return
+        numbers = {"router": self.router.pid}
+        numbers |= {f"monitor {number + 1}": process.pid for number, process in enumerate(self._monitors)}
+        numbers |= {f"plants {part + 1}": process.pid for part, process in enumerate(self._plants)}
+        for name, pid in numbers.items():
+            taken = _memory_mb(pid)
+            if taken:
+                self.memory_mb.setdefault(name, []).append((int(line), taken))
+
+
+def _tell(process: "subprocess.Popen[str]", line: str) -> None:
+    assert process.stdin is not None
+    process.stdin.write(f"{line}\n")
+    process.stdin.flush()
+
+
+def _memory_mb(pid: int) -> float:
+    """What a process holds of the machine's memory; 0 if it is gone."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
+    except (OSError, IndexError):
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -1,0 +1,82 @@
+"""A fleet runs for a minute while its processes are killed, its links cut and garbage comes; ten minutes: `make soak`.
+
+The same code with 40 plants instead of 200, and five times faster: the time goes into starting processes, and on a
+machine with other things to do 200 plants would be late, which says nothing. What happens is counted in rows of the
+plants, which wait for it, so that a slow machine does the same, later. A minute is too short for memory to be level, as
+buffers grow to what the first flood wants; only what grows without end would be found.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from benchmarks.soak.__main__ import soak, table
+from benchmarks.soak.findings import ROW_NS, Change, unaccounted, why_not_once
+from benchmarks.soak.plan import KINDS, drawn
+from reactorwatch.contract.messages_pb2 import Health
+
+ROWS = 500
+ROWS_PER_S = 10.0
+PLANTS = 40
+SEED = 1
+GROWTH_MB = 150.0
+
+EWMA, SHEWHART = "ewma/T", "shewhart/T"
+
+
+def test_in_a_minute_of_kills_cuts_and_garbage_no_sample_is_unaccounted_for_and_each_fault_alarmed_once(
+    tmp_path: Path,
+) -> None:
+    plan = drawn(SEED, PLANTS, ROWS, ROWS_PER_S)
+    assert {(blow.kind, blow.manner) for blow in plan.blows} == set(KINDS)
+    findings = soak(plan, tmp_path)
+    broken = list(findings.broken(GROWTH_MB))
+    assert not broken, "\n".join([*broken, table(plan, findings)])
+    assert (findings.alarmed_once, len(findings.memory_mb)) == (len(plan.faults), 5)
+
+
+@pytest.mark.parametrize(
+    ("health", "samples"),
+    [
+        (Health(rows=100), 0),
+        (Health(rows=99), 3),
+        (Health(rows=99, lost=3), 0),
+        (Health(rows=99, lost=2, late=1), 0),
+        (Health(rows=100, incomplete_rows=1), 1),
+        (Health(rows=100, incomplete_rows=1, late=1), 0),
+        (Health(rows=101), 3),
+        (Health(rows=101, incomplete_rows=1), 1),
+    ],
+)
+def test_samples_are_accounted_for_that_are_in_rows_or_counted(health: Health, samples: int) -> None:
+    """Of 100 rows that were published, three samples each."""
+    assert unaccounted(health, rows=100) == samples
+
+
+def changes(*events: tuple[int, str, str]) -> list[Change]:
+    return [Change(row * ROW_NS, alarm, event) for row, alarm, event in events]
+
+
+@pytest.mark.parametrize(
+    ("told", "once"),
+    [
+        (changes((50, EWMA, "raised"), (52, SHEWHART, "raised")), True),
+        (changes((50, EWMA, "raised"), (60, EWMA, "cleared"), (70, EWMA, "raised")), True),
+        (changes(), False),
+        (changes((49, EWMA, "raised")), False),
+        (changes((90, EWMA, "raised")), False),
+        (changes((50, EWMA, "raised"), (50, EWMA, "raised")), False),
+    ],
+    ids=["once", "again when it was over", "never", "before the fault", "long after it", "twice"],
+)
+def test_a_fault_is_alarmed_once_if_an_alarm_comes_soon_and_none_comes_again_while_it_stands(
+    told: Sequence[Change], once: bool
+) -> None:
+    """The fault sets in with row 50."""
+    assert (why_not_once(told, 50 * ROW_NS) is None) == once
+
+
+def test_the_same_seed_is_the_same_plan_and_another_is_another() -> None:
+    assert drawn(1, PLANTS, ROWS, ROWS_PER_S) == drawn(1, PLANTS, ROWS, ROWS_PER_S)
+    assert drawn(1, PLANTS, ROWS, ROWS_PER_S) != drawn(2, PLANTS, ROWS, ROWS_PER_S)

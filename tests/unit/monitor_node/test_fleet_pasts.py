@@ -1,0 +1,50 @@
+"""What is known of plants from before, as a monitor finds it that may be cut off."""
+
+import threading
+
+import pytest
+
+from monitor_node import fleet_pasts
+from monitor_node.fleet_pasts import Pasts
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.runtime.bus import Exchange, MemoryBus
+
+WITHIN_S = 30.0
+
+
+class CutOff(MemoryBus):
+    """A bus whose router is gone at first, and found again at the third look."""
+
+    def __init__(self) -> None:
+        super().__init__(Exchange())
+        self._looks = iter((False, False, True))
+        self.seen: list[str] = []
+        self.asked = threading.Event()
+
+    @property
+    def has_router(self) -> bool:
+        found = next(self._looks, True)
+        self.seen.append("router" if found else "no router")
+        return found
+
+    def recall(self, key_expression: str) -> list[Encoded]:
+        self.seen.append(key_expression)
+        self.asked.set()
+        return []
+
+
+@pytest.fixture(autouse=True)
+def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("SETTLE_S", "RETURN_S", "LOOK_AGAIN_S"):
+        monkeypatch.setattr(fleet_pasts, name, 0.0)
+
+
+def test_who_is_cut_off_takes_nobody_s_plants_over_until_the_others_are_to_be_seen_again() -> None:
+    bus = CutOff()
+    pasts = Pasts(bus, None, lambda _plant, _line: None)
+    pasts.ask("a")
+    pasts.begin()
+    assert bus.asked.wait(WITHIN_S)
+    pasts.close()
+    assert bus.seen[:2] == ["no router", "no router"]
+    assert bus.seen[-2:] == ["router", "reactor/a/sample/**"]
