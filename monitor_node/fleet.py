@@ -18,11 +18,13 @@ from heapq import heappop, heappush
 
 import msgspec
 
+from monitor_node.alarm_states import Event
 from monitor_node.arrivals import Arrivals, Past
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.plants import QuietPlants
+from monitor_node.recorded_lives import SILENCE
 from monitor_node.shards import Crew
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
@@ -143,9 +145,22 @@ class FleetMonitor:
                 state = None
         if state is None:
             monitor.go_on_from_alarms(self._heard.get(plant, {}).values())
+        else:
+            monitor.go_on_from_alarms(self._silence_since(plant, monitor))
         self._monitors[plant] = monitor
         self._in_charge(plant, True)
         self._schedule(plant, monitor)
+
+    def _silence_since(self, plant: str, monitor: Monitor) -> list[Alarm]:
+        """A silence that another has raised and that the state does not know: no sample tells of it again."""
+        last_ns = monitor.last_ns
+        return [
+            alarm
+            for alarm in self._heard.get(plant, {}).values()
+            if alarm.alarm == SILENCE
+            and alarm.event == Event.RAISED.value
+            and (last_ns is None or alarm.raised_ns > last_ns)
+        ]
 
     def release(self, plant: str) -> State | None:
         """Watch a plant no longer; returns its state, for who does. None: it was not watched here."""
@@ -388,4 +403,7 @@ class FleetMonitor:
         if not isinstance(alarm, Alarm) or topic is None:
             return False
         before = self._heard.get(topic.plant, {}).get(alarm.alarm)
-        return before is not None and alarm.time_ns <= before.time_ns
+        if before is None or alarm.time_ns > before.time_ns:
+            return False
+        ends_it = before.event == Event.RAISED.value and alarm.event == Event.CLEARED.value
+        return alarm.time_ns < before.time_ns or not ends_it  # a silence may end at the time at which it was raised

@@ -1,4 +1,4 @@
-"""Finding out what is known of plants from before, in a thread of its own: one after the other.
+"""Finding out what is known of plants from before, in threads of its own: of a few at a time.
 
 Who watched a plant until now may just be storing what it remembers, and its last words may be on their way; so a plant
 is asked for a moment after it has become ours.
@@ -23,6 +23,12 @@ RETURN_S = 2.0
 """After we are back: by then those that the same router was gone for are, too."""
 
 LOOK_AGAIN_S = 0.1
+<<<<<<< HEAD
+=======
+
+AT_A_TIME = 4
+"""Plants; one that does not answer, as it is frozen, is waited for for ten seconds."""
+>>>>>>> 0ab6c56dc7e3c28e653bfdcae91c53a307e41795
 
 
 class Pasts:
@@ -43,7 +49,8 @@ class Pasts:
 
     def begin(self) -> None:
         """Find those that were asked for, from now on: what is published from now on comes by itself."""
-        threading.Thread(target=self._find, name="pasts", daemon=True).start()
+        for _ in range(AT_A_TIME):
+            threading.Thread(target=self._find, name="pasts", daemon=True).start()
 
     @property
     def is_waiting(self) -> bool:
@@ -68,7 +75,12 @@ class Pasts:
     def close(self) -> None:
         """Ask for no more."""
         self._ended.set()
+<<<<<<< HEAD
         self._asked.put(None)
+=======
+        for _ in range(AT_A_TIME):
+            self._asked.put(None)
+>>>>>>> 0ab6c56dc7e3c28e653bfdcae91c53a307e41795
 
     def _find(self) -> None:
         while (asked := self._asked.get()) is not None:

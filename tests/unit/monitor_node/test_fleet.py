@@ -204,6 +204,26 @@ def test_with_the_state_of_who_died_no_alarm_is_lost_and_none_is_told_twice(
     ]
 
 
+def test_a_silence_that_was_raised_after_the_state_was_stored_is_cleared_by_who_goes_on_from_it() -> None:
+    """It was raised by the clock of receipt; in the samples there is none, so nothing else tells that it is over."""
+    run, at_home = run_of("b", 2), home("b", 2)
+    first = fleet(shard=Shard(at_home, 2), name="first")
+    first.on_messages(run[:300], 0)
+    state, last_ns = first.monitor("b").to_bytes(), first.monitor("b").last_ns
+    assert last_ns is not None
+    raised_ns = last_ns + 30 * SECOND_NS
+    silent = Alarm(time_ns=raised_ns, alarm="silence/plant", event="raised", raised_ns=raised_ns)
+    silent.state = AlarmState.ALARM_STATE_UNACKNOWLEDGED
+    payload, encoding = encode_message(silent)
+    second = fleet(shard=Shard(3 - at_home, 2), name="second", ask_past=noting([]))
+    second.on_alive(shard_token(at_home), True, 0)
+    second.on_message(Encoded("reactor/b/alarm/silence/plant", payload, encoding), 0)
+    second.on_alive(shard_token(at_home), False, 0)
+    said = second.on_past(Past("b", state, run[:300]), 0)
+    said += [item for message in run[300:] for item in second.on_message(message, 0)]
+    assert alarms(said) == [("reactor/b/alarm/silence/plant", "cleared", raised_ns)]
+
+
 def test_a_state_that_cannot_be_used_is_told_and_the_plant_learned_anew(runs: dict[str, list[Encoded]]) -> None:
     asked: list[tuple[str, bool]] = []
     monitor = fleet(ask_past=noting(asked), unusable=lambda plant, _: f"; {plant} is kept aside")
