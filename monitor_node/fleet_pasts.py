@@ -23,12 +23,9 @@ RETURN_S = 2.0
 """After we are back: by then those that the same router was gone for are, too."""
 
 LOOK_AGAIN_S = 0.1
-<<<<<<< HEAD
-=======
 
 AT_A_TIME = 4
 """Plants; one that does not answer, as it is frozen, is waited for for ten seconds."""
->>>>>>> 0ab6c56dc7e3c28e653bfdcae91c53a307e41795
 
 
 class Pasts:
@@ -75,12 +72,8 @@ class Pasts:
     def close(self) -> None:
         """Ask for no more."""
         self._ended.set()
-<<<<<<< HEAD
-        self._asked.put(None)
-=======
         for _ in range(AT_A_TIME):
             self._asked.put(None)
->>>>>>> 0ab6c56dc7e3c28e653bfdcae91c53a307e41795
 
     def _find(self) -> None:
         while (asked := self._asked.get()) is not None:

@@ -35,13 +35,9 @@ from recorder.player import samples_of
 
 SIGNALS = 3
 SOON_ROWS = 20
-<<<<<<< HEAD
-GROWTH_MB = 16.0
-=======
 GROWTH_MB = 32.0
 """Buffers keep the size that a flood has given them. In ten minutes with 200 plants, where a third is 240,000 samples,
 to keep a hundred and fifty bytes of each is more."""
->>>>>>> 0ab6c56dc7e3c28e653bfdcae91c53a307e41795
 SILENCE = "silence/"
 ROW_NS = round(PERIOD_MIN * MINUTE_NS)
 

@@ -24,11 +24,7 @@ from reactorwatch.runtime.config import BusConfig
 PAUSE_S = 0.05
 AT_A_TIME = 10
 FLOOD = 20_000
-<<<<<<< HEAD
-LARGE = 5
-=======
 LARGE = 2
->>>>>>> 0ab6c56dc7e3c28e653bfdcae91c53a307e41795
 LARGE_BYTES = 10_000_000
 MADE_UP = 5
 """Names of plants that there are not. Each costs a monitor: a fleet meets whoever is heard of."""

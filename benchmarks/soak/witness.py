@@ -5,11 +5,7 @@ from collections.abc import Callable
 
 from benchmarks.link_cuts import connected
 from benchmarks.soak.site import FLEET, PATIENCE_S
-<<<<<<< HEAD
-from monitor_node.health import NODE
-=======
 from monitor_node.core import NODE
->>>>>>> 0ab6c56dc7e3c28e653bfdcae91c53a307e41795
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Health
