@@ -115,12 +115,12 @@ def judged(name: str, number: int, first_seed: int) -> Judged:
     """Draw, diagnose and judge one record."""
     warm_up()
     hidden = drawn(class_named(name), number, first_seed)
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         said = diagnose(hidden.record, cstr())
     except Exception as error:  # noqa: BLE001 # whatever it is, it is a result of the study
-        return failed(hidden, f"{type(error).__name__}: {error}", time.perf_counter() - began)
-    return judge(hidden, said, time.perf_counter() - began)
+        return failed(hidden, f"{type(error).__name__}: {error}", time.process_time() - began)
+    return judge(hidden, said, time.process_time() - began)
 
 
 def warm_up() -> None:

@@ -13,7 +13,8 @@ import structlog
 from monitor_node.alarm_commands import COMMANDS
 from monitor_node.alarm_file import AlarmFile
 from monitor_node.config import MonitorConfig
-from monitor_node.core import NODE, Monitor
+from monitor_node.core import Monitor
+from monitor_node.health import NODE
 from monitor_node.state_file import StateFile
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication

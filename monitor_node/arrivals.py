@@ -6,7 +6,7 @@ What comes of a plant meanwhile is kept, and follows what was told of before. A 
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from monitor_node.core import LARGEST_SAMPLE
+from monitor_node.sample_limits import LARGEST_SAMPLE
 from reactorwatch.contract.codec import Encoded
 
 MOST_KEPT = 100_000

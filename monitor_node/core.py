@@ -8,72 +8,27 @@ plant follows from the samples and from what people said of its alarms, so a rep
 anything says the same, value for value.
 """
 
-from collections.abc import Iterable, Mapping
-from math import isfinite
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_commands import obey
-from monitor_node.alignment import Aligner, Counts, Row
+from monitor_node.alignment import Aligner, Row
 from monitor_node.config import MonitorConfig
+from monitor_node.health import NODE, health_of
 from monitor_node.monitor_state import MonitorState, opened, sealed, settings_of
+from monitor_node.receipt import HEARD_AGAIN_NS, STALL_NS, Receipt
 from monitor_node.refusals import Refusals
+from monitor_node.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, unusable
 from monitor_node.sample_run import Held, SampleRun
 from monitor_node.told_again import ToldAgain
 from monitor_node.watch import PlantWatch
-from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, Quality, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-
-NODE = "monitor"
-
-HEARD_AGAIN_NS = 1_000_000
-"""Samples nearer to each other are one sign of life: the signals of a row come together."""
-
-STALL_NS = 1_000_000_000
-"""What is due is done within a millisecond; who is so late was frozen, or his clock was set."""
-
-LARGEST_SAMPLE = 1000
-"""Bytes. A sample takes some thirty and its unit; what is larger is not even read."""
-
-LARGEST_VALUE = 1e15
-"""What is larger measures nothing, and its square would soon be more than a number can hold."""
-
-LARGEST_NUMBER = 2**62
-"""Of a sample, and of its time, 146 years from 1970: sums of them must still fit a message."""
-
-UNSPECIFIED, BAD = Quality.QUALITY_UNSPECIFIED, Quality.QUALITY_BAD  # looked up once, not at every sample
-USABLE = frozenset({Quality.QUALITY_GOOD, Quality.QUALITY_UNCERTAIN})
-
-
-class Receipt(NamedTuple):
-    """How messages came, by the clock of receipt.
-
-    Attributes:
-        start_ns: when the monitor was started.
-        heard_ns: of the newest sign of life that counted, see `HEARD_AGAIN_NS`.
-        received_ns: likewise, as the silence of the plant knows it; None: nothing has come.
-        counted_ns: of these, the one that the next spacing is counted from; None: what comes next is the first.
-        lag_ns: the longest that a message has waited since health was told.
-        health_due_ns: when it is told next.
-        ticked: whether the clock was looked at before.
-        stalls: how often that was more than a second late.
-        not_stored: how often what is remembered could not be stored.
-    """
-
-    start_ns: int
-    heard_ns: int
-    received_ns: int | None
-    counted_ns: int | None
-    lag_ns: int
-    health_due_ns: int
-    ticked: bool
-    stalls: int
-    not_stored: int
 
 
 class Monitor:
@@ -161,7 +116,7 @@ class Monitor:
         """
         quality, value = sample.quality, sample.value  # each look into the message costs as much as a line here
         if quality not in USABLE or not abs(value) < LARGEST_VALUE:
-            self.refusals.add(*_unusable(signal, sample))
+            self.refusals.add(*unusable(signal, sample))
             return []
         if self._told_again is not None and self._told_again.heard(
             self._places[signal], sample.time_ns, sample.sequence
@@ -458,68 +413,3 @@ class Monitor:
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)
-
-
-def _unusable(signal: str, sample: Sample) -> tuple[str, str]:
-    """Why a sample cannot be used: a word to count by, and what it was."""
-    if sample.quality == UNSPECIFIED:
-        return "payload", f"{signal}: the sample has no quality, so it is no Sample of ours"
-    if not isfinite(sample.value):
-        return "not_finite", f"{signal} is {sample.value} at {sample.time_ns} ns"
-    if sample.quality == BAD:
-        return "bad_quality", f"{signal} is marked bad at {sample.time_ns} ns"
-    if sample.quality not in USABLE:
-        return "bad_quality", f"{signal} has the quality {sample.quality}, which this version does not know"
-    return "out_of_range", f"{signal} is {sample.value} at {sample.time_ns} ns: sizes must be below {LARGEST_VALUE:g}"
-
-
-def health_of(
-    now_ns: int,
-    phase: str,
-    start_ns: int,
-    counts: Counts,
-    refused: Mapping[str, int],
-    *,
-    received: int,
-    published: int,
-    lag_ns: int,
-    heard_from_ns: Mapping[str, int],
-    not_stored: int,
-    stalls: int,
-) -> Health:
-    """How a plant's monitor does.
-
-    Args:
-        now_ns: the time.
-        phase: as `Monitor.phase`, or `stopped`.
-        start_ns: when it was started.
-        counts: of samples on their way into rows.
-        refused: counts by reason.
-        received: messages so far.
-        published: likewise.
-        lag_ns: the longest that one has waited.
-        heard_from_ns: by signal, the time of its first sample.
-        not_stored: how often what is remembered could not be stored.
-        stalls: how often the clock was looked at more than a second late.
-    """
-    return Health(
-        time_ns=now_ns,
-        node=NODE,
-        version=__version__,
-        phase=phase,
-        uptime_s=(now_ns - start_ns) / 1e9,
-        received=received,
-        lost=counts.lost,
-        late=counts.late,
-        refused=sum(refused.values()),
-        refused_by_reason=refused,
-        lag_ms=lag_ns / 1e6,
-        duplicated=counts.duplicated,
-        out_of_order=counts.out_of_order,
-        published=published,
-        rows=counts.rows,
-        incomplete_rows=counts.incomplete_rows,
-        heard_from_ns=heard_from_ns,
-        not_stored=not_stored,
-        stalls=stalls,
-    )

@@ -31,7 +31,7 @@ class Score:
         onset_inside: share of the 95 % intervals that hold it.
         held_out: median and 90 % of the error of T on rows not seen over its noise.
         before: the same of the nominal model.
-        seconds: median and largest.
+        seconds: of a core, median and largest.
         errors: diagnoses that came to no end.
     """
 

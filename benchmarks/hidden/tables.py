@@ -43,7 +43,7 @@ COLUMNS: tuple[tuple[str, Cell], ...] = (
     ("in interval %", lambda score: percent(score.onset_inside)),
     ("held-out T / noise", lambda score: both(score.held_out, 3)),
     ("before", lambda score: both(score.before, 1)),
-    ("seconds, median / most", lambda score: both(score.seconds, 1)),
+    ("seconds of a core, median / most", lambda score: both(score.seconds, 1)),
     ("errors", lambda score: str(score.errors)),
 )
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from monitor_node.alignment import Counts, Row
 from monitor_node.config import MonitorConfig
-from monitor_node.core import LARGEST_SAMPLE, NODE, STALL_NS, USABLE, Monitor, Receipt, health_of
+from monitor_node.core import Monitor
+from monitor_node.health import NODE, health_of
 from monitor_node.monitor_state import sealed, settings_of
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.lining_up import COUNTS
@@ -16,7 +17,9 @@ from monitor_node.quiet.ring import kept_spacings
 from monitor_node.quiet.rows import NEW_MINUTE, judge, prepare
 from monitor_node.quiet.samples import silent_from, take_samples
 from monitor_node.quiet.slots import NEVER_NS, Slots
+from monitor_node.receipt import STALL_NS, Receipt
 from monitor_node.references import GATE
+from monitor_node.sample_limits import LARGEST_SAMPLE, USABLE
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.core import HEARD_AGAIN_NS, LARGEST_NUMBER, LARGEST_VALUE
 from monitor_node.quiet.layout import Array, Ints, Places, Records
+from monitor_node.receipt import HEARD_AGAIN_NS
+from monitor_node.sample_limits import LARGEST_NUMBER, LARGEST_VALUE
 from monitor_node.sample_run import ALIKE, TOLERANCE
 from monitor_node.sample_run import DEVIATIONS as RUN_DEVIATIONS
 from monitor_node.sample_run import MEMORY as RUN_MEMORY

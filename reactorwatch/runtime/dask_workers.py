@@ -92,7 +92,12 @@ def _check_workers(client: Any, address: str) -> None:
         raise InputError(
             f"--scheduler {address}: has no workers; start some with: dask worker {address} --nthreads 1"
         ) from error
-    for worker, version in client.run(_asks_for_version()).items():
+    versions = client.run(_asks_for_version(), on_error="return")
+    for worker, version in versions.items():
+        if isinstance(version, OSError):  # it died meanwhile, which costs a retry of its jobs
+            continue
+        if isinstance(version, Exception):
+            raise version
         if version is None:
             raise InputError(f"--scheduler {address}: worker {worker} has no reactorwatch; install {__version__} there")
         if version != __version__:

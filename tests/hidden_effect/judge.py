@@ -41,7 +41,7 @@ class Judged:
         right_place: whether the location is right.
         held_out: error of T on rows not seen, in true standard deviations of its noise.
         before: the same of the nominal model.
-        seconds: that it took.
+        seconds: of a core that it took.
         remark: what went wrong, if the diagnosis did not come to an end.
     """
 

@@ -86,12 +86,13 @@ def test_each_process_has_one_thread_of_linear_algebra(monkeypatch: pytest.Monke
 
 
 def test_who_stops_asking_leaves_no_process_behind() -> None:
-    before = set(multiprocessing.active_children())
+    before = set(multiprocessing.active_children())  # of a cluster that other tests have, they come and go
     outcomes = LocalWorkers(2).outcomes(square, range(100))
     next(outcomes)
-    assert set(multiprocessing.active_children()) > before
+    own = {child for child in set(multiprocessing.active_children()) - before if "Dask" not in child.name}
+    assert own
     outcomes.close()  # type: ignore[attr-defined] # it is a generator
-    assert set(multiprocessing.active_children()) == before
+    assert not own & set(multiprocessing.active_children())
 
 
 def test_outcomes_wait_for_those_before_them() -> None:

@@ -1,0 +1,30 @@
+"""Which samples can be used at all."""
+
+from math import isfinite
+
+from reactorwatch.contract.messages_pb2 import Quality, Sample
+
+LARGEST_SAMPLE = 1000
+"""Bytes. A sample takes some thirty and its unit; what is larger is not even read."""
+
+LARGEST_VALUE = 1e15
+"""What is larger measures nothing, and its square would soon be more than a number can hold."""
+
+LARGEST_NUMBER = 2**62
+"""Of a sample, and of its time, 146 years from 1970: sums of them must still fit a message."""
+
+USABLE = frozenset({Quality.QUALITY_GOOD, Quality.QUALITY_UNCERTAIN})
+"""Looked up once, and not at every sample."""
+
+
+def unusable(signal: str, sample: Sample) -> tuple[str, str]:
+    """Why a sample cannot be used: a word to count by, and what it was."""
+    if sample.quality == Quality.QUALITY_UNSPECIFIED:
+        return "payload", f"{signal}: the sample has no quality, so it is no Sample of ours"
+    if not isfinite(sample.value):
+        return "not_finite", f"{signal} is {sample.value} at {sample.time_ns} ns"
+    if sample.quality == Quality.QUALITY_BAD:
+        return "bad_quality", f"{signal} is marked bad at {sample.time_ns} ns"
+    if sample.quality not in USABLE:
+        return "bad_quality", f"{signal} has the quality {sample.quality}, which this version does not know"
+    return "out_of_range", f"{signal} is {sample.value} at {sample.time_ns} ns: sizes must be below {LARGEST_VALUE:g}"
