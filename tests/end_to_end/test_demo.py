@@ -20,6 +20,8 @@ from recorder.mcap_file import read_messages
 
 from .conftest import REACTORWATCH
 
+pytestmark = pytest.mark.xdist_group("demo")  # it is run once
+
 B = TypeVar("B", bound=Message)
 ONSET_MIN, SPAN_MIN = 150.0, 200.0
 
