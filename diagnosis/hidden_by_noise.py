@@ -78,14 +78,12 @@ def _set_in(search: Search, item: Explained) -> Explained:
     process_sd = tuple(min(sd, least) for sd, least in zip(search.noise.process_sd, quiet, strict=False))
     search.noise = replace(search.noise, process_sd=process_sd)
     item = search.refitted(item)
-    onset_min = run.time_min[0]
-    for number in range(ROUNDS):
+    for _ in range(ROUNDS):
         before = item.bic
         for course in (Constant(run.time_min), Step(run.time_min)):
             other = Hypothesis(sized, (course,))
-            begin = other.at(run, (np.array([item.fit.theta[0][0], *(onset_min for _ in course.numbers)]),))
-            fit = jumping.finely(run, other, begin, anywhere=number == 0)
-            onset_min = fit.theta[0][1] if course.numbers else onset_min
+            numbers = [item.fit.theta[0][0], *(number.lower for number in course.numbers)]
+            fit = jumping.finely(run, other, other.at(run, (np.array(numbers),)))
             item = min(item, search.judged(other, fit), key=lambda each: each.bic)
         search.settle(item)
         item = search.refitted(item)

@@ -61,21 +61,19 @@ def sized(run: Run, hypothesis: Hypothesis, best: Fit, place: int, scans: Sequen
     return best
 
 
-def finely(run: Run, hypothesis: Hypothesis, best: Fit, anywhere: bool = True) -> Fit:
+def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
     """With the best onset for its size, if it is a step, and then the best size to a tenth of a permille.
 
     Args:
         run: the record.
         hypothesis: one such effect, constant or as a step.
         best: where it begins.
-        anywhere: whether the onset is looked for in the whole record, or about where it is.
     """
     course, usual = hypothesis.courses[0], hypothesis.sized.effects[0].starts
     for size in np.geomspace(usual[0], usual[-1], _USUAL):
         best = _better(run, hypothesis, best, 0, np.append(size, best.theta[0][1:]))
     if course.numbers:
-        if anywhere:
-            best = _moved(run, hypothesis, best, _after_moves(run))
+        best = _moved(run, hypothesis, best, _after_moves(run))
         rows = course.period_min * np.arange(-_NEAREST_ROWS, _NEAREST_ROWS + 1)
         best = _moved(run, hypothesis, best, best.theta[0][1] + rows)
     return sized(run, hypothesis, best, 0, _SIZES + _FINELY)
