@@ -194,7 +194,7 @@ class Hypothesis:
                 continue
             over_row, at_row = course.derivatives(numbers, moved)
             column = self.column(place)
-            g = signatures.shown(ways, column, np.ascontiguousarray(over_row[1:-1]), np.ascontiguousarray(at_row[2:]))
+            g = signatures.shown(ways, column, over_row[1:-1], at_row[2:])
             columns.append(g.reshape(-1, course.freedom))
         return np.concatenate(columns, axis=1)
 
@@ -221,7 +221,7 @@ class Hypothesis:
             Shape (values from the third row on, coefficients).
         """
         ways = self.sized.ways(run, self._signals(fit.theta), fit.found)
-        over_row, at_row = (np.ascontiguousarray(item) for item in course.basis(np.empty(0)))
+        over_row, at_row = course.basis(np.empty(0))
         g = signatures.shown(ways, self.column(place), over_row[1:-1], at_row[2:])
         return g.reshape(-1, course.coefficients)
 

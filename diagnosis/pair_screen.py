@@ -102,7 +102,7 @@ class PairScreen:
 
     def _slow(self, ways: Ways) -> Iterator[Block]:
         """Every direct effect as a constant and as a curve."""
-        over_row, at_row = (np.ascontiguousarray(item) for item in self._free.basis(np.empty(0)))
+        over_row, at_row = self._free.basis(np.empty(0))
         for cause, effect in enumerate(self._screen.direct):
             g = signatures.shown(ways, cause, over_row[1:-1], at_row[2:]).reshape(-1, KNOTS)
             yield from self._both(effect, None, g)
@@ -141,7 +141,7 @@ class PairScreen:
                 period = lead.theta[2:]
                 key = (lead.effect.name, round(log(float(period[0])), 2))
                 if lead.score(self._run.values) > least and key not in found:
-                    over_row, at_row = (np.ascontiguousarray(item) for item in self._sine.basis(period))
+                    over_row, at_row = self._sine.basis(period)
                     cause = self._screen.direct.index(lead.effect)
                     g = signatures.shown(about, cause, over_row[1:-1], at_row[2:])
                     found[key] = Block(lead.effect, self._sine, period, None, g.reshape(-1, 2))

@@ -240,7 +240,7 @@ class Screen:
 
     def _in_course(self, ways: Ways, effects: Sequence[Effect], course: Course, shape: Array) -> list[Lead]:
         """All causes in one course with given numbers."""
-        over_row, at_row = (np.ascontiguousarray(item) for item in course.basis(shape))
+        over_row, at_row = course.basis(shape)
         leads = []
         for cause, effect in enumerate(effects):
             a, b = signatures.products(ways, cause, over_row[1:-1], at_row[2:])
