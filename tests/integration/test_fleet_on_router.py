@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import msgspec
 import pytest
-import structlog
 
 from monitor_node.fleet_config import FleetConfig
 from reactorwatch.cli.processes import write_settings
@@ -23,27 +22,15 @@ from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, List
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal
 from tests.unit.monitor_node.fleets import QUICK, alone, run_of
 
+from .client import client
+
+pytestmark = pytest.mark.usefixtures("plain_log")
+
 WITHIN_S = 30.0
 PLANTS = ("alpha", "beta", "gamma", "delta")
-
-
-@pytest.fixture(autouse=True)
-def plain_log() -> None:
-    """An earlier test may have sent the log to a stream that is closed by now."""
-    structlog.reset_defaults()
-
-
-@pytest.fixture
-def bus_config() -> Iterator[BusConfig]:
-    """A router of its own for each test."""
-    config = BusConfig(endpoint=free_endpoint())
-    router = bus_zenoh.router(config)
-    yield config
-    router.close()
 
 
 class Watchers:
@@ -64,14 +51,6 @@ class Watchers:
         """Wait until just these are watched."""
         with self._changed:
             assert self._changed.wait_for(lambda: set(self._alive) == plants, WITHIN_S), self._alive
-
-
-@contextmanager
-def client(config: BusConfig) -> Iterator[ZenohBus]:
-    bus = bus_zenoh.connect(config, "test", StopSignal())
-    assert bus is not None
-    yield bus
-    bus.close()
 
 
 @contextmanager

@@ -6,21 +6,17 @@ import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
 
 import pytest
-import structlog
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encode_message
 from reactorwatch.errors import InputError
-from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal
 from recorder.__main__ import record
 from recorder.config import RecorderConfig, ReplayConfig
@@ -30,31 +26,12 @@ from recorder.replay import replay
 from tests.running import WITHIN_S, running
 from tests.unit.recorder import golden
 
+from .client import client
+
+pytestmark = pytest.mark.usefixtures("plain_log")
+
 ALIVE = "reactor/cstr/alive/recorder"
 LINGER_S = 1.0  # a machine busy with other tests may fall silent for longer than the default
-
-
-@pytest.fixture(autouse=True)
-def plain_log() -> None:
-    """An earlier test may have sent the log to a stream that is closed by now."""
-    structlog.reset_defaults()
-
-
-@pytest.fixture
-def bus_config() -> Iterator[BusConfig]:
-    """A router of its own for each test."""
-    config = BusConfig(endpoint=free_endpoint())
-    router = bus_zenoh.router(config)
-    yield config
-    router.close()
-
-
-@contextmanager
-def client(config: BusConfig) -> Iterator[ZenohBus]:
-    bus = bus_zenoh.connect(config, "test", StopSignal())
-    assert bus is not None
-    yield bus
-    bus.close()
 
 
 def wait_alive(bus: ZenohBus) -> None:
