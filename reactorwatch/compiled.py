@@ -11,6 +11,9 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
@@ -25,3 +28,23 @@ def compiled(kernel: Kernel) -> Kernel:
         The compiled function; it is called like the original.
     """
     return cast(Kernel, numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel))
+
+
+def _call_at(_typing: Any, address: Any, numbers: Any) -> Any:
+    """The type of a call of machine code, and what writes it."""
+
+    def written(_context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        word = ir.IntType(64)
+        given = [builder.extract_value(arguments[1], place) for place in range(len(numbers))]
+        kind = ir.FunctionType(word, [word] * len(given))
+        return builder.call(builder.inttoptr(arguments[0], kind.as_pointer()), given)
+
+    return types.int64(address, numbers), written
+
+
+call_at = cast(Callable[[int, tuple[int, ...]], int], intrinsic(_call_at))
+"""Call machine code from a kernel: `call_at(address, (number, ...))`.
+
+All numbers are of 64 bits, and so is the address. Where arrays are (`array.ctypes.data`) is a number, too. Who hands
+such an address to a kernel has to keep what is there.
+"""

@@ -39,7 +39,6 @@ def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
         ("left_ns", i, ()),  # time of the row that left last
         ("have", np.int32, ()),  # which signals of the pending row have come, a bit each
         ("left", np.int32, ()),  # rows that left and are remembered
-        ("rows_in_batch", np.int32, ()),
         ("shut", np.int32, ()),  # from here on, samples are for the plant's own monitor
         ("odd", np.int32, ()),  # likewise, rows
         # counts and times

@@ -14,7 +14,7 @@ from monitor_node.monitor_state import sealed, settings_of
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.lining_up import COUNTS
 from monitor_node.quiet.ring import kept_spacings
-from monitor_node.quiet.rows import NEW_MINUTE, judge, prepare
+from monitor_node.quiet.rows import NEW_MINUTE, judge
 from monitor_node.quiet.samples import silent_from, take_samples
 from monitor_node.quiet.slots import NEVER_NS, Slots
 from monitor_node.receipt import STALL_NS, Receipt
@@ -193,7 +193,6 @@ class QuietPlants:
             np.empty(most, np.int32),
             np.empty(most, np.int64),
             np.empty((most, len(self._signals))),
-            np.empty(most, np.int32),
         )
         others = np.empty(codes.size, np.int32)
         good = np.isin(samples.quality, list(USABLE))
@@ -213,47 +212,12 @@ class QuietPlants:
             *rows,
             others,
         )
-        return rows.of(slice(count)), others[:left_over]
+        return rows.first(count), others[:left_over]
 
     def _judged(self, rows: "_Rows", publications: list[Publication]) -> dict[int, list[Row]]:
         """Judge rows; returns, by slot, those that are out of the ordinary, and all after them."""
         waiting: dict[int, list[Row]] = {}
-        for number in range(int(rows.turns.max(initial=-1)) + 1):
-            each = rows.of(rows.turns == number)
-            found = self._turn(each)
-            for place in np.flatnonzero(found).tolist():
-                slot, time_ns = int(each.slots[place]), int(each.times_ns[place])
-                if found[place] == NEW_MINUTE:
-                    publications += self._figures(slot, time_ns)
-                else:
-                    waiting.setdefault(slot, []).append(Row(time_ns, tuple(each.values[place].tolist()), False))
-        self._slots.plants["rows_in_batch"][rows.slots] = 0
-        return waiting
-
-    def _turn(self, rows: "_Rows") -> NDArray[np.int32]:
-        """Judge rows of different plants; what each was."""
-        form, count = self._form, rows.slots.size
-        times_min = np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns.tolist()])
-        after, told = self._rows.results(count)
-        noise = self._slots.plants["variance"].shape[1]
-        memory, new = np.empty((count, after.shape[2])), np.empty((count, 3 + 2 * len(self._signals)))
-        constants, found = np.empty((count, self._parameters.size + noise)), np.empty(count, np.int32)
-        prepare(
-            self._slots.plants,
-            rows.slots,
-            rows.times_ns,
-            times_min,
-            rows.values,
-            self._parameters,
-            LONGEST_ROW_MIN,
-            GATE,
-            memory,
-            new,
-            constants,
-            found,
-        )
-        if count:
-            self._rows.fill(count, [memory, new, constants], [after, told])
+        found = np.empty(rows.slots.size, np.int32)
         judge(
             self._slots.plants,
             self._scratch,
@@ -261,18 +225,26 @@ class QuietPlants:
             self._slots.ring,
             rows.slots,
             rows.times_ns,
-            times_min,
+            np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns.tolist()]),
             rows.values,
-            after[:, 0, :],
-            told[:, 0, :],
+            self._rows.address,
+            self._parameters,
+            LONGEST_ROW_MIN,
+            GATE,
             self._config.silence_periods,
-            form.places,
-            form.rules,
+            self._form.places,
+            self._form.rules,
             1.0 - self._config.dead_band,
             self._config.mewma_weight,
             found,
         )
-        return found
+        for place in np.flatnonzero(found).tolist():
+            slot, time_ns = int(rows.slots[place]), int(rows.times_ns[place])
+            if found[place] == NEW_MINUTE:
+                publications += self._figures(slot, time_ns)
+            else:
+                waiting.setdefault(slot, []).append(Row(time_ns, tuple(rows.values[place].tolist()), False))
+        return waiting
 
     def _figures(self, slot: int, time_ns: int) -> list[Publication]:
         """Tell the figures of a plant's alarms."""
@@ -347,14 +319,12 @@ class _Rows(NamedTuple):
         slots: of their plants.
         times_ns: their times.
         values: input first, shape (rows, signals).
-        turns: how many rows of the same plant came before.
     """
 
     slots: NDArray[np.int32]
     times_ns: NDArray[np.int64]
     values: NDArray[np.float64]
-    turns: NDArray[np.int32]
 
-    def of(self, which: slice | NDArray[np.bool_]) -> "_Rows":
-        """Some of them."""
-        return _Rows(self.slots[which], self.times_ns[which], self.values[which], self.turns[which])
+    def first(self, count: int) -> "_Rows":
+        """So many of them."""
+        return _Rows(self.slots[:count], self.times_ns[:count], self.values[:count])

@@ -32,7 +32,7 @@ from monitor_node.quiet.samples import allowed_ns
 from monitor_node.sampling import LARGEST_GAP
 from monitor_node.silence import MEMORY
 from monitor_node.stuck import AT_REST, STRETCH
-from reactorwatch.compiled import compiled
+from reactorwatch.compiled import call_at, compiled
 from reactorwatch.records.record import MINUTE_NS
 
 ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
@@ -44,52 +44,50 @@ _STRETCH, _ORDER, _MEMORY = STRETCH, LARGEST_ORDER, MEMORY
 
 
 @compiled
-def prepare(
-    plants: Records,
-    rows: Places,
-    row_time_ns: Ints,
-    row_time_min: Array,
-    row_values: Array,
-    parameters: Array,
+def _predicted(
+    p: Any,
+    row_time_ns: int,
+    time_min: float,
+    values: Array,
+    filter_address: int,
     longest_row_min: float,
     gate: float,
-    memory: Array,
     new: Array,
     constants: Array,
-    found: Places,
-) -> None:
-    """Lay out rows of different plants for the filter, see `filter_step.row_function`.
+    after: Array,
+    told: Array,
+) -> bool:
+    """Let the filter go on from a record by a row, see `filter_step.row_function`; whether the row is ordinary to it.
 
     Args:
-        plants: records.
-        rows: the plant of each row; each plant once.
-        row_time_ns: its time.
-        row_time_min: the same in minutes.
-        row_values: its values, input first.
-        parameters: of the model.
+        p: record of the plant; the filter's memory stays as it is.
+        row_time_ns: time of the row.
+        time_min: the same in minutes.
+        values: of the row, input first.
+        filter_address: of the filter's machine code.
         longest_row_min: so soon after the row before two steps lead to it.
         gate: see `references`.
-        memory: filled, shape (rows, numbers of the filter).
-        new: filled.
-        constants: filled.
-        found: filled: whether a row is `ODD`.
+        new: to work in.
+        constants: to work in; begins with the parameters of the model.
+        after: filled: what the filter remembers after it.
+        told: filled: what it said.
     """
-    outputs = row_values.shape[1] - 1
-    for k in range(rows.size):
-        p = plants[rows[k]]
-        spacing = row_time_ns[k] - p.last_ns
-        step = 0.5 * (row_time_min[k] - p.time_min)
-        fits = not p.odd and spacing > 0 and float(spacing) <= LARGEST_GAP * p.period_ns
-        found[k] = ORDINARY if fits and step > 0.0 and 2.0 * step <= longest_row_min else ODD
-        for place in range(memory.shape[1]):
-            memory[k, place] = p.memory[place]
-        new[k, 0], new[k, 1], new[k, 2], new[k, 3], new[k, 4] = p.input, row_values[k, 0], row_time_min[k], step, step
-        for place in range(outputs):
-            new[k, 5 + place], new[k, 5 + outputs + place] = row_values[k, 1 + place], gate
-        for place in range(parameters.size):
-            constants[k, place] = parameters[place]
-        for place in range(p.variance.size):
-            constants[k, parameters.size + place] = p.variance[place]
+    outputs = values.size - 1
+    spacing = row_time_ns - p.last_ns
+    step = 0.5 * (time_min - p.time_min)
+    if p.odd or spacing <= 0 or float(spacing) > LARGEST_GAP * p.period_ns:
+        return False
+    if not (step > 0.0 and 2.0 * step <= longest_row_min):
+        return False
+    new[0], new[1], new[2], new[3], new[4] = p.input, values[0], time_min, step, step
+    for place in range(outputs):
+        new[5 + place], new[5 + outputs + place] = values[1 + place], gate
+    parameters = constants.size - p.variance.size
+    for place in range(p.variance.size):
+        constants[parameters + place] = p.variance[place]
+    remembered, given, known = p.memory.ctypes.data, new.ctypes.data, constants.ctypes.data
+    call_at(filter_address, (1, remembered, given, known, after.ctypes.data, told.ctypes.data))
+    return bool(told[told.size - 1] != 0.0)
 
 
 @compiled
@@ -245,8 +243,10 @@ def judge(
     row_time_ns: Ints,
     row_time_min: Array,
     row_values: Array,
-    after: Array,
-    told: Array,
+    filter_address: int,
+    parameters: Array,
+    longest_row_min: float,
+    gate: float,
     silence_limit: float,
     charts: Places,
     rules: Places,
@@ -254,34 +254,52 @@ def judge(
     weight: float,
     found: Places,
 ) -> None:
-    """Judge rows of different plants, which the filter has predicted.
+    """Judge rows, those of a plant one after the other.
 
     Args:
         plants: records; those of ordinary rows go on.
         scratch: one record, to work in.
         times: of the newest rows, the spacing before each, see `record_type`; shape (plants, rows kept).
         ring: their values, shape (plants, rows kept, signals); without columns if causes are not looked for.
-        rows: the plant of each row; each plant once.
+        rows: the plant of each row.
         row_time_ns: its time.
         row_time_min: the same in minutes.
         row_values: its values, input first.
-        after: what the filter remembers after it.
-        told: what it said.
+        filter_address: of the filter's machine code.
+        parameters: of the model.
+        longest_row_min: see `_predicted`.
+        gate: likewise.
         silence_limit: periods.
         charts: of Shewhart, EWMA, CUSUM and MEWMA, the place of the first alarm; -1: there is no such chart.
         rules: of each alarm of a chart, how many points out raise it, and a bit for each that is looked at.
         reach: how near to the centre is back in.
         weight: of the MEWMA chart.
-        found: `ODD` for rows that are not to be judged here; filled with what each was.
+        found: filled with what each was; after a row that was odd, all of its plant are.
     """
     outputs = row_values.shape[1] - 1
     e, columns = np.empty(outputs), np.empty((SETTINGS + _MOST_NUMBERS, outputs))
+    memory, noise = scratch[0].memory.size, scratch[0].variance.size
+    new, constants = np.empty(3 + 2 * row_values.shape[1]), np.empty(parameters.size + noise)
+    after, told = np.empty(memory), np.empty(5 * outputs + 1)
+    constants[: parameters.size] = parameters
     keeps = times.shape[1]
     for k in range(rows.size):
         slot = rows[k]
-        ordinary = found[k] == ORDINARY and told[k, told.shape[1] - 1] != 0.0
         scratch[0] = plants[slot]
         p = scratch[0]
+        ordinary = _predicted(
+            p,
+            row_time_ns[k],
+            row_time_min[k],
+            row_values[k],
+            filter_address,
+            longest_row_min,
+            gate,
+            new,
+            constants,
+            after,
+            told,
+        )
         spacing = row_time_ns[k] - p.last_ns
         over = spacing - p.usual_ns
         ordinary = ordinary and over % p.unit_ns == 0 and abs(over // p.unit_ns) < 2**31
@@ -290,7 +308,7 @@ def judge(
             for place in range(outputs):
                 value = row_values[k, 1 + place]
                 ordinary = ordinary and _moves(p, place, value)
-                z = (value - told[k, place]) / told[k, 2 * outputs + place]
+                z = (value - told[place]) / told[2 * outputs + place]
                 e[place] = _whitened(p, place, z)
                 ordinary = ordinary and abs(e[place]) <= p.spike_limit[place] and abs(e[place]) < LARGEST_VALUE
         if not (ordinary and _charted(p, e, columns, charts, rules, reach, weight)):
@@ -299,8 +317,8 @@ def judge(
             continue
         p.last_ns, p.spacing_ns = row_time_ns[k], spacing
         p.time_min, p.input = row_time_min[k], row_values[k, 0]
-        for place in range(after.shape[1]):
-            p.memory[place] = after[k, place]
+        for place in range(memory):
+            p.memory[place] = after[place]
         p.rows_watched += 1
         times[slot, p.head] = over // p.unit_ns
         for place in range(ring.shape[2]):

@@ -80,7 +80,6 @@ def take_samples(
     rows: Places,
     row_time_ns: Ints,
     row_values: Array,
-    row_round: Places,
     others: Places,
 ) -> tuple[int, int]:
     """Line samples up into rows.
@@ -101,7 +100,6 @@ def take_samples(
         rows: filled: the plant of each row.
         row_time_ns: filled: its time.
         row_values: filled: its values, input first.
-        row_round: filled: how many rows of its plant came before it in this batch.
         others: filled: the samples that are for the plants' own monitors, or somebody else.
 
     Returns:
@@ -142,8 +140,6 @@ def take_samples(
             row_time_ns[count] = time_ns[k]
             for place in range(signals):
                 row_values[count, place] = p.values[place]
-            row_round[count] = p.rows_in_batch
-            p.rows_in_batch += 1
             p.have = 0
             p.left_ns = time_ns[k]
             p.left = min(p.left + 1, most_left)

@@ -53,6 +53,10 @@ class RowCode:
         chained: so many of its first arguments are the first results of the row before.
         stops: whether a row whose very last number is not above zero is the last one.
 
+    Attributes:
+        address: of the machine code, for kernels (`compiled.call_at`): it takes the rows and the addresses of arguments
+            and results, as `fill` does, and lives as long as this does.
+
     Raises:
         ValueError: the function has an operation that there is no machine code for.
     """
@@ -68,9 +72,9 @@ class RowCode:
         ]
         self._sizes = [item.numel() for item in symbols]
         self._shapes = [item.shape for item in results]
-        self._engine, address = _machine_code(_Text(function, self._kinds, self._sizes, self._shapes, stops).whole)
+        self._engine, self.address = _machine_code(_Text(function, self._kinds, self._sizes, self._shapes, stops).whole)
         pointers = [ctypes.c_void_p] * (len(symbols) + len(results))
-        self._call: Callable[..., int] = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, *pointers)(address)
+        self._call: Callable[..., int] = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, *pointers)(self.address)
 
     def results(self, rows: int) -> list[Array]:
         """Where the results of so many rows fit, each of shape (rows, its columns, its rows), as CasADi keeps them."""

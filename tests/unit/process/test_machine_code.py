@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from reactorwatch.compiled import call_at, compiled
 from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array
 
@@ -59,6 +60,19 @@ def test_a_chain_stops_with_the_row_that_does_not_go_well() -> None:
     after, good = np.zeros(5), np.zeros(5)
     assert code.fill(5, [np.array([10.0]), np.arange(1.0, 6.0)], [after, good]) == 2
     np.testing.assert_array_equal(after, [11.0, 13.0, 16.0, 0.0, 0.0])  # the third is worked out, and no more
+
+
+@compiled
+def _filled_at(address: int, u: Array, x: Array) -> int:
+    return call_at(address, (u.size, x.ctypes.data, u.ctypes.data, x.ctypes.data))
+
+
+def test_a_kernel_calls_it_by_its_address() -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    code = RowCode(ca.Function("f", [x, u], [2 * x + u]), chained=1)
+    row = np.array([1.0])
+    assert _filled_at(code.address, np.array([3.0]), row) == 1
+    np.testing.assert_array_equal(row, [5.0])
 
 
 def test_what_is_no_number_does_not_go_well() -> None:
