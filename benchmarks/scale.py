@@ -52,6 +52,7 @@ SIZES = (1, 10, 100, 1000, 10_000)
 SIGNALS = 3
 LEARNED_ROWS = 900
 FAST_SAMPLES = 600_000
+MOST_ROWS = 20_000
 LATENCY_S = 15
 IDLE_S = 10.0
 WITHIN_S = 60.0
@@ -75,12 +76,12 @@ SHARP = MonitorConfig(
 
 def record() -> list[Encoded]:
     """What a plant publishes."""
-    return [encode(item) for item in samples_of(simulate_record(PlantConfig(seed=1), 3000), "p0")]
+    return [encode(item) for item in samples_of(simulate_record(PlantConfig(seed=1), LEARNED_ROWS + MOST_ROWS), "p0")]
 
 
 def sized(count: int) -> int:
     """Rows that every plant publishes as fast as it goes."""
-    return max(FAST_SAMPLES // (SIGNALS * count), 10) if count > 100 else 2000
+    return min(max(FAST_SAMPLES // (SIGNALS * count), 10), MOST_ROWS)
 
 
 # --- processes that are measured ---------------------------------------------------------------------------------

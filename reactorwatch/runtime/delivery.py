@@ -14,20 +14,35 @@ MOST_ASKED_FOR = 100
 and then there would be no end of it."""
 
 
+STREAM_PARTS = 3  # of a key: root, plant and kind
+
+
+def stream_of(key: str) -> str:
+    """The stream that a key is in.
+
+    >>> stream_of("reactor/cstr/chart/ewma/T")
+    'reactor/cstr/chart'
+    """
+    return "/".join(key.split("/", STREAM_PARTS)[:STREAM_PARTS])
+
+
 class Numbered(NamedTuple):
     """A message as its publisher numbered it.
 
     Attributes:
         publisher: who.
-        stream: what was counted.
-        number: in the stream.
+        number: in its stream.
         message: what; `received_ns` is when it came.
     """
 
     publisher: int
-    stream: str
     number: int
     message: Encoded
+
+    @property
+    def stream(self) -> str:
+        """What was counted."""
+        return stream_of(self.message.key)
 
 
 class Delivery:
@@ -65,11 +80,12 @@ class Delivery:
             order = self._order
             waited, now_ns = order.due_ns(), time.monotonic_ns()
             takes_next, going = order.takes_next, list[Encoded | Gap]()
-            for publisher, stream, number, message in came:
-                if takes_next(publisher, stream, message.key, number, now_ns):
+            for publisher, number, message in came:
+                key = message.key
+                if takes_next(publisher, key, number, now_ns):
                     going.append(message)
                 else:
-                    going += order.arrive(publisher, stream, message.key, number, message, now_ns)
+                    going += order.arrive(publisher, stream_of(key), key, number, message, now_ns)
             self._hand_on(going)
             if order.due_ns() != waited:
                 self._changed.notify()

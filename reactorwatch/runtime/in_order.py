@@ -24,12 +24,11 @@ moment (`GATHER_NS`) nothing came that was older than what he had heard already.
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from itertools import accumulate
 from operator import itemgetter
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, NamedTuple
 
-Item = TypeVar("Item")
+from reactorwatch.runtime.numbered_stream import Item, Stream, Waiting
 
 PATIENCE_NS = 5_000_000_000
 RECOVERY_NS = 15_000_000_000
@@ -38,13 +37,12 @@ LOOK_AGAIN_NS = 250_000_000
 GATHER_NS = 500_000_000
 MOST_LOST = 100_000
 """Runs of lost numbers of a stream that are remembered: what comes of them after all goes on."""
-MOST_HELD = 1_000_000
-MOST_HELD_BYTES = 256 << 20
-"""Messages of a stream that may wait, and their payload; with more, what is missing is given up."""
 MOST_STREAMS = 100_000
-MOST_KEYS = 10_000
-"""Streams, and keys of a stream, that are remembered. A publisher that is started anew is another stream, so is each
-plant of a fleet."""
+"""That are remembered. A publisher that is started anew is another stream, so is each plant of a fleet."""
+STRANGE_NS = 60_000_000_000
+FEW_STREAMS = 1000
+"""A stream of which one number came, that nobody had told of and that is not its first, is nobody's: of more than a few
+streams such ones are forgotten when they have been silent for so long. Garbage makes a stream a message."""
 
 
 class Gap(NamedTuple):
@@ -67,42 +65,6 @@ class Gap(NamedTuple):
     noticed_ns: int
 
 
-@dataclass(slots=True)
-class _Stream(Generic[Item]):
-    expected: int | None = None
-    newest: int = 0
-    before: int = -1  # the last number when the listening began
-    told: dict[int, Item] = field(default_factory=dict)  # of what was before
-    told_from: dict[str, int] = field(default_factory=dict)  # the first of each key
-    held: dict[int, tuple[int, Item]] = field(default_factory=dict)  # with when it came
-    held_bytes: int = 0
-    heard_ns: int = 0  # when something came last
-    due_ns: int | None = None  # when to look whether to wait no longer; None: nothing waits
-    recovered_ns: int = 0  # when something that was missing came last, or it began to be missing
-    keys: dict[str, int] = field(default_factory=dict)  # the newest number that came of each
-    lost: list[tuple[int, int]] = field(default_factory=list)  # (first, last)
-
-    @property
-    def is_full(self) -> bool:
-        """Whether more waits than there is room for."""
-        return len(self.held) > MOST_HELD or self.held_bytes > MOST_HELD_BYTES
-
-    def note(self, key: str, number: int) -> None:
-        """A key has come to a number."""
-        if key in self.keys or len(self.keys) < MOST_KEYS:
-            self.keys[key] = max(self.keys.get(key, number), number)
-
-    @property
-    def passed(self) -> int:
-        """The number that every key has come to."""
-        return min(self.keys.values(), default=self.newest)
-
-    @property
-    def told_by_all(self) -> int:
-        """From where on what was before was told of every key: of one less is remembered than of another."""
-        return max(self.told_from.values(), default=0)
-
-
 class InOrder(Generic[Item]):
     """Lets messages through in the order of their numbers.
 
@@ -113,16 +75,17 @@ class InOrder(Generic[Item]):
 
     def __init__(self, *, gathering: bool = False, size: Callable[[Item], int] = lambda _: 0) -> None:
         self._size = size
-        self._streams: dict[tuple[int, str], _Stream[Item]] = {}
-        self._waiting: dict[tuple[int, str], _Stream[Item]] = {}  # all in which something waits; perhaps others
+        self._streams: dict[tuple[int, str], Stream[Item]] = {}
+        self._by_key: dict[str, Stream[Item]] = {}  # that went on last on a key
+        self._waiting: dict[tuple[int, str], Stream[Item]] = {}  # all in which something waits; perhaps others
         self._gathering = gathering
+        self._look_at = FEW_STREAMS  # so many streams: whether some are nobody's
 
-    def takes_next(self, publisher: int, stream: str, key: str, number: int, now_ns: int) -> bool:
+    def takes_next(self, publisher: int, key: str, number: int, now_ns: int) -> bool:
         """Take a message in if it is the one that is expected, and nothing waits: it goes on. As nearly always."""
-        state = self._streams.get((publisher, stream))
-        if state is None or number != state.expected or state.held:
+        state = self._by_key.get(key)
+        if state is None or number != state.expected or publisher != state.publisher or state.waiting is not None:
             return False
-        state.note(key, number)
         state.expected, state.heard_ns = number + 1, now_ns
         return True
 
@@ -133,50 +96,61 @@ class InOrder(Generic[Item]):
         name = publisher, stream
         state = self._streams.get(name)
         if state is None:
-            state = self._new(name)
+            state = self._new(name, now_ns)
             if not number and not self._gathering:
                 state.expected = 0
         state.heard_ns = now_ns
         state.note(key, number)
         if state.expected is None and not self._gathering and number <= state.before:
             return
-        if number == state.expected and not state.held:  # as nearly always
+        if number == state.expected and not (state.waiting is not None and state.waiting.held):  # as nearly always
             state.expected = number + 1
+            state.settle()
+            if key in state.keys:
+                self._by_key[key] = state
             yield item
             return
         if state.expected is not None and number < state.expected:
-            if _take_out(state.lost, number):
+            if state.lost is not None and _take_out(state.lost, number):
                 yield item  # it was given up, and has come after all
             return
-        if self._gathering and state.is_full:
+        yield from self._wait(name, state, number, item, now_ns)
+
+    def _wait(
+        self, name: tuple[int, str], state: Stream[Item], number: int, item: Item, now_ns: int
+    ) -> Iterator[Item | Gap]:
+        """Keep a message for which something is missing; yields what goes on nevertheless."""
+        waiting = state.wait()
+        if self._gathering and waiting.is_full:
             return  # it will be told as missing
-        if number not in state.held:
-            state.held[number] = now_ns, item
-            state.held_bytes += self._size(item)
+        if number not in waiting.held:
+            waiting.held[number] = now_ns, item
+            waiting.held_bytes += self._size(item)
         if self._gathering:
             return
         patience_ns = GATHER_NS if state.expected is None else PATIENCE_NS
-        if state.due_ns is None or number < state.newest:  # something begins to be waited for, or is being recovered
-            state.due_ns = now_ns + patience_ns
-            state.recovered_ns = now_ns
+        if waiting.due_ns is None or number < waiting.newest:  # something begins to be waited for, or is recovered
+            waiting.due_ns = now_ns + patience_ns
+            waiting.recovered_ns = now_ns
             self._waiting[name] = state
-        state.newest = max(state.newest, number)
-        yield from self._contiguous(state)
-        if state.is_full:
-            yield from self._give_up(name, state, now_ns, now_ns, state.newest)
+        waiting.newest = max(waiting.newest, number)
+        yield from self._contiguous(state, waiting)
+        if waiting.is_full:
+            yield from self._give_up(name, state, waiting, now_ns, now_ns, waiting.newest)
 
     def overdue(self, now_ns: int) -> Iterator[Item | Gap]:
         """Yields what has waited for long enough."""
         for name, state in list(self._waiting.items()):
-            if state.due_ns is None or now_ns < state.due_ns:
+            waiting = state.waiting
+            if waiting is None or waiting.due_ns is None or now_ns < waiting.due_ns:
                 continue
-            silent_until_ns = state.recovered_ns + RECOVERY_NS
-            passed = state.newest if now_ns >= silent_until_ns else state.passed
+            silent_until_ns = waiting.recovered_ns + RECOVERY_NS
+            passed = waiting.newest if now_ns >= silent_until_ns else state.passed
             if state.expected is None or state.expected < passed:
                 since_ns = now_ns if state.expected is None else now_ns - PATIENCE_NS
-                yield from self._give_up(name, state, since_ns, now_ns, passed)
+                yield from self._give_up(name, state, waiting, since_ns, now_ns, passed)
             else:
-                state.due_ns = min(now_ns + LOOK_AGAIN_NS, silent_until_ns)
+                waiting.due_ns = min(now_ns + LOOK_AGAIN_NS, silent_until_ns)
 
     def tell_last(self, publisher: int, stream: str, key: str, number: int) -> None:
         """While gathering: the number that a publisher has come to on one of its keys."""
@@ -186,18 +160,17 @@ class InOrder(Generic[Item]):
 
     def tell(self, publisher: int, stream: str, key: str, number: int, item: Item) -> None:
         """While gathering: a message of before."""
-        state = self._stream(publisher, stream)
-        if len(state.told) >= MOST_HELD:
-            return
-        state.told[number] = item
-        state.told_from[key] = min(state.told_from.get(key, number), number)
+        self._stream(publisher, stream).wait().tell(key, number, item)
 
     def is_told(self) -> bool:
         """While gathering: whether nothing is missing of what was before, nor between it and what has come since."""
         for state in self._streams.values():
-            first = state.told_by_all
-            numbers = {number for number in (*state.told, *state.held) if number >= first}
-            if state.told and len(numbers) <= max(state.before, *numbers) - first:
+            waiting = state.waiting
+            if waiting is None or not waiting.told:
+                continue
+            first = waiting.told_by_all
+            numbers = {number for number in (*waiting.told, *waiting.held) if number >= first}
+            if len(numbers) <= max(state.before, *numbers) - first:
                 return False
         return True
 
@@ -205,42 +178,58 @@ class InOrder(Generic[Item]):
         """What was before has all been told; yields what goes on."""
         self._gathering = False
         for name, state in self._streams.items():
-            live = {number: came for number, came in state.held.items() if number > state.before}
-            state.held = {number: (now_ns, item) for number, item in state.told.items()} | live
-            state.told = {}
-            state.held_bytes = sum(self._size(item) for _, item in state.held.values())
-            for number in sorted(number for number in state.held if number < state.told_by_all):
-                yield self._released(state, number)
-            state.newest = max(state.held, default=state.before)
-            if state.held:
-                yield from self._give_up(name, state, now_ns, now_ns, state.newest)
+            waiting = state.wait()
+            live = {number: came for number, came in waiting.held.items() if number > state.before}
+            waiting.held = {number: (now_ns, item) for number, item in waiting.told.items()} | live
+            waiting.told = {}
+            waiting.held_bytes = sum(self._size(item) for _, item in waiting.held.values())
+            for number in sorted(number for number in waiting.held if number < waiting.told_by_all):
+                yield self._released(waiting, number)
+            waiting.newest = max(waiting.held, default=state.before)
+            if waiting.held:
+                yield from self._give_up(name, state, waiting, now_ns, now_ns, waiting.newest)
             elif state.before >= 0:
-                state.expected = state.before + 1
+                state.goes_on_from(state.before)
+            state.settle()
 
-    def _stream(self, publisher: int, stream: str) -> _Stream[Item]:
-        return self._streams.get((publisher, stream)) or self._new((publisher, stream))
+    def _stream(self, publisher: int, stream: str) -> Stream[Item]:
+        return self._streams.get((publisher, stream)) or self._new((publisher, stream), 0)
 
-    def _new(self, name: tuple[int, str]) -> _Stream[Item]:
-        """Begin to remember a stream; if there are too many, those are forgotten that have been silent for longest."""
-        if len(self._streams) >= MOST_STREAMS:
-            idle = [(state.heard_ns, known) for known, state in self._streams.items() if not (state.held or state.told)]
-            for _, known in sorted(idle)[: MOST_STREAMS // 10]:
-                del self._streams[known]
-        state: _Stream[Item] = _Stream()
+    def _new(self, name: tuple[int, str], now_ns: int) -> Stream[Item]:
+        """Begin to remember a stream."""
+        if len(self._streams) >= min(self._look_at, MOST_STREAMS):
+            self._forget(now_ns)
+            self._look_at = max(2 * len(self._streams), FEW_STREAMS)
+        state: Stream[Item] = Stream(*name)
         self._streams[name] = state
         return state
 
-    def _released(self, state: _Stream[Item], number: int) -> Item:
-        item = state.held.pop(number)[1]
-        state.held_bytes -= self._size(item)
+    def _forget(self, now_ns: int) -> None:
+        """Forget streams that are nobody's; if there are too many still, those that were silent for longest."""
+        gone = [
+            name for name, state in self._streams.items() if state.is_strange and now_ns - state.heard_ns >= STRANGE_NS
+        ]
+        if len(self._streams) - len(gone) >= MOST_STREAMS:
+            idle = [(state.heard_ns, name) for name, state in self._streams.items() if state.waiting is None]
+            gone = [name for _, name in sorted(idle)[: MOST_STREAMS // 10]]
+        for name in gone:
+            state = self._streams.pop(name)
+            for key in state.keys:
+                if self._by_key.get(key) is state:
+                    del self._by_key[key]
+
+    def _released(self, waiting: Waiting[Item], number: int) -> Item:
+        item = waiting.held.pop(number)[1]
+        waiting.held_bytes -= self._size(item)
         return item
 
     def due_ns(self) -> int | None:
         """When to ask for what is overdue; None: nothing waits."""
         if not self._waiting:
             return None
-        self._waiting = {name: state for name, state in self._waiting.items() if state.due_ns is not None}
-        return min((state.due_ns for state in self._waiting.values() if state.due_ns is not None), default=None)
+        due = {name: state.waiting.due_ns for name, state in self._waiting.items() if state.waiting is not None}
+        self._waiting = {name: state for name, state in self._waiting.items() if due.get(name) is not None}
+        return min((due_ns for due_ns in due.values() if due_ns is not None), default=None)
 
     def waiting(self, now_ns: int) -> dict[str, int]:
         """The streams of which something is overdue, with when the first came that waits for it.
@@ -249,20 +238,30 @@ class InOrder(Generic[Item]):
         """
         found: dict[str, int] = {}
         for (_, stream), state in self._waiting.items():
-            if state.due_ns is not None and state.due_ns <= now_ns and state.held and state.expected is not None:
-                since_ns = min(came_ns for came_ns, _ in state.held.values())
+            waiting = state.waiting
+            if waiting is None or state.expected is None or not waiting.held:
+                continue
+            if waiting.due_ns is not None and waiting.due_ns <= now_ns:
+                since_ns = min(came_ns for came_ns, _ in waiting.held.values())
                 found[stream] = min(found.get(stream, since_ns), since_ns)
         return found
 
-    def _contiguous(self, state: _Stream[Item]) -> Iterator[Item]:
-        while state.expected is not None and state.expected in state.held:
-            yield self._released(state, state.expected)
+    def _contiguous(self, state: Stream[Item], waiting: Waiting[Item]) -> Iterator[Item]:
+        while state.expected is not None and state.expected in waiting.held:
+            yield self._released(waiting, state.expected)
             state.expected += 1
-        if not state.held:
-            state.due_ns = None
+        if not waiting.held:
+            waiting.due_ns = None
+            state.settle()
 
     def _give_up(
-        self, name: tuple[int, str], state: _Stream[Item], since_ns: int, now_ns: int, passed: int
+        self,
+        name: tuple[int, str],
+        state: Stream[Item],
+        waiting: Waiting[Item],
+        since_ns: int,
+        now_ns: int,
+        passed: int,
     ) -> Iterator[Item | Gap]:
         """Do not wait for what is missing before what came until a moment: all of that was lost at once.
 
@@ -271,24 +270,25 @@ class InOrder(Generic[Item]):
         items: list[Item] = []
         lost: list[tuple[int, int]] = []
         gathered = state.expected is None
-        numbers = sorted(state.held)
-        came_ns = [state.held[number][0] for number in numbers]
+        numbers = sorted(waiting.held)
+        came_ns = [waiting.held[number][0] for number in numbers]
         noticed_ns = list(accumulate(reversed(came_ns), min))[::-1]  # when the first came that is behind it, or it did
         for number, known_ns in zip(numbers, noticed_ns, strict=True):
             if state.expected is not None and number > state.expected:
                 if gathered or known_ns > since_ns or number > passed:
                     break  # what is missing here may still come
                 lost.append((state.expected, number - 1))
-            state.expected = number + 1
-            items.append(self._released(state, number))
-        state.due_ns = None
-        if state.held:
-            first_ns = min(came for came, _ in state.held.values())
-            state.due_ns = first_ns + PATIENCE_NS
+            state.goes_on_from(number)
+            items.append(self._released(waiting, number))
+        waiting.due_ns = None
+        if waiting.held:
+            first_ns = min(came for came, _ in waiting.held.values())
+            waiting.due_ns = first_ns + PATIENCE_NS
             self._waiting[name] = state
-            state.recovered_ns = max(state.recovered_ns, first_ns)
+            waiting.recovered_ns = max(waiting.recovered_ns, first_ns)
+        state.settle()
         if lost:
-            state.lost = [*state.lost, *lost][-MOST_LOST:]
+            state.lost = [*(state.lost or ()), *lost][-MOST_LOST:]
             count = sum(last - first + 1 for first, last in lost)
             yield Gap(name[1], name[0], lost[0][0], lost[-1][1], count, now_ns)
         yield from items

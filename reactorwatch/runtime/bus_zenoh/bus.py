@@ -19,16 +19,15 @@ from reactorwatch.runtime.bus import MOST_GATHERED, Request
 from reactorwatch.runtime.bus_zenoh.messages import (
     LONGEST_ENCODING,
     NUMBERED,
-    STREAM_PARTS,
+    Reader,
     first_line,
     is_of_whole_streams,
     numbered,
     payload_of,
     spelled,
-    stream_of,
 )
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.delivery import Delivery, Numbered
+from reactorwatch.runtime.delivery import STREAM_PARTS, Delivery, Numbered, stream_of
 from reactorwatch.runtime.in_order import Gap, InOrder
 
 log = structlog.get_logger()
@@ -178,28 +177,26 @@ class ZenohBus:
         # Of the channel alone: nobody could undeclare a subscriber that is just being asked.
         channel = self._listen(key_expression, zenoh.handlers.FifoChannel(LARGEST_CHANNEL)).handler
 
-        def hand_on(came: list[Numbered | Encoded]) -> None:
-            others = (
-                [item if isinstance(item, Encoded) else item.message for item in came]
-                if delivery is None
-                else [item for item in came if isinstance(item, Encoded)]
-            )
-            if others:
-                handler(others)
-            if delivery is not None and len(others) < len(came):
-                delivery.receive(item for item in came if isinstance(item, Numbered))
-
         def empty() -> None:
+            reader = Reader()
             with contextlib.suppress(zenoh.ZError):  # it is closed
                 while True:
                     sample, now_ns = channel.recv(), time.time_ns()
-                    came, room = list[Numbered | Encoded](), MOST_GATHERED_BYTES
+                    came, others = list[Numbered](), list[Encoded]()
+                    left, room = MOST_GATHERED, MOST_GATHERED_BYTES
                     while sample is not None:
-                        item = numbered(sample, now_ns)
-                        came.append(item)
-                        room -= len(item.payload if isinstance(item, Encoded) else item.message.payload)
-                        sample = channel.try_recv() if len(came) < MOST_GATHERED and room > 0 else None
-                    hand_on(came)
+                        item = reader.read(sample, now_ns)
+                        message = item.message if isinstance(item, Numbered) else item
+                        if delivery is not None and isinstance(item, Numbered):
+                            came.append(item)
+                        else:
+                            others.append(message)
+                        left, room = left - 1, room - len(message.payload)
+                        sample = channel.try_recv() if left and room > 0 else None
+                    if others:
+                        handler(others)
+                    if delivery is not None and came:
+                        delivery.receive(came)
                     time.sleep(GATHER_AGAIN_S)
 
         threading.Thread(target=empty, name="gather", daemon=True).start()
@@ -261,8 +258,8 @@ class ZenohBus:
         order: InOrder[Encoded] = InOrder(gathering=True)
         lately = f"_time=[now(-{self._config.history_s}s)..]"
         with contextlib.suppress(zenoh.ZError):  # it is closed
-            for publisher, stream, number, message in self._remembered(key_expression, lately):
-                order.tell(publisher, stream, message.key, number, message)
+            for came in self._remembered(key_expression, lately):
+                order.tell(came.publisher, came.stream, came.message.key, came.number, came.message)
         told = list(order.gathered(0))
         while (due_ns := order.due_ns()) is not None:  # what is missing is not waited for
             told += order.overdue(due_ns)

@@ -6,17 +6,11 @@ import struct
 import zenoh
 
 from reactorwatch.contract.codec import LARGEST_PAYLOAD, Encoded
-from reactorwatch.runtime.delivery import Numbered
+from reactorwatch.runtime.delivery import STREAM_PARTS, Numbered
 
 LONGEST_ENCODING = 1000
-STREAM_PARTS = 3  # of a key: root, plant and kind
 
 NUMBERED = struct.Struct("<QQ")  # who published a message, and its number in the stream
-
-
-def stream_of(key: str) -> str:
-    """The stream that a key is in."""
-    return "/".join(key.split("/", STREAM_PARTS)[:STREAM_PARTS])
 
 
 def payload_of(payload: zenoh.ZBytes) -> bytes:
@@ -28,17 +22,40 @@ def payload_of(payload: zenoh.ZBytes) -> bytes:
     return data if len(data) <= LARGEST_PAYLOAD else data[: LARGEST_PAYLOAD + 1]
 
 
+class Reader:
+    """Reads what comes, in one thread.
+
+    Nearly all comes with the same encoding, and to ask Zenoh for its text takes longer than to ask whether it is.
+    """
+
+    def __init__(self) -> None:
+        self._encoding = zenoh.Encoding.ZENOH_BYTES
+        self._text = encoding_text(self._encoding)
+
+    def read(self, sample: zenoh.Sample, now_ns: int) -> Numbered | Encoded:
+        """A message that has come, as its publisher numbered it; without a number if it did not."""
+        encoding = sample.encoding
+        if encoding != self._encoding:
+            self._encoding, self._text = encoding, encoding_text(encoding)
+        message = Encoded(str(sample.key_expr), payload_of(sample.payload), self._text, now_ns)
+        attachment = sample.attachment
+        if attachment is None:
+            return message
+        name = attachment.to_bytes()
+        if len(name) != NUMBERED.size:
+            return message
+        publisher, number = NUMBERED.unpack(name)
+        return Numbered(publisher, number, message)
+
+
+def encoding_text(encoding: zenoh.Encoding) -> str:
+    """What an encoding says; none of ours is as long as a stranger's may be."""
+    return str(encoding)[:LONGEST_ENCODING]
+
+
 def numbered(sample: zenoh.Sample, now_ns: int) -> Numbered | Encoded:
-    """A message that has come, as its publisher numbered it; without a number if it did not."""
-    message = Encoded(str(sample.key_expr), payload_of(sample.payload), str(sample.encoding)[:LONGEST_ENCODING], now_ns)
-    attachment = sample.attachment
-    if attachment is None:
-        return message
-    name = attachment.to_bytes()
-    if len(name) != NUMBERED.size:
-        return message
-    publisher, number = NUMBERED.unpack(name)
-    return Numbered(publisher, stream_of(message.key), number, message)
+    """A message that has come by itself, see `Reader`."""
+    return Reader().read(sample, now_ns)
 
 
 def spelled(key_expression: str) -> str:

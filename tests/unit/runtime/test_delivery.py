@@ -17,7 +17,7 @@ SECOND = 10**9
 
 def message(number: int) -> Numbered:
     sample = Encoded("reactor/x/sample/T", str(number).encode(), "", time.time_ns())
-    return Numbered(1, "reactor/x/sample", number, sample)
+    return Numbered(1, number, sample)
 
 
 def each(heard: "SimpleQueue[Encoded | Gap]") -> Callable[[list[Encoded]], None]:

@@ -5,8 +5,17 @@ from collections.abc import Iterable
 
 import pytest
 
-from reactorwatch.runtime import in_order
-from reactorwatch.runtime.in_order import GATHER_NS, LOOK_AGAIN_NS, PATIENCE_NS, RECOVERY_NS, Gap, InOrder
+from reactorwatch.runtime import in_order, numbered_stream
+from reactorwatch.runtime.in_order import (
+    FEW_STREAMS,
+    GATHER_NS,
+    LOOK_AGAIN_NS,
+    PATIENCE_NS,
+    RECOVERY_NS,
+    STRANGE_NS,
+    Gap,
+    InOrder,
+)
 
 STREAM = "reactor/x/sample"
 
@@ -275,14 +284,14 @@ def test_a_late_listener_gathers_as_long_as_older_ones_come_and_not_as_long_as_n
 
 
 def test_no_more_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(in_order, "MOST_HELD", 100)
+    monkeypatch.setattr(numbered_stream, "MOST_HELD", 100)
     order = InOrder[int]()
     fed(order, [0])
     assert fed(order, list(range(2, 103))) == [Gap(STREAM, 1, 1, 1, 1, 0), *range(2, 103)]
 
 
 def test_no_more_bytes_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(in_order, "MOST_HELD_BYTES", 1000)
+    monkeypatch.setattr(numbered_stream, "MOST_HELD_BYTES", 1000)
     order = InOrder[int](size=lambda _: 100)
     fed(order, [0])
     assert fed(order, list(range(2, 13))) == [Gap(STREAM, 1, 1, 1, 1, 0), *range(2, 13)]
@@ -291,7 +300,7 @@ def test_no_more_bytes_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyP
 
 def test_while_what_was_before_is_told_no_more_waits_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """What did not find room is told as missing."""
-    monkeypatch.setattr(in_order, "MOST_HELD", 10)
+    monkeypatch.setattr(numbered_stream, "MOST_HELD", 10)
     order = InOrder[int](gathering=True)
     assert fed(order, range(100)) == []
     told = [*order.gathered(0), *fed(order, [100, 101])]
@@ -313,18 +322,65 @@ def test_publishers_without_number_are_forgotten_and_the_one_that_goes_on_is_not
 
 
 def test_keys_without_number_are_not_all_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(in_order, "MOST_KEYS", 10)
+    monkeypatch.setattr(numbered_stream, "MOST_KEYS", 10)
     order = InOrder[int]()
     assert [item for number in range(100) for item in fed(order, [number], key=f"x{number}")] == list(range(100))
     assert len(order._streams[1, STREAM].keys) == 10
 
 
-def test_keys_without_number_are_not_all_remembered_on_the_fast_way_either(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(in_order, "MOST_KEYS", 10)
+def test_the_fast_way_is_for_keys_that_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numbered_stream, "MOST_KEYS", 10)
     order = InOrder[int]()
-    assert fed(order, [0], key="x0") == [0]
-    assert all(order.takes_next(1, STREAM, f"x{number}", number, 0) for number in range(1, 100))
-    assert len(order._streams[1, STREAM].keys) == 10
+    fed(order, [0], key="x0")
+    for number in range(1, 100):
+        assert not order.takes_next(1, f"x{number}", number, 0)
+        assert fed(order, [number], key=f"x{number}") == [number]
+    assert [order.takes_next(1, f"x{100 + place}", 100 + place, 0) for place in range(3)] == [False] * 3
+    assert [order.takes_next(1, f"x{place}", 100 + place, 0) for place in range(10)] == [True] * 10
+
+
+def test_the_fast_way_is_for_the_publisher_that_went_on_last() -> None:
+    order = InOrder[int]()
+    assert fed(order, [0, 1]) == [0, 1]
+    assert not order.takes_next(2, "T", 2, 0)
+    assert fed(order, [0], publisher=2) == [0]
+    assert not order.takes_next(1, "T", 2, 0)
+    assert order.takes_next(2, "T", 1, 0)
+
+
+def test_the_fast_way_is_closed_while_something_is_waited_for() -> None:
+    order = InOrder[int]()
+    assert fed(order, [0, 2]) == [0]
+    assert not order.takes_next(1, "T", 1, 0)
+    assert fed(order, [1]) == [1, 2]
+    assert order.takes_next(1, "T", 3, 0)
+
+
+def test_publishers_of_one_message_that_nobody_had_told_of_are_forgotten() -> None:
+    """Garbage, with something like a publisher and a number, makes a stream each."""
+    order = InOrder[int]()
+    fed(order, [0])
+    for number in range(1, 10_000):
+        now_ns = number * STRANGE_NS // 1000
+        assert order.takes_next(1, "T", number, now_ns) or fed(order, [number], now_ns=now_ns) == [number]
+        assert fed(order, [2**40 + number], now_ns=now_ns, publisher=1 + number) == []
+        if (due_ns := order.due_ns()) is not None and due_ns <= now_ns:
+            list(order.overdue(now_ns))
+        assert len(order._streams) <= 4000
+
+
+def test_publishers_that_were_told_of_or_heard_from_their_beginning_are_not_forgotten() -> None:
+    """Of an alarm there may be a message a day."""
+    order = InOrder[int](gathering=True)
+    order.tell_last(1, STREAM, "T", 7)
+    assert list(order.gathered(0)) == []
+    assert fed(order, [0], publisher=2) == [0]
+    for number in range(3 * FEW_STREAMS):
+        fed(order, [2**40], now_ns=2 * number * STRANGE_NS, publisher=3 + number)
+        assert order.due_ns() is not None
+        list(order.overdue(2 * number * STRANGE_NS + GATHER_NS))
+    assert fed(order, [9, 8]) == [8, 9]
+    assert fed(order, [2, 1], publisher=2) == [1, 2]
 
 
 def test_the_one_that_goes_on_by_the_fast_way_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -332,5 +388,5 @@ def test_the_one_that_goes_on_by_the_fast_way_is_not_forgotten(monkeypatch: pyte
     order = InOrder[int]()
     assert fed(order, [0]) == [0]
     for number in range(1, 1000):
-        assert order.takes_next(1, STREAM, "a", number, number)
-        assert fed(order, [0], now_ns=number, publisher=1 + number) == [0]
+        assert order.takes_next(1, "T", number, number)
+        assert fed(order, [0], now_ns=number, publisher=1 + number, key="C") == [0]
