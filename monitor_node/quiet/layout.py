@@ -15,6 +15,7 @@ Records: TypeAlias = NDArray[np.void]
 Array: TypeAlias = NDArray[np.float64]
 Ints: TypeAlias = NDArray[np.int64]
 Places: TypeAlias = NDArray[np.int32]
+Bytes: TypeAlias = NDArray[np.uint8]
 
 
 def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
@@ -112,5 +113,6 @@ def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
         ("head", np.int32, ()),  # where the next one goes
         ("unit_ns", i, ()),  # that spacings are kept in
         ("usual_ns", i, ()),  # spacing that is kept as 0
+        ("reference", i, (signals,)),  # bits of the values that others are kept as what they are more than
     ]
     return np.dtype([(name, kind, shape) for name, kind, shape in columns], align=True)

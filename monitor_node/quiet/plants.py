@@ -13,7 +13,7 @@ from monitor_node.health import NODE, health_of
 from monitor_node.monitor_state import sealed, settings_of
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.lining_up import COUNTS
-from monitor_node.quiet.ring import kept_spacings
+from monitor_node.quiet.ring import kept_spacings, kept_values, reference_bits
 from monitor_node.quiet.rows import NEW_MINUTE, judge
 from monitor_node.quiet.samples import silent_from, take_samples
 from monitor_node.quiet.slots import NEVER_NS, Slots
@@ -99,14 +99,18 @@ class QuietPlants:
         rest, rows = found
         usual_ns = round(float(self._scratch[0]["period_ns"]))
         spacings = kept_spacings(rows.times_ns, usual_ns)
-        if spacings is None:
+        reference = reference_bits(rows.values)
+        values = kept_values(rows.values, reference)
+        if spacings is None or values is None:
             return False
         slot = self._slots.take(plant)
         self._slots.plants[slot] = self._scratch[0]
         self._slots.health_due_ns[slot] = self._scratch[0]["health_due_ns"]
         p, count = self._slots.plants[slot], len(rows.times_ns)
         p["unit_ns"], p["usual_ns"], p["kept"], p["head"] = spacings[0], usual_ns, count, count % self._form.keeps
-        self._slots.times[slot, :count], self._slots.ring[slot, :count] = spacings[1], rows.values
+        p["reference"][: reference.size] = reference
+        self._slots.keep_times(slot, spacings[1])
+        self._slots.ring[slot, :count] = values
         shared = self._shared.setdefault
         self._slots.rests[slot] = rest._replace(
             units=shared(rest.units, rest.units),
@@ -143,7 +147,8 @@ class QuietPlants:
         """
         of, slot = self._slots.of[plant], self._slots.take(name)
         slots = self._slots
-        slots.plants[slot], slots.times[slot], slots.ring[slot] = slots.plants[of], slots.times[of], slots.ring[of]
+        slots.plants[slot], slots.ring[slot] = slots.plants[of], slots.ring[of]
+        slots.keep_times(slot, slots.times[of])
         slots.health_due_ns[slot] = slots.health_due_ns[of]
         rest = slots.rest(of)
         slots.rests[slot] = rest._replace(runs=bytes(bytearray(rest.runs)))
@@ -227,6 +232,7 @@ class QuietPlants:
             rows.times_ns,
             np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns.tolist()]),
             rows.values,
+            rows.values.view(np.int64),
             self._rows.address,
             self._parameters,
             LONGEST_ROW_MIN,

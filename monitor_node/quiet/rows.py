@@ -27,7 +27,8 @@ from monitor_node.charts.mewma import _move as _move_mewma
 from monitor_node.charts.shewhart import Shewhart
 from monitor_node.charts.shewhart import _judge as _judge_shewhart
 from monitor_node.prewhitening import LARGEST_ORDER
-from monitor_node.quiet.layout import Array, Ints, Places, Records
+from monitor_node.quiet.layout import Array, Bytes, Ints, Places, Records
+from monitor_node.quiet.ring import VALUE_BYTES, ZERO
 from monitor_node.quiet.samples import allowed_ns
 from monitor_node.sampling import LARGEST_GAP
 from monitor_node.silence import MEMORY
@@ -238,11 +239,12 @@ def judge(
     plants: Records,
     scratch: Records,
     times: Places,
-    ring: Array,
+    ring: Bytes,
     rows: Places,
     row_time_ns: Ints,
     row_time_min: Array,
     row_values: Array,
+    row_bits: Ints,
     filter_address: int,
     parameters: Array,
     longest_row_min: float,
@@ -260,11 +262,12 @@ def judge(
         plants: records; those of ordinary rows go on.
         scratch: one record, to work in.
         times: of the newest rows, the spacing before each, see `record_type`; shape (plants, rows kept).
-        ring: their values, shape (plants, rows kept, signals); without columns if causes are not looked for.
+        ring: their values, see `ring`, shape (plants, rows kept, bytes); without columns if causes are not looked for.
         rows: the plant of each row.
         row_time_ns: its time.
         row_time_min: the same in minutes.
         row_values: its values, input first.
+        row_bits: the same as bits.
         filter_address: of the filter's machine code.
         parameters: of the model.
         longest_row_min: see `_predicted`.
@@ -282,7 +285,7 @@ def judge(
     new, constants = np.empty(3 + 2 * row_values.shape[1]), np.empty(parameters.size + noise)
     after, told = np.empty(memory), np.empty(5 * outputs + 1)
     constants[: parameters.size] = parameters
-    keeps = times.shape[1]
+    keeps, kept = times.shape[1], ring.shape[2] // VALUE_BYTES
     for k in range(rows.size):
         slot = rows[k]
         scratch[0] = plants[slot]
@@ -303,6 +306,9 @@ def judge(
         spacing = row_time_ns[k] - p.last_ns
         over = spacing - p.usual_ns
         ordinary = ordinary and over % p.unit_ns == 0 and abs(over // p.unit_ns) < 2**31
+        for place in range(kept):
+            off = row_bits[k, place] - p.reference[place]
+            ordinary = ordinary and (row_bits[k, place] == 0 or ZERO < off < -ZERO)
         ordinary = ordinary and _hear(p, spacing, silence_limit)
         if ordinary:
             for place in range(outputs):
@@ -320,9 +326,12 @@ def judge(
         for place in range(memory):
             p.memory[place] = after[place]
         p.rows_watched += 1
-        times[slot, p.head] = over // p.unit_ns
-        for place in range(ring.shape[2]):
-            ring[slot, p.head, place] = row_values[k, place]
+        if times[slot, p.head] != over // p.unit_ns:  # or a page of zeros would take memory
+            times[slot, p.head] = over // p.unit_ns
+        for place in range(kept):
+            code = row_bits[k, place] - p.reference[place] if row_bits[k, place] else ZERO
+            for byte in range(VALUE_BYTES):
+                ring[slot, p.head, VALUE_BYTES * place + byte] = code >> 8 * byte & 0xFF
         p.head = p.head + 1 if p.head + 1 < keeps else 0
         p.kept = min(p.kept + 1, keeps)
         minute = row_time_ns[k] // _MINUTE_NS

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from monitor_node.quiet.form import QuietForm, Rest
 from monitor_node.quiet.layout import Records
-from monitor_node.quiet.ring import NewestRows, newest_rows
+from monitor_node.quiet.ring import VALUE_BYTES, NewestRows, newest_rows
 from reactorwatch.contract import keys
 
 FIRST_ROOM = 16
@@ -31,8 +31,9 @@ class Slots:
         rests: by slot.
         codes: by key of a sample, the slot times the signals plus the signal.
         plants: records.
-        times: rings of spacings, shape (slots, rows kept).
-        ring: rings of values, shape (slots, rows kept, columns).
+        times: rings of spacings, shape (slots, rows kept). It takes no memory where all are zero: whoever writes there
+            leaves out what is there already.
+        ring: rings of values, shape (slots, rows kept, bytes).
         health_due_ns: by slot; never for one without a plant.
     """
 
@@ -46,7 +47,7 @@ class Slots:
         self._used: NDArray[np.int64] | None = None
         self.plants: Records
         self.times: NDArray[np.int32]
-        self.ring: NDArray[np.float64]
+        self.ring: NDArray[np.uint8]
         self.health_due_ns: NDArray[np.int64] = np.empty(0, np.int64)
         self._room(FIRST_ROOM)
 
@@ -83,6 +84,11 @@ class Slots:
             self._used = np.array(sorted(self.of.values()), dtype=np.int64)
         return self._used
 
+    def keep_times(self, slot: int, spacings: NDArray[np.int32]) -> None:
+        """Fill the beginning of a ring of spacings."""
+        place = np.flatnonzero(self.times[slot, : spacings.size] != spacings)
+        self.times[slot, place] = spacings[place]
+
     def rest(self, slot: int) -> Rest:
         """What is kept beside the record of a plant."""
         rest = self.rests[slot]
@@ -97,9 +103,11 @@ class Slots:
         """Make room for so many."""
         form, before = self._form, len(self.names)
         records, times = _zeros((plants,), form.record), _zeros((plants, form.keeps), np.dtype(np.int32))
-        ring = _zeros((plants, form.keeps, form.columns), np.dtype(np.float64))
+        ring = _zeros((plants, form.keeps, form.columns * VALUE_BYTES), np.dtype(np.uint8))
         if before:
-            records[:before], times[:before], ring[:before] = self.plants, self.times, self.ring
+            records[:before], ring[:before] = self.plants, self.ring
+            uneven = np.flatnonzero(self.times.any(axis=1))
+            times[uneven] = self.times[uneven]
         self.plants, self.times, self.ring = records, times, ring
         due_ns = np.full(plants, NEVER_NS)
         due_ns[:before] = self.health_due_ns[:before]
