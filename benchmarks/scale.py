@@ -7,7 +7,8 @@ A table with, for each number of plants:
   counts the same messages, in the same run, and the ratio. A publisher sends as fast as it can. Seconds are those of
   the processor's time, of all threads of the process, so that others on the machine do not count;
 - the same without the bus: from bytes to judgements;
-- memory a plant: how much more the process takes with all plants than with a hundredth of them;
+- memory a plant: how much more the process takes with all plants than with a hundredth of them; and with the bus,
+  than with half of them, when samples of all have been heard, slowly, and the health of all has been told;
 - from a sample to its alarm at one sample a second a plant, 99 of 100, as long as the clock says.
 
 The plants are copies of one that was trained, with names of their own; all are quiet but those that are given an alarm.
@@ -40,6 +41,7 @@ from plant_node.record import simulate_record
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encoding_of
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
+from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.access import NOBODY
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
@@ -58,6 +60,8 @@ IDLE_S = 10.0
 WITHIN_S = 60.0
 SHARING = 250  # plants that share a session
 KNOWN_ROWS = 2  # of each plant, after which the router knows its keys; the time is taken from then on
+HELD_ROWS = KNOWN_ROWS + 2  # of each plant, while it is seen what it takes: none of them is out
+HELD_PER_S = 10_000  # so slowly that nothing waits in a buffer
 OUT_EVERY = 50  # plants that are out in a row of the fleet, but at least one
 FLEET = "reactor/*"
 PATIENT = 1e6  # periods: between training and the first sample live a plant is no silent one
@@ -158,6 +162,27 @@ def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
     told = {"samples": node.samples - node.before, "cpu_s": node.ended_s - node.began_s, "quiet": len(node.quiet)}
     print(json.dumps(told | {"bytes": taken, "core": core}), flush=True)
     os._exit(0)  # thousands of tokens need not be withdrawn one by one
+
+
+def held(endpoint: str, plants: int, expected: int) -> None:
+    """Hear so many samples of the fleet, tell the health of each plant, and say what all of it takes."""
+    alone_on_a_core(0)
+    stop = StopSignal()
+    bus_zenoh.bus.MOST_NEW_KEYS = plants  # as it is after some minutes
+    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, passing=PASSING, crowded=True)
+    assert bus is not None
+    node = Counting(FAST, bus, stop)
+    node.learn(plants)
+    node.samples, node.expected = 0, -1
+    threading.Thread(target=watch, args=(node, bus, stop), daemon=True).start()
+    print("ready", flush=True)
+    deadline = time.monotonic() + WITHIN_S
+    while node.samples < expected or len(bus._passing_keys) < plants:
+        assert time.monotonic() < deadline, f"{node.samples} samples, health of {len(bus._passing_keys)} plants"
+        time.sleep(1.0)
+    assert len(node.quiet) == plants
+    print(json.dumps({"bytes": memory_bytes()}), flush=True)
+    os._exit(0)
 
 
 class Nowhere:
@@ -315,6 +340,16 @@ def told(process: "subprocess.Popen[str]") -> dict[str, Any]:
     return found
 
 
+def holding(endpoint: str, plants: int) -> int:
+    """What a monitor of so many plants takes, in bytes."""
+    process = started("held", endpoint, plants, HELD_ROWS * SIGNALS * plants)
+    source = started("publish", endpoint, plants, HELD_ROWS, HELD_PER_S)
+    found = told(process)
+    source.kill()
+    source.wait()
+    return int(found["bytes"])
+
+
 def row_of(plants: int) -> str:
     """Measure with so many plants."""
     rows = sized(plants)
@@ -330,15 +365,19 @@ def row_of(plants: int) -> str:
             found = told(process)
             source.wait()
             rates[listener] = found["samples"] / found["cpu_s"]
+        size = f"{'–':>12}"
+        if plants >= 1000:  # of fewer what differs from run to run is as much as the plants
+            taken = [holding(endpoint, count) for count in (plants // 2, plants)]
+            size = f"{(taken[1] - taken[0]) / (plants - plants // 2) / 1000:9.1f} kB"
         live = started("monitor", endpoint, plants, -1, 1)
         source = started("publish", endpoint, plants, KNOWN_ROWS + LATENCY_S // SIGNALS, plants)
         delays = told(source)
         live.kill()
         p99 = f"{np.percentile(delays['delays_ms'], 99):9.1f} ms" if delays["delays_ms"] else f"{'–':>12}"
-        size = f"{found['bytes'] / 1000:9.1f} kB" if plants >= 100 else f"{'–':>12}"
+        alone = f"{found['bytes'] / 1000:9.1f} kB" if plants >= 100 else f"{'–':>12}"
         return (
             f"{plants:7,} {found['core']:13,.0f} {rates['monitor']:13,.0f} {rates['bare']:13,.0f} "
-            f"{100 * rates['monitor'] / rates['bare']:6.0f} % {size} {p99} "
+            f"{100 * rates['monitor'] / rates['bare']:6.0f} % {alone} {size} {p99} "
             f"({len(delays['delays_ms'])} of {delays['out']})"
         )
     finally:
@@ -348,7 +387,7 @@ def row_of(plants: int) -> str:
 def main() -> None:
     """Measure and print."""
     configure(logging.WARNING)
-    if len(sys.argv) > 1 and sys.argv[1] in ("route", "publish", "monitor", "bare"):
+    if len(sys.argv) > 1 and sys.argv[1] in ("route", "publish", "monitor", "held", "bare"):
         command, endpoint, *numbers = sys.argv[1:]
         if command == "route":
             route(endpoint)
@@ -356,11 +395,16 @@ def main() -> None:
             publish(endpoint, int(numbers[0]), int(numbers[1]), float(numbers[2]))
         elif command == "monitor":
             monitor(endpoint, int(numbers[0]), int(numbers[1]), bool(int(numbers[2])))
+        elif command == "held":
+            held(endpoint, int(numbers[0]), int(numbers[1]))
         else:
             bare(endpoint, int(numbers[0]), int(numbers[1]))
         return
     print("samples a second of one core; p99 from sample to alarm at 1 sample/s a plant (alarms that came)")
-    print(f"{'plants':>7} {'without bus':>13} {'live':>13} {'bare':>13} {'ratio':>8} {'a plant':>12} {'p99':>12}")
+    print(
+        f"{'plants':>7} {'without bus':>13} {'live':>13} {'bare':>13} {'ratio':>8} "
+        + f"{'a plant':>12} {'with bus':>12} {'p99':>12}"
+    )
     for plants in [int(item) for item in sys.argv[1:]] or SIZES:
         print(row_of(plants), flush=True)
     print("goal: live >= 100,000 and >= 20 % of bare, the same from 100 to 10,000; <= 20 kB a plant")

@@ -30,6 +30,24 @@ PRIORITIES = (
 STALE_AFTER_NS = 24 * 60 * MINUTE_NS
 
 
+def are_of_nothing(figures: AlarmKpis) -> bool:
+    """Whether figures say that no alarm ever came up, and that nobody keeps one out of sight.
+
+    Args:
+        figures: those.
+    """
+    return not (
+        figures.alarms_10min
+        or figures.standing
+        or figures.unacknowledged
+        or figures.shelved
+        or figures.suppressed
+        or figures.out_of_service
+        or figures.incidents
+        or any(count.raised for count in figures.priorities)
+    )
+
+
 class Counted(NamedTuple):
     """What the figures need to know of an alarm now."""
 
