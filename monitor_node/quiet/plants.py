@@ -13,7 +13,7 @@ from monitor_node.health import NODE, health_of
 from monitor_node.monitor_state import sealed, settings_of
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.lining_up import COUNTS
-from monitor_node.quiet.ring import kept_spacings, kept_values, reference_bits
+from monitor_node.quiet.ring import kept_spacings, kept_values
 from monitor_node.quiet.rows import NEW_MINUTE, judge
 from monitor_node.quiet.samples import silent_from, take_samples
 from monitor_node.quiet.slots import NEVER_NS, Slots
@@ -99,18 +99,15 @@ class QuietPlants:
         rest, rows = found
         usual_ns = round(float(self._scratch[0]["period_ns"]))
         spacings = kept_spacings(rows.times_ns, usual_ns)
-        reference = reference_bits(rows.values)
-        values = kept_values(rows.values, reference)
+        values = kept_values(rows.values)
         if spacings is None or values is None:
             return False
         slot = self._slots.take(plant)
         self._slots.plants[slot] = self._scratch[0]
         self._slots.health_due_ns[slot] = self._scratch[0]["health_due_ns"]
-        p, count = self._slots.plants[slot], len(rows.times_ns)
-        p["unit_ns"], p["usual_ns"], p["kept"], p["head"] = spacings[0], usual_ns, count, count % self._form.keeps
-        p["reference"][: reference.size] = reference
-        self._slots.keep_times(slot, spacings[1])
-        self._slots.ring[slot, :count] = values
+        p = self._slots.plants[slot]
+        p["unit_ns"], p["usual_ns"] = spacings[0], usual_ns
+        self._slots.keep(slot, spacings[1], values)
         shared = self._shared.setdefault
         self._slots.rests[slot] = rest._replace(
             units=shared(rest.units, rest.units),
@@ -147,9 +144,7 @@ class QuietPlants:
         """
         of, slot = self._slots.of[plant], self._slots.take(name)
         slots = self._slots
-        slots.plants[slot], slots.ring[slot] = slots.plants[of], slots.ring[of]
-        slots.keep_times(slot, slots.times[of])
-        slots.health_due_ns[slot] = slots.health_due_ns[of]
+        slots.copy(of, slot)
         rest = slots.rest(of)
         slots.rests[slot] = rest._replace(runs=bytes(bytearray(rest.runs)))
 
@@ -228,6 +223,7 @@ class QuietPlants:
             self._scratch,
             self._slots.times,
             self._slots.ring,
+            self._slots.others,
             rows.slots,
             rows.times_ns,
             np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns.tolist()]),

@@ -8,22 +8,24 @@ in 32 bits. If that does not fit, as when a plant whose times are in nanoseconds
 has a monitor until the ring is past it. Of a plant whose rows come evenly all are zero, and memory that never held
 anything else takes no room (see `slots`).
 
-A value is kept in seven bytes: the 64 bits of its number, less those of a value that the signal had before. That fits
-as long as values are of one sign and within a factor of 200 of that one, and it fits for zero, which has a code of its
-own.
+What was measured is kept in seven bytes: the 64 bits of its number, less those of a value that the signal had before.
+That fits as long as values are of one sign and within a factor of 200 of that one, and it fits for zero, which has a
+code of its own.
+
+The input is mostly one of a few values, at which it is held for some rows each: one byte tells which of those that the
+kept rows have, as far as there are no more than `LEVELS`. One that is none of them, as under a controller, is kept as
+it is, in an array that takes memory only where that happened.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from monitor_node.quiet.layout import Array, Bytes, Ints
+from monitor_node.quiet.layout import LEVELS, Array, Bytes, Ints, Places
 from reactorwatch.records.record import MINUTE_NS
 
 UNITS_NS = (1_000_000, 1_000, 1)
 """In which spacings are kept, the first in which all are whole."""
-
 
 VALUE_BYTES = 7
 ZERO = -(2 ** (8 * VALUE_BYTES - 1))
@@ -42,7 +44,7 @@ class NewestRows(NamedTuple):
     values: Array
 
 
-def kept_spacings(times_ns: list[int], usual_ns: int) -> tuple[int, NDArray[np.int32]] | None:
+def kept_spacings(times_ns: list[int], usual_ns: int) -> tuple[int, Places] | None:
     """The spacings of rows as the ring keeps them, and the unit that they are in; None if they do not fit.
 
     Args:
@@ -55,52 +57,91 @@ def kept_spacings(times_ns: list[int], usual_ns: int) -> tuple[int, NDArray[np.i
     return None if np.any(np.abs(kept) >= 2**31) else (unit_ns, kept.astype(np.int32))
 
 
-def reference_bits(values: Array) -> Ints:
-    """The bits that values are kept as what they are more than: of each signal's last one that is not zero.
+class Kept(NamedTuple):
+    """Values as they are kept; n rows of s signals.
+
+    Attributes:
+        rows: which level the input is at, then what was measured, shape (n, bytes).
+        reference: bits of the values that measured ones are kept as what they are more than, shape (s - 1,).
+        levels: bits of the values of the input, shape (LEVELS,).
+        level_rows: how many rows are at each, shape (LEVELS,).
+        others: bits of the input where it is at none of them, shape (n,).
+    """
+
+    rows: Bytes
+    reference: Ints
+    levels: Ints
+    level_rows: Places
+    others: Ints
+
+
+def row_bytes(columns: int) -> int:
+    """What a row takes.
 
     Args:
-        values: shape (rows, signals).
+        columns: how many values it has; none if they are not kept.
     """
-    bits = np.ascontiguousarray(values).view(np.int64)
-    return np.array([column[np.flatnonzero(column)[-1]] if column.any() else 0 for column in bits.T], dtype=np.int64)
+    return 1 + VALUE_BYTES * (columns - 1) if columns else 0
 
 
-def kept_values(values: Array, reference: Ints) -> Bytes | None:
-    """Values as the ring keeps them, shape (rows, bytes); None if they do not fit.
+def kept_values(values: Array) -> Kept | None:
+    """Values as they are kept; None if they do not fit.
 
     Args:
-        values: shape (rows, signals).
-        reference: see `reference_bits`.
+        values: input first, shape (rows, signals).
     """
     bits = np.ascontiguousarray(values).view(np.int64)
-    codes = np.where(bits == 0, ZERO, bits - reference)
-    if np.any((bits != 0) & ((codes <= ZERO) | (codes >= -ZERO))):
+    if not values.shape[1]:
+        none = np.zeros(LEVELS, np.int64)
+        return Kept(np.empty((len(values), 0), np.uint8), bits[0, :0], none, none.astype(np.int32), none[:0])
+    measured = bits[:, 1:]
+    last = [column[np.flatnonzero(column)[-1:]] for column in measured.T]
+    reference = np.array([each[0] if each.size else 0 for each in last], dtype=np.int64)
+    codes = np.where(measured == 0, ZERO, measured - reference)
+    if np.any((measured != 0) & ((codes <= ZERO) | (codes >= -ZERO))):
         return None
-    whole = np.ascontiguousarray(codes.astype("<i8")).view(np.uint8).reshape(*values.shape, 8)
-    return np.ascontiguousarray(whole[:, :, :VALUE_BYTES]).reshape(len(values), -1)
+    whole = np.ascontiguousarray(codes.astype("<i8")).view(np.uint8).reshape(*codes.shape, 8)
+    found, which, counts = np.unique(bits[:, 0], return_inverse=True, return_counts=True)
+    most = np.argsort(-counts, kind="stable")[:LEVELS]
+    levels, level_rows = np.zeros(LEVELS, np.int64), np.zeros(LEVELS, np.int32)
+    levels[: most.size], level_rows[: most.size] = found[most], counts[most]
+    place = np.full(found.size, LEVELS, np.uint8)
+    place[most] = np.arange(most.size)
+    at = place[which]
+    rows = np.column_stack([at, whole[:, :, :VALUE_BYTES].reshape(len(values), -1)])
+    return Kept(rows, reference, levels, level_rows, np.where(at == LEVELS, bits[:, 0], 0))
 
 
-def values_of(kept: Bytes, reference: Ints) -> Array:
+def values_of(kept: Kept) -> Array:
     """The values that are kept, shape (rows, signals)."""
-    whole = np.zeros((len(kept), kept.shape[1] // VALUE_BYTES, 8), np.uint8)
-    whole[:, :, 8 - VALUE_BYTES :] = kept.reshape(len(kept), -1, VALUE_BYTES)
+    rows = kept.rows
+    if not rows.shape[1]:
+        return np.empty((len(rows), 0))
+    whole = np.zeros((len(rows), rows.shape[1] // VALUE_BYTES, 8), np.uint8)
+    whole[:, :, 8 - VALUE_BYTES :] = rows[:, 1:].reshape(len(rows), -1, VALUE_BYTES)
     codes = whole.view("<i8")[:, :, 0] >> 8 * (8 - VALUE_BYTES)  # with its sign
-    return np.where(codes == ZERO, 0, codes + reference[: codes.shape[1]]).astype(np.int64).view(np.float64)
+    measured = np.where(codes == ZERO, 0, codes + kept.reference)
+    at = rows[:, 0]
+    inputs = np.where(at < LEVELS, kept.levels[np.minimum(at, LEVELS - 1)], kept.others)
+    return np.ascontiguousarray(np.column_stack([inputs, measured])).view(np.float64)
 
 
-def newest_rows(p: np.void, times: NDArray[np.int32], ring: Bytes) -> NewestRows:
+def newest_rows(p: np.void, times: Places, ring: Bytes, others: Ints) -> NewestRows:
     """The rows that a ring keeps.
 
     Args:
         p: record of the plant.
         times: spacings, shape (rows kept,).
         ring: values, shape (rows kept, bytes).
+        others: inputs at no level, shape (rows kept,).
     """
-    kept, keeps = int(p["kept"]), len(times)
-    order = (int(p["head"]) - kept + np.arange(kept)) % keeps
+    count, keeps = int(p["kept"]), len(times)
+    order = (int(p["head"]) - count + np.arange(count)) % keeps
     over = times[order].astype(np.int64) * p["unit_ns"] + p["usual_ns"]
+    at_no_level = others[order] if others.size else others
+    kept = Kept(ring[order], p["reference"], p["levels"], p["level_rows"], at_no_level)
     since = np.concatenate([[0], np.cumsum(over[:0:-1])])  # from each row to the newest, newest first
-    return NewestRows((p["last_ns"] - since)[::-1].tolist(), values_of(ring[order], p["reference"]))
+    return NewestRows((p["last_ns"] - since)[::-1].tolist(), values_of(kept))
 
 
 def times_ns_of(times_min: Array) -> list[int]:

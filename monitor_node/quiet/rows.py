@@ -27,7 +27,7 @@ from monitor_node.charts.mewma import _move as _move_mewma
 from monitor_node.charts.shewhart import Shewhart
 from monitor_node.charts.shewhart import _judge as _judge_shewhart
 from monitor_node.prewhitening import LARGEST_ORDER
-from monitor_node.quiet.layout import Array, Bytes, Ints, Places, Records
+from monitor_node.quiet.layout import LEVELS, Array, Bytes, Ints, Places, Records
 from monitor_node.quiet.ring import VALUE_BYTES, ZERO
 from monitor_node.quiet.samples import allowed_ns
 from monitor_node.sampling import LARGEST_GAP
@@ -235,11 +235,43 @@ def _charted(p: Any, e: Array, columns: Array, charts: Places, rules: Places, re
 
 
 @compiled
+def _level(p: Any, bits: int) -> int:
+    """Which level the input is at, perhaps a new one in place of one that no row has; `LEVELS` if there is none."""
+    free = LEVELS
+    for level in range(LEVELS):
+        if p.level_rows[level] == 0:
+            free = min(free, level)
+        elif p.levels[level] == bits:
+            return level
+    if free < LEVELS:
+        p.levels[free] = bits
+    return free
+
+
+@compiled
+def _keep(p: Any, row: Bytes, others: Ints, bits: Ints) -> None:
+    """Put a row into the ring, see `ring.Kept`."""
+    if p.kept == others.size and row[0] < LEVELS:
+        p.level_rows[row[0]] -= 1  # of the row that goes
+    level = _level(p, bits[0])
+    row[0] = level
+    if level < LEVELS:
+        p.level_rows[level] += 1
+    else:
+        others[p.head] = bits[0]
+    for place in range(bits.size - 1):
+        code = bits[1 + place] - p.reference[place] if bits[1 + place] else ZERO
+        for byte in range(VALUE_BYTES):
+            row[1 + VALUE_BYTES * place + byte] = code >> 8 * byte & 0xFF
+
+
+@compiled
 def judge(
     plants: Records,
     scratch: Records,
     times: Places,
     ring: Bytes,
+    others: Ints,
     rows: Places,
     row_time_ns: Ints,
     row_time_min: Array,
@@ -262,7 +294,9 @@ def judge(
         plants: records; those of ordinary rows go on.
         scratch: one record, to work in.
         times: of the newest rows, the spacing before each, see `record_type`; shape (plants, rows kept).
-        ring: their values, see `ring`, shape (plants, rows kept, bytes); without columns if causes are not looked for.
+        ring: their values, see `ring.Kept`, shape (plants, rows kept, bytes); without columns if causes are not
+            looked for.
+        others: inputs at no level, likewise, shape (plants, rows kept).
         rows: the plant of each row.
         row_time_ns: its time.
         row_time_min: the same in minutes.
@@ -285,7 +319,7 @@ def judge(
     new, constants = np.empty(3 + 2 * row_values.shape[1]), np.empty(parameters.size + noise)
     after, told = np.empty(memory), np.empty(5 * outputs + 1)
     constants[: parameters.size] = parameters
-    keeps, kept = times.shape[1], ring.shape[2] // VALUE_BYTES
+    keeps, kept = times.shape[1], ring.shape[2] > 0
     for k in range(rows.size):
         slot = rows[k]
         scratch[0] = plants[slot]
@@ -306,9 +340,9 @@ def judge(
         spacing = row_time_ns[k] - p.last_ns
         over = spacing - p.usual_ns
         ordinary = ordinary and over % p.unit_ns == 0 and abs(over // p.unit_ns) < 2**31
-        for place in range(kept):
-            off = row_bits[k, place] - p.reference[place]
-            ordinary = ordinary and (row_bits[k, place] == 0 or ZERO < off < -ZERO)
+        for place in range(outputs if kept else 0):
+            off = row_bits[k, 1 + place] - p.reference[place]
+            ordinary = ordinary and (row_bits[k, 1 + place] == 0 or ZERO < off < -ZERO)
         ordinary = ordinary and _hear(p, spacing, silence_limit)
         if ordinary:
             for place in range(outputs):
@@ -328,10 +362,8 @@ def judge(
         p.rows_watched += 1
         if times[slot, p.head] != over // p.unit_ns:  # or a page of zeros would take memory
             times[slot, p.head] = over // p.unit_ns
-        for place in range(kept):
-            code = row_bits[k, place] - p.reference[place] if row_bits[k, place] else ZERO
-            for byte in range(VALUE_BYTES):
-                ring[slot, p.head, VALUE_BYTES * place + byte] = code >> 8 * byte & 0xFF
+        if kept:
+            _keep(p, ring[slot, p.head], others[slot], row_bits[k])
         p.head = p.head + 1 if p.head + 1 < keeps else 0
         p.kept = min(p.kept + 1, keeps)
         minute = row_time_ns[k] // _MINUTE_NS

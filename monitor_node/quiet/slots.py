@@ -1,7 +1,7 @@
 """The arrays of the quiet plants: a slot for each, which the next one gets when it goes."""
 
 from math import prod
-from mmap import mmap
+from mmap import MAP_ANONYMOUS, MAP_PRIVATE, mmap
 from typing import Any
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from monitor_node.quiet.form import QuietForm, Rest
 from monitor_node.quiet.layout import Records
-from monitor_node.quiet.ring import VALUE_BYTES, NewestRows, newest_rows
+from monitor_node.quiet.ring import Kept, NewestRows, newest_rows, row_bytes
 from reactorwatch.contract import keys
 
 FIRST_ROOM = 16
@@ -34,6 +34,7 @@ class Slots:
         times: rings of spacings, shape (slots, rows kept). It takes no memory where all are zero: whoever writes there
             leaves out what is there already.
         ring: rings of values, shape (slots, rows kept, bytes).
+        others: rings of inputs at no level, shape (slots, rows kept); it takes no memory either where there are none.
         health_due_ns: by slot; never for one without a plant.
     """
 
@@ -48,6 +49,7 @@ class Slots:
         self.plants: Records
         self.times: NDArray[np.int32]
         self.ring: NDArray[np.uint8]
+        self.others: NDArray[np.int64]
         self.health_due_ns: NDArray[np.int64] = np.empty(0, np.int64)
         self._room(FIRST_ROOM)
 
@@ -84,10 +86,22 @@ class Slots:
             self._used = np.array(sorted(self.of.values()), dtype=np.int64)
         return self._used
 
-    def keep_times(self, slot: int, spacings: NDArray[np.int32]) -> None:
-        """Fill the beginning of a ring of spacings."""
-        place = np.flatnonzero(self.times[slot, : spacings.size] != spacings)
-        self.times[slot, place] = spacings[place]
+    def keep(self, slot: int, spacings: NDArray[np.int32], kept: Kept) -> None:
+        """Fill the beginning of the rings of a plant that comes, and what its record says of them."""
+        p, count = self.plants[slot], spacings.size
+        p["kept"], p["head"] = count, count % self._form.keeps
+        p["levels"], p["level_rows"] = kept.levels, kept.level_rows
+        p["reference"][: kept.reference.size] = kept.reference
+        self.ring[slot, :count] = kept.rows
+        _write(self.times[slot, :count], spacings)
+        _write(self.others[slot, : kept.others.size], kept.others)
+
+    def copy(self, of: int, slot: int) -> None:
+        """Fill record and rings of a plant with those of another."""
+        self.plants[slot], self.ring[slot] = self.plants[of], self.ring[of]
+        self.health_due_ns[slot] = self.health_due_ns[of]
+        _write(self.times[slot], self.times[of])
+        _write(self.others[slot], self.others[of])
 
     def rest(self, slot: int) -> Rest:
         """What is kept beside the record of a plant."""
@@ -97,24 +111,33 @@ class Slots:
 
     def newest(self, slot: int) -> NewestRows:
         """The newest rows of a plant."""
-        return newest_rows(self.plants[slot], self.times[slot], self.ring[slot])
+        return newest_rows(self.plants[slot], self.times[slot], self.ring[slot], self.others[slot])
 
     def _room(self, plants: int) -> None:
         """Make room for so many."""
         form, before = self._form, len(self.names)
         records, times = _zeros((plants,), form.record), _zeros((plants, form.keeps), np.dtype(np.int32))
-        ring = _zeros((plants, form.keeps, form.columns * VALUE_BYTES), np.dtype(np.uint8))
+        ring = _zeros((plants, form.keeps, row_bytes(form.columns)), np.dtype(np.uint8))
+        others = _zeros((plants, form.keeps if form.columns else 0), np.dtype(np.int64))
         if before:
             records[:before], ring[:before] = self.plants, self.ring
-            uneven = np.flatnonzero(self.times.any(axis=1))
-            times[uneven] = self.times[uneven]
-        self.plants, self.times, self.ring = records, times, ring
+            for now, then in ((times, self.times), (others, self.others)):
+                written = np.flatnonzero(then.any(axis=1))
+                now[written] = then[written]
+        self.plants, self.times, self.ring, self.others = records, times, ring, others
         due_ns = np.full(plants, NEVER_NS)
         due_ns[:before] = self.health_due_ns[:before]
         self.health_due_ns = due_ns
 
 
+def _write(into: NDArray[Any], values: NDArray[Any]) -> None:
+    """Write what is not there already: what was never written takes no memory."""
+    place = np.flatnonzero(into != values)
+    into[place] = values[place]
+
+
 def _zeros(shape: tuple[int, ...], kind: np.dtype[Any]) -> NDArray[Any]:
-    """An array of zeros, straight from the system: it keeps no memory of what is not used yet, nor of what was."""
+    """An array of zeros, straight from the system: it keeps no memory of what was never written, nor of what was."""
     count = prod(shape)
-    return np.frombuffer(mmap(-1, max(count, 1) * kind.itemsize), kind, count).reshape(shape)
+    memory = mmap(-1, max(count, 1) * kind.itemsize, flags=MAP_PRIVATE | MAP_ANONYMOUS)  # if shared, to read takes some
+    return np.frombuffer(memory, kind, count).reshape(shape)

@@ -237,18 +237,19 @@ def test_what_is_remembered_of_a_quiet_plant_is_what_its_own_monitor_remembers(c
     assert again.receipt._replace(start_ns=0, health_due_ns=0) == own.receipt._replace(start_ns=0, health_due_ns=0)
 
 
-@pytest.mark.parametrize(("input_value", "stays"), [(0.0, True), (0.1, False)])
-def test_a_value_of_another_size_is_remembered_to_the_bit_whoever_does(input_value: float, stays: bool) -> None:
-    """The ring has no room for one; zero is another matter."""
-    run = run_of("x", 12, span_min=100.0)
-    last = len(run) - 9
-    run[last] = changed(run[last], value=input_value)
+@pytest.mark.parametrize("rows", [950, 1050, 1690, 1760])
+def test_an_input_is_remembered_to_the_bit_however_many_values_it_has(rows: int) -> None:
+    """It is held for some rows each, then another each row, then held again for longer than rows are kept."""
+    run = run_of("x", 12, span_min=180.0)[: 3 * rows]
+    for place in range(950, min(rows, 1100)):
+        run[3 * place] = changed(run[3 * place], value=Sample.FromString(run[3 * place].payload).value + 1e-9 * place)
     monitor, own = fleet(LOOKING), Monitor(msgspec.structs.replace(LOOKING, plant="x"), 0, points=False)
-    for begin in range(0, last + 3, 3):
-        monitor.on_messages(run[begin : begin + 3], 10**9 * begin)
-        for message in run[begin : begin + 3]:
-            own.on_message(message, 10**9 * begin)
-    assert (monitor.quiet == ["x"]) == stays
+    for begin in range(0, len(run), 30):
+        now_ns = 10**9 * begin
+        monitor.on_messages(run[begin : begin + 30], now_ns)
+        for message in run[begin : begin + 30]:
+            own.on_message(message, now_ns)
+    assert monitor.quiet == ["x"]
     assert comparable(monitor.monitor("x").state).to_bytes() == comparable(own.state).to_bytes()
 
 
