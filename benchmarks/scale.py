@@ -22,7 +22,6 @@ import gc
 import json
 import logging
 import os
-import struct
 import subprocess
 import sys
 import threading
@@ -33,37 +32,37 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from benchmarks.fleet.traffic import (
+    FLEET,
+    KNOWN_ROWS,
+    LEARNED_ROWS,
+    MOST_ROWS,
+    SIGNALS,
+    WITHIN_S,
+    alone_on_a_core,
+    publish,
+    record,
+    route,
+)
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet_config import FleetConfig
 from monitor_node.fleet_node import PASSING, FleetNode, watch
-from plant_node.config import PlantConfig
-from plant_node.record import simulate_record
+from monitor_node.quiet.slots import NEVER_NS
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encoding_of
-from reactorwatch.contract.messages_pb2 import Alarm, Sample
+from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.runtime import bus_zenoh
-from reactorwatch.runtime.access import NOBODY
-from reactorwatch.runtime.bus_zenoh import connect, router
+from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal
-from recorder.player import samples_of
 
 SIZES = (1, 10, 100, 1000, 10_000)
-SIGNALS = 3
-LEARNED_ROWS = 900
 FAST_SAMPLES = 600_000
-MOST_ROWS = 20_000
 LATENCY_S = 15
 IDLE_S = 10.0
-WITHIN_S = 60.0
-SHARING = 250  # plants that share a session
-KNOWN_ROWS = 2  # of each plant, after which the router knows its keys; the time is taken from then on
 HELD_ROWS = KNOWN_ROWS + 2  # of each plant, while it is seen what it takes: none of them is out
 HELD_PER_S = 10_000  # so slowly that nothing waits in a buffer
-OUT_EVERY = 50  # plants that are out in a row of the fleet, but at least one
-FLEET = "reactor/*"
 PATIENT = 1e6  # periods: between training and the first sample live a plant is no silent one
 FAST = MonitorConfig(training_min=20.0, charts=("shewhart", "ewma", "cusum", "mewma"), silence_periods=PATIENT)
 SHARP = MonitorConfig(
@@ -78,23 +77,12 @@ SHARP = MonitorConfig(
 """One point out raises an alarm, one point back in clears it."""
 
 
-def record() -> list[Encoded]:
-    """What a plant publishes."""
-    return [encode(item) for item in samples_of(simulate_record(PlantConfig(seed=1), LEARNED_ROWS + MOST_ROWS), "p0")]
-
-
 def sized(count: int) -> int:
     """Rows that every plant publishes as fast as it goes."""
     return min(max(FAST_SAMPLES // (SIGNALS * count), 10), MOST_ROWS)
 
 
 # --- processes that are measured ---------------------------------------------------------------------------------
-
-
-def alone_on_a_core(core: int) -> None:
-    """Stay on one core, if there are others for the rest."""
-    if (os.cpu_count() or 1) > 1:
-        os.sched_setaffinity(0, {core})
 
 
 def memory_bytes() -> int:
@@ -164,8 +152,11 @@ def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
     os._exit(0)  # thousands of tokens need not be withdrawn one by one
 
 
-def held(endpoint: str, plants: int, expected: int) -> None:
-    """Hear so many samples of the fleet, tell the health of each plant, and say what all of it takes."""
+def held(endpoint: str, plants: int) -> None:
+    """Say what this process takes when half of the plants were heard and their health told, and then all.
+
+    What it takes for any number of plants, such as threads and their buffers, is in both.
+    """
     alone_on_a_core(0)
     stop = StopSignal()
     bus_zenoh.bus.MOST_NEW_KEYS = plants  # as it is after some minutes
@@ -173,15 +164,19 @@ def held(endpoint: str, plants: int, expected: int) -> None:
     assert bus is not None
     node = Counting(FAST, bus, stop)
     node.learn(plants)
-    node.samples, node.expected = 0, -1
+    assert node._quiet is not None
+    due_ns = node._quiet._slots.health_due_ns
+    due_ns[plants // 2 : plants] = NEVER_NS
+    node.samples = 0
     threading.Thread(target=watch, args=(node, bus, stop), daemon=True).start()
-    print("ready", flush=True)
-    deadline = time.monotonic() + WITHIN_S
-    while node.samples < expected or len(bus._passing_keys) < plants:
-        assert time.monotonic() < deadline, f"{node.samples} samples, health of {len(bus._passing_keys)} plants"
-        time.sleep(1.0)
-    assert len(node.quiet) == plants
-    print(json.dumps({"bytes": memory_bytes()}), flush=True)
+    for expected in (plants // 2, plants):
+        print("ready", flush=True)
+        deadline = time.monotonic() + WITHIN_S
+        while node.samples < HELD_ROWS * SIGNALS * expected or len(bus._passing_keys) < expected:
+            assert time.monotonic() < deadline, f"{node.samples} samples, health of {len(bus._passing_keys)} plants"
+            time.sleep(1.0)
+        print(json.dumps({"bytes": memory_bytes(), "quiet": len(node.quiet)}), flush=True)
+        due_ns[plants // 2 : plants] = 0
     os._exit(0)
 
 
@@ -238,84 +233,6 @@ def bare(endpoint: str, expected: int, plants: int) -> None:
     os._exit(0)
 
 
-# --- processes beside them ---------------------------------------------------------------------------------------
-
-
-def route(endpoint: str) -> None:
-    """Be the router."""
-    alone_on_a_core(1)
-    hub = router(BusConfig(endpoint=endpoint))
-    print("ready", flush=True)
-    threading.Event().wait()
-    del hub
-
-
-def publish(endpoint: str, plants: int, rows: int, per_s: float) -> None:
-    """Publish rows of all plants, as fast as it goes or at a pace, some of them far out in that case."""
-    alone_on_a_core(1)
-    bus = connect(BusConfig(endpoint=endpoint), "publisher", StopSignal())
-    assert bus is not None
-    numbered, encoding = struct.Struct("<QQ"), encoding_of(Sample)
-    signals = ("qc", "C", "T")
-    # A session takes the longer to declare a key the more it has; a real plant has one of its own.
-    buses = [connect(BusConfig(endpoint=endpoint), "publisher", StopSignal()) for _ in range(plants // SHARING + 1)]
-    publishers = [
-        [
-            buses[number // SHARING]._session.declare_publisher(  # type: ignore[union-attr]
-                keys.key(f"p{number}", keys.SAMPLE, signal),
-                encoding=encoding,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-            )
-            for signal in signals
-        ]
-        for number in range(plants)
-    ]
-    arrived: dict[tuple[str, int], float] = {}
-
-    def on_alarms(messages: list[Encoded]) -> None:
-        now = time.perf_counter()
-        for message in messages:
-            alarm = decode(message.payload, message.encoding)
-            if isinstance(alarm, Alarm) and alarm.alarm == "shewhart/T" and alarm.event == "raised":
-                arrived[message.key.split("/")[1], alarm.time_ns] = now
-
-    if per_s:
-        bus.gather(f"{FLEET}/{keys.ALARM}/**", on_alarms)
-    payloads = [item.payload for item in record()[SIGNALS * LEARNED_ROWS :]]
-    time.sleep(1.0)  # until the router knows all keys
-    sent: dict[tuple[str, int], float] = {}
-    begin, count = time.perf_counter(), 0
-    for row in range(rows):
-        if row == KNOWN_ROWS and per_s:
-            for each in buses:  # what comes back from the router was behind all that came before it
-                for _ in each._session.get(NOBODY, timeout=WITHIN_S):  # type: ignore[union-attr]
-                    pass
-            time.sleep(1.0)  # until the monitor has heard it
-            begin, count = time.perf_counter(), 0
-        out = set(np.random.default_rng(row).choice(plants, max(plants // OUT_EVERY, 1), replace=False).tolist())
-        for place in range(SIGNALS):
-            payload, time_ns, far = payloads[SIGNALS * row + place], 0, b""
-            if per_s and place == SIGNALS - 1 and row > KNOWN_ROWS and row % 3 == 1:
-                sample = Sample.FromString(payload)
-                sample.value += 100.0
-                far, time_ns = sample.SerializeToString(), sample.time_ns
-            for number in range(plants):
-                if per_s and row >= KNOWN_ROWS and (wait_s := begin + count / per_s - time.perf_counter()) > 0:
-                    time.sleep(wait_s)
-                which = far if far and number in out else payload
-                if which is far:
-                    sent[f"p{number}", time_ns] = time.perf_counter()
-                publishers[number][place].put(which, attachment=numbered.pack(number + 1, SIGNALS * row + place))
-                count += 1
-    deadline = time.perf_counter() + WITHIN_S
-    while len(arrived) < len(sent) and time.perf_counter() < deadline:
-        time.sleep(0.01)
-    delays = [1e3 * (arrived[key] - since) for key, since in sent.items() if key in arrived]
-    print(json.dumps({"out": len(sent), "delays_ms": delays}), flush=True)
-    time.sleep(2.0 if not per_s else 0.0)  # what is on its way still goes
-    os._exit(0)
-
-
 # --- the table ---------------------------------------------------------------------------------------------------
 
 
@@ -340,14 +257,21 @@ def told(process: "subprocess.Popen[str]") -> dict[str, Any]:
     return found
 
 
-def holding(endpoint: str, plants: int) -> int:
-    """What a monitor of so many plants takes, in bytes."""
-    process = started("held", endpoint, plants, HELD_ROWS * SIGNALS * plants)
-    source = started("publish", endpoint, plants, HELD_ROWS, HELD_PER_S)
-    found = told(process)
-    source.kill()
-    source.wait()
-    return int(found["bytes"])
+def on_the_bus(endpoint: str, plants: int) -> float:
+    """What is kept for a plant that is heard, and whose health is told, beside what its monitor keeps; in bytes."""
+    process = started("held", endpoint, plants)
+    assert process.stdout is not None
+    taken: list[int] = []
+    for first in (0, plants // 2):
+        if first:
+            assert process.stdout.readline() == "ready\n"
+        source = started("publish", endpoint, plants // 2, HELD_ROWS, HELD_PER_S, first)
+        found = told(process)
+        source.kill()
+        source.wait()
+        assert found["quiet"] == plants, found
+        taken.append(int(found["bytes"]))
+    return (taken[1] - taken[0]) / (plants // 2)
 
 
 def row_of(plants: int) -> str:
@@ -366,9 +290,8 @@ def row_of(plants: int) -> str:
             source.wait()
             rates[listener] = found["samples"] / found["cpu_s"]
         size = f"{'–':>12}"
-        if plants >= 1000:  # of fewer what differs from run to run is as much as the plants
-            taken = [holding(endpoint, count) for count in (plants // 2, plants)]
-            size = f"{(taken[1] - taken[0]) / (plants - plants // 2) / 1000:9.1f} kB"
+        if plants >= 1000:  # of fewer what differs from time to time is as much as the plants
+            size = f"{(found['bytes'] + on_the_bus(endpoint, plants)) / 1000:9.1f} kB"
         live = started("monitor", endpoint, plants, -1, 1)
         source = started("publish", endpoint, plants, KNOWN_ROWS + LATENCY_S // SIGNALS, plants)
         delays = told(source)
@@ -392,11 +315,13 @@ def main() -> None:
         if command == "route":
             route(endpoint)
         elif command == "publish":
-            publish(endpoint, int(numbers[0]), int(numbers[1]), float(numbers[2]))
+            publish(
+                endpoint, int(numbers[0]), int(numbers[1]), float(numbers[2]), int(numbers[3]) if numbers[3:] else 0
+            )
         elif command == "monitor":
             monitor(endpoint, int(numbers[0]), int(numbers[1]), bool(int(numbers[2])))
         elif command == "held":
-            held(endpoint, int(numbers[0]), int(numbers[1]))
+            held(endpoint, int(numbers[0]))
         else:
             bare(endpoint, int(numbers[0]), int(numbers[1]))
         return
