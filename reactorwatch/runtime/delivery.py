@@ -74,8 +74,8 @@ class Delivery:
         self._thread = threading.Thread(target=self._give_up_when_due, name="delivery", daemon=True)
         self._thread.start()
 
-    def receive(self, came: Iterable[Numbered]) -> None:
-        """Take messages in, and hand on what may go on."""
+    def receive(self, came: Iterable[tuple[int, int, Encoded]]) -> None:
+        """Take messages in, each `Numbered`, and hand on what may go on."""
         with self._changed:
             order = self._order
             waited, now_ns = order.due_ns(), time.monotonic_ns()

@@ -182,15 +182,14 @@ class ZenohBus:
             with contextlib.suppress(zenoh.ZError):  # it is closed
                 while True:
                     sample, now_ns = channel.recv(), time.time_ns()
-                    came, others = list[Numbered](), list[Encoded]()
+                    came, others = list[tuple[int, int, Encoded]](), list[Encoded]()
                     left, room = MOST_GATHERED, MOST_GATHERED_BYTES
                     while sample is not None:
-                        item = reader.read(sample, now_ns)
-                        message = item.message if isinstance(item, Numbered) else item
-                        if delivery is not None and isinstance(item, Numbered):
-                            came.append(item)
-                        else:
+                        who, message = reader.read(sample, now_ns)
+                        if who is None or delivery is None:
                             others.append(message)
+                        else:
+                            came.append((*who, message))
                         left, room = left - 1, room - len(message.payload)
                         sample = channel.try_recv() if left and room > 0 else None
                     if others:

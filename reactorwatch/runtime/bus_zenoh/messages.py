@@ -32,20 +32,17 @@ class Reader:
         self._encoding = zenoh.Encoding.ZENOH_BYTES
         self._text = encoding_text(self._encoding)
 
-    def read(self, sample: zenoh.Sample, now_ns: int) -> Numbered | Encoded:
-        """A message that has come, as its publisher numbered it; without a number if it did not."""
+    def read(self, sample: zenoh.Sample, now_ns: int) -> tuple[tuple[int, int] | None, Encoded]:
+        """A message that has come, and before it who published it as which number, if he told."""
         encoding = sample.encoding
         if encoding != self._encoding:
             self._encoding, self._text = encoding, encoding_text(encoding)
         message = Encoded(str(sample.key_expr), payload_of(sample.payload), self._text, now_ns)
         attachment = sample.attachment
         if attachment is None:
-            return message
+            return None, message
         name = attachment.to_bytes()
-        if len(name) != NUMBERED.size:
-            return message
-        publisher, number = NUMBERED.unpack(name)
-        return Numbered(publisher, number, message)
+        return NUMBERED.unpack(name) if len(name) == NUMBERED.size else None, message
 
 
 def encoding_text(encoding: zenoh.Encoding) -> str:
@@ -54,8 +51,9 @@ def encoding_text(encoding: zenoh.Encoding) -> str:
 
 
 def numbered(sample: zenoh.Sample, now_ns: int) -> Numbered | Encoded:
-    """A message that has come by itself, see `Reader`."""
-    return Reader().read(sample, now_ns)
+    """A message that has come by itself, see `Reader`; with its number if it has one."""
+    who, message = Reader().read(sample, now_ns)
+    return message if who is None else Numbered(*who, message)
 
 
 def spelled(key_expression: str) -> str:
