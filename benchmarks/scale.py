@@ -105,7 +105,7 @@ class Counting(FleetNode):
         if self.samples < self.known:
             self.began_s, self.before = time.process_time(), self.samples
         said = super().on_messages(messages, now_ns)
-        self.samples += sum("/sample/" in message.key for message in messages)  # not its own alarms
+        self.samples += len(messages) if "/sample/" in messages[0].key else 0  # not its own alarms, which come apart
         self.ended_s = time.process_time()
         if self.samples == self.expected:
             self._stop.set()
