@@ -95,7 +95,7 @@ def free_run(run: Run, sized: Sized, signals: Sequence[Signal], known: Mapping[s
         signals: the deviations in it.
         known: what uncertain parameters are off by, by name.
     """
-    return _freely(run, sized, signals, sized.follow(run, signals)[2], known)
+    return _freely(run, sized, signals, sized.follow(run, signals).found, known)
 
 
 def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovations, known: Mapping[str, float]) -> Array:
@@ -115,7 +115,7 @@ def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovation
 
 
 def _errors(run: Run, hidden: Array, sized: Sized, signals: Sequence[Signal], known: Mapping[str, float]) -> Errors:
-    _, _, found = sized.follow(run, signals)
+    found = sized.follow(run, signals).found
     free = _freely(run, sized, signals, found, known)
     with np.errstate(invalid="ignore"):
         return Errors(_rms((run.measured - free)[hidden]), _rms(found.residual[hidden]))

@@ -15,12 +15,12 @@ from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Signal, Step
 from diagnosis.hypothesis import Fit
 from diagnosis.run import Run
 from diagnosis.screen import DECAYS, EDGE_ROWS, KNOTS, Lead
-from diagnosis.sized import clipped
+from diagnosis.sized import Followed, clipped
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array
 
-Follow: TypeAlias = Callable[[Effect, Signal], tuple[float, Array]]
-"""From a deviation of an effect to the loss and the whitened innovations of a filter that knows of it."""
+Follow: TypeAlias = Callable[[Effect, Sequence[Signal]], Sequence[Followed]]
+"""From some deviations of an effect to what filters that know of them make of the run."""
 
 
 class MemoryScreen:
@@ -44,16 +44,17 @@ class MemoryScreen:
 
         Args:
             without: a fit without any of the effects.
-            follow: loss and whitened innovations of the same with a deviation of one effect in it.
+            follow: what filters make of the run that know of the same, and of a deviation of one effect.
             of: these effects alone; None: all.
             least_score: promises of less, in BIC, are not held against a run of the filter.
         """
         found = []
         for effect in self._effects if of is None else of:
-            tried = []
-            for start in effect.starts or (effect.typical,):
-                loss, w = follow(effect, self._constant.signal(np.array([start])))
-                tried.append((2.0 * (without.loss - loss), start, w))
+            starts = effect.starts or (effect.typical,)
+            followed = follow(effect, [self._constant.signal(np.array([start])) for start in starts])
+            tried = [
+                (2.0 * (without.loss - item.loss), start, item.w) for start, item in zip(starts, followed, strict=True)
+            ]
             gain, start, w = max(tried, key=lambda item: item[0])
             if gain > 0.0:
                 found.append(Lead(effect, self._constant, np.array([start]), gain))
@@ -74,8 +75,8 @@ class MemoryScreen:
         """How much of the gain that scaling promises a run with that constant size keeps, at most all of it."""
         if constant.gain <= 0.0:
             return 1.0 if constant.gain == 0.0 else 0.0
-        loss = follow(constant.effect, self._constant.signal(constant.theta))[0]
-        return min(2.0 * (without.loss - loss) / constant.gain, 1.0)
+        (found,) = follow(constant.effect, [self._constant.signal(constant.theta)])
+        return min(2.0 * (without.loss - found.loss) / constant.gain, 1.0)
 
     def scaled(self, effect: Effect, w: Array, g: Array) -> list[Lead]:
         """From the signature of a size of 1 in every row.

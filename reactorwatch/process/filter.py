@@ -45,6 +45,7 @@ from reactorwatch.process.doubt import Doubt, variance_of
 from reactorwatch.process.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.process.filter_start import Beginning
 from reactorwatch.process.filter_step import row_code, row_function, walk_function
+from reactorwatch.process.filter_stretches import Stretch, Stretches, alone
 from reactorwatch.process.innovations import Innovation, Innovations
 from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array, ProcessModel
@@ -236,6 +237,10 @@ class Filter:
 
     def over(self, record: FilterRecord, start: FilterState | None = None) -> Innovations:
         """As `run`, of a record that is laid out already."""
+        return alone(self.stretches(record, start))
+
+    def stretches(self, record: FilterRecord, start: FilterState | None = None) -> Stretches:
+        """As `over`, with a stop at every stretch of rows, for whoever takes those of several filters at once."""
         if start is None:
             self.restart()
         else:
@@ -249,8 +254,11 @@ class Filter:
             done = 0
             if self._time_min is not None and near[row]:
                 part = slice(row, ends[bisect_left(ends, row)])
-                done = self._run_near(rows[part], told[part], memory[part])
+                done = yield Stretch(self.code, self._memory, rows[part], self._constants, memory[part], told[part])
+                if row + done < part.stop:
+                    told[row + done], memory[row + done] = nan, nan
             if done:
+                self._memory[:] = memory[row + done - 1]
                 row += done
                 self._remember(float(record.time_min[row - 1]), record.inputs[row - 1].tolist())
             else:
@@ -273,18 +281,9 @@ class Filter:
         elif self._time_min is not None:
             memory[row] = self._memory
 
-    def _run_near(self, new: Array, told: Array, memory: Array) -> int:
-        """Take rows in at once; returns how many of them, up to the first that did not go well."""
-        rows = len(new)
-        done = self._rows.fill(rows, [self._memory, new, self._constants], [memory, told])
-        if done:
-            self._memory[:] = memory[done - 1]
-        if done < rows:
-            told[done], memory[done] = nan, nan
-        return done
-
     @cached_property
-    def _rows(self) -> RowCode:
+    def code(self) -> RowCode:
+        """Of its rows, see `filter_step`."""
         return row_code(self.model)
 
     @cached_property

@@ -316,4 +316,4 @@ def shown_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
     """(x, u, p, t) -> derivatives of the outputs by x and by the sizes."""
     x, u, p, t, y = model.shown()
     by = [ca.densify(ca.jacobian(y, item)) for item in (x, ca.vertcat(*sizes))]
-    return ca.Function("shown", [x, u, p, t], by)
+    return ca.Function("shown", [x, u, p, t], ca.cse(by))
