@@ -214,7 +214,7 @@ class Sized:
     def _filters(self, count: int) -> list[Filter]:
         """So many, with the noise that holds now."""
         while len(self._spare) < count - 1:
-            self._spare.append(Filter(self.model, self.levels))
+            self._spare.append(self._filter.twin())
         for item in self._spare[: count - 1]:
             item.noise = self.levels
             item.change(self._noise.times)

@@ -124,6 +124,12 @@ class Filter:
         self.noise = noise
         self.change(changes or {})
 
+    def twin(self) -> "Filter":
+        """Another one of the same model, noise and changes, which knows nothing yet; for the same thread."""
+        other = Filter(self.model, self._noise, self._changes)
+        other._beginning = self._beginning  # what it takes to make is more than to use it
+        return other
+
     @property
     def noise(self) -> NoiseLevels:
         """Of the plant and its sensors."""

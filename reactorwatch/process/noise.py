@@ -159,7 +159,8 @@ class _Tuning:
         self._highest = np.concatenate([np.full(self._of_states.stop, inf), limits[1]])
         self._first = np.maximum([rough_sensor_sd(column) for column in measured.T], smallest_sd)
         first = NoiseLevels(tuple(self._first.tolist()), (0.0,) * len(model.states))
-        self._filters = [Filter(model, first) for _ in range(LANES)]
+        one = Filter(model, first)
+        self._filters = [one, *(one.twin() for _ in range(LANES - 1))]
 
     def found(self, nearby: NoiseLevels | None) -> tuple[NoiseLevels, dict[str, float]]:
         """The best noise levels, and the best values of what else was to be learned."""
