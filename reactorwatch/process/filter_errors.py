@@ -170,19 +170,33 @@ class FilterErrors:
             of_ways = doubt.of_rows(slice(1, None))
             for moments in np.unique(of_ways.moments[of_ways.rows]).tolist():
                 rows = np.flatnonzero(of_ways.moments == moments)
-                ends = self._walked_in_doubt(x[rows], u[rows], time_min[rows], time_min[rows + 1], p, of_ways, rows)
+                held = (there[rows], F[rows], G[rows])
+                ends = self._walked_in_doubt(
+                    x[rows], u[rows], time_min[rows], time_min[rows + 1], p, of_ways, rows, held
+                )
                 there[rows], F[rows], G[rows] = (np.mean(item, axis=0) for item in ends)
                 apart = ends[0] - there[rows]
                 spread[rows] = np.einsum("mki,mkj->kij", apart, apart) / moments
         return there, F, G, spread
 
     def _walked_in_doubt(
-        self, x: Array, u: Array, begin_min: Array, end_min: Array, p: Array, doubt: Doubt, rows: NDArray[np.intp]
+        self,
+        x: Array,
+        u: Array,
+        begin_min: Array,
+        end_min: Array,
+        p: Array,
+        doubt: Doubt,
+        rows: NDArray[np.intp],
+        unchanged: tuple[Array, Array, Array],
     ) -> tuple[Array, Array, Array]:
         """Where ways with as many moments lead from each, and their derivatives; the first axis is that of moments."""
         ends: list[tuple[Array, Array, Array]] = []
         for moment in np.linspace(doubt.first_min[rows], doubt.last_min[rows], doubt.moments[rows[0]]):
             changed = np.clip(moment, begin_min, end_min)
+            if np.array_equal(changed, end_min):
+                ends.append(unchanged)
+                continue
             held, F, G = self._walked_surely(x, u, begin_min, changed - begin_min, p)
             there, of_x, of_size = self._walked_surely(held, doubt.inputs[rows], changed, end_min - changed, p)
             ends.append((there, of_x @ F, of_x @ G + of_size))
