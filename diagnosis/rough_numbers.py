@@ -26,15 +26,15 @@ OFFSETS = (0.5, 1.0, 2.0)
 """To either side, in standard deviations that the fit has found, and at least rows."""
 
 WIDENINGS, ROUNDS = 7, 3
-OUT_OF_QUESTION = 4.0
-"""In log likelihood: a value that is worse by more adds nothing."""
+OUT_OF_QUESTION = 7.0
+"""In log likelihood: a value that is worse by more adds nothing, and behind it no other hump is looked for."""
 
 LEAST_GAIN, AS_LIKELY = 0.1, 0.5
 """In log likelihood: by so much more a value is taken for the likeliest; by so much less it is still as good."""
 
-AT_THE_EDGE, CLIFF, HALVINGS, FINER = 1.0, 3.0, 3, 20
-"""In log likelihood, where it falls, and what is a steep fall; how often more values are tried in that; and steps
-between two values tried."""
+FAR_BETWEEN, UNSURE, MOST_MORE, FINER = 1.01, 0.08, 12, 20
+"""In the first look's reaches, what is far between values in question; of the whole, how much of the likelihood may lie
+here or there between two values; how many more are tried for each; and steps between two values tried."""
 
 HOLLOWS, APART_ROWS = 3, 20
 """How many onsets of effects with memory are tried, and by how much they differ."""
@@ -125,25 +125,37 @@ class _Scan:
             if likeliest.loss > best.fit.loss - LEAST_GAIN:
                 break
             best = self._search.fit(best.hypothesis, likeliest.theta)
-        self._find_the_edges(best, known)
+        self._look_between(best, known)
         mean, _ = _moments(known, here)
         trial = _at(self._search, best, self._place, self._number, mean)
         if trial.loss < best.fit.loss + AS_LIKELY:
             best, here = self._search.judged(best.hypothesis, trial), mean
         return best, _moments(known, here)[1]
 
-    def _find_the_edges(self, best: Explained, known: dict[float, Fit]) -> None:
-        """Try more values where the likelihood falls steeply."""
-        for _ in range(HALVINGS):
-            values = sorted(known)
-            likely = [value for value in values if known[value].loss < best.fit.loss + AT_THE_EDGE]
-            for inner, outer in ((values.index(likely[0]), -1), (values.index(likely[-1]), 1)):
-                if not 0 <= inner + outer < len(values):
-                    continue
-                near, far = values[inner], values[inner + outer]
-                if known[far].loss - known[near].loss > CLIFF:
-                    value = 0.5 * (near + far)
-                    known[value] = _at(self._search, best, self._place, self._number, value)
+    def _look_between(self, best: Explained, known: dict[float, Fit]) -> None:
+        """Try more values where another hump may be: far between such as are in question, and where it is steep."""
+        for _ in range(MOST_MORE):
+            values, above = self._values(best, known)
+            width = np.where(np.maximum(above[1:], above[:-1]) < OUT_OF_QUESTION, np.diff(values), 0.0)
+            if width.max(initial=0.0) <= FAR_BETWEEN * self._reach:
+                break
+            self._halve(best, known, values, int(np.argmax(width)))
+        for _ in range(MOST_MORE):
+            values, above = self._values(best, known)
+            unsure = np.diff(values) * np.abs(np.diff(np.exp(-above)))
+            if unsure.max(initial=0.0) <= UNSURE * float(np.trapezoid(np.exp(-above), values)):
+                break
+            self._halve(best, known, values, int(np.argmax(unsure)))
+
+    def _values(self, best: Explained, known: dict[float, Fit]) -> tuple[Array, Array]:
+        """Those that were tried, in order, and how much worse than the best they are in log likelihood."""
+        values = sorted(known)
+        return np.array(values), np.array([known[value].loss - best.fit.loss for value in values])
+
+    def _halve(self, best: Explained, known: dict[float, Fit], values: Array, place: int) -> None:
+        """Try the value between two."""
+        value = float(0.5 * (values[place] + values[place + 1]))
+        known[value] = _at(self._search, best, self._place, self._number, value)
 
     def _to_a_side(self, here: float, side: float) -> Iterator[float]:
         """Values to try, within the bounds, further and further away."""
