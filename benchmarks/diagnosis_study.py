@@ -44,7 +44,10 @@ what is hidden is, in `tests/hidden_effect/catalogue.py`.
 
 *first*: exactly what is hidden is named. *listed*: it is named, or among the alternatives. *list*: how many
 explanations are on it. *wrong*: something is claimed that is not there. *place*: the location is right. *curve*: of the
-whole course, whatever its profile is called.
+whole course, whatever its profile is called. *held-out T*: the free run's error on rows that the fit did not see, over
+the noise that was drawn in those very rows (median / 90 %). Over the noise's standard deviation it scatters, whatever
+was found, because few rows are held out of a short record: `/ its sd` is that, *the truth's* the same of the plant
+itself, and *before* of the simulation that lacks the cause.
 
 ### What each cause was called
 

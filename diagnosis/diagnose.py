@@ -124,6 +124,7 @@ def diagnose(
             "of the record's own making, or timing of its input"
         )
     curves = curves_of(whole, run, model, found.nominal, best, covariances)
+    curves = replace(curves, held_out=dict(zip(model.output_names, after.values.T, strict=True)))
     if verdict == UNKNOWN and strange is not None and strange.effect.location == location:
         curves = replace(curves, unknown=strange.course)
     causes = tuple(causes_of(best, covariances))

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diagnosis.courses import Signal
 from diagnosis.run import Run
@@ -34,10 +35,17 @@ FEWEST_ROWS = 100
 
 
 class Errors(NamedTuple):
-    """Root mean square errors on the rows held out, each of shape (n_y,); NaN where the free run came to an end."""
+    """Root mean square errors on what was held out.
+
+    Attributes:
+        free: of a free run, shape (n_y,); NaN where it came to an end.
+        one_step: of the filter's predictions, likewise.
+        values: which values they are of, shape (rows, n_y).
+    """
 
     free: Array
     one_step: Array
+    values: NDArray[np.bool_]
 
 
 def held_out_rows(run: Run, onsets_min: Sequence[float] = ()) -> Array:
@@ -95,7 +103,7 @@ def free_run(run: Run, sized: Sized, signals: Sequence[Signal], known: Mapping[s
         signals: the deviations in it.
         known: what uncertain parameters are off by, by name.
     """
-    return _freely(run, sized, signals, sized.follow(run, signals)[2], known)
+    return _freely(run, sized, signals, sized.follow(run, signals).found, known)
 
 
 def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovations, known: Mapping[str, float]) -> Array:
@@ -115,10 +123,11 @@ def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovation
 
 
 def _errors(run: Run, hidden: Array, sized: Sized, signals: Sequence[Signal], known: Mapping[str, float]) -> Errors:
-    _, _, found = sized.follow(run, signals)
+    found = sized.follow(run, signals).found
     free = _freely(run, sized, signals, found, known)
     with np.errstate(invalid="ignore"):
-        return Errors(_rms((run.measured - free)[hidden]), _rms(found.residual[hidden]))
+        values = hidden[:, None] & np.isfinite(run.measured)
+        return Errors(_rms((run.measured - free)[hidden]), _rms(found.residual[hidden]), values)
 
 
 def _rms(values: Array) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.run import Run
 from diagnosis.sized import loss_of
+from reactorwatch.process.machine_code import LANES
 from reactorwatch.process.model import Array
 
 _SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
@@ -54,8 +55,9 @@ def sized(run: Run, hypothesis: Hypothesis, best: Fit, place: int, scans: Sequen
     for reach, count in scans:
         numbers, course = best.theta[place], hypothesis.courses[place]
         scaled = np.arange(numbers.size) < course.coefficients
-        for share in np.geomspace(1.0 / reach, reach, count):
-            best = _better(run, hypothesis, best, place, np.where(scaled, share * numbers, numbers))
+        shares = np.geomspace(1.0 / reach, reach, count)
+        tried = [np.where(scaled, share * numbers, numbers) for share in shares]
+        best = _best_of(run, hypothesis, best, place, tried)
         if loss_of(best.w) > nothing - _LEAST_GAIN:
             break
     return best
@@ -70,8 +72,8 @@ def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
         best: where it begins.
     """
     course, usual = hypothesis.courses[0], hypothesis.sized.effects[0].starts
-    for size in np.geomspace(usual[0], usual[-1], _USUAL):
-        best = _better(run, hypothesis, best, 0, np.append(size, best.theta[0][1:]))
+    sizes = np.geomspace(usual[0], usual[-1], _USUAL)
+    best = _best_of(run, hypothesis, best, 0, [np.append(size, best.theta[0][1:]) for size in sizes])
     if course.numbers:
         best = _moved(run, hypothesis, best, _after_moves(run))
         rows = course.period_min * np.arange(-_NEAREST_ROWS, _NEAREST_ROWS + 1)
@@ -89,12 +91,18 @@ def _after_moves(run: Run) -> Array:
 def _moved(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> Fit:
     size = best.theta[0][0]
     late = hypothesis.at(run, (np.array([size, np.max(onsets)]),))  # until an onset the filter runs as with a later one
-    for onset in onsets:
-        best = _better(run, hypothesis, best, 0, np.array([size, onset]), late)
+    return _best_of(run, hypothesis, best, 0, [np.array([size, onset]) for onset in onsets], late)
+
+
+def _best_of(
+    run: Run, hypothesis: Hypothesis, best: Fit, place: int, several: Sequence[Array], like: Fit | None = None
+) -> Fit:
+    """The best of a fit and of others with other numbers of one effect; see `Hypothesis.at` for what they are like."""
+    for begin in range(0, len(several), LANES):
+        thetas = [
+            [numbers if other == place else item for other, item in enumerate(best.theta)]
+            for numbers in several[begin : begin + LANES]
+        ]
+        tried = hypothesis.at_all(run, thetas, best if like is None else like)
+        best = min([best, *tried], key=lambda item: item.loss)
     return best
-
-
-def _better(run: Run, hypothesis: Hypothesis, best: Fit, place: int, numbers: Array, like: Fit | None = None) -> Fit:
-    theta = [numbers if other == place else item for other, item in enumerate(best.theta)]
-    tried = hypothesis.at(run, theta, best if like is None else like)
-    return tried if tried.loss < best.loss else best

@@ -15,12 +15,12 @@ from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Signal, Step
 from diagnosis.hypothesis import Fit
 from diagnosis.run import Run
 from diagnosis.screen import DECAYS, EDGE_ROWS, KNOTS, Lead
-from diagnosis.sized import clipped
+from diagnosis.sized import Followed, clipped
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array
 
-Follow: TypeAlias = Callable[[Effect, Signal], tuple[float, Array]]
-"""From a deviation of an effect to the loss and the whitened innovations of a filter that knows of it."""
+Follow: TypeAlias = Callable[[Effect, Sequence[Signal]], Sequence[Followed]]
+"""From some deviations of an effect to what filters that know of them make of the run."""
 
 
 class MemoryScreen:
@@ -44,38 +44,50 @@ class MemoryScreen:
 
         Args:
             without: a fit without any of the effects.
-            follow: loss and whitened innovations of the same with a deviation of one effect in it.
+            follow: what filters make of the run that know of the same, and of a deviation of one effect.
             of: these effects alone; None: all.
             least_score: promises of less, in BIC, are not held against a run of the filter.
         """
         found = []
         for effect in self._effects if of is None else of:
-            tried = []
-            for start in effect.starts or (effect.typical,):
-                loss, w = follow(effect, self._constant.signal(np.array([start])))
-                tried.append((2.0 * (without.loss - loss), start, w))
-            gain, start, w = max(tried, key=lambda item: item[0])
+            starts = effect.starts or (effect.typical,)
+            followed = follow(effect, [self._constant.signal(np.array([start])) for start in starts])
+            tried = [
+                (2.0 * (without.loss - item.loss), start, item.w) for start, item in zip(starts, followed, strict=True)
+            ]
+            gain, start, _ = max(tried, key=lambda item: item[0])
             if gain > 0.0:
                 found.append(Lead(effect, self._constant, np.array([start]), gain))
             before = clipped(without.w)
-            for _, start, w in tried:
-                scaled = self.scaled(effect, before, (before - clipped(w)) / start)
-                promising = max(item.score(self._run.values) for item in scaled) > least_score
-                kept = self._kept(without, follow, scaled[0]) if promising and not effect.jumps else 1.0
+            scaled = [self.scaled(effect, before, (before - clipped(w)) / start) for _, start, w in tried]
+            for leads, kept in zip(scaled, self._kept(without, follow, scaled, least_score), strict=True):
                 # What acts in jumps does not scale: a fit has to scan its size, and can do so for one alone.
                 found += [
                     replace(item, gain=kept * item.gain)
-                    for item in scaled
+                    for item in leads
                     if kept > 0.0 and (not effect.jumps or item.course.name in ("constant", "step"))
                 ]
         return found
 
-    def _kept(self, without: Fit, follow: Follow, constant: Lead) -> float:
-        """How much of the gain that scaling promises a run with that constant size keeps, at most all of it."""
-        if constant.gain <= 0.0:
-            return 1.0 if constant.gain == 0.0 else 0.0
-        loss = follow(constant.effect, self._constant.signal(constant.theta))[0]
-        return min(2.0 * (without.loss - loss) / constant.gain, 1.0)
+    def _kept(self, without: Fit, follow: Follow, scaled: Sequence[Sequence[Lead]], least_score: float) -> list[float]:
+        """How much of the gain that each scaling promises a run with that constant size keeps, at most all of it.
+
+        A scaling that promises little, or is of an effect that acts in jumps, is believed without a run.
+        """
+        kept, asked = [1.0] * len(scaled), []
+        for number, leads in enumerate(scaled):
+            constant = leads[0]
+            if constant.effect.jumps or max(item.score(self._run.values) for item in leads) <= least_score:
+                continue
+            if constant.gain > 0.0:
+                asked.append(number)
+            elif constant.gain < 0.0:
+                kept[number] = 0.0
+        if asked:
+            signals = [self._constant.signal(scaled[number][0].theta) for number in asked]
+            for number, item in zip(asked, follow(scaled[0][0].effect, signals), strict=True):
+                kept[number] = min(2.0 * (without.loss - item.loss) / scaled[number][0].gain, 1.0)
+        return kept
 
     def scaled(self, effect: Effect, w: Array, g: Array) -> list[Lead]:
         """From the signature of a size of 1 in every row.

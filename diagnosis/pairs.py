@@ -23,7 +23,7 @@ from diagnosis.hypothesis import MOST_STEPS, Hypothesis
 from diagnosis.pair_screen import PairLead, PairScreen, Remembered
 from diagnosis.screen import KNOTS, Lead
 from diagnosis.search import IN_QUESTION, Explained, Found, Key, Search, keep
-from diagnosis.sized import clipped
+from diagnosis.sized import Followed, clipped
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array
 
@@ -158,7 +158,7 @@ class PairSearch:
         (part,) = _parts(first)
         leads = search.screen.leads(first.hypothesis, first.fit)
         others = [effect for effect in search.screen.with_memory if effect is not part.effect]
-        leads += search.memory.leads(first.fit, lambda item, signal: self._followed([part], item, signal), others)
+        leads += search.memory.leads(first.fit, lambda item, signals: self._followed([part], item, signals), others)
         leads = self._simple([lead for lead in leads if lead.effect is not part.effect])
         pairs = [self._fitted([part, _part_of(lead)], EXCHANGE_STEPS) for lead in leads]
         if not pairs:
@@ -257,15 +257,16 @@ class PairSearch:
             of = [
                 item for item in search.screen.with_memory if item is not other.effect and (item is effect or not own)
             ]
-            leads += search.memory.leads(alone.fit, lambda item, signal: self._followed([other], item, signal), of)
+            leads += search.memory.leads(alone.fit, lambda item, signals: self._followed([other], item, signals), of)
         leads = [lead for lead in leads if lead.effect is not other.effect]
         return sorted(leads, key=lambda item: -item.score(self._run.values))
 
-    def _followed(self, beside: Sequence[Part], effect: Effect, signal: Signal) -> tuple[float, Array]:
-        """Loss and whitened innovations with one more deviation."""
-        signals = {part.effect.name: part.course.signal(part.theta) for part in beside} | {effect.name: signal}
+    def _followed(self, beside: Sequence[Part], effect: Effect, signals: Sequence[Signal]) -> list[Followed]:
+        """What filters make of the run with one more deviation, of several."""
+        others = {part.effect.name: part.course.signal(part.theta) for part in beside}
         effects = self._sorted([*(part.effect for part in beside), effect])
-        return self._search.sized(effects).follow(self._run, [signals[item.name] for item in effects])[:2]
+        several = [[(others | {effect.name: signal})[item.name] for item in effects] for signal in signals]
+        return self._search.sized(effects).follow_all(self._run, several)
 
     def _screened(self, about: Explained) -> list[PairLead]:
         """Pairs that may explain all that there is to explain, linearised about a run."""
@@ -287,9 +288,9 @@ class PairSearch:
                 starts = (max(float(np.mean(np.abs(part.course.signal(part.theta).at_row))), 0.1 * effect.typical),)
                 beside = [item for item in parts if item is not part]
                 before = about.hypothesis.without(self._run, about.fit, own[effect.name])
-            for start in starts:
-                w = self._followed(beside, effect, self._constant.signal(np.array([start])))[1]
-                found.append(Remembered(effect, start, clipped(before) - clipped(w)))
+            followed = self._followed(beside, effect, [self._constant.signal(np.array([start])) for start in starts])
+            for start, item in zip(starts, followed, strict=True):
+                found.append(Remembered(effect, start, clipped(before) - clipped(item.w)))
         return found
 
     def _fitted(self, parts: Sequence[Part], steps: int = MOST_STEPS, scan: bool = False) -> Explained:

@@ -6,7 +6,6 @@ from numpy.typing import NDArray
 from diagnosis.run import Run
 from diagnosis.units import check_units
 from reactorwatch.errors import InputError
-from reactorwatch.process.doubt import early_share
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.records.record import Record
 
@@ -88,24 +87,26 @@ def _check_bounds(name: str, signal: str, unit: str, values: Array, lower: float
         raise InputError(f"{name}: {rule}, its median is {typical:g}{hint or '; check its unit'}")
 
 
-def _breaks(time_min: Array, inputs: Array, known: NDArray[np.bool_]) -> tuple[tuple[int, ...], Array | None]:
+def _breaks(
+    time_min: Array, inputs: Array, known: NDArray[np.bool_]
+) -> tuple[tuple[int, ...], NDArray[np.intp] | None]:
     """Rows whose inputs differ from those of the row before, with rows missing between them or the inputs in it.
 
     Nobody knows when they changed. Where rows are irregular by nature none is taken to be missing.
 
     Returns:
-        Those before which too much is missing, and what the others are (see `Run.early`).
+        Those before which too much is missing, and how many are before the others (see `Run.missing`).
     """
     step = np.diff(time_min)
     period = float(np.median(step))
     counts = step / period
     regular = np.mean(np.abs(counts - np.round(counts)) < _OFF_GRID) > _REGULAR
     changed = np.any(np.diff(inputs, axis=0) != 0.0, axis=1)
-    missing = np.round(counts) - 1.0
-    short = changed & regular & (missing > 0.5) & (missing <= FEW_ROWS) & np.all(known[:-1], axis=1)
+    missing = np.round(counts).astype(np.intp) - 1
+    short = changed & regular & (missing > 0) & (missing <= FEW_ROWS) & np.all(known[:-1], axis=1)
     long = changed & ((counts > 1.5) & regular | ~np.all(known[:-1], axis=1)) & ~short
-    early = np.append(0.0, np.where(short, early_share(np.maximum(missing, 0.0)), 0.0))
-    return tuple((np.flatnonzero(long) + 1).tolist()), early if np.any(short) else None
+    few = np.append(0, np.where(short, missing, 0))
+    return tuple((np.flatnonzero(long) + 1).tolist()), few if np.any(short) else None
 
 
 def _held(values: Array) -> Array:

@@ -3,6 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from diagnosis.difference import Difference
 from reactorwatch.process.model import Array
 
@@ -201,6 +204,7 @@ class Curves:
         deviation: m(t) of each cause, by its name.
         deviation_sd: its standard deviation.
         unknown: what acts where nothing has a name; None: no such.
+        held_out: which values the errors before and after are of, by output.
     """
 
     time_min: Array
@@ -213,6 +217,7 @@ class Curves:
     deviation: dict[str, Array]
     deviation_sd: dict[str, Array]
     unknown: UnknownCourse | None = None
+    held_out: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -20,21 +20,22 @@ from diagnosis.courses import Step
 from diagnosis.hypothesis import Fit
 from diagnosis.search import Explained, Search
 from diagnosis.sized import row_losses
+from reactorwatch.process.machine_code import LANES
 from reactorwatch.process.model import Array
 
 OFFSETS = (0.5, 1.0, 2.0)
 """To either side, in standard deviations that the fit has found, and at least rows."""
 
 WIDENINGS, ROUNDS = 7, 3
-OUT_OF_QUESTION = 4.0
-"""In log likelihood: a value that is worse by more adds nothing."""
+OUT_OF_QUESTION = 7.0
+"""In log likelihood: a value that is worse by more adds nothing, and behind it no other hump is looked for."""
 
 LEAST_GAIN, AS_LIKELY = 0.1, 0.5
 """In log likelihood: by so much more a value is taken for the likeliest; by so much less it is still as good."""
 
-AT_THE_EDGE, CLIFF, HALVINGS, FINER = 1.0, 3.0, 3, 20
-"""In log likelihood, where it falls, and what is a steep fall; how often more values are tried in that; and steps
-between two values tried."""
+FAR_BETWEEN, UNSURE, MOST_MORE, FINER = 1.01, 0.08, 12, 20
+"""In the first look's reaches, what is far between values in question; of the whole, how much of the likelihood may lie
+here or there between two values; how many more are tried for each; and steps between two values tried."""
 
 HOLLOWS, APART_ROWS = 3, 20
 """How many onsets of effects with memory are tried, and by how much they differ."""
@@ -115,35 +116,54 @@ class _Scan:
         for _ in range(ROUNDS):
             here = float(best.fit.theta[self._place][self._number])
             known = {here: best.fit}
-            for side in (-1.0, 1.0):
-                for value in self._to_a_side(here, side):
-                    known[value] = _at(self._search, best, self._place, self._number, value)
-                    far = abs(value - here) > OFFSETS[-1] * self._reach
-                    if far and known[value].loss > best.fit.loss + OUT_OF_QUESTION:
-                        break
+            far = OFFSETS[-1] * self._reach
+            sides = [list(self._to_a_side(here, side)) for side in (-1.0, 1.0)]
+            self._try(best, known, [value for side in sides for value in side if abs(value - here) <= far])
+            further = [[value for value in side if abs(value - here) > far] for side in sides]
+            while further := [side for side in further if side]:
+                self._try(best, known, [side[0] for side in further])
+                further = [side[1:] for side in further if known[side[0]].loss <= best.fit.loss + OUT_OF_QUESTION]
             likeliest = min(known.values(), key=lambda item: item.loss)
             if likeliest.loss > best.fit.loss - LEAST_GAIN:
                 break
             best = self._search.fit(best.hypothesis, likeliest.theta)
-        self._find_the_edges(best, known)
+        self._look_between(best, known)
         mean, _ = _moments(known, here)
         trial = _at(self._search, best, self._place, self._number, mean)
         if trial.loss < best.fit.loss + AS_LIKELY:
             best, here = self._search.judged(best.hypothesis, trial), mean
         return best, _moments(known, here)[1]
 
-    def _find_the_edges(self, best: Explained, known: dict[float, Fit]) -> None:
-        """Try more values where the likelihood falls steeply."""
-        for _ in range(HALVINGS):
-            values = sorted(known)
-            likely = [value for value in values if known[value].loss < best.fit.loss + AT_THE_EDGE]
-            for inner, outer in ((values.index(likely[0]), -1), (values.index(likely[-1]), 1)):
-                if not 0 <= inner + outer < len(values):
-                    continue
-                near, far = values[inner], values[inner + outer]
-                if known[far].loss - known[near].loss > CLIFF:
-                    value = 0.5 * (near + far)
-                    known[value] = _at(self._search, best, self._place, self._number, value)
+    def _look_between(self, best: Explained, known: dict[float, Fit]) -> None:
+        """Try more values where another hump may be: far between such as are in question, and where it is steep."""
+        for _ in range(MOST_MORE // LANES):
+            values, above = self._values(best, known)
+            width = np.where(np.maximum(above[1:], above[:-1]) < OUT_OF_QUESTION, np.diff(values), 0.0)
+            if not self._halved(best, known, width, FAR_BETWEEN * self._reach):
+                break
+        for _ in range(MOST_MORE // LANES):
+            values, above = self._values(best, known)
+            likelihood = np.exp(-above)
+            unsure = np.diff(values) * np.abs(np.diff(likelihood))
+            if not self._halved(best, known, unsure, UNSURE * float(np.trapezoid(likelihood, values))):
+                break
+
+    def _values(self, best: Explained, known: dict[float, Fit]) -> tuple[Array, Array]:
+        """Those that were tried, in order, and how much worse than the best they are in log likelihood."""
+        values = sorted(known)
+        return np.array(values), np.array([known[value].loss - best.fit.loss for value in values])
+
+    def _halved(self, best: Explained, known: dict[float, Fit], of_each: Array, least: float) -> bool:
+        """Try values in the middle between two, where there is most of something; whether there is enough of it."""
+        values, most = sorted(known), np.argsort(-of_each)[:LANES].tolist()
+        middles = [0.5 * (values[place] + values[place + 1]) for place in most if of_each[place] > least]
+        self._try(best, known, middles)
+        return bool(middles)
+
+    def _try(self, best: Explained, known: dict[float, Fit], values: Sequence[float]) -> None:
+        for begin in range(0, len(values), LANES):
+            part = values[begin : begin + LANES]
+            known.update(zip(part, _at_all(self._search, best, self._place, self._number, part), strict=True))
 
     def _to_a_side(self, here: float, side: float) -> Iterator[float]:
         """Values to try, within the bounds, further and further away."""
@@ -171,6 +191,12 @@ def _moments(known: dict[float, Fit], here: float) -> tuple[float, float]:
 
 
 def _at(search: Search, best: Explained, place: int, number: int, value: float) -> Fit:
-    theta = [item.copy() for item in best.fit.theta]
-    theta[place][number] = value
-    return best.hypothesis.at(search.run, theta)
+    return _at_all(search, best, place, number, [value])[0]
+
+
+def _at_all(search: Search, best: Explained, place: int, number: int, values: Sequence[float]) -> list[Fit]:
+    """With one number of one effect exchanged; together they take less time."""
+    thetas = [[item.copy() for item in best.fit.theta] for _ in values]
+    for theta, value in zip(thetas, values, strict=True):
+        theta[place][number] = value
+    return best.hypothesis.at_all(search.run, thetas)

@@ -18,15 +18,15 @@ class Run:
         inputs: shape (rows, n_u); each row is held until the next one.
         measured: shape (rows, n_y); NaN where missing.
         breaks: rows before which nobody knows what the inputs did for long: a filter begins anew there.
-        early: where they changed in a few missing rows before a row, nobody knows in which: for what share of the way
-            to it they were on average what they are there, shape (rows,), else 0; None: nowhere.
+        missing: how many rows are missing before a row with which they are others, so that nobody knows when they
+            changed, but may guess it, shape (rows,), else 0; None: nowhere.
     """
 
     time_min: Array
     inputs: Array
     measured: Array
     breaks: tuple[int, ...] = ()
-    early: Array | None = None
+    missing: NDArray[np.intp] | None = None
 
     @property
     def known_inputs(self) -> Array:
@@ -38,7 +38,8 @@ class Run:
     @property
     def after_doubt(self) -> NDArray[np.intp]:
         """Rows before which nobody knows what the inputs did."""
-        return np.concatenate([self.breaks, [] if self.early is None else np.flatnonzero(self.early)]).astype(np.intp)
+        breaks = np.array(self.breaks, dtype=np.intp)
+        return breaks if self.missing is None else np.concatenate([breaks, np.flatnonzero(self.missing)])
 
     @property
     def values(self) -> int:
@@ -59,9 +60,9 @@ def doubt_of(run: Run, inputs: Array, leads_to: NDArray[np.intp] | None = None) 
         inputs: of a filter of it: those of the run, and then others, whose courses are known; shape (rows, n).
         leads_to: if the filter has more rows, the row of the run that each is, or leads to, shape (rows,); else None.
     """
-    if run.early is None:
+    if run.missing is None:
         return None
-    to = slice(None) if leads_to is None else leads_to
+    to = np.arange(run.time_min.size) if leads_to is None else leads_to
     others = np.vstack([inputs[:1], inputs[:-1]])
     others[:, : run.inputs.shape[1]] = run.inputs[to]
-    return Doubt(others, run.early[to])
+    return Doubt.behind(run.time_min, run.inputs, run.missing).of_rows(to)._replace(inputs=others)

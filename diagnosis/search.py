@@ -22,7 +22,7 @@ from diagnosis.memory_screen import MemoryScreen
 from diagnosis.outliers import gross_outliers, outliers, without
 from diagnosis.run import Run
 from diagnosis.screen import Lead, Screen
-from diagnosis.sized import Sized
+from diagnosis.sized import Followed, Sized
 from diagnosis.wandering import Noise, suspected
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import Array, ProcessModel
@@ -185,7 +185,7 @@ class Search:
         nominal = self._sized[()] = Sized(self._model, (), self._still((1.0,) * len(self._model.outputs)))
         noise = nominal.tuned(self.run, (), self._smallest_sd)
         nominal.noise = self._still(noise.measurement_sd)
-        self.run = without(self.run, outliers(self.run.measured, nominal.follow(self.run, ())[2].residual))
+        self.run = without(self.run, outliers(self.run.measured, nominal.follow(self.run, ()).found.residual))
         return noise
 
     def _still(self, measurement_sd: tuple[float, ...]) -> Noise:
@@ -199,7 +199,7 @@ class Search:
         """
         sized, signals, noise = best.hypothesis.sized, best.hypothesis.signals(best.fit), self.noise
         sized.noise = self._still(noise.measurement_sd)
-        left = sized.follow(self.run, signals)[2].residual
+        left = sized.follow(self.run, signals).found.residual
         self._use_noise(sized)
         wandering = suspected(noise, self._model.output_names, left, self._period_min)
         if not wandering:
@@ -208,7 +208,7 @@ class Search:
             self._model, sized.effects, Noise(noise.measurement_sd, noise.process_sd, wandering), self._period_min
         )
         beside.noise = beside.tuned(self.run, signals, self._smallest_sd)
-        gain = 2.0 * (sized.follow(self.run, signals)[0] - beside.follow(self.run, signals)[0])
+        gain = 2.0 * (sized.follow(self.run, signals).loss - beside.follow(self.run, signals).loss)
         if gain < LEAST_SENSOR_GAIN + 2 * len(wandering) * log(self.run.values):
             return False
         nominal = Sized(self._model, (), beside.noise, self._period_min)
@@ -250,8 +250,8 @@ class Search:
                 break
         return found
 
-    def _followed(self, effect: Effect, signal: Signal) -> tuple[float, Array]:
-        return self.sized((effect,)).follow(self.run, [signal])[:2]
+    def _followed(self, effect: Effect, signals: Sequence[Signal]) -> list[Followed]:
+        return self.sized((effect,)).follow_all(self.run, [[signal] for signal in signals])
 
     def resolved(self, item: Explained, steps: int = MOST_STEPS) -> Explained:
         """With as many knots as its free curves need."""

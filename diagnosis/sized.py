@@ -19,7 +19,10 @@ from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filled import Filled, filled
 from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors, Ways
+from reactorwatch.process.filter_record import FilterRecord
+from reactorwatch.process.filter_stretches import together
 from reactorwatch.process.innovations import Innovations
+from reactorwatch.process.machine_code import LANES
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.noise import tune_with
 
@@ -43,6 +46,20 @@ class Known(NamedTuple):
 
     found: Innovations
     rows: int
+
+
+class Followed(NamedTuple):
+    """What a filter makes of a run.
+
+    Attributes:
+        loss: minus the log likelihood, up to a constant that all share.
+        w: whitened innovations, shape (rows, n_y); NaN where nothing was measured.
+        found: the filter's run.
+    """
+
+    loss: float
+    w: Array
+    found: Innovations
 
 
 class Sized:
@@ -71,6 +88,7 @@ class Sized:
             sized = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
         self._filtered = sized
         self._filter = Filter(self.model, self._levels_of(noise))
+        self._spare: list[Filter] = []
         self._errors = self._filtered.errors.with_noise(self.levels)
         self.noise = noise
 
@@ -124,17 +142,29 @@ class Sized:
             run.known_inputs, [item for place, item in enumerate(signals) if place != self.late]
         )
 
-    def follow(
-        self, run: Run, signals: Sequence[Signal], begun: Known | None = None
-    ) -> tuple[float, Array, Innovations]:
-        """Loss, whitened innovations and the filter's run, of which the first rows may be known."""
+    def follow(self, run: Run, signals: Sequence[Signal]) -> Followed:
+        """What the filter makes of a run with these deviations."""
+        return self.follow_all(run, [signals])[0]
+
+    def follow_all(
+        self, run: Run, several: Sequence[Sequence[Signal]], begun: Sequence[Known | None] | None = None
+    ) -> list[Followed]:
+        """What filters make of a run, each with other deviations; a few of them take little longer than one.
+
+        Args:
+            run: the record.
+            several: of each filter the deviations.
+            begun: of each, a run whose first rows are those of its own; None: none is known.
+        """
+        laid = [self._laid_out(run, signals) for signals in several]
+        # Where a sensor is late, a known run is not one of the rows that the filter takes.
+        known = [None] * len(laid) if begun is None or self.late is not None else begun
+        found = self._filtered_rows([rows for rows, _ in laid], known)
+        return [self._judged(run, by, item) for (_, by), item in zip(laid, found, strict=True)]
+
+    def _judged(self, run: Run, by: Moved | None, found: Innovations) -> Followed:
         known, least = np.isfinite(run.measured), np.array(self.noise.measurement_sd)
         unseen = np.zeros_like(known)
-        rows, by = self._laid_out(run, signals)
-        if begun is not None and by is None and rows.own.size == rows.time_min.size:
-            found = self._continued(rows, begun)
-        else:
-            found = rows.of_record(self._filter.run(rows.time_min, rows.inputs, rows.measured, doubt=rows.doubt))
         if by is not None and self.late is not None:
             output = self._output(self.late)
             found = gathered(found, by, output)
@@ -146,22 +176,49 @@ class Sized:
         known[begins] = unseen[begins] = False
         # What was true before the beginning counts as expected: a longer delay must neither gain nor lose by it.
         loss, w = _judged(known, unseen, good, found.whitened, found.conditional_sd, least)
-        return float(loss), w, found
+        return Followed(float(loss), w, found)
 
-    def _continued(self, rows: Filled, begun: Known) -> Innovations:
-        """The filter's run from where a known one may not be followed further; the numbers are those of a whole run."""
-        last, (time_min, inputs, measured, doubt, _) = begun.rows - 1, rows
-        if last < 0 or not np.all(np.isfinite(begun.found.x[last])) or not np.all(np.isfinite(inputs[last])):
-            return self._filter.run(time_min, inputs, measured, doubt=doubt)
-        if begun.rows == time_min.size:
-            return begun.found
-        x, P = begun.found.x[last].tolist(), begun.found.P[last].ravel().tolist()
-        start = FilterState(float(time_min[last]), tuple(inputs[last].tolist()), tuple(x), tuple(P))
-        rest = slice(begun.rows, None)
-        later = None if doubt is None else doubt.of_rows(rest)
-        found = self._filter.run(time_min[rest], inputs[rest], measured[rest], start=start, doubt=later)
-        both = zip(begun.found, found, strict=True)
-        return Innovations(*(np.concatenate([known[: begun.rows], more]) for known, more in both))
+    def _filtered_rows(self, several: Sequence[Filled], begun: Sequence[Known | None]) -> list[Innovations]:
+        """The filters' runs over the rows of the record; of rows that are known, nothing is worked out again."""
+        found: list[Innovations] = []
+        for begin in range(0, len(several), LANES):
+            part = several[begin : begin + LANES]
+            found += self._lanes(part, begun[begin : begin + LANES])
+        return found
+
+    def _lanes(self, several: Sequence[Filled], begun: Sequence[Known | None]) -> list[Innovations]:
+        """As many at once as there are lanes, so all from the same row on."""
+        first = min(_rows_of(known, rows) for known, rows in zip(begun, several, strict=True))
+        if first == several[0].time_min.size:
+            return [known.found for known in begun if known is not None]
+        runs = []
+        for filtering, (time_min, inputs, measured, doubt, _), known in zip(
+            self._filters(len(several)), several, begun, strict=True
+        ):
+            rest, start = slice(first, None), None
+            if known is not None and first:
+                x, P = known.found.x[first - 1].tolist(), known.found.P[first - 1].ravel().tolist()
+                start = FilterState(float(time_min[first - 1]), tuple(inputs[first - 1].tolist()), tuple(x), tuple(P))
+            later = None if doubt is None else doubt.of_rows(rest)
+            record = FilterRecord.of(time_min[rest], inputs[rest], measured[rest], doubt=later)
+            runs.append(filtering.stretches(record, start))
+        found = []
+        for rows, known, new in zip(several, begun, together(runs), strict=True):
+            if known is None or not first:
+                found.append(rows.of_record(new))
+                continue
+            both = zip(known.found, new, strict=True)
+            found.append(Innovations(*(np.concatenate([before[:first], more]) for before, more in both)))
+        return found
+
+    def _filters(self, count: int) -> list[Filter]:
+        """So many, with the noise that holds now."""
+        while len(self._spare) < count - 1:
+            self._spare.append(self._filter.twin())
+        for item in self._spare[: count - 1]:
+            item.noise = self.levels
+            item.change(self._noise.times)
+        return [self._filter, *self._spare[: count - 1]]
 
     def tuned(
         self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float], nearby: Noise | None = None
@@ -238,6 +295,16 @@ def ways_between(errors: FilterErrors, run: Run, inputs: Array, found: Innovatio
         began[later],
         None if doubt is None else doubt.of_rows(later),
     )
+
+
+def _rows_of(known: Known | None, rows: Filled) -> int:
+    """How many rows of a known run can stand for those of another one, that goes on from the last of them."""
+    if known is None or rows.own.size != rows.time_min.size:
+        return 0
+    last = known.rows - 1
+    if last < 0 or not np.all(np.isfinite(known.found.x[last])) or not np.all(np.isfinite(rows.inputs[last])):
+        return 0
+    return known.rows
 
 
 def clipped(w: Array) -> Array:

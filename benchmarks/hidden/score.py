@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from math import nan
+from math import isnan, nan
 
 import numpy as np
 
@@ -29,7 +29,9 @@ class Score:
         size_inside: share of the 95 % intervals that hold the size.
         onset: median and 90 % of the error of a step's onset, in min.
         onset_inside: share of the 95 % intervals that hold it.
-        held_out: median and 90 % of the error of T on rows not seen over its noise.
+        held_out: median and 90 % of the error of T on rows not seen over the noise that was drawn in them.
+        held_out_in_sd: the same over the standard deviation of the noise.
+        drawn_in_sd: the same of the truth itself.
         before: the same of the nominal model.
         seconds: of a core, median and largest.
         errors: diagnoses that came to no end.
@@ -50,6 +52,8 @@ class Score:
     onset: tuple[float, float]
     onset_inside: float
     held_out: tuple[float, float]
+    held_out_in_sd: tuple[float, float]
+    drawn_in_sd: tuple[float, float]
     before: tuple[float, float]
     seconds: tuple[float, float]
     errors: int
@@ -57,12 +61,13 @@ class Score:
     @classmethod
     def of(cls, judged: Sequence[Judged]) -> "Score":
         """The score of some records."""
+        ended = [item for item in judged if not item.remark]
         right = [(course, profile) for item in judged if item.first for course, profile in _courses(item)]
         return cls(
             records=len(judged),
             first=_share(item.first for item in judged),
             listed=_share(item.listed for item in judged),
-            count=_mean([item.count for item in judged if not item.remark]),
+            count=_mean([item.count for item in ended]),
             wrong=_share(item.wrong for item in judged),
             unknown=_share(item.verdict == UNKNOWN for item in judged),
             unknown_in_place=_share(item.verdict == UNKNOWN and item.right_place for item in judged),
@@ -73,8 +78,10 @@ class Score:
             size_inside=_share(inside for item in judged for inside in item.size_inside),
             onset=_two([error for item in judged for error in item.onset_errors], 0.9),
             onset_inside=_share(inside for item in judged for inside in item.onset_inside),
-            held_out=_two([item.held_out for item in judged if not item.remark], 0.9),
-            before=_two([item.before for item in judged if not item.remark], 0.9),
+            held_out=_two([item.held_out / item.drawn for item in ended if not isnan(item.drawn)], 0.9),
+            held_out_in_sd=_two([item.held_out for item in ended], 0.9),
+            drawn_in_sd=_two([item.drawn for item in ended if not isnan(item.drawn)], 0.9),
+            before=_two([item.before for item in ended], 0.9),
             seconds=_two([item.seconds for item in judged], 1.0),
             errors=sum(bool(item.remark) for item in judged),
         )

@@ -1,10 +1,10 @@
 """Ways from a row to the next on which an input changed, and nobody knows when.
 
-Rows are missing, and behind them an input is another. Of n missing rows and the one after them each may be the one that
-it changed with, and none is likelier than another. So it was for a share of the way already what it is then, and that
-share has, with s = n / (2 (n + 1)), the mean s and the variance s (1 - s) / 3. What the two inputs make of the state
-over the whole way differs by d; what the change makes of it is on average that share of d, and its covariance is the
-variance times d d'.
+Rows are missing, and behind them an input is another. Each of the missing rows and the one after them may be the one
+that it changed with, and none is likelier than another. So the state is followed from each of these moments; it is on
+average the mean of where they lead, and its covariance is their spread about it. To add to what it would be without a
+change a share of what the change makes of it is not enough: the temperature goes with the time that is left from the
+change on, but the concentration, which only follows the temperature, with the square of it.
 """
 
 from typing import NamedTuple
@@ -20,31 +20,40 @@ class Doubt(NamedTuple):
 
     Attributes:
         inputs: those that may have held already, shape (rows, n_u).
-        early: for what share of the way they did on average, shape (rows,); 0 where there is no doubt.
+        first_min: the first moment from which they may have, shape (rows,).
+        last_min: the last one, likewise; the others are at even distances between them.
+        moments: how many there are, shape (rows,); 0 where there is no doubt.
     """
 
     inputs: Array
-    early: Array
+    first_min: Array
+    last_min: Array
+    moments: NDArray[np.intp]
 
-    def of_rows(self, rows: slice) -> "Doubt":
+    @classmethod
+    def behind(cls, time_min: Array, inputs: Array, missing: NDArray[np.intp]) -> "Doubt":
+        """Of a record in which rows are missing where inputs changed.
+
+        Args:
+            time_min: of its rows, shape (rows,).
+            inputs: that hold from each row on, shape (rows, n_u).
+            missing: how many rows are missing before each row with whose inputs it is not known since when they hold,
+                shape (rows,); else 0.
+        """
+        before = np.append(time_min[:1], time_min[:-1])
+        moments = np.where(missing > 0, missing + 1, 0)
+        return cls(inputs, before + (time_min - before) / np.maximum(moments, 1), time_min, moments)
+
+    def of_rows(self, rows: slice | NDArray[np.intp]) -> "Doubt":
         """Of some rows."""
-        return Doubt(self.inputs[rows], self.early[rows])
+        return Doubt(self.inputs[rows], self.first_min[rows], self.last_min[rows], self.moments[rows])
 
     @property
     def rows(self) -> NDArray[np.bool_]:
         """To which ways in doubt lead, shape (rows,)."""
-        return np.asarray(self.early > 0.0)
+        return np.asarray(self.moments > 0)
 
-
-def early_share(missing: Array) -> Array:
-    """The share of the way on average, for numbers of missing rows.
-
-    >>> early_share(np.array([1.0, 3.0])).tolist()
-    [0.25, 0.375]
-    """
-    return np.asarray(missing / (2.0 * (missing + 1.0)))
-
-
-def variance_of(share: Array) -> Array:
-    """The variance of the share, for its mean."""
-    return np.asarray(share * (1.0 - share) / 3.0)
+    def times_min(self, row: int) -> list[float]:
+        """The moments of a way, in order."""
+        found: list[float] = np.linspace(self.first_min[row], self.last_min[row], self.moments[row]).tolist()
+        return found

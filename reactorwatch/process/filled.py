@@ -63,7 +63,7 @@ def filled(time_min: Array, inputs: Array, measured: Array, doubt: Doubt | None 
     more = np.full((source.size, measured.shape[1]), np.nan)
     more[own] = measured
     if doubt is not None:
-        early = np.zeros(source.size)
-        early[own] = doubt.early
-        doubt = Doubt(doubt.inputs[source], early)
+        moments = np.zeros(source.size, dtype=np.intp)
+        moments[own] = doubt.moments
+        doubt = doubt.of_rows(source)._replace(moments=moments)
     return Filled(times, inputs[source], more, doubt, own)

@@ -22,8 +22,8 @@ What is out of the ordinary is handled like this:
 - A row more than `LONGEST_STEP_MIN` after the one before is walked to in steps. After a gap of more than
   `LONGEST_GAP_MIN`, or a step back in time, the filter begins anew: on an unstable stretch the uncertainty grows
   without bound, and the model does not know what was done to the plant meanwhile.
-- Where an input is another behind missing rows, nobody knows when it changed; the state is predicted for both, and is
-  as uncertain as that makes it (see `doubt`).
+- Where an input is another behind missing rows, nobody knows when it changed; the state is predicted for each moment
+  that it may have, and is as uncertain as that makes it (see `doubt`).
 - It begins anew as well where the equations leave the bounds of the states, or are no numbers any more. A correction
   that leads out of the bounds is cut off there.
 - It begins at what is measured (see `filter_start`), and says nothing of that row; as long as nothing is, it waits.
@@ -41,10 +41,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.process.array_function import ArrayFunction
-from reactorwatch.process.doubt import Doubt, variance_of
+from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.process.filter_start import Beginning
 from reactorwatch.process.filter_step import row_code, row_function, walk_function
+from reactorwatch.process.filter_stretches import Stretch, Stretches, alone
 from reactorwatch.process.innovations import Innovation, Innovations
 from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array, ProcessModel
@@ -123,6 +124,12 @@ class Filter:
         self.noise = noise
         self.change(changes or {})
 
+    def twin(self) -> "Filter":
+        """Another one of the same model, noise and changes, which knows nothing yet; for the same thread."""
+        other = Filter(self.model, self._noise, self._changes)
+        other._beginning = self._beginning  # what it takes to make is more than to use it
+        return other
+
     @property
     def noise(self) -> NoiseLevels:
         """Of the plant and its sensors."""
@@ -173,7 +180,7 @@ class Filter:
         *,
         gate: float = inf,
         accept: Sequence[bool] = (),
-        doubt: tuple[Sequence[float], float] | None = None,
+        doubt: tuple[Sequence[float], Sequence[float]] | None = None,
     ) -> Innovation:
         """Take a row in.
 
@@ -183,8 +190,8 @@ class Filter:
             measured: one an output; NaN: missing.
             gate: standard deviations beyond which a measurement does not correct the state ...
             accept: ... unless this says so for its output; empty: for none.
-            doubt: the inputs that may have held already since the row before, and for what share of the way they did on
-                average (see `doubt`); None: it is known that those of the row before did.
+            doubt: the inputs that may have held before the row already, and the times from which on, in order, each as
+                likely (see `doubt`); None: it is known that those of the row before did.
         """
         n, before = self._n_y, self._time_min
         if before is None or not 0.0 < time_min - before <= LONGEST_GAP_MIN:
@@ -236,6 +243,10 @@ class Filter:
 
     def over(self, record: FilterRecord, start: FilterState | None = None) -> Innovations:
         """As `run`, of a record that is laid out already."""
+        return alone(self.stretches(record, start))
+
+    def stretches(self, record: FilterRecord, start: FilterState | None = None) -> Stretches:
+        """As `over`, with a stop at every stretch of rows, for whoever takes those of several filters at once."""
         if start is None:
             self.restart()
         else:
@@ -249,8 +260,11 @@ class Filter:
             done = 0
             if self._time_min is not None and near[row]:
                 part = slice(row, ends[bisect_left(ends, row)])
-                done = self._run_near(rows[part], told[part], memory[part])
+                done = yield Stretch(self.code, self._memory, rows[part], self._constants, memory[part], told[part])
+                if row + done < part.stop:
+                    told[row + done], memory[row + done] = nan, nan
             if done:
+                self._memory[:] = memory[row + done - 1]
                 row += done
                 self._remember(float(record.time_min[row - 1]), record.inputs[row - 1].tolist())
             else:
@@ -266,25 +280,16 @@ class Filter:
         """Take a row in by itself."""
         time_min, inputs, values = record.time_min[row], record.inputs[row].tolist(), record.measured[row].tolist()
         doubt, accept = record.doubt, record.accept[row].tolist()
-        other = (doubt.inputs[row].tolist(), float(doubt.early[row])) if doubt is not None and doubt.rows[row] else None
+        other = (doubt.inputs[row].tolist(), doubt.times_min(row)) if doubt is not None and doubt.rows[row] else None
         found = self.update(float(time_min), inputs, values, gate=record.gate, accept=accept, doubt=other)
         if found is not self._nothing:
             told[row], memory[row] = self._told, self._memory
         elif self._time_min is not None:
             memory[row] = self._memory
 
-    def _run_near(self, new: Array, told: Array, memory: Array) -> int:
-        """Take rows in at once; returns how many of them, up to the first that did not go well."""
-        rows = len(new)
-        done = self._rows.fill(rows, [self._memory, new, self._constants], [memory, told])
-        if done:
-            self._memory[:] = memory[done - 1]
-        if done < rows:
-            told[done], memory[done] = nan, nan
-        return done
-
     @cached_property
-    def _rows(self) -> RowCode:
+    def code(self) -> RowCode:
+        """Of its rows, see `filter_step`."""
         return row_code(self.model)
 
     @cached_property
@@ -331,15 +336,22 @@ class Filter:
         return memory
 
     def _predict_in_doubt(
-        self, before: float, time_min: float, inputs: Sequence[float], other: Sequence[float], early: float
+        self, before: float, time_min: float, inputs: Sequence[float], other: Sequence[float], times: Sequence[float]
     ) -> None:
         """Predict a whole way on which the inputs became others, nobody knows when."""
-        edges, start = self._edges(before, time_min), self._memory.copy()
-        held = self._reset(self._walked(start, self._inputs, edges), inputs, time_min)
-        changed = self._reset(self._walked(self._reset(start, other, before), other, edges), inputs, time_min)
-        apart = changed[: self._n_x] - held[: self._n_x]
-        self._memory[:] = held + early * (changed - held)
-        self._memory[self._n_x :] += float(variance_of(np.array(early))) * np.outer(apart, apart).ravel()
+        held, now, ends = self._memory.copy(), before, []
+        for moment in times:
+            changed = min(max(moment, before), time_min)
+            if changed > now:
+                held, now = self._walked(held, self._inputs, self._edges(now, changed)), changed
+            end = held
+            if changed < time_min:
+                end = self._walked(self._reset(held, other, changed), other, self._edges(changed, time_min))
+            ends.append(self._reset(end, inputs, time_min))
+        mean = np.mean(ends, axis=0)
+        apart = np.array(ends)[:, : self._n_x] - mean[: self._n_x]
+        self._memory[:] = mean
+        self._memory[self._n_x :] += (apart.T @ apart / len(ends)).ravel()
         self._inputs = tuple(inputs)
 
     def _reset(self, memory: Array, inputs: Sequence[float], time_min: float) -> Array:

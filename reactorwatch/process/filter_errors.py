@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.compiled import compiled
-from reactorwatch.process.doubt import Doubt, variance_of
+from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_step import exponential
 from reactorwatch.process.integrate import LONGEST_STEP_MIN, symbolic_step
@@ -63,8 +63,7 @@ class Path:
         there: where the way from each row but the last leads, shape (n_x,).
         F: d there / d state before, shape (n_x, n_x).
         G: d there / d sizes, shape (n_x, sizes).
-        spread: how uncertain there is, standard deviations with signs, where nobody knows when inputs changed, shape
-            (n_x,).
+        spread: how uncertain there is, standard deviations, where nobody knows when inputs changed, shape (n_x,).
         shown: the outputs in each row, shape (rows, n_y).
         H: d outputs / d state, shape (rows, n_y, n_x).
         D: d outputs / d sizes, shape (rows, n_y, sizes).
@@ -157,23 +156,52 @@ class FilterErrors:
         there, F, G, spread = self._walked(x[:-1], inputs[:-1], time_min, p, doubt)
         H, D = self._code.shown.over(x, inputs, p, time_min)
         (y,) = self._code.outputs.over(x, inputs, p, time_min)
-        return Path(there, F, G, spread, y[:, :, 0], H, D)
+        of_each = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+        return Path(there, F, G, of_each, y[:, :, 0], H, D)
 
     def _walked(
         self, x: Array, u: Array, time_min: Array, p: Array, doubt: Doubt | None
     ) -> tuple[Array, Array, Array, Array]:
-        """Where the ways lead, their derivatives, and how uncertain the first is because of its inputs."""
+        """Where the ways lead, their derivatives, and the covariance of the first because of its inputs."""
         t, step = time_min[:-1], np.diff(time_min)
         there, F, G = self._walked_surely(x, u, t, step, p)
-        spread = np.zeros_like(there)
+        spread = np.zeros((*there.shape, there.shape[1]))
         if doubt is not None:
-            rows = np.flatnonzero(doubt.rows[1:])
-            early = doubt.early[1:][rows]
-            others = self._walked_surely(x[rows], doubt.inputs[1:][rows], t[rows], step[rows], p)
-            spread[rows] = np.sqrt(variance_of(early))[:, None] * (others[0] - there[rows])
-            for found, other in zip((there, F, G), others, strict=True):
-                found[rows] += early.reshape(-1, *(1,) * (found.ndim - 1)) * (other - found[rows])
+            of_ways = doubt.of_rows(slice(1, None))
+            for moments in np.unique(of_ways.moments[of_ways.rows]).tolist():
+                rows = np.flatnonzero(of_ways.moments == moments)
+                held = (there[rows], F[rows], G[rows])
+                ends = self._walked_in_doubt(
+                    x[rows], u[rows], time_min[rows], time_min[rows + 1], p, of_ways, rows, held
+                )
+                there[rows], F[rows], G[rows] = (np.mean(item, axis=0) for item in ends)
+                apart = ends[0] - there[rows]
+                spread[rows] = np.einsum("mki,mkj->kij", apart, apart) / moments
         return there, F, G, spread
+
+    def _walked_in_doubt(
+        self,
+        x: Array,
+        u: Array,
+        begin_min: Array,
+        end_min: Array,
+        p: Array,
+        doubt: Doubt,
+        rows: NDArray[np.intp],
+        unchanged: tuple[Array, Array, Array],
+    ) -> tuple[Array, Array, Array]:
+        """Where ways with as many moments lead from each, and their derivatives; the first axis is that of moments."""
+        ends: list[tuple[Array, Array, Array]] = []
+        for moment in np.linspace(doubt.first_min[rows], doubt.last_min[rows], doubt.moments[rows[0]]):
+            changed = np.clip(moment, begin_min, end_min)
+            if np.array_equal(changed, end_min):
+                ends.append(unchanged)
+                continue
+            held, F, G = self._walked_surely(x, u, begin_min, changed - begin_min, p)
+            there, of_x, of_size = self._walked_surely(held, doubt.inputs[rows], changed, end_min - changed, p)
+            ends.append((there, of_x @ F, of_x @ G + of_size))
+        there, F, G = (np.stack(items) for items in zip(*ends, strict=True))
+        return there, F, G
 
     def _walked_surely(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
         pieces = np.maximum(np.ceil(step / _LONGEST_PIECE_MIN), 1.0)
@@ -238,7 +266,7 @@ def _whitened(
                 FP[i, j] = value
         for i in range(n_x):
             for j in range(n_x):
-                value = spread[k, i] * spread[k, j]
+                value = spread[k, i, j]
                 if i == j:
                     value += q[i] * step[k]
                 for m in range(n_x):
@@ -316,4 +344,4 @@ def shown_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
     """(x, u, p, t) -> derivatives of the outputs by x and by the sizes."""
     x, u, p, t, y = model.shown()
     by = [ca.densify(ca.jacobian(y, item)) for item in (x, ca.vertcat(*sizes))]
-    return ca.Function("shown", [x, u, p, t], by)
+    return ca.Function("shown", [x, u, p, t], ca.cse(by))

@@ -82,7 +82,9 @@ class Beginning:
             x = points[int(np.argmin(distances))].state if points else x
         noise, wide = np.square(measurement_sd), self._wide
         for _ in range(CORRECTIONS):
-            x = _called(self._corrected, x, u, p, time_min, y, noise, wide)[0][0]
+            before, x = x, _called(self._corrected, x, u, p, time_min, y, noise, wide)[0][0]
+            if np.array_equal(before, x):
+                break
         P = _called(self._corrected, x, u, p, time_min, y, START_SDS**2 * noise, wide)[1]
         return self._with_memory(x, u, p, time_min, P)
 

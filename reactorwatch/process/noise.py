@@ -31,6 +31,9 @@ import numpy as np
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_record import FilterRecord
+from reactorwatch.process.filter_stretches import together
+from reactorwatch.process.innovations import Innovations
+from reactorwatch.process.machine_code import LANES
 from reactorwatch.process.model import Array, ProcessModel
 
 SHARES = (0.3, 0.03, 0.003)
@@ -155,7 +158,9 @@ class _Tuning:
         self._lowest = np.concatenate([np.log(smallest_sd), np.log(LEAST_SHARE * self._scales), limits[0]])
         self._highest = np.concatenate([np.full(self._of_states.stop, inf), limits[1]])
         self._first = np.maximum([rough_sensor_sd(column) for column in measured.T], smallest_sd)
-        self._filter = Filter(model, NoiseLevels(tuple(self._first.tolist()), (0.0,) * len(model.states)))
+        first = NoiseLevels(tuple(self._first.tolist()), (0.0,) * len(model.states))
+        one = Filter(model, first)
+        self._filters = [one, *(one.twin() for _ in range(LANES - 1))]
 
     def found(self, nearby: NoiseLevels | None) -> tuple[NoiseLevels, dict[str, float]]:
         """The best noise levels, and the best values of what else was to be learned."""
@@ -163,12 +168,12 @@ class _Tuning:
         if self._rows > FIRST_ROWS:
             self._take(self._rows)
             starts = [best.theta] + ([self._near(nearby)] if nearby is not None else [])
-            best = min((self._tried(theta) for theta in starts), key=lambda trial: trial.loss)
+            best = min(self._tried(starts), key=lambda trial: trial.loss)
             best = self._climbed(self._without_outliers(best))
         for index in self._of_states:
             theta = best.theta.copy()
             theta[index] = self._lowest[index]
-            without = self._tried(theta)
+            (without,) = self._tried([theta])
             if without.loss < best.loss + LEAST_GAIN:
                 best = without
         theta = self._stepped(best, range(self._n_y)).theta
@@ -189,12 +194,11 @@ class _Tuning:
     def _without_outliers(self, best: _Trial) -> _Trial:
         """The same noise levels on the record without its outliers: an outlier of one sensor whitens into all."""
         record = self._record
-        self._use(best.theta)
-        run = self._filter.over(record)
+        (run,) = self._runs([best.theta])
         with np.errstate(invalid="ignore"):
             measured = np.where(np.abs(run.residual) > GATE * run.sd, np.nan, record.measured)
         self._record = FilterRecord.of(record.time_min, record.inputs, measured, GATE, doubt=record.doubt)
-        return self._tried(best.theta)
+        return self._tried([best.theta])[0]
 
     def _climbed(self, best: _Trial) -> _Trial:
         """The best that steps of scoring find."""
@@ -210,7 +214,7 @@ class _Tuning:
         others = np.log([item.value for item in self._learned])
         for share in SHARES:
             states = np.where(self._apart > 0.0, self._apart, share * self._scales)
-            trial = self._tried(np.concatenate([sensors, np.log(states), others]))
+            (trial,) = self._tried([np.concatenate([sensors, np.log(states), others])])
             inside = (trial.w != 0.0) & (np.abs(trial.w) < CLIP)
             mean_square = np.sum(trial.w**2 * inside, axis=0) / np.maximum(np.sum(inside, axis=0), 1)
             sensors = sensors + 0.5 * np.log(np.maximum(mean_square, 1e-6))
@@ -220,12 +224,9 @@ class _Tuning:
 
     def _stepped(self, best: _Trial, chosen: range) -> _Trial:
         """After a step of scoring in the chosen components of theta; `best` if no step is better."""
-        of_w, of_d = np.empty((2, len(chosen), *best.w.shape))
-        for place, index in enumerate(chosen):
-            theta = best.theta.copy()
-            theta[index] += DIFFERENCE
-            near = self._tried(theta)
-            of_w[place], of_d[place] = (near.w - best.w) / DIFFERENCE, (near.d - best.d) / DIFFERENCE
+        near = self._tried([best.theta + DIFFERENCE * (np.arange(best.theta.size) == index) for index in chosen])
+        of_w = np.stack([(trial.w - best.w) / DIFFERENCE for trial in near])
+        of_d = np.stack([(trial.d - best.d) / DIFFERENCE for trial in near])
         counted = np.where(np.abs(best.w) < CLIP, 1.0 / _CUT_MEAN_SQUARE, 0.0)
         gradient = np.sum(of_d + of_w * best.w * counted, axis=(1, 2))
         of_w, of_d = (of_w * np.sqrt(counted)).reshape(len(chosen), -1), of_d.reshape(len(chosen), -1)
@@ -236,14 +237,14 @@ class _Tuning:
         step[chosen] = -np.linalg.solve(information + np.diag(_RIDGE * np.diag(information) + 1.0), gradient)
         step *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(step))), LONGEST_STEP))
         for _ in range(MOST_CUTS):
-            trial = self._tried(np.clip(best.theta + step, self._lowest, self._highest))
+            (trial,) = self._tried([np.clip(best.theta + step, self._lowest, self._highest)])
             if trial.loss < best.loss:
                 return trial
             step *= _CUT
         return best
 
     def _levels(self, theta: Array) -> NoiseLevels:
-        sds, of_states = np.exp(theta), np.zeros(len(self._filter.model.states))
+        sds, of_states = np.exp(theta), np.zeros(len(self._filters[0].model.states))
         own = slice(self._of_states.start, self._of_states.stop)
         of_states[self._states] = sds[own] * (theta[own] > self._lowest[own])
         return NoiseLevels(tuple(sds[: self._n_y].tolist()), tuple(of_states.tolist()))
@@ -255,14 +256,24 @@ class _Tuning:
             for item, value in zip(self._learned, values, strict=True)
         }
 
-    def _use(self, theta: Array) -> None:
-        self._filter.noise = self._levels(theta)
-        if self._learned:
-            self._filter.change(self._changes(theta))
+    def _runs(self, thetas: Sequence[Array]) -> list[Innovations]:
+        """What filters with these numbers say of the record, at most as many as there are filters at once."""
+        found: list[Innovations] = []
+        for begin in range(0, len(thetas), len(self._filters)):
+            runs = []
+            for item, theta in zip(self._filters, thetas[begin:], strict=False):
+                item.noise = self._levels(theta)
+                if self._learned:
+                    item.change(self._changes(theta))
+                runs.append(item.stretches(self._record))
+            found += together(runs)
+        return found
 
-    def _tried(self, theta: Array) -> _Trial:
-        self._use(theta)
-        run = self._filter.over(self._record)
+    def _tried(self, thetas: Sequence[Array]) -> list[_Trial]:
+        """What some numbers make of the record."""
+        return [self._judged(theta, run) for theta, run in zip(thetas, self._runs(thetas), strict=True)]
+
+    def _judged(self, theta: Array, run: Innovations) -> _Trial:
         w, sd = run.whitened[BURN_IN:], run.conditional_sd[BURN_IN:]
         known = np.isfinite(w)
         w, d = np.where(known, w, 0.0), np.log(np.where(known, sd, 1.0))

@@ -37,6 +37,7 @@ class Hidden:
         strength: by how much the log likelihood of the white sensors' noise grows, twice, where the simulation knows
             the truth: the sum of squares of what the outputs differ by, in standard deviations of the noise.
         played: what happened in the plant, without noise.
+        shown: what the sensors of C and T would have shown in the rows of the record without noise, shape (rows, 2).
     """
 
     record: Record
@@ -46,6 +47,7 @@ class Hidden:
     courses: tuple[HiddenCourse, ...]
     strength: float
     played: Played
+    shown: Array
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -82,7 +84,8 @@ def draw(
     plan = _plan(circumstances, done, noise, seed)
     nominal = play(plan)
     if not effects:
-        return Hidden(_record(plan, nominal, noise, circumstances, rng), seed, circumstances, (), (), 0.0, nominal)
+        record, shown = _record(plan, nominal, noise, circumstances, rng)
+        return Hidden(record, seed, circumstances, (), (), 0.0, nominal, shown)
     for _ in range(TRIES):
         courses = tuple(
             _course(effect, None if kinds is None else kinds[place], done.time_min, rng)
@@ -94,8 +97,8 @@ def draw(
             continue
         if min(_strengths(trial, played, circumstances.noise_sd)) >= LEAST_STRENGTH:
             strength = _strength(trial, played, {}, circumstances.noise_sd)
-            record = _record(trial, played, noise, circumstances, rng)
-            return Hidden(record, seed, circumstances, tuple(effects), courses, strength, played)
+            record, shown = _record(trial, played, noise, circumstances, rng)
+            return Hidden(record, seed, circumstances, tuple(effects), courses, strength, played, shown)
     names = " and ".join(effect.name for effect in effects)
     raise CannotHideError(f"seed {seed}: {names} shows too little under {circumstances}, or puts the reactor out")
 
@@ -181,9 +184,12 @@ def _noise(circumstances: Circumstances, rows: int, rng: np.random.Generator) ->
     return np.asarray(drawn * np.array(circumstances.noise_sd))
 
 
-def _record(plan: Plan, played: Played, noise: Array, circumstances: Circumstances, rng: np.random.Generator) -> Record:
-    """What is measured of a run."""
-    values = np.stack([played.concentration, played.temperature], axis=1) + noise
+def _record(
+    plan: Plan, played: Played, noise: Array, circumstances: Circumstances, rng: np.random.Generator
+) -> tuple[Record, Array]:
+    """What is measured of a run, and what would be without noise."""
+    shown = np.stack([played.concentration, played.temperature], axis=1)
+    values = shown + noise
     if circumstances.outliers:
         off = rng.random(values.shape) < circumstances.outliers
         far = rng.uniform(10.0, 30.0, values.shape) * rng.choice([-1.0, 1.0], values.shape)
@@ -198,7 +204,7 @@ def _record(plan: Plan, played: Played, noise: Array, circumstances: Circumstanc
         there = rng.random(plan.time_min.size) >= circumstances.missing
         there[0] = True
     columns = {"qc": played.qc[there], "C": values[there, 0], "T": values[there, 1]}
-    return Record(plan.time_min[there], columns, f"hidden effect, seed {plan.seed}")
+    return Record(plan.time_min[there], columns, f"hidden effect, seed {plan.seed}"), shown[there]
 
 
 def _strengths(plan: Plan, played: Played, noise_sd: tuple[float, float]) -> list[float]:

@@ -40,6 +40,7 @@ class Judged:
         onset_inside: whether its 95 % interval holds the onset.
         right_place: whether the location is right.
         held_out: error of T on rows not seen, in true standard deviations of its noise.
+        drawn: what that of the truth itself would be: the noise that was drawn in those rows, likewise.
         before: the same of the nominal model.
         seconds: of a core that it took.
         remark: what went wrong, if the diagnosis did not come to an end.
@@ -65,6 +66,7 @@ class Judged:
     onset_inside: tuple[bool, ...] = ()
     right_place: bool = False
     held_out: float = nan
+    drawn: float = nan
     before: float = nan
     seconds: float = nan
     remark: str = field(default="")
@@ -120,6 +122,7 @@ def judge(hidden: Hidden, said: Diagnosis, seconds: float) -> Judged:
         ),
         right_place=said.location in places if places else said.location == "",
         held_out=held_out.rmse_after / noise_sd,
+        drawn=_drawn(hidden, said) / noise_sd,
         before=held_out.rmse_before / noise_sd,
         seconds=seconds,
     )
@@ -136,6 +139,14 @@ def _truth(hidden: Hidden) -> tuple[int, tuple[str, ...], tuple[str, ...], tuple
 
 def _off(cause: Cause, course: HiddenCourse) -> float:
     return abs(cause.parameters["size"].value - course.size)
+
+
+def _drawn(hidden: Hidden, said: Diagnosis) -> float:
+    """Root mean square of the noise of T in the rows not seen."""
+    if said.curves is None:
+        return nan
+    noise = (hidden.record.columns["T"] - hidden.shown[:, 1])[said.curves.held_out["T"]]
+    return float(np.sqrt(np.mean(noise**2))) if noise.size else nan
 
 
 def _curve_error(cause: Cause, course: HiddenCourse, said: Diagnosis) -> float:

@@ -22,7 +22,8 @@ def hidden(*names: str, size: float = 2.0, onset_min: float = 4.0) -> Hidden:
     """A step of each, in a record of which nothing else matters."""
     effects = tuple(item for item in CATALOGUE + OUTSIDE if item.name in names)
     courses = tuple(HiddenCourse("step", size, onset_min) for _ in effects)
-    return Hidden(Record(TIME, {}, "made up"), 1, Circumstances(), effects, courses, 1000.0, EMPTY)
+    record = Record(TIME, {"T": 440.0 + np.where(TIME < 6.0, 0.36, 0.0)}, "made up")
+    return Hidden(record, 1, Circumstances(), effects, courses, 1000.0, EMPTY, np.full((11, 2), 440.0))
 
 
 def said(*names: str, verdict: str = "named", others: tuple[str, ...] = (), location: str = "feed") -> Diagnosis:
@@ -45,7 +46,9 @@ def said(*names: str, verdict: str = "named", others: tuple[str, ...] = (), loca
         adequacy={},
         experiment=None,
         extended_model={},
-        curves=Curves(TIME, {}, {}, {}, {}, {}, {}, dict.fromkeys(names, curve), {}),
+        curves=Curves(
+            TIME, {}, {}, {}, {}, {}, {}, dict.fromkeys(names, curve), {}, held_out={"T": (TIME > 3.0) & (TIME < 8.0)}
+        ),
     )
 
 
@@ -61,6 +64,11 @@ def test_the_right_name_is_first_and_its_numbers_are_compared() -> None:
     assert judged.onset_inside == (False,)
     assert judged.held_out == pytest.approx(1.1)
     assert judged.before == pytest.approx(10.0)
+
+
+def test_beside_the_error_on_rows_not_seen_stands_the_noise_that_was_drawn_in_them() -> None:
+    judged = judge(hidden("feed_temperature"), said("feed_temperature"), 1.0)
+    assert judged.drawn == pytest.approx(1.2 * np.sqrt(0.5))  # of four rows two, by 1.2 standard deviations
 
 
 def test_the_error_of_a_curve_is_relative_to_the_true_one() -> None:

@@ -33,7 +33,15 @@ def test_shares_are_shares_of_all_records() -> None:
 
 def test_a_quantile_is_a_value_that_occurred_and_what_is_no_number_counts_as_the_worst() -> None:
     score = Score.of([one("a", "a", held_out=value) for value in (1.0, 1.1, 1.2, nan)])
-    assert score.held_out == (1.1, np.inf)
+    assert score.held_out_in_sd == (1.1, np.inf)
+
+
+def test_an_error_is_compared_with_the_noise_of_its_own_rows() -> None:
+    errors = ((0.9, 0.9), (1.1, 1.1), (1.02, 1.0))  # in standard deviations: of what was found, of the truth
+    score = Score.of([one("a", "a", held_out=found, drawn=drawn) for found, drawn in errors])
+    assert score.held_out == (1.0, 1.02)
+    assert score.held_out_in_sd == (1.02, 1.1)
+    assert score.drawn_in_sd == (1.0, 1.1)
 
 
 def test_where_there_is_nothing_there_is_no_score() -> None:

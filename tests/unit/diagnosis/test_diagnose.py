@@ -24,6 +24,18 @@ def test_where_nothing_is_wrong_it_says_so() -> None:
     assert found.gain.held_out["T"].rmse_before == pytest.approx(0.3, rel=0.15)
 
 
+def test_it_tells_which_values_its_errors_are_of() -> None:
+    record = record_of(rows=2000)
+    record.columns["T"][990:1010] = np.nan
+    found = diagnose(record, cstr())
+    assert found.curves is not None
+    for name, gain in found.gain.held_out.items():
+        values = found.curves.held_out[name]
+        off = (record.columns[name] - found.curves.free_before[name])[values]
+        assert off.size >= 300
+        assert gain.rmse_before == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-12)
+
+
 @pytest.mark.parametrize(
     ("fault", "size", "onset"),
     [

@@ -5,11 +5,15 @@ import pytest
 
 from diagnosis.courses import Step
 from diagnosis.hypothesis import Hypothesis
+from diagnosis.record_checks import run_of as of_record
 from diagnosis.result import Estimate
 from diagnosis.rough_numbers import WITHIN_ROW, settled
 from diagnosis.search import Search
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
+from tests.hidden_effect.catalogue import named
+from tests.hidden_effect.draw import draw
+from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES
 from tests.unit.diagnosis.runs import run_of
 
 PERIOD_MIN = 0.1
@@ -60,6 +64,28 @@ def test_a_valve_that_sticks_says_between_which_sizes_it_does_the_same() -> None
     onset, size, _ = step_of("valve_stiction", 3.0, 30.35, 30.35)
     assert abs(size.value - 3.0) < 2.0 * size.sd < 1.0
     assert abs(onset.value - 30.35) < 2.0 * onset.sd < 10.0
+
+
+def test_an_onset_of_which_the_likelihood_has_two_humps_may_be_at_either() -> None:
+    """Held to the likelihood on a fine grid: here half a minute apart, with a valley of 3.5 between them."""
+    effect = next(item for item in named() if item.name == "wall_heat_capacity")
+    hidden = draw(31_100_016, (effect,), NAMED_CIRCUMSTANCES["medium"])
+    size, onset_min = hidden.courses[0].size, hidden.courses[0].onset_min
+    run = of_record(hidden.record, cstr())
+    search = Search(cstr(), EFFECTS, run, (1e-4, 1e-2))
+    sized = search.sized(tuple(item for item in EFFECTS if item.name == effect.name))
+    hypothesis = Hypothesis(sized, (Step(run.time_min),))
+    fitted = search.fit(hypothesis, (np.array([size, onset_min + 0.4]),))
+    search.settle(fitted)
+    fitted = search.refitted(fitted)
+    best, (sds,) = settled(search, fitted, [np.sqrt(np.diag(hypothesis.covariance(run, fitted.fit)))])
+    sd, (found, estimate) = sds[1], best.fit.theta[0]
+    grid = np.arange(estimate - 1.0, estimate + 1.0, 0.02)
+    losses = np.array([hypothesis.at(run, (np.array([found, onset]),)).loss for onset in grid])
+    likelihood = np.exp(losses.min() - losses)
+    spread = np.sqrt(np.sum(likelihood * (grid - estimate) ** 2) / np.sum(likelihood))
+    assert sd == pytest.approx(spread, rel=0.15)
+    assert abs(estimate - onset_min) < 2.0 * sd
 
 
 def test_a_smooth_onset_is_left_to_the_fit() -> None:

@@ -5,14 +5,16 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.process.cstr import cstr
-from reactorwatch.process.doubt import Doubt, early_share, variance_of
+from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.filled import filled
 from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.filter_errors import FilterErrors
 from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.noise import tune_with
@@ -21,35 +23,86 @@ SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
 
 
 @pytest.mark.parametrize("missing", [1, 2, 5, 40])
-def test_the_share_has_the_mean_and_variance_of_all_rows_that_it_may_have_changed_with(missing: int) -> None:
-    changed_with = np.arange(1, missing + 2)
-    shares = 1.0 - changed_with / (missing + 1)
-    share = early_share(np.array(float(missing)))
-    assert share == pytest.approx(np.mean(shares), abs=1e-12)
-    assert variance_of(share) == pytest.approx(np.var(shares), abs=1e-12)
+def test_inputs_may_have_changed_with_each_missing_row_and_the_one_after_them(missing: int) -> None:
+    time_min = np.delete(0.1 * np.arange(60.0), np.arange(7, 7 + missing))
+    doubt = Doubt.behind(time_min, np.zeros((time_min.size, 1)), missing * (np.arange(time_min.size) == 7))
+    np.testing.assert_allclose(doubt.times_min(7), 0.1 * np.arange(7, 8 + missing), rtol=1e-12)
+    assert np.flatnonzero(doubt.rows).tolist() == [7]
 
 
-def test_a_tank_that_fills_is_as_uncertain_as_when_its_valve_opened() -> None:
-    """dx/dt = u: by 0.2 min the level rises by 0.2 u times the share for which the valve was open."""
+@pytest.mark.parametrize("missing", [1, 2, 5])
+def test_a_tank_that_fills_is_as_uncertain_as_when_its_valve_opened(missing: int) -> None:
+    """dx/dt = u: the level rises by u times the time for which the valve was open."""
     model, noise = filling(), NoiseLevels((0.1,), (0.0,))
     kalman, sure = Filter(model, noise), Filter(model, noise)
     for tank in (kalman, sure):
         for row in range(50):
             tank.update(0.1 * row, (0.0,), (5.0,))
-    kalman.update(5.1, (3.0,), (np.nan,), doubt=((3.0,), 0.25))
-    sure.update(5.1, (3.0,), (np.nan,))
-    by = 3.0 * (5.1 - 4.9)
-    assert kalman.state.x[0] == pytest.approx(sure.state.x[0] + 0.25 * by, rel=1e-9)
-    assert kalman.state.P[0] == pytest.approx(sure.state.P[0] + variance_of(np.array(0.25)) * by**2, rel=1e-9)
+    moments, now = (4.9 + 0.1 * np.arange(1, missing + 2)).tolist(), 5.0 + 0.1 * missing
+    kalman.update(now, (3.0,), (np.nan,), doubt=((3.0,), moments))
+    sure.update(now, (3.0,), (np.nan,))
+    by = 3.0 * (now - np.array(moments))
+    assert kalman.state.x[0] == pytest.approx(sure.state.x[0] + np.mean(by), rel=1e-9)
+    assert kalman.state.P[0] == pytest.approx(sure.state.P[0] + np.var(by), rel=1e-9)
+
+
+@pytest.mark.parametrize("missing", [1, 2, 5])
+def test_what_follows_a_level_goes_with_the_square_of_the_time_for_which_the_valve_was_open(missing: int) -> None:
+    """dx/dt = u, dz/dt = x: of u since r the level x is u r, and z is u r^2 / 2."""
+    model, noise = filling(followed=True), NoiseLevels((0.1,), (0.0, 0.0))
+    kalman, sure = Filter(model, noise), Filter(model, noise)
+    for tanks in (kalman, sure):
+        for row in range(50):
+            tanks.update(0.1 * row, (0.0,), (5.0,))
+    moments, now = (4.9 + 0.1 * np.arange(1, missing + 2)).tolist(), 5.0 + 0.1 * missing
+    kalman.update(now, (3.0,), (np.nan,), doubt=((3.0,), moments))
+    sure.update(now, (3.0,), (np.nan,))
+    open_min = now - np.array(moments)
+    by = np.array([3.0 * open_min, 1.5 * open_min**2])
+    np.testing.assert_allclose(np.subtract(kalman.state.x, sure.state.x), np.mean(by, axis=1), rtol=1e-9)
+    np.testing.assert_allclose(
+        np.subtract(kalman.state.P, sure.state.P), np.cov(by, bias=True).ravel(), rtol=1e-6, atol=1e-12
+    )
+
+
+def test_behind_holes_anywhere_innovations_do_not_go_with_the_way_in_which_the_input_changed() -> None:
+    """Their standard error is 0.04; with half of the way for a change in its middle those of C go by 0.2."""
+    seen: list[Array] = []
+    for seed in range(3):
+        time_min, qc, measured, _ = with_holes(seed=10 + seed)
+        there = np.random.default_rng(seed).random(time_min.size) >= 0.2
+        there[0] = True
+        missing = missing_of(time_min[there], qc[there])
+        doubt = Doubt.behind(time_min[there], qc[there][:, None], missing)
+        found = Filter(cstr(), SENSORS).run(time_min[there], qc[there][:, None], measured[there], doubt=doubt)
+        behind = np.flatnonzero(missing)
+        way = np.sign(qc[there][behind] - qc[there][behind - 1])[:, None]
+        seen += [*(way * found.whitened[behind])]
+    assert len(seen) > 400
+    np.testing.assert_allclose(np.mean(seen, axis=0), 0.0, atol=0.12)
+
+
+def test_the_equations_of_the_errors_expect_of_a_way_in_doubt_what_the_filter_expects() -> None:
+    time_min, qc, measured, there = with_holes(seed=7)
+    inputs, missing = qc[there][:, None], missing_of(time_min[there], qc[there])
+    doubt, times, seen = Doubt.behind(time_min[there], inputs, missing), time_min[there], measured[there]
+    levels = NoiseLevels(SENSORS.measurement_sd, (1e-4, 0.05))
+    found = Filter(cstr(), levels).run(times, inputs, seen, doubt=doubt)
+    later = slice(1, None)  # the filter begins with the first row
+    x, P, residual = (item[later] for item in (found.x, found.P, found.residual))
+    errors = FilterErrors(cstr(), levels, (), ())
+    ways = errors.ways(times[later], inputs[later], x, P, residual, np.isfinite(residual), None, doubt.of_rows(later))
+    assert np.count_nonzero(missing) > 200
+    np.testing.assert_allclose(ways.w, found.whitened[2:], atol=0.03)
 
 
 def test_innovations_behind_holes_are_as_large_as_the_filter_says() -> None:
     """Mean squares of 600 and more, whose standard deviation is 0.06; without doubt they are far larger."""
     time_min, qc, measured, there = with_holes(seed=3)
-    inputs, early = qc[there][:, None], early_of(time_min[there], qc[there])
-    doubt = Doubt(inputs, early)
+    inputs, missing = qc[there][:, None], missing_of(time_min[there], qc[there])
+    doubt = Doubt.behind(time_min[there], inputs, missing)
     doubted = Filter(cstr(), SENSORS).run(time_min[there], inputs, measured[there], doubt=doubt)
-    behind = np.flatnonzero(early)
+    behind = np.flatnonzero(missing)
     assert behind.size > 300
     assert np.mean(doubted.whitened[behind] ** 2) == pytest.approx(1.0, abs=0.25)
     assert np.mean(doubted.whitened[behind + 1] ** 2) == pytest.approx(1.0, abs=0.25)
@@ -60,7 +113,7 @@ def test_innovations_behind_holes_are_as_large_as_the_filter_says() -> None:
 def test_what_a_noise_search_learns_does_not_take_holes_for_noise() -> None:
     time_min, qc, measured, there = with_holes(seed=4)
     inputs = qc[there][:, None]
-    doubt = Doubt(inputs, early_of(time_min[there], qc[there]))
+    doubt = Doubt.behind(time_min[there], inputs, missing_of(time_min[there], qc[there]))
     with_doubt, without = (
         tune_with(cstr(), time_min[there], inputs, measured[there], (1e-4, 0.01), (), {}, item)[0]
         for item in (doubt, None)
@@ -76,7 +129,7 @@ def test_a_sticking_valve_keeps_its_place_behind_a_hole() -> None:
     qc, there = record.columns["qc"], np.ones(3000, dtype=bool)
     there[2 + np.flatnonzero(np.diff(qc[1:]))[::3]] = False
     measured = np.column_stack([record.columns["C"], record.columns["T"]])
-    doubt = Doubt(qc[there][:, None], early_of(record.time_min[there], qc[there]))
+    doubt = Doubt.behind(record.time_min[there], qc[there][:, None], missing_of(record.time_min[there], qc[there]))
     kalman = Filter(fault.extend(cstr()), NoiseLevels(SENSORS.measurement_sd, (0.0,) * 3))
     found = kalman.run(record.time_min[there], qc[there], measured[there], doubt=doubt)
     stands = np.empty(3000)
@@ -88,8 +141,8 @@ def test_a_sticking_valve_keeps_its_place_behind_a_hole() -> None:
 
 def test_with_rows_put_in_a_filter_says_what_it_says_row_by_row() -> None:
     time_min, qc, measured, there = with_holes(seed=6)
-    inputs, early = qc[there][:, None], early_of(time_min[there], qc[there])
-    doubt = Doubt(inputs, early)
+    inputs, missing = qc[there][:, None], missing_of(time_min[there], qc[there])
+    doubt = Doubt.behind(time_min[there], inputs, missing)
     kalman = Filter(cstr(), NoiseLevels(SENSORS.measurement_sd, (1e-4, 0.05)))
     rows = filled(time_min[there], inputs, measured[there], doubt)
     assert rows.own.size == np.count_nonzero(there) < rows.time_min.size
@@ -105,13 +158,16 @@ def test_a_record_without_holes_stays_as_it_is() -> None:
     assert rows.time_min is time_min
 
 
-def filling() -> ProcessModel:
-    """A tank that fills as fast as its valve lets it; built from the reactor's parts."""
+def filling(followed: bool = False) -> ProcessModel:
+    """A tank that fills as fast as its valve lets it, and what its level fills; built from the reactor's parts."""
     model = cstr()
     level = replace(model.states[1], lower=-100.0, upper=100.0, scale=1.0)
     output = replace(model.outputs[1], expression=level.symbol)
+    other = replace(model.states[0], lower=-100.0, upper=100.0, scale=1.0)
+    states, rhs = [level, other], [model.inputs[0].symbol + ca.SX(0), level.symbol + ca.SX(0)]
+    count = 2 if followed else 1
     return replace(
-        model, states=(level,), rhs=(model.inputs[0].symbol + ca.SX(0),), outputs=(output,), at_rest={}, resets={}
+        model, states=tuple(states[:count]), rhs=tuple(rhs[:count]), outputs=(output,), at_rest={}, resets={}
     )
 
 
@@ -130,6 +186,6 @@ def with_holes(seed: int) -> tuple[Array, Array, Array, Array]:
     return record.time_min, qc, measured, there
 
 
-def early_of(time_min: Array, qc: Array) -> Array:
-    missing = np.round(np.diff(time_min) / 0.1) - 1.0
-    return np.append(0.0, np.where((np.diff(qc) != 0.0) & (missing > 0), early_share(np.maximum(missing, 0.0)), 0.0))
+def missing_of(time_min: Array, qc: Array) -> NDArray[np.intp]:
+    missing = np.round(np.diff(time_min) / 0.1).astype(np.intp) - 1
+    return np.append(0, np.where(np.diff(qc) != 0.0, missing, 0))

@@ -102,3 +102,39 @@ def test_an_operation_without_machine_code_is_named() -> None:
     x = ca.SX.sym("x")
     with pytest.raises(ValueError, match="no machine code for CasADi's operation OP_ERFINV"):
         RowCode(ca.Function("f", [x], [ca.erfinv(x)]))
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 4, 5, 11, 12])
+def test_every_row_is_done_whatever_the_number_of_rows(rows: int) -> None:
+    """Rows are taken four at a time; behind the last one nothing is written."""
+    x = ca.SX.sym("x", 2)
+    code = RowCode(ca.Function("f", [x], [ca.vertcat(x[0] + x[1], ca.sin(x[0]))]))
+    xs, into = np.random.default_rng(rows).normal(size=(rows, 2)), np.full((rows + 4, 2), -7.0)
+    assert code.fill(rows, [xs], [into]) == rows
+    np.testing.assert_array_equal(into[:rows, 0], xs[:, 0] + xs[:, 1])
+    assert np.all(into[rows:] == -7.0)
+
+
+@pytest.mark.parametrize("chains", [1, 2, 3, 4])
+def test_chains_go_together_each_by_itself(chains: int) -> None:
+    """X <- a x + u of each chain, with a start, a factor and inputs of its own."""
+    x, u, a = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("a")
+    code = RowCode(ca.Function("f", [x, u, a], [a * x + u]), shared=[2], chained=1)
+    rng = np.random.default_rng(chains)
+    starts, us, factors = rng.normal(size=(chains, 1)), rng.normal(size=(chains, 9)), rng.normal(size=(chains, 1))
+    results = [[np.empty(9)] for _ in range(chains)]
+    assert code.fill_together(9, list(zip(starts, us, factors, strict=True)), results) == 9
+    for start, inputs, factor, (found,) in zip(starts, us, factors, results, strict=True):
+        value = start[0]
+        for row in range(9):
+            value = factor[0] * value + inputs[row]
+            assert found[row] == value
+
+
+def test_chains_that_go_together_stop_with_the_first_that_does_not_go_well() -> None:
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    code = RowCode(ca.Function("f", [x, u], [x + u, 15 - (x + u)]), chained=1, stops=True)
+    arguments = [[np.array([begin]), np.arange(1.0, 6.0)] for begin in (0.0, 7.0, -50.0)]
+    results = [[np.zeros(5), np.zeros(5)] for _ in arguments]
+    assert code.fill_together(5, arguments, results) == 3  # 7 + 1 + 2 + 3 < 15, + 4 is not
+    np.testing.assert_array_equal(results[2][0][:3], [-49.0, -47.0, -44.0])

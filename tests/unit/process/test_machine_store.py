@@ -1,0 +1,59 @@
+"""Machine code is kept on disk, and what is damaged or cannot be kept is made anew."""
+
+from pathlib import Path
+
+import pytest
+
+from reactorwatch.process.machine_store import MachineStore
+
+
+class Maker:
+    """Makes code, and counts how often."""
+
+    def __init__(self, code: bytes = b"code") -> None:
+        self.made, self._code = 0, code
+
+    def __call__(self) -> bytes:
+        self.made += 1
+        return self._code
+
+
+def test_what_was_made_once_is_not_made_again(tmp_path: Path) -> None:
+    make = Maker()
+    assert [MachineStore(tmp_path / "new").code("name", make) for _ in range(3)] == [b"code"] * 3
+    assert make.made == 1
+
+
+def test_another_name_is_other_code(tmp_path: Path) -> None:
+    store = MachineStore(tmp_path)
+    assert (store.code("one", Maker(b"1")), store.code("two", Maker(b"2"))) == (b"1", b"2")
+
+
+@pytest.mark.parametrize("damage", [b"", b"short", bytes(32) + b"code", bytes(40)])
+def test_what_is_damaged_is_made_anew_and_then_kept(tmp_path: Path, damage: bytes) -> None:
+    store, make = MachineStore(tmp_path), Maker()
+    store.code("name", make)
+    (tmp_path / "name").write_bytes(damage)
+    assert [store.code("name", make) for _ in range(2)] == [b"code"] * 2
+    assert make.made == 2
+
+
+def test_half_a_file_is_never_under_its_name(tmp_path: Path) -> None:
+    """Whatever is in the folder afterwards is whole: one that is written has another name."""
+    MachineStore(tmp_path).code("name", Maker())
+    assert [item.name for item in tmp_path.iterdir()] == ["name"]
+
+
+def test_without_a_folder_code_is_made_all_the_same(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    make = Maker()
+    assert [MachineStore(tmp_path / "file" / "store").code("name", make) for _ in range(2)] == [b"code"] * 2
+    assert make.made == 2
+
+
+def test_of_too_many_the_oldest_go(tmp_path: Path) -> None:
+    store, make = MachineStore(tmp_path, kept=10, removed=4), Maker()
+    for number in range(11):
+        store.code(f"{number:02}", make)
+        (tmp_path / f"{number:02}").touch()
+    assert sorted(item.name for item in tmp_path.iterdir()) == [f"{number:02}" for number in range(4, 11)]
