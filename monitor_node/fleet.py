@@ -14,21 +14,20 @@ Nothing here reads a clock or does I/O.
 """
 
 from collections.abc import Callable, Iterator
-from heapq import heappop, heappush
 
 import msgspec
 
-from monitor_node.alarm_states import Event
 from monitor_node.arrivals import Arrivals, Past
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.fleet_alarms import AlarmsBefore
+from monitor_node.fleet_dues import Dues
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.plants import QuietPlants
-from monitor_node.recorded_lives import SILENCE
 from monitor_node.shards import Crew
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 
@@ -82,7 +81,7 @@ class FleetMonitor:
         self._ask_past, self._store, self._unusable = ask_past, store, unusable
         self._arrivals = Arrivals()
         first = Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
-        self._alarms = {alarm.alarm for alarm in first.alarms.all_alarms()}
+        self._before = AlarmsBefore([alarm.alarm for alarm in first.alarms.all_alarms()])
         form = None if points or first.model is None else QuietForm.of(config, first.model)
         self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
         self._look_at_row: dict[str, int] = {}  # of a plant with a monitor of its own: when to see whether it is quiet
@@ -90,9 +89,7 @@ class FleetMonitor:
         self._patience_ns: int | None = start_ns + PATIENCE_NS
         self._monitors: dict[str, Monitor | None] = {}  # by plant; None: it is another's
         self._plants: dict[str, str] = {}  # by key of a sample
-        self._heard: dict[str, dict[str, Alarm]] = {}  # by plant and name, the newest of what another said of an alarm
-        self._dues: list[tuple[int, str]] = []
-        self._due_ns: dict[str, int] = {}  # of each plant, the earliest that is in `_dues`
+        self._dues = Dues()
 
     # --- who is watched --------------------------------------------------------------------------------------
 
@@ -124,7 +121,7 @@ class FleetMonitor:
         monitor = self.monitor(past.plant)
         said = [item for message in messages for item in monitor.on_message(message, now_ns)]
         monitor.caught_up()
-        return self._new(said)
+        return self._before.new(said)
 
     def adopt(self, plant: str, state: State | None, now_ns: int) -> None:
         """Begin to watch a plant.
@@ -144,23 +141,12 @@ class FleetMonitor:
                 monitor.notes.append(f"the state that was stored {error}; the plant is learned anew{kept}")
                 state = None
         if state is None:
-            monitor.go_on_from_alarms(self._heard.get(plant, {}).values())
+            monitor.go_on_from_alarms(self._before.of(plant))
         else:
-            monitor.go_on_from_alarms(self._silence_since(plant, monitor))
+            monitor.go_on_from_alarms(self._before.silences_after(plant, monitor.last_ns))
         self._monitors[plant] = monitor
         self._in_charge(plant, True)
-        self._schedule(plant, monitor)
-
-    def _silence_since(self, plant: str, monitor: Monitor) -> list[Alarm]:
-        """A silence that another has raised and that the state does not know: no sample tells of it again."""
-        last_ns = monitor.last_ns
-        return [
-            alarm
-            for alarm in self._heard.get(plant, {}).values()
-            if alarm.alarm == SILENCE
-            and alarm.event == Event.RAISED.value
-            and (last_ns is None or alarm.raised_ns > last_ns)
-        ]
+        self._dues.note(plant, monitor.next_tick_ns())
 
     def release(self, plant: str) -> State | None:
         """Watch a plant no longer; returns its state, for who does. None: it was not watched here."""
@@ -251,19 +237,19 @@ class FleetMonitor:
                 self._monitors[plant] = monitor
                 self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
                 touched.add(plant)
-            publications = self._new(publications)
+            publications = self._before.new(publications)
         for message in messages:
             plant = self._plants.get(message.key) or self._plant_of(message, now_ns)
             own = self._monitors.get(plant)
             if own is not None:
-                publications += self._new(own.on_message(message, now_ns))
+                publications += self._before.new(own.on_message(message, now_ns))
                 touched.add(plant)
             elif plant in self._arrivals:
                 self._arrivals.keep(plant, message)
         for plant in touched:
             own = self._monitors[plant]
             if own is not None and not self._becomes_quiet(plant, own):
-                self._schedule(plant, own)
+                self._dues.note(plant, own.next_tick_ns())
         return publications
 
     def _plant_of(self, message: Encoded, now_ns: int) -> str:
@@ -273,7 +259,9 @@ class FleetMonitor:
             return ""
         self.meet(topic.plant, now_ns)
         if topic.kind == keys.ALARM:
-            self._hear(topic.plant, message)
+            own = self._monitors.get(topic.plant) is not None or self._is_quiet(topic.plant)
+            if topic.plant in self._monitors and not own:  # or it is our own voice
+                self._before.hear(topic.plant, message)
             return ""
         if topic.plant in self._monitors:
             self._plants[message.key] = topic.plant
@@ -296,20 +284,17 @@ class FleetMonitor:
             for plant in self._quiet.overdue(now_ns):
                 self._alone(plant)
             publications += self._quiet.healths(now_ns)
-        while self._dues and self._dues[0][0] <= now_ns:
-            due_ns, plant = heappop(self._dues)
+        for plant in self._dues.taken(now_ns):
             monitor = self._monitors.get(plant)
-            if self._due_ns.get(plant) == due_ns:
-                del self._due_ns[plant]
-                if monitor is not None:
-                    if monitor.next_tick_ns() <= now_ns:
-                        publications += monitor.on_tick(now_ns)
-                    self._schedule(plant, monitor)
+            if monitor is not None:
+                if monitor.next_tick_ns() <= now_ns:
+                    publications += monitor.on_tick(now_ns)
+                self._dues.note(plant, monitor.next_tick_ns())
         return publications
 
     def next_tick_ns(self) -> int:
         """When the first of the plants is due."""
-        due_ns = self._dues[0][0] if self._dues else 2**63 - 1
+        due_ns = self._dues.first_ns()
         if self._quiet:
             due_ns = min(due_ns, self._quiet.next_due_ns())
         return due_ns if self._patience_ns is None else min(due_ns, self._patience_ns)
@@ -354,7 +339,7 @@ class FleetMonitor:
         if self._quiet is not None and plant in self._quiet:
             monitor = self._monitors[plant] = self._quiet.give(plant)
             self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
-            self._schedule(plant, monitor)
+            self._dues.note(plant, monitor.next_tick_ns())
         return self._monitors.get(plant)
 
     def _becomes_quiet(self, plant: str, monitor: Monitor) -> bool:
@@ -367,43 +352,7 @@ class FleetMonitor:
         self._notes += [(plant, note) for note in monitor.notes]
         self._monitors[plant] = None
         del self._look_at_row[plant]
-        self._due_ns.pop(plant, None)
+        self._dues.forget(plant)
         for key in [key for key, of in self._plants.items() if of == plant]:
             del self._plants[key]
         return True
-
-    def _schedule(self, plant: str, monitor: Monitor | None) -> None:
-        """Note when a plant is due, if that is earlier than known; if it is later, that is found when it comes up."""
-        if monitor is None:
-            return
-        due_ns = monitor.next_tick_ns()
-        if due_ns < self._due_ns.get(plant, due_ns + 1):
-            self._due_ns[plant] = due_ns
-            heappush(self._dues, (due_ns, plant))
-
-    def _hear(self, plant: str, message: Encoded) -> None:
-        """Note what another monitor says of an alarm."""
-        if self._monitors.get(plant) is not None or self._is_quiet(plant):
-            return  # it is our own voice
-        try:
-            alarm = decode(message.payload, message.encoding)
-        except DecodeError:
-            return
-        if isinstance(alarm, Alarm) and plant in self._monitors and alarm.alarm in self._alarms:
-            self._heard.setdefault(plant, {})[alarm.alarm] = alarm
-
-    def _new(self, publications: list[Publication]) -> list[Publication]:
-        """Those that the monitor before us has not said already."""
-        if not self._heard or not publications:
-            return publications
-        return [item for item in publications if not self._was_said(item)]
-
-    def _was_said(self, publication: Publication) -> bool:
-        alarm, topic = publication.message, keys.parse(publication.key)
-        if not isinstance(alarm, Alarm) or topic is None:
-            return False
-        before = self._heard.get(topic.plant, {}).get(alarm.alarm)
-        if before is None or alarm.time_ns > before.time_ns:
-            return False
-        ends_it = before.event == Event.RAISED.value and alarm.event == Event.CLEARED.value
-        return alarm.time_ns < before.time_ns or not ends_it  # a silence may end at the time at which it was raised
