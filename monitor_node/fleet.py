@@ -22,6 +22,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet_alarms import AlarmsBefore
 from monitor_node.fleet_dues import Dues
+from monitor_node.fleet_recent import Recent
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.plants import QuietPlants
 from monitor_node.shards import Crew
@@ -89,7 +90,7 @@ class FleetMonitor:
         self._patience_ns: int | None = start_ns + PATIENCE_NS
         self._monitors: dict[str, Monitor | None] = {}  # by plant; None: it is another's
         self._plants: dict[str, str] = {}  # by key of a sample
-        self._dues = Dues()
+        self._dues, self._recent = Dues(), Recent()
 
     # --- who is watched --------------------------------------------------------------------------------------
 
@@ -121,6 +122,7 @@ class FleetMonitor:
         monitor = self.monitor(past.plant)
         said = [item for message in messages for item in monitor.on_message(message, now_ns)]
         monitor.caught_up()
+        self._recent.adopted(past.plant, monitor, now_ns)
         return self._before.new(said)
 
     def adopt(self, plant: str, state: State | None, now_ns: int) -> None:
@@ -242,8 +244,11 @@ class FleetMonitor:
             plant = self._plants.get(message.key) or self._plant_of(message, now_ns)
             own = self._monitors.get(plant)
             if own is not None:
-                publications += self._before.new(own.on_message(message, now_ns))
                 touched.add(plant)
+                if self._recent.again(plant, message, now_ns):
+                    own.pass_over()
+                else:
+                    publications += self._before.new(own.on_message(message, now_ns))
             elif plant in self._arrivals:
                 self._arrivals.keep(plant, message)
         for plant in touched:

@@ -204,6 +204,44 @@ def test_with_the_state_of_who_died_no_alarm_is_lost_and_none_is_told_twice(
     ]
 
 
+@pytest.mark.parametrize("stale_rows", [20, 60])
+def test_rows_that_were_told_when_a_plant_was_taken_over_and_come_by_themselves_later_are_not_judged_again(
+    stale_rows: int, runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
+) -> None:
+    """More of them than rows may be late look like a plant whose clock was set back."""
+    run, at_home, said = runs["b"], home("b", 2), list[Publication]()
+    taken_at, resumed_at = 3 * 250, 3 * 255
+    second = fleet(shard=Shard(3 - at_home, 2), ask_past=noting([]))
+    second.on_alive(shard_token(at_home), True, 0)
+    second.on_alive("reactor/b/alive/plant", True, 0)
+    second.on_alive(shard_token(at_home), False, 0)
+    said += second.on_past(Past("b", None, run[:taken_at]), 0)
+    said += second.on_messages(run[taken_at:resumed_at], 0)
+    again = run[taken_at - 3 * stale_rows : taken_at]
+    said += second.on_messages(again, 0)
+    said += second.on_messages(run[resumed_at:], 0)
+    (health,) = [
+        item.message
+        for item in second.on_stop(0)
+        if isinstance(item.message, Health) and item.key.startswith("reactor/b/")
+    ]
+    assert (health.rows, health.incomplete_rows, health.duplicated) == (len(run) // 3, 0, len(again))
+    assert alarms(of("b", said)) == alarms(expected["b"])
+
+
+def test_a_plant_that_is_started_anew_is_heard_though_it_was_taken_over_just_before() -> None:
+    at_home = home("b", 2)
+    second = fleet(shard=Shard(3 - at_home, 2), ask_past=noting([]))
+    second.on_alive(shard_token(at_home), True, 0)
+    second.on_alive("reactor/b/alive/plant", True, 0)
+    second.on_alive(shard_token(at_home), False, 0)
+    run = run_of("b", 2)
+    second.on_past(Past("b", None, run[:300]), 0)
+    for anew_ns, rows in ((0, 100), (61 * SECOND_NS, 200)):  # while it may be the same ones, and afterwards
+        second.on_messages(run[:300], anew_ns)
+        assert second.monitor("b").rows == rows
+
+
 def test_a_silence_that_was_raised_after_the_state_was_stored_is_cleared_by_who_goes_on_from_it() -> None:
     """It was raised by the clock of receipt; in the samples there is none, so nothing else tells that it is over."""
     run, at_home = run_of("b", 2), home("b", 2)
