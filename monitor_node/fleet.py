@@ -10,21 +10,21 @@ is left out when it is found again, so that no alarm is told twice. Without one 
 alarms are not forgotten: monitors of a fleet hear each other's alarms, so one that stands is not raised again, and it
 is cleared when it is over.
 
+While others may have taken over from ourselves nothing is judged (`hold`), until it is known of which plants they have
+(`go_on`). Of those we go on from what they know.
+
 Nothing here reads a clock or does I/O.
 """
 
-from collections.abc import Callable, Iterator
-
-import msgspec
+from collections.abc import Callable, Iterable, Iterator
 
 from monitor_node.arrivals import Arrivals, Past
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet_alarms import AlarmsBefore
-from monitor_node.fleet_dues import Dues
+from monitor_node.fleet_dues import NEVER_NS
 from monitor_node.fleet_recent import Recent
-from monitor_node.quiet.form import QuietForm
-from monitor_node.quiet.plants import QuietPlants
+from monitor_node.fleet_watched import State, WatchedPlants
 from monitor_node.shards import Crew
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
@@ -35,14 +35,11 @@ from reactorwatch.process.model import ProcessModel
 PATIENCE_NS = 10_000_000_000
 """After the start: a shard of which nobody was seen by then is taken for gone."""
 
-LOOK_AGAIN_ROWS = 8
-"""After so many rows it is seen again whether a plant is quiet."""
-
 MOST_PLANTS = 100_000
 """A stranger may make up names of plants; there are no more than these."""
 
-State = bytes
-"""All that a monitor remembers of a plant."""
+MOST_HELD = 500_000
+"""Messages that wait until it is known whose the plants are; with more they are judged, as late is worse than twice."""
 
 
 class FleetMonitor:
@@ -77,32 +74,28 @@ class FleetMonitor:
         unusable: Callable[[str, InputError], str] = lambda _plant, _why: "",
         in_charge: Callable[[str, bool], None] = lambda _plant, _ours: None,
     ) -> None:
-        self._config, self._model, self._points = config, model, points
         self._crew, self._in_charge = crew, in_charge
         self._ask_past, self._store, self._unusable = ask_past, store, unusable
+        self._here = WatchedPlants(config, start_ns, model, points=points)
         self._arrivals = Arrivals()
-        first = Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
-        self._before = AlarmsBefore([alarm.alarm for alarm in first.alarms.all_alarms()])
-        form = None if points or first.model is None else QuietForm.of(config, first.model)
-        self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
-        self._look_at_row: dict[str, int] = {}  # of a plant with a monitor of its own: when to see whether it is quiet
-        self._notes: list[tuple[str, str]] = []
         self._patience_ns: int | None = start_ns + PATIENCE_NS
-        self._monitors: dict[str, Monitor | None] = {}  # by plant; None: it is another's
-        self._plants: dict[str, str] = {}  # by key of a sample
-        self._dues, self._recent = Dues(), Recent()
+        self._met: dict[str, None] = {}  # all plants that are known, whoever watches them
+        self._signals = (config.input, *config.outputs)
+        self._plants: dict[str, str] = {}  # by key of a sample, those that are not quiet
+        self._before, self._recent = AlarmsBefore(self._here.alarms), Recent()
+        self._held: list[Encoded] | None = None  # what came while it is not known whose the plants are
 
     # --- who is watched --------------------------------------------------------------------------------------
 
     @property
     def plants(self) -> list[str]:
         """Those that are watched here."""
-        return [plant for plant, monitor in self._monitors.items() if monitor is not None or self._is_quiet(plant)]
+        return self._here.plants
 
     @property
     def quiet(self) -> list[str]:
         """Those of them in which nothing happens just now."""
-        return [] if self._quiet is None else self._quiet.plants
+        return self._here.quiet
 
     def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
         """A node of a plant, or another monitor of the fleet, came or went."""
@@ -120,10 +113,11 @@ class FleetMonitor:
         messages = self._arrivals.end(past.plant, past.messages)
         self.adopt(past.plant, past.state, now_ns)
         monitor = self.monitor(past.plant)
-        said = [item for message in messages for item in monitor.on_message(message, now_ns)]
+        said = self._before.new([item for message in messages for item in monitor.on_message(message, now_ns)])
         monitor.caught_up()
         self._recent.adopted(past.plant, monitor, now_ns)
-        return self._before.new(said)
+        self._before.passed(past.plant)
+        return said
 
     def adopt(self, plant: str, state: State | None, now_ns: int) -> None:
         """Begin to watch a plant.
@@ -134,7 +128,7 @@ class FleetMonitor:
                 anew. One that cannot be used is noted, and counts as none.
             now_ns: now.
         """
-        monitor = Monitor(self._named(plant), now_ns, points=self._points, model=self._model)
+        monitor = self._here.unwatched(plant, now_ns)
         if state is not None:
             try:
                 monitor.from_bytes(state)
@@ -146,18 +140,48 @@ class FleetMonitor:
             monitor.go_on_from_alarms(self._before.of(plant))
         else:
             monitor.go_on_from_alarms(self._before.silences_after(plant, monitor.last_ns))
-        self._monitors[plant] = monitor
+        self._here.add(plant, monitor)
+        self._met[plant] = None
         self._in_charge(plant, True)
-        self._dues.note(plant, monitor.next_tick_ns())
 
     def release(self, plant: str) -> State | None:
         """Watch a plant no longer; returns its state, for who does. None: it was not watched here."""
-        monitor = self._alone(plant)
-        self._monitors[plant] = None
+        monitor = self._here.remove(plant)
         if monitor is None:
             return None
         self._in_charge(plant, False)
         return monitor.to_bytes()
+
+    def rejoin(self, plant: str, now_ns: int) -> None:
+        """Another watches a plant that is watched here, or did meanwhile: go on from what he knows, if it is ours."""
+        monitor = self._here.remove(plant)
+        if monitor is None:
+            return
+        self._before.we_said(plant, monitor.alarms.all_alarms(), monitor.last_ns)
+        self._in_charge(plant, False)
+        if self._crew.is_ours(plant):
+            self._arrive(plant, now_ns, taken_over=True)
+
+    def hold(self) -> None:
+        """Judge nothing until it is known whose the plants are."""
+        self._held = [] if self._held is None else self._held
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing is judged just now."""
+        return self._held is not None
+
+    def go_on(self, others: Iterable[str], now_ns: int) -> list[Publication]:
+        """Judge what came meanwhile, and what comes.
+
+        Args:
+            others: plants of ours that others have watched meanwhile.
+            now_ns: now.
+        """
+        held, self._held = self._held or [], None
+        for plant in others:
+            self.rejoin(plant, now_ns)
+        return self.on_messages(held, now_ns)
 
     def monitor(self, plant: str) -> Monitor:
         """The monitor of a plant.
@@ -165,51 +189,40 @@ class FleetMonitor:
         Raises:
             InputError: it is not watched here.
         """
-        monitor = self._alone(plant)
+        monitor = self._here.alone(plant)
         if monitor is None:
             raise InputError(f"plant {plant!r} is not watched here (there are: {', '.join(self.plants)})")
         return monitor
 
     def state_of(self, plant: str) -> State:
         """All that is remembered of a plant that is watched here."""
-        if self._quiet is not None and plant in self._quiet:
-            return self._quiet.state_of(plant)
-        return self.monitor(plant).to_bytes()
+        return self._here.state_of(plant)
 
     def received_of(self, plant: str) -> int | None:
         """How many messages of a plant came; None: it is not watched here."""
-        if self._quiet is not None and plant in self._quiet:
-            return self._quiet.received_of(plant)
-        monitor = self._monitors.get(plant)
-        return None if monitor is None else monitor.received
+        return self._here.received_of(plant)
 
     def not_stored(self, plant: str) -> None:
         """Count that what is remembered of a plant could not be stored."""
-        if self._quiet is not None and plant in self._quiet:
-            self._quiet.not_stored(plant)
-        elif (monitor := self._monitors.get(plant)) is not None:
-            monitor.not_stored += 1
-
-    def _named(self, plant: str) -> MonitorConfig:
-        return msgspec.structs.replace(self._config, plant=plant)
+        self._here.not_stored(plant)
 
     def meet(self, plant: str, now_ns: int) -> None:
         """Know of a plant, if it is new."""
-        if plant in self._monitors or len(self._monitors) >= MOST_PLANTS:
+        if plant in self._met or len(self._met) >= MOST_PLANTS:
             return
         try:
             keys.checked_plant(plant)
         except ValueError:
             return
-        self._monitors[plant] = None
+        self._met[plant] = None
         if self._crew.is_ours(plant):
             self._arrive(plant, now_ns, taken_over=False)
 
     def _share_out(self, now_ns: int) -> None:
         """Begin to watch what is ours now, and cease to watch what is not."""
-        for plant in list(self._monitors):
+        for plant in list(self._met):
             ours = self._crew.is_ours(plant)
-            watched, arriving = self._monitors[plant] is not None or self._is_quiet(plant), plant in self._arrivals
+            watched, arriving = plant in self._here, plant in self._arrivals
             if ours and not (watched or arriving):
                 self._arrive(plant, now_ns, taken_over=True)
             elif arriving and not ours:
@@ -231,18 +244,14 @@ class FleetMonitor:
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         """Take in what was published, in the order of each plant."""
-        publications: list[Publication] = []
-        touched: set[str] = set()
-        if self._quiet:
-            publications, messages, given = self._quiet.on_messages(messages, now_ns)
-            for plant, monitor in given.items():
-                self._monitors[plant] = monitor
-                self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
-                touched.add(plant)
-            publications = self._before.new(publications)
+        if self._held is not None:
+            self._held += messages
+            return [] if len(self._held) < MOST_HELD else self.go_on((), now_ns)
+        publications, messages, touched = self._here.on_messages(messages, now_ns)
+        publications = self._before.new(publications)
         for message in messages:
             plant = self._plants.get(message.key) or self._plant_of(message, now_ns)
-            own = self._monitors.get(plant)
+            own = self._here.own(plant)
             if own is not None:
                 touched.add(plant)
                 if self._recent.again(plant, message, now_ns):
@@ -251,10 +260,9 @@ class FleetMonitor:
                     publications += self._before.new(own.on_message(message, now_ns))
             elif plant in self._arrivals:
                 self._arrivals.keep(plant, message)
-        for plant in touched:
-            own = self._monitors[plant]
-            if own is not None and not self._becomes_quiet(plant, own):
-                self._dues.note(plant, own.next_tick_ns())
+        for plant in self._here.touched(touched):
+            for signal in self._signals:
+                self._plants.pop(keys.key(plant, keys.SAMPLE, signal), None)
         return publications
 
     def _plant_of(self, message: Encoded, now_ns: int) -> str:
@@ -264,44 +272,34 @@ class FleetMonitor:
             return ""
         self.meet(topic.plant, now_ns)
         if topic.kind == keys.ALARM:
-            own = self._monitors.get(topic.plant) is not None or self._is_quiet(topic.plant)
-            if topic.plant in self._monitors and not own:  # or it is our own voice
+            if topic.plant in self._met and topic.plant not in self._here:  # or it is our own voice
                 self._before.hear(topic.plant, message)
             return ""
-        if topic.plant in self._monitors:
+        if topic.plant in self._met and topic.name in self._signals:
             self._plants[message.key] = topic.plant
         return topic.plant
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """Let a person act on a plant's alarms; None: the plant is another's to answer for."""
         topic = keys.parse(question.key)
-        monitor = self._alone(topic.plant) if topic is not None else None
+        monitor = self._here.alone(topic.plant) if topic is not None and not self.holds else None
         return (None, []) if monitor is None else monitor.on_command(question, now_ns)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish the health of the plants' monitors where it is due, and silences of plants."""
-        publications: list[Publication] = []
+        if self.holds:
+            return []
         if self._patience_ns is not None and now_ns >= self._patience_ns:
             self._patience_ns = None
             if self._crew.presume_gone():
                 self._share_out(now_ns)
-        if self._quiet:
-            for plant in self._quiet.overdue(now_ns):
-                self._alone(plant)
-            publications += self._quiet.healths(now_ns)
-        for plant in self._dues.taken(now_ns):
-            monitor = self._monitors.get(plant)
-            if monitor is not None:
-                if monitor.next_tick_ns() <= now_ns:
-                    publications += monitor.on_tick(now_ns)
-                self._dues.note(plant, monitor.next_tick_ns())
-        return publications
+        return self._here.on_tick(now_ns)
 
     def next_tick_ns(self) -> int:
         """When the first of the plants is due."""
-        due_ns = self._dues.first_ns()
-        if self._quiet:
-            due_ns = min(due_ns, self._quiet.next_due_ns())
+        if self.holds:
+            return NEVER_NS
+        due_ns = self._here.next_tick_ns()
         return due_ns if self._patience_ns is None else min(due_ns, self._patience_ns)
 
     @property
@@ -311,53 +309,14 @@ class FleetMonitor:
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the health of all for the last time."""
-        said = [item for monitor in self._monitors.values() if monitor is not None for item in monitor.on_stop(now_ns)]
-        return said + (self._quiet.last_healths(now_ns) if self._quiet else [])
+        return self._here.on_stop(now_ns)
 
     def copy(self, plant: str, name: str) -> None:
         """Watch another plant that is, so far, like a quiet one: for trials with many plants."""
-        assert self._quiet is not None
-        self._quiet.copied(plant, name)
-        self._monitors[name] = None
+        self._here.copy(plant, name)
+        self._met[name] = None
         self._in_charge(name, True)
 
     def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
         """What people are to be told: plant and line."""
-        yield from self._notes
-        self._notes.clear()
-        for plant, monitor in self._monitors.items():
-            if monitor is None:
-                continue
-            refused = monitor.refusals.report(now_ns)
-            if refused is not None:
-                yield plant, refused
-            while monitor.notes:
-                yield plant, monitor.notes.pop(0)
-
-    # --- within ----------------------------------------------------------------------------------------------
-
-    def _is_quiet(self, plant: str) -> bool:
-        return self._quiet is not None and plant in self._quiet
-
-    def _alone(self, plant: str) -> Monitor | None:
-        """The plant's own monitor, if it is watched here."""
-        if self._quiet is not None and plant in self._quiet:
-            monitor = self._monitors[plant] = self._quiet.give(plant)
-            self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
-            self._dues.note(plant, monitor.next_tick_ns())
-        return self._monitors.get(plant)
-
-    def _becomes_quiet(self, plant: str, monitor: Monitor) -> bool:
-        """Hold a plant with the quiet ones, if it is one; whether it is."""
-        if self._quiet is None or monitor.rows < self._look_at_row.get(plant, 0):
-            return False
-        self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
-        if not self._quiet.take(plant, monitor):
-            return False
-        self._notes += [(plant, note) for note in monitor.notes]
-        self._monitors[plant] = None
-        del self._look_at_row[plant]
-        self._dues.forget(plant)
-        for key in [key for key, of in self._plants.items() if of == plant]:
-            del self._plants[key]
-        return True
+        return self._here.reports(now_ns)

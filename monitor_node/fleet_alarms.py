@@ -3,9 +3,11 @@
 Monitors of a fleet hear each other's alarms. Who takes a plant over finds again what the one before had found, as far
 as its state does not know it; what was said already is left out. An alarm was said if something was said of it at its
 time or later, but for the end of a silence, which may be at the time at which it was raised.
+
+The one before may have been ourselves: others may have watched the plant for a while, and we go on from their state.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 
 from monitor_node.alarm_states import Event
 from monitor_node.recorded_lives import SILENCE
@@ -23,7 +25,8 @@ class AlarmsBefore:
 
     def __init__(self, names: Collection[str]) -> None:
         self._names = frozenset(names)
-        self._said: dict[str, dict[str, Alarm]] = {}  # by plant and name
+        self._said: dict[str, dict[str, Alarm]] = {}  # by others, by plant and name
+        self._ours: dict[str, dict[str, Alarm]] = {}  # by ourselves, until that has been passed
 
     def hear(self, plant: str, message: Encoded) -> None:
         """Note what another monitor says of an alarm of a plant."""
@@ -38,24 +41,43 @@ class AlarmsBefore:
         """What was said last of each alarm of a plant."""
         return list(self._said.get(plant, {}).values())
 
+    def we_said(self, plant: str, alarms: Iterable[Alarm], last_ns: int | None) -> None:
+        """Note that all that there is to say of a plant's alarms up to a row was said by ourselves.
+
+        Args:
+            plant: its name.
+            alarms: as they were then.
+            last_ns: time of that row; None: there was none.
+        """
+        for alarm in alarms:
+            stands = alarm.raised_ns and not alarm.cleared_ns
+            alarm.time_ns = max(last_ns or 0, alarm.raised_ns, alarm.cleared_ns)
+            alarm.event = (Event.RAISED if stands else Event.CLEARED).value
+            self._ours.setdefault(plant, {})[alarm.alarm] = alarm
+
+    def passed(self, plant: str) -> None:
+        """From now on what is found of a plant is later than all that we said before others watched it."""
+        self._ours.pop(plant, None)
+
     def silences_after(self, plant: str, last_ns: int | None) -> list[Alarm]:
-        """Silences that were raised after the last row that a state knows: no sample tells of them again.
+        """Silences that a state does not know and no sample tells of again.
+
+        They were raised after its last row; or by ourselves, who could not hear that the plant went on.
 
         Args:
             plant: its name.
             last_ns: time of that row; None: it knows none.
         """
-        return [
-            alarm
-            for alarm in self.of(plant)
-            if alarm.alarm == SILENCE
-            and alarm.event == Event.RAISED.value
-            and (last_ns is None or alarm.raised_ns > last_ns)
-        ]
+        said, ours = self._said.get(plant, {}).get(SILENCE), self._ours.get(plant, {}).get(SILENCE)
+        if ours is not None and ours.event == Event.RAISED.value:
+            over = said is not None and said.raised_ns == ours.raised_ns and said.event == Event.CLEARED.value
+            return [] if over else [ours]
+        raised_later = said is not None and (last_ns is None or said.raised_ns > last_ns)
+        return [said] if said is not None and raised_later and said.event == Event.RAISED.value else []
 
     def new(self, publications: list[Publication]) -> list[Publication]:
         """Those publications that were not said before."""
-        if not self._said or not publications:
+        if not (self._said or self._ours) or not publications:
             return publications
         return [item for item in publications if not self._was_said(item)]
 
@@ -63,8 +85,12 @@ class AlarmsBefore:
         alarm, topic = publication.message, keys.parse(publication.key)
         if not isinstance(alarm, Alarm) or topic is None:
             return False
-        before = self._said.get(topic.plant, {}).get(alarm.alarm)
-        if before is None or alarm.time_ns > before.time_ns:
-            return False
-        ends_it = before.event == Event.RAISED.value and alarm.event == Event.CLEARED.value
-        return alarm.time_ns < before.time_ns or not ends_it  # a silence may end at the time at which it was raised
+        said = (before.get(topic.plant, {}).get(alarm.alarm) for before in (self._said, self._ours))
+        return any(_covers(before, alarm) for before in said if before is not None)
+
+
+def _covers(before: Alarm, alarm: Alarm) -> bool:
+    ends_it = before.event == Event.RAISED.value and alarm.event == Event.CLEARED.value
+    if alarm.time_ns == before.time_ns:
+        return not ends_it  # a silence may end at the time at which it was raised
+    return alarm.time_ns < before.time_ns
