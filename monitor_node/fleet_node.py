@@ -11,6 +11,7 @@ from monitor_node.alarm_commands import COMMANDS
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet import FleetMonitor
+from monitor_node.fleet_absence import Absence
 from monitor_node.fleet_config import FleetConfig
 from monitor_node.fleet_pasts import Pasts
 from monitor_node.fleet_states import FleetStates
@@ -75,6 +76,7 @@ class FleetNode(FleetMonitor):
         self._states = states
         self._pasts = Pasts(bus, self._states, lambda plant, line: log.warning(line, plant=plant))
         self._every_ns = int(config.state_every_s * 1e9)
+        self._absence = Absence(lambda: bus.has_router)
         self._deaf = len(self.subscriptions)
         self._changed: set[str] = set()  # plants of which an alarm changed since their state was stored
         self._round: list[str] = []  # plants that are looked at next, whether something came of them
@@ -109,6 +111,11 @@ class FleetNode(FleetMonitor):
 
     def _show(self, plant: str, ours: bool) -> None:
         token = keys.key(plant, keys.ALIVE, NODE)
+        self._stored_at.pop(plant, None)
+        if ours and self.crew.is_shared:
+            self._changed.add(
+                plant
+            )  # so that another, if he was only cut off, finds that we have gone on from his state
         log.info("watching" if ours else "no longer watching", plant=plant)
         if ours and len(self._shown) < MOST_TOKENS:
             self._shown.add(token)
@@ -119,18 +126,27 @@ class FleetNode(FleetMonitor):
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; alarms are logged."""
-        return self._noted(super().on_messages(messages, now_ns))
+        return self._attended(now_ns) + self._noted(super().on_messages(messages, now_ns))
+
+    def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
+        """See `FleetMonitor`; if it is our own that went, others may have our plants."""
+        if token == self.crew.token and not is_alive:
+            self._absence.begins(now_ns)
+        return self._attended(now_ns) + self._noted(super().on_alive(token, is_alive, now_ns))
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """See `FleetMonitor`; alarms are logged."""
+        before = self._attended(now_ns)
         reply, publications = super().on_command(question, now_ns)
-        return reply, self._noted(publications)
+        return reply, before + self._noted(publications)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; what is remembered is stored, and what is to be told of it is logged."""
-        publications: list[Publication] = []
+        publications = self._attended(now_ns)
         if now_ns >= self._look_ns:
             self._look_ns = now_ns + LOOK_EVERY_NS
+            if not self._bus.has_router:
+                self._absence.begins(now_ns)
             self._store_due(now_ns)
             for past in self._pasts.found():
                 publications += self._noted(self.on_past(past, now_ns))
@@ -164,6 +180,20 @@ class FleetNode(FleetMonitor):
             self._count_failures()
         return super().on_stop(now_ns)
 
+    def _attended(self, now_ns: int) -> list[Publication]:
+        """Judge nothing while others may have our plants; then, of those that they have, go on from their states."""
+        absent = self._absence.lasts(now_ns)
+        if self._states is None or absent == self.holds:
+            return []
+        if absent:
+            if self.crew.is_shared:
+                log.warning("the other monitors may take us for gone: nothing is judged until we are back")
+                self.hold()
+            return []
+        others = self._states.of_others(self.plants)
+        log.info("back", plants=len(self.plants), watched_by_others=len(others))
+        return self._noted(self.go_on(others, now_ns))
+
     # --- what survives a restart -----------------------------------------------------------------------------
 
     def _find_past(self, plant: str, taken_over: bool) -> bool:
@@ -184,9 +214,12 @@ class FleetNode(FleetMonitor):
 
     def _store_due(self, now_ns: int) -> None:
         """Store plants of which an alarm changed, which has been told by now, and some of which something came."""
-        if self._states is None:
+        if self._states is None or self.holds:
             return
         self._count_failures()
+        for plant in self._states.lost():
+            log.info("another monitor has stored a newer state", plant=plant)
+            self.rejoin(plant, now_ns)
         due = [plant for plant in self._changed if self.received_of(plant) is not None]
         self._changed.clear()
         if not self._round and not 0 <= now_ns - self._round_ns < self._every_ns:

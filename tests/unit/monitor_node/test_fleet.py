@@ -392,3 +392,16 @@ def test_a_silence_that_who_was_cut_off_has_raised_is_over_with_the_next_sample(
     said += monitor.on_past(Past("a", other.state_of("a"), run[:603]), now_ns)
     (raised, cleared) = [item.message for item in said if isinstance(item.message, Alarm)]
     assert (raised.event, cleared.event, cleared.raised_ns) == ("raised", "cleared", raised.raised_ns)
+
+
+def test_more_than_can_be_held_is_judged_rather_than_lost(
+    runs: dict[str, list[Encoded]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("monitor_node.fleet.MOST_HELD", 60)
+    monitor = fleet()
+    monitor.hold()
+    for message in runs["a"][:59]:
+        monitor.on_message(message, 0)
+    assert monitor.plants == []
+    monitor.on_message(runs["a"][59], 0)
+    assert (monitor.holds, monitor.monitor("a").rows) == (False, 20)

@@ -1,0 +1,110 @@
+"""A fleet's monitor with a folder of states, beside another one: who has a plant last, has it."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from monitor_node import fleet_pasts
+from monitor_node.fleet_config import FleetConfig
+from monitor_node.fleet_node import LOOK_EVERY_NS, FleetNode
+from monitor_node.fleet_states import FleetStates
+from reactorwatch.runtime.bus import Exchange, MemoryBus
+
+from .fleets import QUICK, fleet, run_of
+
+WITHIN_S = 30.0
+
+
+class Linked(MemoryBus):
+    """A bus whose router can be gone."""
+
+    has_router = True
+
+
+class Bench:
+    """A monitor, and the clock that it is told."""
+
+    def __init__(self, folder: Path, shard: str) -> None:
+        self.bus, self.states, self.now_ns = Linked(Exchange()), FleetStates(folder), 0
+        config = msgspec.structs.replace(QUICK, state_every_s=0.1)
+        self.node = FleetNode(config, FleetConfig(plants="reactor/*", shard=shard), self.bus, 0, self.states)
+        for _ in self.node.subscriptions:
+            self.node.listens()
+
+    def tick(self) -> None:
+        """A moment later."""
+        self.now_ns += LOOK_EVERY_NS
+        self.node.on_tick(self.now_ns)
+
+    def tick_until_watched(self, plant: str) -> None:
+        """Its past is found by a thread."""
+        until_s = time.monotonic() + WITHIN_S
+        while plant not in self.node.plants:
+            assert time.monotonic() < until_s
+            self.tick()
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Bench]:
+    """One of two monitors, both of whose shards it has, or a single one."""
+    for name in ("SETTLE_S", "RETURN_S", "LOOK_AGAIN_S"):
+        monkeypatch.setattr(fleet_pasts, name, 0.0)
+    bench = Bench(tmp_path, getattr(request, "param", "1/2"))
+    for _ in range(101):  # the other was never seen
+        bench.tick()
+    bench.node.on_alive("reactor/a/alive/plant", True, bench.now_ns)
+    bench.tick_until_watched("a")
+    yield bench
+    bench.node.on_stop(bench.now_ns)
+
+
+def test_who_finds_a_newer_state_than_his_own_where_he_wants_to_store_goes_on_from_it(
+    bench: Bench, tmp_path: Path
+) -> None:
+    run = run_of("a", 1, span_min=5.0)
+    other = fleet()
+    other.on_messages(run[:60], 0)
+    (tmp_path / "a.state").write_bytes(other.state_of("a"))
+    bench.node.on_messages(run[:30], bench.now_ns)
+    assert bench.node.monitor("a").rows == 10
+    bench.states.put("a", bench.node.state_of("a"))
+    until_s = time.monotonic() + WITHIN_S
+    while "a" not in bench.node.plants or bench.node.monitor("a").rows == 10:
+        assert time.monotonic() < until_s
+        bench.tick()
+    assert bench.node.monitor("a").rows == 20
+
+
+def test_while_the_router_is_gone_and_until_the_others_had_their_time_nothing_is_judged(bench: Bench) -> None:
+    run, returned_at = run_of("a", 1, span_min=5.0), 0
+    bench.bus.has_router = False
+    bench.tick()
+    for place in range(0, 60, 3):
+        bench.tick()
+        bench.node.on_messages(run[place : place + 3], bench.now_ns)
+    assert bench.node.monitor("a").rows == 0
+    bench.bus.has_router = True
+    while bench.node.holds:
+        assert bench.node.monitor("a").rows == 0
+        bench.tick()
+        returned_at += 1
+    assert returned_at * LOOK_EVERY_NS == 2_000_000_000
+    assert bench.node.monitor("a").rows == 20
+
+
+@pytest.mark.parametrize("bench", ["1/1"], indirect=True)
+def test_who_is_alone_goes_on_while_the_router_is_gone(bench: Bench) -> None:
+    bench.bus.has_router = False
+    bench.tick()
+    bench.tick()
+    assert not bench.node.holds
+
+
+def test_commands_are_left_to_the_others_while_they_may_have_the_plant(bench: Bench) -> None:
+    bench.bus.has_router = False
+    bench.tick()
+    bench.tick()
+    assert bench.node.on_command(run_of("a", 1, span_min=1.0)[0], bench.now_ns) == (None, [])
