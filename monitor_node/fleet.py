@@ -24,6 +24,7 @@ from monitor_node.core import Monitor
 from monitor_node.fleet_alarms import AlarmsBefore
 from monitor_node.fleet_dues import NEVER_NS
 from monitor_node.fleet_recent import Recent
+from monitor_node.fleet_strangers import PROVEN_MESSAGES, PROVEN_ROWS, Strangers
 from monitor_node.fleet_watched import State, WatchedPlants
 from monitor_node.shards import Crew
 from reactorwatch.contract import keys
@@ -36,7 +37,6 @@ PATIENCE_NS = 10_000_000_000
 """After the start: a shard of which nobody was seen by then is taken for gone."""
 
 MOST_PLANTS = 100_000
-"""A stranger may make up names of plants; there are no more than these."""
 
 MOST_HELD = 500_000
 """Messages that wait until it is known whose the plants are; with more they are judged, as late is worse than twice."""
@@ -80,6 +80,7 @@ class FleetMonitor:
         self._arrivals = Arrivals()
         self._patience_ns: int | None = start_ns + PATIENCE_NS
         self._met: dict[str, None] = {}  # all plants that are known, whoever watches them
+        self._strangers = Strangers()
         self._signals = (config.input, *config.outputs)
         self._plants: dict[str, str] = {}  # by key of a sample, those that are not quiet
         self._before, self._recent = AlarmsBefore(self._here.alarms), Recent()
@@ -103,13 +104,15 @@ class FleetMonitor:
         if self._crew.note(token, is_alive=is_alive):
             self._share_out(now_ns)
         elif topic is not None and topic.kind == keys.ALIVE and is_alive:
-            self.meet(topic.plant, now_ns)
+            self.meet(topic.plant, now_ns, vouched=True)
         return []
 
     def on_past(self, past: Past, now_ns: int) -> list[Publication]:
         """Begin to watch a plant whose past was asked for, if it is still ours: judge that, and what came since."""
         if past.plant not in self._arrivals:
             return []
+        if past.state is not None:
+            self._strangers.vouch(past.plant)
         messages = self._arrivals.end(past.plant, past.messages)
         self.adopt(past.plant, past.state, now_ns)
         monitor = self.monitor(past.plant)
@@ -198,6 +201,16 @@ class FleetMonitor:
         """All that is remembered of a plant that is watched here."""
         return self._here.state_of(plant)
 
+    def is_worth_storing(self, plant: str) -> bool:
+        """Whether anything is known of a plant that is watched here, and it is certain that there is such a plant."""
+        own = self._here.own(plant)
+        return plant not in self._strangers and (own is None or own.rows > 0)
+
+    @property
+    def forgotten(self) -> int:
+        """How many plants were forgotten that nobody vouched for, and that said nothing any more."""
+        return self._strangers.forgotten
+
     def received_of(self, plant: str) -> int | None:
         """How many messages of a plant came; None: it is not watched here."""
         return self._here.received_of(plant)
@@ -206,17 +219,43 @@ class FleetMonitor:
         """Count that what is remembered of a plant could not be stored."""
         self._here.not_stored(plant)
 
-    def meet(self, plant: str, now_ns: int) -> None:
-        """Know of a plant, if it is new."""
-        if plant in self._met or len(self._met) >= MOST_PLANTS:
+    def meet(self, plant: str, now_ns: int, *, vouched: bool) -> None:
+        """Know of a plant, if it is new.
+
+        Args:
+            plant: its name.
+            now_ns: now.
+            vouched: whether it is certain that there is such a plant; if not, see `fleet_strangers`.
+        """
+        if plant in self._met:
+            if vouched:
+                self._strangers.vouch(plant)
+            return
+        if len(self._met) >= MOST_PLANTS or not (vouched or self._strangers.have_room):
             return
         try:
             keys.checked_plant(plant)
         except ValueError:
             return
         self._met[plant] = None
+        if not vouched:
+            self._strangers.meet(plant, now_ns)
         if self._crew.is_ours(plant):
             self._arrive(plant, now_ns, taken_over=False)
+
+    def _forget(self, plant: str) -> None:
+        """Know of a plant no longer."""
+        del self._met[plant]
+        if plant in self._arrivals:
+            self._arrivals.end(plant)
+        if self._here.remove(plant) is not None:
+            self._in_charge(plant, False)
+        self._before.forget(plant)
+        self._forget_keys(plant)
+
+    def _forget_keys(self, plant: str) -> None:
+        for signal in self._signals:
+            self._plants.pop(keys.key(plant, keys.SAMPLE, signal), None)
 
     def _share_out(self, now_ns: int) -> None:
         """Begin to watch what is ours now, and cease to watch what is not."""
@@ -227,8 +266,10 @@ class FleetMonitor:
                 self._arrive(plant, now_ns, taken_over=True)
             elif arriving and not ours:
                 self._arrivals.end(plant)
-            elif watched and not ours and (state := self.release(plant)) is not None:
-                self._store(plant, state)
+            elif watched and not ours:
+                is_known = self.is_worth_storing(plant)
+                if (state := self.release(plant)) is not None and is_known:
+                    self._store(plant, state)
 
     def _arrive(self, plant: str, now_ns: int, *, taken_over: bool) -> None:
         if self._ask_past(plant, taken_over):
@@ -252,6 +293,7 @@ class FleetMonitor:
         for message in messages:
             plant = self._plants.get(message.key) or self._plant_of(message, now_ns)
             own = self._here.own(plant)
+            messages_of = self._strangers.hear(plant, now_ns) if plant in self._strangers else 0
             if own is not None:
                 touched.add(plant)
                 if self._recent.again(plant, message, now_ns):
@@ -260,9 +302,14 @@ class FleetMonitor:
                     publications += self._before.new(own.on_message(message, now_ns))
             elif plant in self._arrivals:
                 self._arrivals.keep(plant, message)
+            elif messages_of >= PROVEN_MESSAGES:
+                self._strangers.vouch(plant)
+        for plant in [plant for plant in touched if plant in self._strangers]:
+            own = self._here.own(plant)
+            if own is not None and own.rows >= PROVEN_ROWS:
+                self._strangers.vouch(plant)
         for plant in self._here.touched(touched):
-            for signal in self._signals:
-                self._plants.pop(keys.key(plant, keys.SAMPLE, signal), None)
+            self._forget_keys(plant)
         return publications
 
     def _plant_of(self, message: Encoded, now_ns: int) -> str:
@@ -270,7 +317,7 @@ class FleetMonitor:
         topic = keys.parse(message.key)
         if topic is None or topic.kind not in (keys.SAMPLE, keys.ALARM):
             return ""
-        self.meet(topic.plant, now_ns)
+        self.meet(topic.plant, now_ns, vouched=False)
         if topic.kind == keys.ALARM:
             if topic.plant in self._met and topic.plant not in self._here:  # or it is our own voice
                 self._before.hear(topic.plant, message)
@@ -293,6 +340,8 @@ class FleetMonitor:
             self._patience_ns = None
             if self._crew.presume_gone():
                 self._share_out(now_ns)
+        for plant in self._strangers.forget(now_ns):
+            self._forget(plant)
         return self._here.on_tick(now_ns)
 
     def next_tick_ns(self) -> int:

@@ -59,6 +59,11 @@ class AlarmsBefore:
         """From now on what is found of a plant is later than all that we said before others watched it."""
         self._ours.pop(plant, None)
 
+    def forget(self, plant: str) -> None:
+        """Nothing was said of a plant."""
+        self._said.pop(plant, None)
+        self._ours.pop(plant, None)
+
     def silences_after(self, plant: str, last_ns: int | None) -> list[Alarm]:
         """Silences that a state does not know and no sample tells of again.
 

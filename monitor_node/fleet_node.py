@@ -85,6 +85,7 @@ class FleetNode(FleetMonitor):
         self._said: dict[str, str] = {}
         self._shown: set[str] = set()
         self._report_ns = start_ns
+        self._forgotten_told = 0
         # The older of two with the same shard is in charge: names sort by the time of the start.
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
         self.crew = Crew(self.expression, shards.parsed(fleet.shard), name)
@@ -102,7 +103,7 @@ class FleetNode(FleetMonitor):
         )
         for plant in self._states.plants if self._states is not None else []:
             if matches(self.expression, f"{keys.ROOT}/{plant}"):
-                self.meet(plant, start_ns)
+                self.meet(plant, start_ns, vouched=True)
 
     @property
     def subscriptions(self) -> tuple[str, ...]:
@@ -155,6 +156,9 @@ class FleetNode(FleetMonitor):
             self._report_ns = now_ns + REPORT_EVERY_NS
             for plant, line in self.reports(now_ns):
                 log.warning(line, plant=plant)
+            if self.forgotten > self._forgotten_told:
+                self._forgotten_told = self.forgotten
+                log.warning("plants were forgotten that showed no token and said nothing more", so_far=self.forgotten)
         return publications
 
     def next_tick_ns(self) -> int:
@@ -174,7 +178,7 @@ class FleetNode(FleetMonitor):
         """See `FleetMonitor`; all is stored for the last time."""
         self._pasts.close()
         if self._states is not None:
-            for plant in self.plants:
+            for plant in filter(self.is_worth_storing, self.plants):
                 self._states.put(plant, self.state_of(plant))
             self._states.close()
             self._count_failures()
@@ -229,7 +233,7 @@ class FleetNode(FleetMonitor):
             plant, looked = self._round.pop(), looked + 1
             if self.received_of(plant) not in (None, self._stored_at.get(plant)):
                 due.append(plant)
-        for plant in due:
+        for plant in filter(self.is_worth_storing, due):
             self._states.put(plant, self.state_of(plant))
             self._stored_at[plant] = self.received_of(plant) or 0
 

@@ -108,3 +108,13 @@ def test_commands_are_left_to_the_others_while_they_may_have_the_plant(bench: Be
     bench.tick()
     bench.tick()
     assert bench.node.on_command(run_of("a", 1, span_min=1.0)[0], bench.now_ns) == (None, [])
+
+
+def test_there_is_no_file_of_a_plant_of_which_nothing_is_known(bench: Bench, tmp_path: Path) -> None:
+    bench.node.on_messages(run_of("made-up", 1, span_min=1.0), bench.now_ns)
+    bench.tick_until_watched("made-up")
+    for _ in range(10):
+        bench.tick()
+    bench.node.on_messages(run_of("a", 1, span_min=1.0), bench.now_ns)
+    bench.node.on_stop(bench.now_ns)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.state"]
