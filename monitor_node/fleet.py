@@ -29,7 +29,7 @@ from monitor_node.fleet_watched import State, WatchedPlants
 from monitor_node.shards import Crew
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 
@@ -200,6 +200,11 @@ class FleetMonitor:
     def state_of(self, plant: str) -> State:
         """All that is remembered of a plant that is watched here."""
         return self._here.state_of(plant)
+
+    def alarms_of(self, plant: str) -> list[Alarm] | None:
+        """The alarms of a plant; None if they are as they were when it last had a monitor of its own."""
+        own = self._here.own(plant)
+        return None if own is None else own.alarms.all_alarms()
 
     def is_worth_storing(self, plant: str) -> bool:
         """Whether anything is known of a plant that is watched here, and it is certain that there is such a plant."""

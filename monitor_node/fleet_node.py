@@ -25,7 +25,8 @@ from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus, matches
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.config import BusConfig, MetricsConfig
+from reactorwatch.runtime.metrics import FleetMetrics, served
 from reactorwatch.runtime.model_file import model_on_the_bus
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 
@@ -58,6 +59,7 @@ class FleetNode(FleetMonitor):
         bus: an open bus.
         start_ns: now.
         states: where what is remembered of each plant is kept; None: nowhere.
+        metrics: where the counts of each plant are shown; None: nowhere.
 
     Raises:
         InputError: settings that do not fit together, or a model that cannot be used.
@@ -70,8 +72,9 @@ class FleetNode(FleetMonitor):
         bus: Bus,
         start_ns: int,
         states: FleetStates | None = None,
+        metrics: FleetMetrics | None = None,
     ) -> None:
-        self._bus = bus
+        self._bus, self.metrics = bus, metrics
         self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
         self._states = states
         self._pasts = Pasts(bus, self._states, lambda plant, line: log.warning(line, plant=plant))
@@ -113,6 +116,11 @@ class FleetNode(FleetMonitor):
     def _show(self, plant: str, ours: bool) -> None:
         token = keys.key(plant, keys.ALIVE, NODE)
         self._stored_at.pop(plant, None)
+        if self.metrics is not None:
+            if ours:
+                self.metrics.watch(plant, lambda: self.alarms_of(plant))
+            else:
+                self.metrics.leave(plant)
         if ours and self.crew.is_shared:
             self._changed.add(
                 plant
@@ -260,8 +268,19 @@ class FleetNode(FleetMonitor):
         return publications
 
 
-def run(config: MonitorConfig, fleet: FleetConfig, bus_config: BusConfig) -> None:
+def run(
+    config: MonitorConfig,
+    fleet: FleetConfig,
+    bus_config: BusConfig,
+    metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
+) -> None:
     """Watch the plants until SIGINT or SIGTERM.
+
+    Args:
+        config: how each plant is watched.
+        fleet: which plants.
+        bus_config: where the bus is.
+        metrics_config: where the counts are shown.
 
     Raises:
         InputError: settings that do not fit together, or that the bus cannot use; a folder where nothing can be stored.
@@ -271,12 +290,12 @@ def run(config: MonitorConfig, fleet: FleetConfig, bus_config: BusConfig) -> Non
             raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
     Monitor(config, 0, points=fleet.points, model=model_on_the_bus(config.model))  # or they make none
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
-    with stop_on_signals() as stop:
+    with served(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop, passing=PASSING, crowded=True)
         if bus is None:
             return
         try:
-            watch(FleetNode(config, fleet, bus, time.time_ns(), states), bus, stop)
+            watch(FleetNode(config, fleet, bus, time.time_ns(), states, metrics), bus, stop)
         finally:
             bus.close()
 
@@ -297,4 +316,5 @@ def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
         commands=tuple(f"{plants}/{keys.COMMAND}/{name}" for name in COMMANDS),
         on_ready=lambda: bus.announce(node.crew.token),
         linger_s=LINGER_S,
+        on_publish=node.metrics.published if node.metrics is not None else None,
     )

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
 from typing import NamedTuple
+from urllib.request import urlopen
 
 import msgspec
 import pytest
@@ -23,8 +24,10 @@ from reactorwatch.contract.codec import Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms, Sample
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.config import BusConfig, MetricsConfig
+from reactorwatch.runtime.metrics import PORT_AFTER
 from reactorwatch.runtime.serve import StopSignal
+from tests.ports import LOOPBACK, three_free_ports
 from tests.unit.monitor_node.fleets import QUICK, alone, run_of
 
 from .client import client
@@ -107,6 +110,29 @@ def test_plants_are_discovered_by_their_tokens_and_by_their_samples(bus_config: 
         watchers.wait_for({"alpha", "beta"})
         heard = {health.get(timeout=WITHIN_S) for _ in range(4)}
         assert heard == {"reactor/alpha/health/monitor", "reactor/beta/health/monitor"}
+
+
+def test_what_is_counted_of_each_plant_is_on_the_monitor_s_page(bus_config: BusConfig, tmp_path: Path) -> None:
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    port, settings = three_free_ports(), tmp_path / "settings.toml"
+    fleet, metrics = FleetConfig(plants="reactor/*"), MetricsConfig(port=port)
+    write_settings(settings, {"bus": bus_config, "monitor": QUICK, "fleet": fleet, "metrics": metrics})
+    command = [sys.executable, "-m", "reactorwatch", "monitor", "--config", str(settings)]
+    with client(bus_config) as bus, (tmp_path / "log").open("wb") as said:
+        health, process = SimpleQueue[str](), subprocess.Popen(command, stderr=said)
+        bus.subscribe("reactor/*/health/monitor", lambda message: health.put(message.key))
+        try:
+            crew_of(bus)(1)
+            for plant in PLANTS:
+                bus.announce(f"reactor/{plant}/alive/plant")
+            assert len({health.get(timeout=WITHIN_S) for _ in PLANTS}) == len(PLANTS)
+            with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER['monitor']}/metrics", timeout=WITHIN_S) as answer:
+                page = answer.read().decode()
+        finally:
+            process.kill()
+            process.wait()
+    for plant in PLANTS:
+        assert f'reactorwatch_messages_received_total{{node="monitor",plant="{plant}"}} 0.0' in page
 
 
 def test_one_monitor_answers_a_command_and_that_of_the_plant(bus_config: BusConfig, tmp_path: Path) -> None:

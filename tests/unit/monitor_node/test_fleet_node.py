@@ -11,7 +11,9 @@ from monitor_node import fleet_pasts
 from monitor_node.fleet_config import FleetConfig
 from monitor_node.fleet_node import LOOK_EVERY_NS, FleetNode
 from monitor_node.fleet_states import FleetStates
+from monitor_node.shards import Crew, Shard, home
 from reactorwatch.runtime.bus import Exchange, MemoryBus
+from reactorwatch.runtime.metrics import FleetMetrics
 
 from .fleets import QUICK, fleet, run_of
 
@@ -108,6 +110,26 @@ def test_commands_are_left_to_the_others_while_they_may_have_the_plant(bench: Be
     bench.tick()
     bench.tick()
     assert bench.node.on_command(run_of("a", 1, span_min=1.0)[0], bench.now_ns) == (None, [])
+
+
+def test_the_counts_and_alarms_of_each_plant_are_on_the_page_as_long_as_it_is_watched(bench: Bench) -> None:
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    metrics = bench.node.metrics = FleetMetrics("monitor")
+    plant = next(name for name in map(str, range(99)) if home(name, 2) == 2)
+    bench.node.on_alive(f"reactor/{plant}/alive/plant", True, bench.now_ns)
+    bench.tick_until_watched(plant)
+    run = run_of(plant, 1, span_min=1.0)
+    bench.node.on_messages(run, bench.now_ns)
+    bench.now_ns += int(QUICK.health_period_s * 1e9)
+    for publication in bench.node.on_tick(bench.now_ns):
+        metrics.published(publication)
+    shown = {metric.name: metric.samples for metric in metrics.collect()}
+    (rows,) = shown["reactorwatch_rows"]
+    assert (rows.labels, rows.value) == ({"plant": plant, "node": "monitor"}, len(run) // 3)
+    normal = [sample.value for sample in shown["reactorwatch_alarms"] if sample.labels["state"] == "normal"]
+    assert normal == [len(bench.node.monitor(plant).alarms.all_alarms())]
+    bench.node.on_alive(Crew(bench.node.expression, Shard(2, 2), "other").token, True, bench.now_ns)
+    assert list(metrics.collect()) == []
 
 
 def test_there_is_no_file_of_a_plant_of_which_nothing_is_known(bench: Bench, tmp_path: Path) -> None:
