@@ -18,7 +18,7 @@ Nothing here reads a clock or does I/O.
 
 from collections.abc import Callable, Iterable, Iterator
 
-from monitor_node.arrivals import Arrivals, Past
+from monitor_node.arrivals import Arrivals, Past, cut
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet_alarms import AlarmsBefore
@@ -291,7 +291,7 @@ class FleetMonitor:
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         """Take in what was published, in the order of each plant."""
         if self._held is not None:
-            self._held += messages
+            self._held += map(cut, messages)
             return [] if len(self._held) < MOST_HELD else self.go_on((), now_ns)
         publications, messages, touched = self._here.on_messages(messages, now_ns)
         publications = self._before.new(publications)

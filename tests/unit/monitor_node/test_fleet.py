@@ -1,5 +1,6 @@
 """The watch over a fleet: each plant is watched as if it were alone, by one monitor."""
 
+import tracemalloc
 from collections.abc import Callable
 
 import pytest
@@ -465,6 +466,24 @@ def test_a_silence_that_who_was_cut_off_has_raised_is_over_with_the_next_sample(
     said += monitor.on_past(Past("a", other.state_of("a"), run[:603]), now_ns)
     (raised, cleared) = [item.message for item in said if isinstance(item.message, Alarm)]
     assert (raised.event, cleared.event, cleared.raised_ns) == ("raised", "cleared", raised.raised_ns)
+
+
+def test_what_is_too_large_takes_no_room_while_it_is_held_and_is_refused_afterwards(
+    runs: dict[str, list[Encoded]],
+) -> None:
+    monitor = fleet()
+    monitor.on_messages(runs["a"][:30], 0)
+    monitor.hold()
+    tracemalloc.start()
+    try:
+        for _ in range(100):
+            monitor.on_message(runs["a"][0]._replace(payload=bytes(1_000_000)), 0)
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    monitor.go_on((), 0)
+    assert held < 1_000_000
+    assert monitor.monitor("a").refusals.by_reason == {"too_large": 100}
 
 
 def test_more_than_can_be_held_is_judged_rather_than_lost(
