@@ -26,6 +26,7 @@ from monitor_node.fleet_dues import NEVER_NS
 from monitor_node.fleet_recent import Recent
 from monitor_node.fleet_strangers import PROVEN_MESSAGES, PROVEN_ROWS, Strangers
 from monitor_node.fleet_watched import State, WatchedPlants
+from monitor_node.recorded_lives import SILENCE
 from monitor_node.shards import Crew
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
@@ -117,6 +118,7 @@ class FleetMonitor:
         self.adopt(past.plant, past.state, now_ns)
         monitor = self.monitor(past.plant)
         said = self._before.new([item for message in messages for item in monitor.on_message(message, now_ns)])
+        self._note_silence(past.plant, monitor)
         monitor.caught_up()
         self._recent.adopted(past.plant, monitor, now_ns)
         self._before.passed(past.plant)
@@ -140,12 +142,14 @@ class FleetMonitor:
                 monitor.notes.append(f"the state that was stored {error}; the plant is learned anew{kept}")
                 state = None
         if state is None:
-            monitor.go_on_from_alarms(self._before.of(plant))
-        else:
-            monitor.go_on_from_alarms(self._before.silences_after(plant, monitor.last_ns))
+            monitor.go_on_from_alarms(alarm for alarm in self._before.of(plant) if alarm.alarm != SILENCE)
         self._here.add(plant, monitor)
         self._met[plant] = None
         self._in_charge(plant, True)
+
+    def _note_silence(self, plant: str, monitor: Monitor) -> None:
+        """Have the next sample end a silence that was said before; rows from before it end none."""
+        monitor.go_on_from_alarms(self._before.silences_after(plant, monitor.alarms.alarm(SILENCE).raised_ns))
 
     def release(self, plant: str) -> State | None:
         """Watch a plant no longer; returns its state, for who does. None: it was not watched here."""
@@ -281,6 +285,7 @@ class FleetMonitor:
             self._arrivals.begin(plant)
         else:
             self.adopt(plant, None, now_ns)
+            self._note_silence(plant, self.monitor(plant))
 
     # --- what the loop calls ---------------------------------------------------------------------------------
 

@@ -52,6 +52,8 @@ class AlarmsBefore:
         for alarm in alarms:
             stands = alarm.raised_ns and not alarm.cleared_ns
             alarm.time_ns = max(last_ns or 0, alarm.raised_ns, alarm.cleared_ns)
+            if stands and alarm.alarm == SILENCE:
+                alarm.time_ns = alarm.raised_ns  # of its end nothing was said, whatever rows came
             alarm.event = (Event.RAISED if stands else Event.CLEARED).value
             self._ours.setdefault(plant, {})[alarm.alarm] = alarm
 
@@ -64,21 +66,21 @@ class AlarmsBefore:
         self._said.pop(plant, None)
         self._ours.pop(plant, None)
 
-    def silences_after(self, plant: str, last_ns: int | None) -> list[Alarm]:
-        """Silences that a state does not know and no sample tells of again.
-
-        They were raised after its last row; or by ourselves, who could not hear that the plant went on.
+    def silences_after(self, plant: str, known_ns: int) -> list[Alarm]:
+        """The silence that was raised last, if it is later than any that is known: no sample tells of it again.
 
         Args:
             plant: its name.
-            last_ns: time of that row; None: it knows none.
+            known_ns: when the last one was raised that is known.
         """
         said, ours = self._said.get(plant, {}).get(SILENCE), self._ours.get(plant, {}).get(SILENCE)
-        if ours is not None and ours.event == Event.RAISED.value:
-            over = said is not None and said.raised_ns == ours.raised_ns and said.event == Event.CLEARED.value
-            return [] if over else [ours]
-        raised_later = said is not None and (last_ns is None or said.raised_ns > last_ns)
-        return [said] if said is not None and raised_later and said.event == Event.RAISED.value else []
+        over_ns = said.raised_ns if said is not None and said.event == Event.CLEARED.value else 0
+        standing = [
+            alarm
+            for alarm in (said, ours)
+            if alarm is not None and alarm.event == Event.RAISED.value and alarm.raised_ns > max(known_ns, over_ns)
+        ]
+        return sorted(standing, key=lambda alarm: alarm.raised_ns)[-1:]
 
     def new(self, publications: list[Publication]) -> list[Publication]:
         """Those publications that were not said before."""

@@ -263,6 +263,34 @@ def test_a_silence_that_was_raised_after_the_state_was_stored_is_cleared_by_who_
     assert alarms(said) == [("reactor/b/alarm/silence/plant", "cleared", raised_ns)]
 
 
+@pytest.mark.parametrize("way", ["with a state", "without", "with a newer state then"])
+def test_a_silence_that_the_other_raised_is_ended_though_rows_from_before_it_are_judged_first(way: str) -> None:
+    """The state is of row 100, the silence of row 110, and rows up to 120 are told with the past; 121 is the next."""
+    run, at_home, said = run_of("b", 2), home("b", 2), list[Publication]()
+    first = fleet(shard=Shard(at_home, 2), name="first")
+    first.on_messages(run[:300], 0)
+    state = first.monitor("b").to_bytes()
+    first.on_messages(run[300:330], 0)
+    first_ns = Sample.FromString(run[0].payload).time_ns
+    raised_ns = first_ns + 114 * (Sample.FromString(run[3].payload).time_ns - first_ns)
+    silent = Alarm(time_ns=raised_ns, alarm="silence/plant", event="raised", raised_ns=raised_ns)
+    silent.state = AlarmState.ALARM_STATE_UNACKNOWLEDGED
+    payload, encoding = encode_message(silent)
+    second = fleet(shard=Shard(3 - at_home, 2), name="second", ask_past=noting([]))
+    second.on_alive(shard_token(at_home), True, 0)
+    second.on_message(Encoded("reactor/b/alarm/silence/plant", payload, encoding), 0)
+    second.on_alive(shard_token(at_home), False, 0)
+    said += second.on_past(Past("b", None if way == "without" else state, run[:360]), 0)
+    if way == "with a newer state then":
+        second.rejoin("b", 0)
+        said += second.on_past(Past("b", first.state_of("b"), run[:360]), 0)
+    assert alarms(said) == []
+    said += second.on_messages(run[360:], 0)
+    ((key, event, time_ns),) = alarms(said)
+    assert (key, event) == ("reactor/b/alarm/silence/plant", "cleared")
+    assert time_ns >= raised_ns
+
+
 def test_a_state_that_cannot_be_used_is_told_and_the_plant_learned_anew(runs: dict[str, list[Encoded]]) -> None:
     asked: list[tuple[str, bool]] = []
     monitor = fleet(ask_past=noting(asked), unusable=lambda plant, _: f"; {plant} is kept aside")
@@ -463,7 +491,8 @@ def test_a_silence_that_who_was_cut_off_has_raised_is_over_with_the_next_sample(
     other.adopt("a", state, 0)
     other.on_messages(run[300:600], 0)
     monitor.rejoin("a", now_ns)
-    said += monitor.on_past(Past("a", other.state_of("a"), run[:603]), now_ns)
+    said += monitor.on_past(Past("a", other.state_of("a"), run[:600]), now_ns)
+    said += monitor.on_messages(run[600:603], now_ns)
     (raised, cleared) = [item.message for item in said if isinstance(item.message, Alarm)]
     assert (raised.event, cleared.event, cleared.raised_ns) == ("raised", "cleared", raised.raised_ns)
 
