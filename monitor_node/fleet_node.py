@@ -204,7 +204,7 @@ class FleetNode(FleetMonitor):
             return []
         others = self._states.of_others(self.plants)
         log.info("back", plants=len(self.plants), watched_by_others=len(others))
-        return self._noted(self.go_on(others, now_ns))
+        return self.go_on(others, now_ns)  # it notes what it says
 
     # --- what survives a restart -----------------------------------------------------------------------------
 

@@ -7,11 +7,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from monitor_node import fleet_pasts
+from monitor_node import fleet_node, fleet_pasts
 from monitor_node.fleet_config import FleetConfig
 from monitor_node.fleet_node import LOOK_EVERY_NS, FleetNode
 from monitor_node.fleet_states import FleetStates
 from monitor_node.shards import Crew, Shard, home
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.metrics import FleetMetrics
 
@@ -95,6 +97,26 @@ def test_while_the_router_is_gone_and_until_the_others_had_their_time_nothing_is
         returned_at += 1
     assert returned_at * LOOK_EVERY_NS == 2_000_000_000
     assert bench.node.monitor("a").rows == 20
+
+
+def test_an_alarm_that_is_found_in_what_was_held_back_is_logged_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logged: list[str] = []
+    monkeypatch.setattr(fleet_node.log, "info", lambda event, **_: logged.append(event))
+    run = run_of("a", 1, leak_min=30.0)
+    bench.bus.has_router = False
+    bench.tick()
+    bench.tick()
+    bench.node.on_messages(run, bench.now_ns)
+    bench.bus.has_router = True
+    said: list[Publication] = []
+    while bench.node.holds:
+        bench.now_ns += LOOK_EVERY_NS
+        said += bench.node.on_tick(bench.now_ns)
+    told = sum(isinstance(item.message, Alarm) for item in said)
+    assert told > 0
+    assert logged.count("alarm") == told
 
 
 @pytest.mark.parametrize("bench", ["1/1"], indirect=True)
