@@ -188,7 +188,7 @@ class FleetMonitor:
         held, self._held = self._held or [], None
         for plant in others:
             self.rejoin(plant, now_ns)
-        return self.on_messages(held, now_ns)
+        return self._judged(held, now_ns)
 
     def monitor(self, plant: str) -> Monitor:
         """The monitor of a plant.
@@ -298,6 +298,9 @@ class FleetMonitor:
         if self._held is not None:
             self._held += map(cut, messages)
             return [] if len(self._held) < MOST_HELD else self.go_on((), now_ns)
+        return self._judged(messages, now_ns)
+
+    def _judged(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         publications, messages, touched = self._here.on_messages(messages, now_ns)
         publications = self._before.new(publications)
         for message in messages:

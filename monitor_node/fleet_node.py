@@ -122,9 +122,7 @@ class FleetNode(FleetMonitor):
             else:
                 self.metrics.leave(plant)
         if ours and self.crew.is_shared:
-            self._changed.add(
-                plant
-            )  # so that another, if he was only cut off, finds that we have gone on from his state
+            self._changed.add(plant)  # another who was only cut off is to find that we have gone on from his state
         log.info("watching" if ours else "no longer watching", plant=plant)
         if ours and len(self._shown) < MOST_TOKENS:
             self._shown.add(token)
@@ -145,9 +143,8 @@ class FleetNode(FleetMonitor):
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """See `FleetMonitor`; alarms are logged."""
-        before = self._attended(now_ns)
         reply, publications = super().on_command(question, now_ns)
-        return reply, before + self._noted(publications)
+        return reply, self._noted(publications)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; what is remembered is stored, and what is to be told of it is logged."""
@@ -204,7 +201,7 @@ class FleetNode(FleetMonitor):
             return []
         others = self._states.of_others(self.plants)
         log.info("back", plants=len(self.plants), watched_by_others=len(others))
-        return self.go_on(others, now_ns)  # it notes what it says
+        return self._noted(self.go_on(others, now_ns))
 
     # --- what survives a restart -----------------------------------------------------------------------------
 

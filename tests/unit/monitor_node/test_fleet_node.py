@@ -99,6 +99,19 @@ def test_while_the_router_is_gone_and_until_the_others_had_their_time_nothing_is
     assert bench.node.monitor("a").rows == 20
 
 
+def test_while_the_router_is_gone_for_long_more_than_can_be_held_is_judged(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("monitor_node.fleet.MOST_HELD", 60)
+    run = run_of("a", 1, span_min=10.0)
+    bench.bus.has_router = False
+    bench.tick()
+    for place in range(0, 240, 3):
+        bench.tick()
+        bench.node.on_messages(run[place : place + 3], bench.now_ns)
+    assert bench.node.monitor("a").rows == 80
+
+
 def test_an_alarm_that_is_found_in_what_was_held_back_is_logged_once(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
