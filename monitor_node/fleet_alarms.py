@@ -51,9 +51,9 @@ class AlarmsBefore:
         """
         for alarm in alarms:
             stands = alarm.raised_ns and not alarm.cleared_ns
-            alarm.time_ns = max(last_ns or 0, alarm.raised_ns, alarm.cleared_ns)
-            if stands and alarm.alarm == SILENCE:
-                alarm.time_ns = alarm.raised_ns  # of its end nothing was said, whatever rows came
+            # Of a silence that another has raised by his clock rows tell nothing: only what was said of it was.
+            judged_ns = last_ns if last_ns is not None and alarm.alarm != SILENCE else 0
+            alarm.time_ns = max(judged_ns, alarm.raised_ns, alarm.cleared_ns)
             alarm.event = (Event.RAISED if stands else Event.CLEARED).value
             self._ours.setdefault(plant, {})[alarm.alarm] = alarm
 

@@ -291,6 +291,26 @@ def test_a_silence_that_the_other_raised_is_ended_though_rows_from_before_it_are
     assert time_ns >= raised_ns
 
 
+def test_a_silence_that_only_the_newer_state_knows_is_ended_though_later_rows_were_judged_from_an_older_one() -> None:
+    """The silence was raised after row 110; who came back has judged up to row 120 before he finds the newer state."""
+    run = run_of("b", 2)
+    first = fleet()
+    for row in range(110):
+        first.on_messages(run[3 * row : 3 * row + 3], row * SECOND_NS)
+        first.on_tick(row * SECOND_NS)
+    older, now_ns, said = first.state_of("b"), 109 * SECOND_NS, list[Publication]()
+    while not alarms(said):
+        now_ns += SECOND_NS // 10
+        said += first.on_tick(now_ns)
+    second = fleet(ask_past=noting([]))
+    second.on_alive("reactor/b/alive/plant", True, 0)
+    said += second.on_past(Past("b", older, run[:360]), 0)
+    second.rejoin("b", 0)
+    said += second.on_past(Past("b", first.state_of("b"), run[:360]), 0)
+    said += second.on_messages(run[360:], 0)
+    assert [event for _, event, _ in alarms(said)] == ["raised", "cleared"]
+
+
 def test_a_state_that_cannot_be_used_is_told_and_the_plant_learned_anew(runs: dict[str, list[Encoded]]) -> None:
     asked: list[tuple[str, bool]] = []
     monitor = fleet(ask_past=noting(asked), unusable=lambda plant, _: f"; {plant} is kept aside")
