@@ -164,8 +164,9 @@ def held(endpoint: str, plants: int) -> None:
     assert bus is not None
     node = Counting(FAST, bus, stop)
     node.learn(plants)
-    assert node._quiet is not None
-    due_ns = node._quiet._slots.health_due_ns
+    quiet = node._here._quiet
+    assert quiet is not None
+    due_ns = quiet._slots.health_due_ns
     due_ns[plants // 2 : plants] = NEVER_NS
     node.samples = 0
     threading.Thread(target=watch, args=(node, bus, stop), daemon=True).start()

@@ -7,10 +7,24 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from monitor_node.sample_limits import LARGEST_SAMPLE
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 
 MOST_KEPT = 100_000
 """Messages of all such plants; what comes beyond that is lost, unless it is told as being of before."""
+
+
+LARGEST_KEPT = 1 << 16
+"""Of other payloads than samples: no alarm is as large."""
+
+
+def cut(message: Encoded) -> Encoded:
+    """So much of a message that it is refused if it is too large: what waits must take no more room."""
+    if len(message.payload) <= LARGEST_SAMPLE:
+        return message
+    topic = keys.parse(message.key)
+    largest = LARGEST_SAMPLE if topic is not None and topic.kind == keys.SAMPLE else LARGEST_KEPT
+    return message._replace(payload=message.payload[: largest + 1])
 
 
 class Past(NamedTuple):
@@ -42,9 +56,9 @@ class Arrivals:
         self._kept[plant] = []
 
     def keep(self, plant: str, message: Encoded) -> None:
-        """Keep what came of a plant that is waited for; so much of it that it is refused if it is too large."""
+        """Keep what came of a plant that is waited for."""
         if self._count < MOST_KEPT:
-            self._kept[plant].append(message._replace(payload=message.payload[: LARGEST_SAMPLE + 1]))
+            self._kept[plant].append(cut(message))
             self._count += 1
 
     def end(self, plant: str, told: Iterable[Encoded] = ()) -> list[Encoded]:

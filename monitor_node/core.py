@@ -261,7 +261,6 @@ class Monitor:
             raise InputError(f"is no state of this software's monitor: {error}") from error
         self.alarms, self._watch = board, watch
         self._runs = state.runs
-        self._runs = state.runs
         self._aligner.state, self._told_again = state.alignment, ToldAgain(state.alignment)
         self._units, self._heard_from_ns = state.units, state.heard_from_ns
         self._output_units = [self._units[output] for output in self.config.outputs]
@@ -274,6 +273,11 @@ class Monitor:
         if self._settings is None:
             self._settings = settings_of(self.config, self._watch.model, points=self._points)
         return self._settings
+
+    def pass_over(self) -> None:
+        """A sample came that was judged before: count it."""
+        self.received += 1
+        self._aligner.state.counts.duplicated += 1
 
     @property
     def is_catching_up(self) -> bool:

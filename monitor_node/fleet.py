@@ -10,24 +10,26 @@ is left out when it is found again, so that no alarm is told twice. Without one 
 alarms are not forgotten: monitors of a fleet hear each other's alarms, so one that stands is not raised again, and it
 is cleared when it is over.
 
+While others may have taken over from ourselves nothing is judged (`hold`), until it is known of which plants they have
+(`go_on`). Of those we go on from what they know.
+
 Nothing here reads a clock or does I/O.
 """
 
-from collections.abc import Callable, Iterator
-from heapq import heappop, heappush
+from collections.abc import Callable, Iterable, Iterator
 
-import msgspec
-
-from monitor_node.alarm_states import Event
-from monitor_node.arrivals import Arrivals, Past
+from monitor_node.arrivals import Arrivals, Past, cut
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.quiet.form import QuietForm
-from monitor_node.quiet.plants import QuietPlants
+from monitor_node.fleet_alarms import AlarmsBefore
+from monitor_node.fleet_dues import NEVER_NS
+from monitor_node.fleet_recent import Recent
+from monitor_node.fleet_strangers import PROVEN_MESSAGES, PROVEN_ROWS, Strangers
+from monitor_node.fleet_watched import State, WatchedPlants
 from monitor_node.recorded_lives import SILENCE
 from monitor_node.shards import Crew
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
@@ -35,14 +37,10 @@ from reactorwatch.process.model import ProcessModel
 PATIENCE_NS = 10_000_000_000
 """After the start: a shard of which nobody was seen by then is taken for gone."""
 
-LOOK_AGAIN_ROWS = 8
-"""After so many rows it is seen again whether a plant is quiet."""
-
 MOST_PLANTS = 100_000
-"""A stranger may make up names of plants; there are no more than these."""
 
-State = bytes
-"""All that a monitor remembers of a plant."""
+MOST_HELD = 500_000
+"""Messages that wait until it is known whose the plants are; with more they are judged, as late is worse than twice."""
 
 
 class FleetMonitor:
@@ -77,34 +75,29 @@ class FleetMonitor:
         unusable: Callable[[str, InputError], str] = lambda _plant, _why: "",
         in_charge: Callable[[str, bool], None] = lambda _plant, _ours: None,
     ) -> None:
-        self._config, self._model, self._points = config, model, points
         self._crew, self._in_charge = crew, in_charge
         self._ask_past, self._store, self._unusable = ask_past, store, unusable
+        self._here = WatchedPlants(config, start_ns, model, points=points)
         self._arrivals = Arrivals()
-        first = Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
-        self._alarms = {alarm.alarm for alarm in first.alarms.all_alarms()}
-        form = None if points or first.model is None else QuietForm.of(config, first.model)
-        self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
-        self._look_at_row: dict[str, int] = {}  # of a plant with a monitor of its own: when to see whether it is quiet
-        self._notes: list[tuple[str, str]] = []
         self._patience_ns: int | None = start_ns + PATIENCE_NS
-        self._monitors: dict[str, Monitor | None] = {}  # by plant; None: it is another's
-        self._plants: dict[str, str] = {}  # by key of a sample
-        self._heard: dict[str, dict[str, Alarm]] = {}  # by plant and name, the newest of what another said of an alarm
-        self._dues: list[tuple[int, str]] = []
-        self._due_ns: dict[str, int] = {}  # of each plant, the earliest that is in `_dues`
+        self._met: dict[str, None] = {}  # all plants that are known, whoever watches them
+        self._strangers = Strangers()
+        self._signals = (config.input, *config.outputs)
+        self._plants: dict[str, str] = {}  # by key of a sample, those that are not quiet
+        self._before, self._recent = AlarmsBefore(self._here.alarms), Recent()
+        self._held: list[Encoded] | None = None  # what came while it is not known whose the plants are
 
     # --- who is watched --------------------------------------------------------------------------------------
 
     @property
     def plants(self) -> list[str]:
         """Those that are watched here."""
-        return [plant for plant, monitor in self._monitors.items() if monitor is not None or self._is_quiet(plant)]
+        return self._here.plants
 
     @property
     def quiet(self) -> list[str]:
         """Those of them in which nothing happens just now."""
-        return [] if self._quiet is None else self._quiet.plants
+        return self._here.quiet
 
     def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
         """A node of a plant, or another monitor of the fleet, came or went."""
@@ -112,19 +105,24 @@ class FleetMonitor:
         if self._crew.note(token, is_alive=is_alive):
             self._share_out(now_ns)
         elif topic is not None and topic.kind == keys.ALIVE and is_alive:
-            self.meet(topic.plant, now_ns)
+            self.meet(topic.plant, now_ns, vouched=True)
         return []
 
     def on_past(self, past: Past, now_ns: int) -> list[Publication]:
         """Begin to watch a plant whose past was asked for, if it is still ours: judge that, and what came since."""
         if past.plant not in self._arrivals:
             return []
+        if past.state is not None:
+            self._strangers.vouch(past.plant)
         messages = self._arrivals.end(past.plant, past.messages)
         self.adopt(past.plant, past.state, now_ns)
         monitor = self.monitor(past.plant)
-        said = [item for message in messages for item in monitor.on_message(message, now_ns)]
+        said = self._before.new([item for message in messages for item in monitor.on_message(message, now_ns)])
+        self._note_silence(past.plant, monitor)
         monitor.caught_up()
-        return self._new(said)
+        self._recent.adopted(past.plant, monitor, now_ns)
+        self._before.passed(past.plant)
+        return said
 
     def adopt(self, plant: str, state: State | None, now_ns: int) -> None:
         """Begin to watch a plant.
@@ -135,7 +133,7 @@ class FleetMonitor:
                 anew. One that cannot be used is noted, and counts as none.
             now_ns: now.
         """
-        monitor = Monitor(self._named(plant), now_ns, points=self._points, model=self._model)
+        monitor = self._here.unwatched(plant, now_ns)
         if state is not None:
             try:
                 monitor.from_bytes(state)
@@ -144,32 +142,53 @@ class FleetMonitor:
                 monitor.notes.append(f"the state that was stored {error}; the plant is learned anew{kept}")
                 state = None
         if state is None:
-            monitor.go_on_from_alarms(self._heard.get(plant, {}).values())
-        else:
-            monitor.go_on_from_alarms(self._silence_since(plant, monitor))
-        self._monitors[plant] = monitor
+            monitor.go_on_from_alarms(alarm for alarm in self._before.of(plant) if alarm.alarm != SILENCE)
+        self._here.add(plant, monitor)
+        self._met[plant] = None
         self._in_charge(plant, True)
-        self._schedule(plant, monitor)
 
-    def _silence_since(self, plant: str, monitor: Monitor) -> list[Alarm]:
-        """A silence that another has raised and that the state does not know: no sample tells of it again."""
-        last_ns = monitor.last_ns
-        return [
-            alarm
-            for alarm in self._heard.get(plant, {}).values()
-            if alarm.alarm == SILENCE
-            and alarm.event == Event.RAISED.value
-            and (last_ns is None or alarm.raised_ns > last_ns)
-        ]
+    def _note_silence(self, plant: str, monitor: Monitor) -> None:
+        """Have the next sample end a silence that was said before; rows from before it end none."""
+        monitor.go_on_from_alarms(self._before.silences_after(plant, monitor.alarms.alarm(SILENCE).raised_ns))
 
     def release(self, plant: str) -> State | None:
         """Watch a plant no longer; returns its state, for who does. None: it was not watched here."""
-        monitor = self._alone(plant)
-        self._monitors[plant] = None
+        monitor = self._here.remove(plant)
         if monitor is None:
             return None
         self._in_charge(plant, False)
         return monitor.to_bytes()
+
+    def rejoin(self, plant: str, now_ns: int) -> None:
+        """Another watches a plant that is watched here, or did meanwhile: go on from what he knows, if it is ours."""
+        monitor = self._here.remove(plant)
+        if monitor is None:
+            return
+        self._before.we_said(plant, monitor.alarms.all_alarms(), monitor.last_ns)
+        self._in_charge(plant, False)
+        if self._crew.is_ours(plant):
+            self._arrive(plant, now_ns, taken_over=True)
+
+    def hold(self) -> None:
+        """Judge nothing until it is known whose the plants are."""
+        self._held = [] if self._held is None else self._held
+
+    @property
+    def holds(self) -> bool:
+        """Whether nothing is judged just now."""
+        return self._held is not None
+
+    def go_on(self, others: Iterable[str], now_ns: int) -> list[Publication]:
+        """Judge what came meanwhile, and what comes.
+
+        Args:
+            others: plants of ours that others have watched meanwhile.
+            now_ns: now.
+        """
+        held, self._held = self._held or [], None
+        for plant in others:
+            self.rejoin(plant, now_ns)
+        return self._judged(held, now_ns)
 
     def monitor(self, plant: str) -> Monitor:
         """The monitor of a plant.
@@ -177,63 +196,96 @@ class FleetMonitor:
         Raises:
             InputError: it is not watched here.
         """
-        monitor = self._alone(plant)
+        monitor = self._here.alone(plant)
         if monitor is None:
             raise InputError(f"plant {plant!r} is not watched here (there are: {', '.join(self.plants)})")
         return monitor
 
     def state_of(self, plant: str) -> State:
         """All that is remembered of a plant that is watched here."""
-        if self._quiet is not None and plant in self._quiet:
-            return self._quiet.state_of(plant)
-        return self.monitor(plant).to_bytes()
+        return self._here.state_of(plant)
+
+    def alarms_of(self, plant: str) -> list[Alarm] | None:
+        """The alarms of a plant; None if they are as they were when it last had a monitor of its own."""
+        own = self._here.own(plant)
+        return None if own is None else own.alarms.all_alarms()
+
+    def is_worth_storing(self, plant: str) -> bool:
+        """Whether anything is known of a plant that is watched here, and it is certain that there is such a plant."""
+        own = self._here.own(plant)
+        return plant not in self._strangers and (own is None or own.rows > 0)
+
+    @property
+    def forgotten(self) -> int:
+        """How many plants were forgotten that nobody vouched for, and that said nothing any more."""
+        return self._strangers.forgotten
 
     def received_of(self, plant: str) -> int | None:
         """How many messages of a plant came; None: it is not watched here."""
-        if self._quiet is not None and plant in self._quiet:
-            return self._quiet.received_of(plant)
-        monitor = self._monitors.get(plant)
-        return None if monitor is None else monitor.received
+        return self._here.received_of(plant)
 
     def not_stored(self, plant: str) -> None:
         """Count that what is remembered of a plant could not be stored."""
-        if self._quiet is not None and plant in self._quiet:
-            self._quiet.not_stored(plant)
-        elif (monitor := self._monitors.get(plant)) is not None:
-            monitor.not_stored += 1
+        self._here.not_stored(plant)
 
-    def _named(self, plant: str) -> MonitorConfig:
-        return msgspec.structs.replace(self._config, plant=plant)
+    def meet(self, plant: str, now_ns: int, *, vouched: bool) -> None:
+        """Know of a plant, if it is new.
 
-    def meet(self, plant: str, now_ns: int) -> None:
-        """Know of a plant, if it is new."""
-        if plant in self._monitors or len(self._monitors) >= MOST_PLANTS:
+        Args:
+            plant: its name.
+            now_ns: now.
+            vouched: whether it is certain that there is such a plant; if not, see `fleet_strangers`.
+        """
+        if plant in self._met:
+            if vouched:
+                self._strangers.vouch(plant)
+            return
+        if len(self._met) >= MOST_PLANTS or not (vouched or self._strangers.have_room):
             return
         try:
             keys.checked_plant(plant)
         except ValueError:
             return
-        self._monitors[plant] = None
+        self._met[plant] = None
+        if not vouched:
+            self._strangers.meet(plant, now_ns)
         if self._crew.is_ours(plant):
             self._arrive(plant, now_ns, taken_over=False)
 
+    def _forget(self, plant: str) -> None:
+        """Know of a plant no longer."""
+        del self._met[plant]
+        if plant in self._arrivals:
+            self._arrivals.end(plant)
+        if self._here.remove(plant) is not None:
+            self._in_charge(plant, False)
+        self._before.forget(plant)
+        self._forget_keys(plant)
+
+    def _forget_keys(self, plant: str) -> None:
+        for signal in self._signals:
+            self._plants.pop(keys.key(plant, keys.SAMPLE, signal), None)
+
     def _share_out(self, now_ns: int) -> None:
         """Begin to watch what is ours now, and cease to watch what is not."""
-        for plant in list(self._monitors):
+        for plant in list(self._met):
             ours = self._crew.is_ours(plant)
-            watched, arriving = self._monitors[plant] is not None or self._is_quiet(plant), plant in self._arrivals
+            watched, arriving = plant in self._here, plant in self._arrivals
             if ours and not (watched or arriving):
                 self._arrive(plant, now_ns, taken_over=True)
             elif arriving and not ours:
                 self._arrivals.end(plant)
-            elif watched and not ours and (state := self.release(plant)) is not None:
-                self._store(plant, state)
+            elif watched and not ours:
+                is_known = self.is_worth_storing(plant)
+                if (state := self.release(plant)) is not None and is_known:
+                    self._store(plant, state)
 
     def _arrive(self, plant: str, now_ns: int, *, taken_over: bool) -> None:
         if self._ask_past(plant, taken_over):
             self._arrivals.begin(plant)
         else:
             self.adopt(plant, None, now_ns)
+            self._note_silence(plant, self.monitor(plant))
 
     # --- what the loop calls ---------------------------------------------------------------------------------
 
@@ -243,27 +295,34 @@ class FleetMonitor:
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         """Take in what was published, in the order of each plant."""
-        publications: list[Publication] = []
-        touched: set[str] = set()
-        if self._quiet:
-            publications, messages, given = self._quiet.on_messages(messages, now_ns)
-            for plant, monitor in given.items():
-                self._monitors[plant] = monitor
-                self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
-                touched.add(plant)
-            publications = self._new(publications)
+        if self._held is not None:
+            self._held += map(cut, messages)
+            return [] if len(self._held) < MOST_HELD else self.go_on((), now_ns)
+        return self._judged(messages, now_ns)
+
+    def _judged(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
+        publications, messages, touched = self._here.on_messages(messages, now_ns)
+        publications = self._before.new(publications)
         for message in messages:
             plant = self._plants.get(message.key) or self._plant_of(message, now_ns)
-            own = self._monitors.get(plant)
+            own = self._here.own(plant)
+            messages_of = self._strangers.hear(plant, now_ns) if plant in self._strangers else 0
             if own is not None:
-                publications += self._new(own.on_message(message, now_ns))
                 touched.add(plant)
+                if self._recent.again(plant, message, now_ns):
+                    own.pass_over()
+                else:
+                    publications += self._before.new(own.on_message(message, now_ns))
             elif plant in self._arrivals:
                 self._arrivals.keep(plant, message)
-        for plant in touched:
-            own = self._monitors[plant]
-            if own is not None and not self._becomes_quiet(plant, own):
-                self._schedule(plant, own)
+            elif messages_of >= PROVEN_MESSAGES:
+                self._strangers.vouch(plant)
+        for plant in [plant for plant in touched if plant in self._strangers]:
+            own = self._here.own(plant)
+            if own is not None and own.rows >= PROVEN_ROWS:
+                self._strangers.vouch(plant)
+        for plant in self._here.touched(touched):
+            self._forget_keys(plant)
         return publications
 
     def _plant_of(self, message: Encoded, now_ns: int) -> str:
@@ -271,47 +330,38 @@ class FleetMonitor:
         topic = keys.parse(message.key)
         if topic is None or topic.kind not in (keys.SAMPLE, keys.ALARM):
             return ""
-        self.meet(topic.plant, now_ns)
+        self.meet(topic.plant, now_ns, vouched=False)
         if topic.kind == keys.ALARM:
-            self._hear(topic.plant, message)
+            if topic.plant in self._met and topic.plant not in self._here:  # or it is our own voice
+                self._before.hear(topic.plant, message)
             return ""
-        if topic.plant in self._monitors:
+        if topic.plant in self._met and topic.name in self._signals:
             self._plants[message.key] = topic.plant
         return topic.plant
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """Let a person act on a plant's alarms; None: the plant is another's to answer for."""
         topic = keys.parse(question.key)
-        monitor = self._alone(topic.plant) if topic is not None else None
+        monitor = self._here.alone(topic.plant) if topic is not None and not self.holds else None
         return (None, []) if monitor is None else monitor.on_command(question, now_ns)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish the health of the plants' monitors where it is due, and silences of plants."""
-        publications: list[Publication] = []
+        if self.holds:
+            return []
         if self._patience_ns is not None and now_ns >= self._patience_ns:
             self._patience_ns = None
             if self._crew.presume_gone():
                 self._share_out(now_ns)
-        if self._quiet:
-            for plant in self._quiet.overdue(now_ns):
-                self._alone(plant)
-            publications += self._quiet.healths(now_ns)
-        while self._dues and self._dues[0][0] <= now_ns:
-            due_ns, plant = heappop(self._dues)
-            monitor = self._monitors.get(plant)
-            if self._due_ns.get(plant) == due_ns:
-                del self._due_ns[plant]
-                if monitor is not None:
-                    if monitor.next_tick_ns() <= now_ns:
-                        publications += monitor.on_tick(now_ns)
-                    self._schedule(plant, monitor)
-        return publications
+        for plant in self._strangers.forget(now_ns):
+            self._forget(plant)
+        return self._here.on_tick(now_ns)
 
     def next_tick_ns(self) -> int:
         """When the first of the plants is due."""
-        due_ns = self._dues[0][0] if self._dues else 2**63 - 1
-        if self._quiet:
-            due_ns = min(due_ns, self._quiet.next_due_ns())
+        if self.holds:
+            return NEVER_NS
+        due_ns = self._here.next_tick_ns()
         return due_ns if self._patience_ns is None else min(due_ns, self._patience_ns)
 
     @property
@@ -321,89 +371,14 @@ class FleetMonitor:
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Publish the health of all for the last time."""
-        said = [item for monitor in self._monitors.values() if monitor is not None for item in monitor.on_stop(now_ns)]
-        return said + (self._quiet.last_healths(now_ns) if self._quiet else [])
+        return self._here.on_stop(now_ns)
 
     def copy(self, plant: str, name: str) -> None:
         """Watch another plant that is, so far, like a quiet one: for trials with many plants."""
-        assert self._quiet is not None
-        self._quiet.copied(plant, name)
-        self._monitors[name] = None
+        self._here.copy(plant, name)
+        self._met[name] = None
         self._in_charge(name, True)
 
     def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
         """What people are to be told: plant and line."""
-        yield from self._notes
-        self._notes.clear()
-        for plant, monitor in self._monitors.items():
-            if monitor is None:
-                continue
-            refused = monitor.refusals.report(now_ns)
-            if refused is not None:
-                yield plant, refused
-            while monitor.notes:
-                yield plant, monitor.notes.pop(0)
-
-    # --- within ----------------------------------------------------------------------------------------------
-
-    def _is_quiet(self, plant: str) -> bool:
-        return self._quiet is not None and plant in self._quiet
-
-    def _alone(self, plant: str) -> Monitor | None:
-        """The plant's own monitor, if it is watched here."""
-        if self._quiet is not None and plant in self._quiet:
-            monitor = self._monitors[plant] = self._quiet.give(plant)
-            self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
-            self._schedule(plant, monitor)
-        return self._monitors.get(plant)
-
-    def _becomes_quiet(self, plant: str, monitor: Monitor) -> bool:
-        """Hold a plant with the quiet ones, if it is one; whether it is."""
-        if self._quiet is None or monitor.rows < self._look_at_row.get(plant, 0):
-            return False
-        self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
-        if not self._quiet.take(plant, monitor):
-            return False
-        self._notes += [(plant, note) for note in monitor.notes]
-        self._monitors[plant] = None
-        del self._look_at_row[plant]
-        self._due_ns.pop(plant, None)
-        for key in [key for key, of in self._plants.items() if of == plant]:
-            del self._plants[key]
-        return True
-
-    def _schedule(self, plant: str, monitor: Monitor | None) -> None:
-        """Note when a plant is due, if that is earlier than known; if it is later, that is found when it comes up."""
-        if monitor is None:
-            return
-        due_ns = monitor.next_tick_ns()
-        if due_ns < self._due_ns.get(plant, due_ns + 1):
-            self._due_ns[plant] = due_ns
-            heappush(self._dues, (due_ns, plant))
-
-    def _hear(self, plant: str, message: Encoded) -> None:
-        """Note what another monitor says of an alarm."""
-        if self._monitors.get(plant) is not None or self._is_quiet(plant):
-            return  # it is our own voice
-        try:
-            alarm = decode(message.payload, message.encoding)
-        except DecodeError:
-            return
-        if isinstance(alarm, Alarm) and plant in self._monitors and alarm.alarm in self._alarms:
-            self._heard.setdefault(plant, {})[alarm.alarm] = alarm
-
-    def _new(self, publications: list[Publication]) -> list[Publication]:
-        """Those that the monitor before us has not said already."""
-        if not self._heard or not publications:
-            return publications
-        return [item for item in publications if not self._was_said(item)]
-
-    def _was_said(self, publication: Publication) -> bool:
-        alarm, topic = publication.message, keys.parse(publication.key)
-        if not isinstance(alarm, Alarm) or topic is None:
-            return False
-        before = self._heard.get(topic.plant, {}).get(alarm.alarm)
-        if before is None or alarm.time_ns > before.time_ns:
-            return False
-        ends_it = before.event == Event.RAISED.value and alarm.event == Event.CLEARED.value
-        return alarm.time_ns < before.time_ns or not ends_it  # a silence may end at the time at which it was raised
+        return self._here.reports(now_ns)

@@ -12,6 +12,7 @@ from monitor_node.alarm_kpis import are_of_nothing
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet import FleetMonitor
+from monitor_node.fleet_absence import Absence
 from monitor_node.fleet_config import FleetConfig
 from monitor_node.fleet_pasts import Pasts
 from monitor_node.fleet_states import FleetStates
@@ -25,7 +26,8 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus, matches
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.config import BusConfig, MetricsConfig
+from reactorwatch.runtime.metrics import FleetMetrics, served
 from reactorwatch.runtime.model_file import model_on_the_bus
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 
@@ -61,6 +63,7 @@ class FleetNode(FleetMonitor):
         bus: an open bus.
         start_ns: now.
         states: where what is remembered of each plant is kept; None: nowhere.
+        metrics: where the counts of each plant are shown; None: nowhere.
 
     Raises:
         InputError: settings that do not fit together, or a model that cannot be used.
@@ -73,12 +76,14 @@ class FleetNode(FleetMonitor):
         bus: Bus,
         start_ns: int,
         states: FleetStates | None = None,
+        metrics: FleetMetrics | None = None,
     ) -> None:
-        self._bus = bus
+        self._bus, self.metrics = bus, metrics
         self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
         self._states = states
         self._pasts = Pasts(bus, self._states, lambda plant, line: log.warning(line, plant=plant))
         self._every_ns = int(config.state_every_s * 1e9)
+        self._absence = Absence(lambda: bus.has_router)
         self._deaf = len(self.subscriptions)
         self._changed: set[str] = set()  # plants of which an alarm changed since their state was stored
         self._round: list[str] = []  # plants that are looked at next, whether something came of them
@@ -88,6 +93,7 @@ class FleetNode(FleetMonitor):
         self._figured: set[str] = set()  # keys of the figures of alarms of which there were any
         self._shown: set[str] = set()
         self._report_ns = start_ns
+        self._forgotten_told = 0
         # The older of two with the same shard is in charge: names sort by the time of the start.
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
         self.crew = Crew(self.expression, shards.parsed(fleet.shard), name)
@@ -105,7 +111,7 @@ class FleetNode(FleetMonitor):
         )
         for plant in self._states.plants if self._states is not None else []:
             if matches(self.expression, f"{keys.ROOT}/{plant}"):
-                self.meet(plant, start_ns)
+                self.meet(plant, start_ns, vouched=True)
 
     @property
     def subscriptions(self) -> tuple[str, ...]:
@@ -114,6 +120,14 @@ class FleetNode(FleetMonitor):
 
     def _show(self, plant: str, ours: bool) -> None:
         token = keys.key(plant, keys.ALIVE, NODE)
+        self._stored_at.pop(plant, None)
+        if self.metrics is not None:
+            if ours:
+                self.metrics.watch(plant, lambda: self.alarms_of(plant))
+            else:
+                self.metrics.leave(plant)
+        if ours and self.crew.is_shared:
+            self._changed.add(plant)  # another who was only cut off is to find that we have gone on from his state
         log.info("watching" if ours else "no longer watching", plant=plant)
         if ours and len(self._shown) < MOST_TOKENS:
             self._shown.add(token)
@@ -124,7 +138,13 @@ class FleetNode(FleetMonitor):
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; alarms are logged."""
-        return self._noted(super().on_messages(messages, now_ns))
+        return self._attended(now_ns) + self._noted(super().on_messages(messages, now_ns))
+
+    def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
+        """See `FleetMonitor`; if it is our own that went, others may have our plants."""
+        if token == self.crew.token and not is_alive:
+            self._absence.begins(now_ns)
+        return self._attended(now_ns) + self._noted(super().on_alive(token, is_alive, now_ns))
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """See `FleetMonitor`; alarms are logged."""
@@ -133,9 +153,11 @@ class FleetNode(FleetMonitor):
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; what is remembered is stored, and what is to be told of it is logged."""
-        publications: list[Publication] = []
+        publications = self._attended(now_ns)
         if now_ns >= self._look_ns:
             self._look_ns = now_ns + LOOK_EVERY_NS
+            if not self._bus.has_router:
+                self._absence.begins(now_ns)
             self._store_due(now_ns)
             for past in self._pasts.found():
                 publications += self._noted(self.on_past(past, now_ns))
@@ -144,6 +166,9 @@ class FleetNode(FleetMonitor):
             self._report_ns = now_ns + REPORT_EVERY_NS
             for plant, line in self.reports(now_ns):
                 log.warning(line, plant=plant)
+            if self.forgotten > self._forgotten_told:
+                self._forgotten_told = self.forgotten
+                log.warning("plants were forgotten that showed no token and said nothing more", so_far=self.forgotten)
         return publications
 
     def next_tick_ns(self) -> int:
@@ -163,11 +188,25 @@ class FleetNode(FleetMonitor):
         """See `FleetMonitor`; all is stored for the last time."""
         self._pasts.close()
         if self._states is not None:
-            for plant in self.plants:
+            for plant in filter(self.is_worth_storing, self.plants):
                 self._states.put(plant, self.state_of(plant))
             self._states.close()
             self._count_failures()
         return super().on_stop(now_ns)
+
+    def _attended(self, now_ns: int) -> list[Publication]:
+        """Judge nothing while others may have our plants; then, of those that they have, go on from their states."""
+        absent = self._absence.lasts(now_ns)
+        if self._states is None or absent == self.holds:
+            return []
+        if absent:
+            if self.crew.is_shared:
+                log.warning("the other monitors may take us for gone: nothing is judged until we are back")
+                self.hold()
+            return []
+        others = self._states.of_others(self.plants)
+        log.info("back", plants=len(self.plants), watched_by_others=len(others))
+        return self._noted(self.go_on(others, now_ns))
 
     # --- what survives a restart -----------------------------------------------------------------------------
 
@@ -189,9 +228,12 @@ class FleetNode(FleetMonitor):
 
     def _store_due(self, now_ns: int) -> None:
         """Store plants of which an alarm changed, which has been told by now, and some of which something came."""
-        if self._states is None:
+        if self._states is None or self.holds:
             return
         self._count_failures()
+        for plant in self._states.lost():
+            log.info("another monitor has stored a newer state", plant=plant)
+            self.rejoin(plant, now_ns)
         due = [plant for plant in self._changed if self.received_of(plant) is not None]
         self._changed.clear()
         if not self._round and not 0 <= now_ns - self._round_ns < self._every_ns:
@@ -201,7 +243,7 @@ class FleetNode(FleetMonitor):
             plant, looked = self._round.pop(), looked + 1
             if self.received_of(plant) not in (None, self._stored_at.get(plant)):
                 due.append(plant)
-        for plant in due:
+        for plant in filter(self.is_worth_storing, due):
             self._states.put(plant, self.state_of(plant))
             self._stored_at[plant] = self.received_of(plant) or 0
 
@@ -234,8 +276,19 @@ class FleetNode(FleetMonitor):
         return told
 
 
-def run(config: MonitorConfig, fleet: FleetConfig, bus_config: BusConfig) -> None:
+def run(
+    config: MonitorConfig,
+    fleet: FleetConfig,
+    bus_config: BusConfig,
+    metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
+) -> None:
     """Watch the plants until SIGINT or SIGTERM.
+
+    Args:
+        config: how each plant is watched.
+        fleet: which plants.
+        bus_config: where the bus is.
+        metrics_config: where the counts are shown.
 
     Raises:
         InputError: settings that do not fit together, or that the bus cannot use; a folder where nothing can be stored.
@@ -245,12 +298,12 @@ def run(config: MonitorConfig, fleet: FleetConfig, bus_config: BusConfig) -> Non
             raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
     Monitor(config, 0, points=fleet.points, model=model_on_the_bus(config.model))  # or they make none
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
-    with stop_on_signals() as stop:
+    with served(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop, passing=PASSING, crowded=True)
         if bus is None:
             return
         try:
-            watch(FleetNode(config, fleet, bus, time.time_ns(), states), bus, stop)
+            watch(FleetNode(config, fleet, bus, time.time_ns(), states, metrics), bus, stop)
         finally:
             bus.close()
 
@@ -271,4 +324,5 @@ def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
         commands=tuple(f"{plants}/{keys.COMMAND}/{name}" for name in COMMANDS),
         on_ready=lambda: bus.announce(node.crew.token),
         linger_s=LINGER_S,
+        on_publish=node.metrics.published if node.metrics is not None else None,
     )

@@ -2,11 +2,18 @@
 
 A file is written whole or not at all, by a thread of its own, so that a slow disk delays no alarm. Monitors that share
 the fleet may share the folder: who takes a plant over goes on from what the one before stored.
+
+Two may take themselves for in charge of a plant for a moment: one of them was cut off, or frozen. So nobody writes over
+a file that is not the one that he has read or written last, by its time and size; he is told that another has (`lost`).
 """
 
+import contextlib
 import os
 import threading
+import time
+from collections.abc import Iterable
 from pathlib import Path
+from typing import TypeAlias
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import is_full, replacing
@@ -15,6 +22,12 @@ ENDING = ".state"
 
 MOST_WAITING = 100
 """States that wait for the disk; with so many, only those of changed alarms and of plants that go are added."""
+
+
+LEFT_S = 600.0
+"""What was being written for so long was left by a writer that was killed."""
+
+_Mark: TypeAlias = tuple[int, int]  # by which a file is known: time and size
 
 
 class FleetStates:
@@ -31,6 +44,8 @@ class FleetStates:
         self._folder = folder
         self._waiting: dict[str, bytes] = {}
         self._failed: list[tuple[str, str]] = []
+        self._marks: dict[str, _Mark] = {}  # of the file of each plant that was read or written last
+        self._lost: list[str] = []
         self._changed = threading.Condition()
         self._closed = False
         try:
@@ -42,6 +57,7 @@ class FleetStates:
         except InputError as error:
             if not is_full(error):
                 raise InputError(f"state folder {folder}: {error}") from error
+        self._clear_up()
         # A daemon: who does not `close` has nothing to write.
         self._thread = threading.Thread(target=self._write_what_waits, name="states", daemon=True)
         self._thread.start()
@@ -58,10 +74,12 @@ class FleetStates:
             InputError: it cannot be read.
         """
         with self._changed:
-            if plant in self._waiting:
+            if plant in self._waiting and not self.is_of_another(plant):
                 return self._waiting[plant]
+            self._waiting.pop(plant, None)
         path = self._path(plant)
         try:
+            self._note(plant)
             return path.read_bytes() if path.exists() else None
         except OSError as error:
             raise InputError(f"state {path}: cannot be read: {error.strerror}") from error
@@ -92,6 +110,20 @@ class FleetStates:
         failed, self._failed = self._failed, []
         return failed
 
+    def lost(self) -> list[str]:
+        """Plants whose state was not written since the last time, because another has written one."""
+        lost, self._lost = self._lost, []
+        return lost
+
+    def is_of_another(self, plant: str) -> bool:
+        """Whether another has written the state of a plant since it was read or written here."""
+        known, found = self._marks.get(plant), _mark_of(self._path(plant))
+        return found not in (None, known) and known is not None
+
+    def of_others(self, plants: Iterable[str]) -> list[str]:
+        """Those plants of which another has."""
+        return [plant for plant in plants if self.is_of_another(plant)]
+
     def close(self) -> None:
         """Write what waits, and end."""
         with self._changed:
@@ -101,6 +133,19 @@ class FleetStates:
 
     def _path(self, plant: str) -> Path:
         return self._folder / f"{plant}{ENDING}"
+
+    def _note(self, plant: str) -> None:
+        """The state of a plant as it is now is known here."""
+        mark = _mark_of(self._path(plant))
+        self._marks[plant] = mark if mark is not None else (0, 0)
+
+    def _clear_up(self) -> None:
+        """Remove what writers that were killed have left."""
+        oldest_s = time.time() - LEFT_S
+        for path in self._folder.glob(f".*{ENDING}.*.tmp"):
+            with contextlib.suppress(OSError):
+                if path.stat().st_mtime < oldest_s:
+                    path.unlink()
 
     def _write_what_waits(self) -> None:
         while True:
@@ -119,13 +164,26 @@ class FleetStates:
     def _written(self, plant: str, state: bytes) -> str | None:
         """Write a state; returns why that was not possible."""
         path = self._path(plant)
+        if self.is_of_another(plant):
+            self._lost.append(plant)
+            return None
         try:
             with replacing(path) as temporary, temporary.open("wb") as file:
                 file.write(state)
                 file.flush()
                 os.fsync(file.fileno())
+            self._note(plant)
         except InputError as error:
             return str(error)
         except OSError as error:
             return f"state {path}: cannot be written: {error.strerror}"
         return None
+
+
+def _mark_of(path: Path) -> _Mark | None:
+    """By which a file is known; None: there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size

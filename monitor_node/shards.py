@@ -93,6 +93,9 @@ class Crew:
         fleet: what they share: the key expression of its plants.
         shard: ours.
         name: ours, unlike all others'.
+
+    Attributes:
+        is_shared: whether there is anybody else, or ever was.
     """
 
     def __init__(self, fleet: str, shard: Shard, name: str) -> None:
@@ -100,6 +103,7 @@ class Crew:
         self._shard, self._name = shard, name
         self._names: dict[int, set[str]] = {shard.number: {name}}
         self._unseen = set(range(1, shard.of + 1)) - {shard.number}
+        self.is_shared = shard.of > 1
 
     @property
     def token(self) -> str:
@@ -122,6 +126,7 @@ class Crew:
         if found is None or (found.fleet, found.of) != (self._fleet, str(self._shard.of)) or not found.number.isdigit():
             return False
         names = self._names.setdefault(int(found.number), set())
+        self.is_shared = self.is_shared or found.name != self._name
         if is_alive:
             names.add(found.name)
             self._unseen.discard(int(found.number))

@@ -142,7 +142,7 @@ def monitor(
         for option, given in (("--plant", name), ("--diagnose", diagnose)):
             if given is not None:
                 raise InputError(f"{option} is for the monitor of one plant; leave it out with --plants")
-        fleet_node.run(config_of_monitor, fleet, bus)
+        fleet_node.run(config_of_monitor, fleet, bus, _metrics(tables))
         return
     if shard is not None:
         raise InputError("--shard is a part of the plants that --plants names; give both")

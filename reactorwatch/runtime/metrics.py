@@ -6,16 +6,17 @@ end, `_total` for what only ever grows. Samples that are missing are a gauge: on
 and a counter that falls is taken for a restart.
 
 The loop of the node tells what is published (`Metrics.of`); a scrape reads it in a thread of the server's own,
-from references that are replaced as a whole.
+from references that are replaced as a whole. A node of many plants has one page of all (`FleetMetrics`).
 """
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import structlog
 
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health
 from reactorwatch.errors import InputError
@@ -29,6 +30,9 @@ log = structlog.get_logger()
 PREFIX = "reactorwatch"
 PORT_AFTER = {"plant": 0, "monitor": 1, "recorder": 2}
 """Where each node's page is, counted from the port of the settings, which may be those of all."""
+
+MOST_SHOWN = 1000
+"""Plants of a fleet that are on its page: a thousand are 1.5 MB, and a sixth of a second of a core at each scrape."""
 
 COUNTERS = {
     "received": ("messages_received", "Messages that came"),
@@ -68,11 +72,12 @@ class Metrics:
         self._health: Health | None = None
         self._by_state: Counter[int] | None = None
 
-    def of(self, alarms: Callable[[], Iterable[Alarm]] | None = None) -> Callable[[Publication], None]:
+    def of(self, alarms: Callable[[], Iterable[Alarm] | None] | None = None) -> Callable[[Publication], None]:
         """What is to be told of each thing that the node publishes.
 
         Args:
-            alarms: the node's alarms as they are, asked for in the thread that tells; None: it has none.
+            alarms: the node's alarms as they are, asked for in the thread that tells; it returns None if they are as
+                they were. None: it has none.
         """
 
         def published(publication: Publication) -> None:
@@ -81,8 +86,9 @@ class Metrics:
                 self._health = message
             elif not isinstance(message, Alarm):
                 return
-            if alarms is not None:
-                self._by_state = Counter(alarm.state for alarm in alarms())
+            found = alarms() if alarms is not None else None
+            if found is not None:
+                self._by_state = Counter(alarm.state for alarm in found)
 
         return published
 
@@ -138,8 +144,60 @@ class Metrics:
         return gauge
 
 
+class FleetMetrics:
+    """The pages of many plants as one.
+
+    Args:
+        node: its name.
+    """
+
+    def __init__(self, node: str) -> None:
+        self._node = node
+        self._pages: dict[str, tuple[Metrics, Callable[[Publication], None]]] = {}  # by plant
+
+    def watch(self, plant: str, alarms: Callable[[], Iterable[Alarm] | None]) -> None:
+        """From now on a plant is on the page, if there are not too many.
+
+        Args:
+            plant: its name.
+            alarms: as for `Metrics.of`.
+        """
+        if len(self._pages) < MOST_SHOWN:
+            page = Metrics(plant, self._node)
+            self._pages[plant] = page, page.of(alarms)
+
+    def leave(self, plant: str) -> None:
+        """A plant is on the page no longer."""
+        self._pages.pop(plant, None)
+
+    def published(self, publication: Publication) -> None:
+        """To be told of each thing that the node publishes."""
+        topic = keys.parse(publication.key)
+        found = self._pages.get(topic.plant) if topic is not None else None
+        if found is not None:
+            found[1](publication)
+
+    def collect(self) -> "Iterator[Metric]":
+        """The page: of each metric all plants together."""
+        together: dict[str, Metric] = {}
+        for page, _ in list(self._pages.values()):
+            for metric in page.collect():
+                if metric.name in together:
+                    together[metric.name].samples += metric.samples
+                else:
+                    together[metric.name] = metric
+        yield from together.values()
+
+
+class _Page(Protocol):
+    def collect(self) -> "Iterator[Metric]": ...
+
+
+Page = TypeVar("Page", bound=_Page)
+
+
 @contextmanager
-def served(config: MetricsConfig, metrics: Metrics, node: str) -> Iterator[Metrics | None]:
+def served(config: MetricsConfig, metrics: Page, node: str) -> Iterator[Page | None]:
     """Serve the page while the context lasts, if the settings ask for it.
 
     Args:

@@ -1,5 +1,6 @@
 """Monitors of a fleet on a real router: plants are discovered, and a monitor that dies is replaced."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -10,19 +11,23 @@ from contextlib import contextmanager
 from pathlib import Path
 from queue import SimpleQueue
 from typing import NamedTuple
+from urllib.request import urlopen
 
 import msgspec
 import pytest
 
+from benchmarks.link_cuts import Proxy
 from monitor_node.fleet_config import FleetConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Health, ListAlarms, Sample
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.config import BusConfig, MetricsConfig
+from reactorwatch.runtime.metrics import PORT_AFTER
 from reactorwatch.runtime.serve import StopSignal
+from tests.ports import LOOPBACK, three_free_ports
 from tests.unit.monitor_node.fleets import QUICK, alone, run_of
 
 from .client import client
@@ -105,6 +110,29 @@ def test_plants_are_discovered_by_their_tokens_and_by_their_samples(bus_config: 
         watchers.wait_for({"alpha", "beta"})
         heard = {health.get(timeout=WITHIN_S) for _ in range(4)}
         assert heard == {"reactor/alpha/health/monitor", "reactor/beta/health/monitor"}
+
+
+def test_what_is_counted_of_each_plant_is_on_the_monitor_s_page(bus_config: BusConfig, tmp_path: Path) -> None:
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    port, settings = three_free_ports(), tmp_path / "settings.toml"
+    fleet, metrics = FleetConfig(plants="reactor/*"), MetricsConfig(port=port)
+    write_settings(settings, {"bus": bus_config, "monitor": QUICK, "fleet": fleet, "metrics": metrics})
+    command = [sys.executable, "-m", "reactorwatch", "monitor", "--config", str(settings)]
+    with client(bus_config) as bus, (tmp_path / "log").open("wb") as said:
+        health, process = SimpleQueue[str](), subprocess.Popen(command, stderr=said)
+        bus.subscribe("reactor/*/health/monitor", lambda message: health.put(message.key))
+        try:
+            crew_of(bus)(1)
+            for plant in PLANTS:
+                bus.announce(f"reactor/{plant}/alive/plant")
+            assert len({health.get(timeout=WITHIN_S) for _ in PLANTS}) == len(PLANTS)
+            with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER['monitor']}/metrics", timeout=WITHIN_S) as answer:
+                page = answer.read().decode()
+        finally:
+            process.kill()
+            process.wait()
+    for plant in PLANTS:
+        assert f'reactorwatch_messages_received_total{{node="monitor",plant="{plant}"}} 0.0' in page
 
 
 def test_one_monitor_answers_a_command_and_that_of_the_plant(bus_config: BusConfig, tmp_path: Path) -> None:
@@ -280,6 +308,64 @@ def test_kills_of_monitors_that_share_a_folder_neither_lose_an_alarm_nor_tell_on
                 process.wait()
         assert all(expected.values())
         assert told.changes == expected
+
+
+LEAKS_MIN, CUT_AT, BACK_AT = 30.0, 280, 330
+"""The leak sets in at row 300, while the first monitor is cut off."""
+
+
+@pytest.mark.parametrize("absence", ["cut off", "frozen"])
+def test_who_comes_back_after_another_took_his_plants_over_tells_no_alarm_again_and_loses_none(
+    absence: str, bus_config: BusConfig, tmp_path: Path
+) -> None:
+    runs = {
+        plant: run_of(plant, seed, leak_min=LEAKS_MIN, span_min=40.0) for seed, plant in enumerate(PLANTS, start=40)
+    }
+    expected = {
+        plant: [change(item.message) for item in alone(plant, run) if isinstance(item.message, Alarm)]
+        for plant, run in runs.items()
+    }
+    rows, states, proxy = len(runs["alpha"]) // 3, tmp_path / "states", Proxy(bus_config.endpoint)
+    states.mkdir()
+    first_bus = msgspec.structs.replace(bus_config, endpoint=proxy.endpoint)
+    with (
+        contextlib.closing(proxy),
+        client(bus_config) as bus,
+        monitor(first_bus, tmp_path, "1/2", states) as first,
+        monitor(bus_config, tmp_path, "2/2", states),
+    ):
+        told, crew_are = Told(bus), crew_of(bus)
+
+        def publish(begin: int, end: int) -> None:
+            for row in range(begin, end):
+                for run in runs.values():
+                    for message in run[3 * row : 3 * row + 3]:
+                        bus.publish(message)
+            told.wait_for(end)
+
+        crew_are(2)
+        publish(0, CUT_AT)
+        with gone(first) if absence == "frozen" else proxy.cut("closed"):
+            crew_are(1)
+            publish(CUT_AT, BACK_AT)
+        crew_are(2)
+        publish(BACK_AT, rows)
+        told.wait_for(rows, sum(map(len, expected.values())))
+    assert all(
+        changes[0].time_ns < Sample.FromString(runs["alpha"][3 * BACK_AT].payload).time_ns
+        for changes in expected.values()
+    )
+    assert told.changes == expected
+
+
+@contextmanager
+def gone(process: subprocess.Popen[bytes]) -> Iterator[None]:
+    """A process stands still while the context lasts."""
+    process.send_signal(signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        process.send_signal(signal.SIGCONT)
 
 
 def _raised(message: Encoded) -> str:

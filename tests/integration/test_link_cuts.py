@@ -7,6 +7,7 @@ import contextlib
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from queue import SimpleQueue
 
 import pytest
 
@@ -59,6 +60,29 @@ def test_a_cut_link_costs_no_sample_and_none_its_place(
 def test_a_router_that_is_killed_and_started_again_costs_no_sample(tmp_path: Path) -> None:
     found = kill_router(tmp_path, 2.0)
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
+
+
+def test_the_first_messages_on_keys_are_heard_though_the_router_was_gone_when_they_were_published(
+    router: Router,
+) -> None:
+    """Of streams that are new, and of one that is known: nobody has heard of these keys before the router is back."""
+    listener, publisher = connected(router.config), connected(router.config)
+    seen: SimpleQueue[bool] = SimpleQueue()
+    heard: SimpleQueue[str] = SimpleQueue()
+    listener.subscribe("reactor/*/alarm/**", lambda message: heard.put(message.key))
+    publisher.watch_alive("reactor/known/alive/publisher", lambda _, is_alive: seen.put(is_alive))
+    publisher.announce("reactor/known/alive/publisher")
+    publisher.publish(Encoded("reactor/known/alarm/first", b"", ""))
+    assert (heard.get(timeout=PATIENCE_S), seen.get(timeout=PATIENCE_S)) == ("reactor/known/alarm/first", True)
+    router.kill()
+    assert not seen.get(timeout=PATIENCE_S)
+    published = [f"reactor/{plant}/alarm/{name}" for name in "xyz" for plant in ("known", "new", "newer")]
+    for key in published:
+        publisher.publish(Encoded(key, b"", ""))
+    router.restart()
+    assert sorted(heard.get(timeout=PATIENCE_S) for _ in published) == sorted(published)
+    publisher.close()
+    listener.close()
 
 
 @pytest.mark.parametrize("whose", ["recorder", "publisher"])

@@ -248,7 +248,7 @@ class ZenohBus:
     def has_router(self) -> bool:
         """See `Bus`."""
         try:
-            return bool(self._session.info.routers_zid())
+            return all(session.info.routers_zid() for session in (self._session, self._voice))
         except zenoh.ZError:  # it is closed
             return False
 

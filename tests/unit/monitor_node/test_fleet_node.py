@@ -1,15 +1,181 @@
-"""What a fleet's monitor tells of what its plants' monitors say."""
+"""A fleet's monitor with a folder of states, beside another one: who has a plant last, has it."""
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
 
 import msgspec
+import pytest
 
+from monitor_node import fleet_node, fleet_pasts
 from monitor_node.core import Monitor
 from monitor_node.fleet_config import FleetConfig
-from monitor_node.fleet_node import FleetNode
+from monitor_node.fleet_node import LOOK_EVERY_NS, FleetNode
+from monitor_node.fleet_states import FleetStates
+from monitor_node.shards import Crew, Shard, home
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
 from reactorwatch.runtime.bus import Exchange, MemoryBus
+from reactorwatch.runtime.metrics import FleetMetrics
 
-from .fleets import PLANTS, QUICK, row_by_row, run_of
+from .fleets import PLANTS, QUICK, fleet, row_by_row, run_of
+
+WITHIN_S = 30.0
+
+
+class Linked(MemoryBus):
+    """A bus whose router can be gone."""
+
+    has_router = True
+
+
+class Bench:
+    """A monitor, and the clock that it is told."""
+
+    def __init__(self, folder: Path, shard: str) -> None:
+        self.bus, self.states, self.now_ns = Linked(Exchange()), FleetStates(folder), 0
+        config = msgspec.structs.replace(QUICK, state_every_s=0.1)
+        self.node = FleetNode(config, FleetConfig(plants="reactor/*", shard=shard), self.bus, 0, self.states)
+        for _ in self.node.subscriptions:
+            self.node.listens()
+
+    def tick(self) -> None:
+        """A moment later."""
+        self.now_ns += LOOK_EVERY_NS
+        self.node.on_tick(self.now_ns)
+
+    def tick_until_watched(self, plant: str) -> None:
+        """Its past is found by a thread."""
+        until_s = time.monotonic() + WITHIN_S
+        while plant not in self.node.plants:
+            assert time.monotonic() < until_s
+            self.tick()
+
+
+@pytest.fixture
+def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Bench]:
+    """One of two monitors, both of whose shards it has, or a single one."""
+    for name in ("SETTLE_S", "RETURN_S", "LOOK_AGAIN_S"):
+        monkeypatch.setattr(fleet_pasts, name, 0.0)
+    bench = Bench(tmp_path, getattr(request, "param", "1/2"))
+    for _ in range(101):  # the other was never seen
+        bench.tick()
+    bench.node.on_alive("reactor/a/alive/plant", True, bench.now_ns)
+    bench.tick_until_watched("a")
+    yield bench
+    bench.node.on_stop(bench.now_ns)
+
+
+def test_who_finds_a_newer_state_than_his_own_where_he_wants_to_store_goes_on_from_it(
+    bench: Bench, tmp_path: Path
+) -> None:
+    run = run_of("a", 1, span_min=5.0)
+    other = fleet()
+    other.on_messages(run[:60], 0)
+    (tmp_path / "a.state").write_bytes(other.state_of("a"))
+    bench.node.on_messages(run[:30], bench.now_ns)
+    assert bench.node.monitor("a").rows == 10
+    bench.states.put("a", bench.node.state_of("a"))
+    until_s = time.monotonic() + WITHIN_S
+    while "a" not in bench.node.plants or bench.node.monitor("a").rows == 10:
+        assert time.monotonic() < until_s
+        bench.tick()
+    assert bench.node.monitor("a").rows == 20
+
+
+def test_while_the_router_is_gone_and_until_the_others_had_their_time_nothing_is_judged(bench: Bench) -> None:
+    run, returned_at = run_of("a", 1, span_min=5.0), 0
+    bench.bus.has_router = False
+    bench.tick()
+    for place in range(0, 60, 3):
+        bench.tick()
+        bench.node.on_messages(run[place : place + 3], bench.now_ns)
+    assert bench.node.monitor("a").rows == 0
+    bench.bus.has_router = True
+    while bench.node.holds:
+        assert bench.node.monitor("a").rows == 0
+        bench.tick()
+        returned_at += 1
+    assert returned_at * LOOK_EVERY_NS == 2_000_000_000
+    assert bench.node.monitor("a").rows == 20
+
+
+def test_while_the_router_is_gone_for_long_more_than_can_be_held_is_judged(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("monitor_node.fleet.MOST_HELD", 60)
+    run = run_of("a", 1, span_min=10.0)
+    bench.bus.has_router = False
+    bench.tick()
+    for place in range(0, 240, 3):
+        bench.tick()
+        bench.node.on_messages(run[place : place + 3], bench.now_ns)
+    assert bench.node.monitor("a").rows == 80
+
+
+def test_an_alarm_that_is_found_in_what_was_held_back_is_logged_once(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logged: list[str] = []
+    monkeypatch.setattr(fleet_node.log, "info", lambda event, **_: logged.append(event))
+    run = run_of("a", 1, leak_min=30.0)
+    bench.bus.has_router = False
+    bench.tick()
+    bench.tick()
+    bench.node.on_messages(run, bench.now_ns)
+    bench.bus.has_router = True
+    said: list[Publication] = []
+    while bench.node.holds:
+        bench.now_ns += LOOK_EVERY_NS
+        said += bench.node.on_tick(bench.now_ns)
+    told = sum(isinstance(item.message, Alarm) for item in said)
+    assert told > 0
+    assert logged.count("alarm") == told
+
+
+@pytest.mark.parametrize("bench", ["1/1"], indirect=True)
+def test_who_is_alone_goes_on_while_the_router_is_gone(bench: Bench) -> None:
+    bench.bus.has_router = False
+    bench.tick()
+    bench.tick()
+    assert not bench.node.holds
+
+
+def test_commands_are_left_to_the_others_while_they_may_have_the_plant(bench: Bench) -> None:
+    bench.bus.has_router = False
+    bench.tick()
+    bench.tick()
+    assert bench.node.on_command(run_of("a", 1, span_min=1.0)[0], bench.now_ns) == (None, [])
+
+
+def test_the_counts_and_alarms_of_each_plant_are_on_the_page_as_long_as_it_is_watched(bench: Bench) -> None:
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    metrics = bench.node.metrics = FleetMetrics("monitor")
+    plant = next(name for name in map(str, range(99)) if home(name, 2) == 2)
+    bench.node.on_alive(f"reactor/{plant}/alive/plant", True, bench.now_ns)
+    bench.tick_until_watched(plant)
+    run = run_of(plant, 1, span_min=1.0)
+    bench.node.on_messages(run, bench.now_ns)
+    bench.now_ns += int(QUICK.health_period_s * 1e9)
+    for publication in bench.node.on_tick(bench.now_ns):
+        metrics.published(publication)
+    shown = {metric.name: metric.samples for metric in metrics.collect()}
+    (rows,) = shown["reactorwatch_rows"]
+    assert (rows.labels, rows.value) == ({"plant": plant, "node": "monitor"}, len(run) // 3)
+    normal = [sample.value for sample in shown["reactorwatch_alarms"] if sample.labels["state"] == "normal"]
+    assert normal == [len(bench.node.monitor(plant).alarms.all_alarms())]
+    bench.node.on_alive(Crew(bench.node.expression, Shard(2, 2), "other").token, True, bench.now_ns)
+    assert list(metrics.collect()) == []
+
+
+def test_there_is_no_file_of_a_plant_of_which_nothing_is_known(bench: Bench, tmp_path: Path) -> None:
+    bench.node.on_messages(run_of("made-up", 1, span_min=1.0), bench.now_ns)
+    bench.tick_until_watched("made-up")
+    for _ in range(10):
+        bench.tick()
+    bench.node.on_messages(run_of("a", 1, span_min=1.0), bench.now_ns)
+    bench.node.on_stop(bench.now_ns)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.state"]
 
 
 def test_figures_of_alarms_are_told_from_the_first_alarm_of_a_plant_on() -> None:

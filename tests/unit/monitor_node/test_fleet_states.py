@@ -1,5 +1,6 @@
 """The folder of a fleet's states: each is there whole, or as it was before."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,53 @@ def test_a_state_that_cannot_be_used_is_kept_under_another_name(tmp_path: Path) 
     assert states.plants == []
     assert (tmp_path / "a.state.damaged").read_bytes() == b"rubbish"
     states.close()
+
+
+def test_who_was_replaced_writes_over_no_newer_state_and_is_told_so(tmp_path: Path) -> None:
+    first, second = FleetStates(tmp_path), FleetStates(tmp_path)
+    assert first.read("a") is None
+    first.put("a", b"of the first")
+    first.close()
+    assert second.read("a") == b"of the first"
+    second.put("a", b"of the second")
+    second.close()
+    again = FleetStates(tmp_path)
+    again._marks = first._marks  # it has not ended, but was cut off
+    assert again.of_others(["a", "b"]) == ["a"]
+    again.put("a", b"later, of the first")
+    again.close()
+    assert (again.lost(), again.lost()) == (["a"], [])
+    assert again.read("a") == b"of the second"
+    assert again.of_others(["a"]) == []
+
+
+def test_what_is_being_written_is_read_unless_another_has_written_since(tmp_path: Path) -> None:
+    states = FleetStates(tmp_path)
+    states.read("a")
+    states.close()  # nothing is written any more
+    states.put("a", b"waits")
+    assert states.read("a") == b"waits"
+    (tmp_path / "a.state").write_bytes(b"of another")
+    assert states.read("a") == b"of another"
+
+
+def test_a_state_that_was_removed_by_a_person_is_written_again(tmp_path: Path) -> None:
+    (tmp_path / "a.state").write_bytes(b"before")
+    states = FleetStates(tmp_path)
+    states.read("a")
+    (tmp_path / "a.state").unlink()
+    states.put("a", b"now")
+    states.close()
+    assert (states.lost(), (tmp_path / "a.state").read_bytes()) == ([], b"now")
+
+
+def test_what_a_writer_has_left_that_was_killed_is_removed_at_the_next_start(tmp_path: Path) -> None:
+    left, fresh = tmp_path / ".a.state.123.tmp", tmp_path / ".b.state.124.tmp"
+    for path in (left, fresh):
+        path.write_bytes(b"half")
+    os.utime(left, (0.0, 0.0))
+    FleetStates(tmp_path).close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == [fresh.name]
 
 
 @pytest.mark.parametrize("name", ["missing", "file"])

@@ -11,7 +11,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import MetricsConfig, section
-from reactorwatch.runtime.metrics import PORT_AFTER, Metrics, served
+from reactorwatch.runtime.metrics import PORT_AFTER, FleetMetrics, Metrics, served
 from tests.ports import LOOPBACK, three_free_ports
 
 HEALTH = Health(
@@ -125,6 +125,52 @@ def test_alarms_are_counted_by_state_also_where_there_are_none(port: int, tell: 
 def test_a_node_that_has_said_nothing_yet_has_a_page_without_counts(port: int, tell: Told) -> None:
     tell(Sample(time_ns=1))
     assert not any(name.startswith(("reactorwatch_messages", "reactorwatch_alarms")) for name in page(port))
+
+
+def test_the_page_of_a_fleet_has_the_counts_and_alarms_of_each_plant_that_is_watched(
+    port: int, alarms: list[Alarm]
+) -> None:
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    found: dict[str, list[Alarm] | None] = {"a": alarms, "b": alarms[1:], "c": alarms}
+    with served(MetricsConfig(port=port), FleetMetrics("monitor"), "monitor") as metrics:
+        assert metrics is not None
+        for plant in found:
+            metrics.watch(plant, lambda plant=plant: found[plant])  # type: ignore[misc]
+            metrics.published(Publication(f"reactor/{plant}/health/monitor", HEALTH))
+        metrics.published(Publication("reactor/nobody/health/monitor", HEALTH))
+        metrics.leave("c")
+        found["a"] = None  # as they were
+        metrics.published(Publication("reactor/a/health/monitor", Health(received=1001)))
+        shown = page(port)
+    received = {name: value for name, value in shown.items() if "messages_received_total" in name}
+    assert received == {
+        'reactorwatch_messages_received_total{node="monitor",plant="a"}': 1001,
+        'reactorwatch_messages_received_total{node="monitor",plant="b"}': 1000,
+    }
+    normal = {name: value for name, value in shown.items() if 'state="normal"' in name}
+    assert normal == {
+        'reactorwatch_alarms{node="monitor",plant="a",state="normal"}': 2,
+        'reactorwatch_alarms{node="monitor",plant="b",state="normal"}': 2,
+    }
+    raised = shown['reactorwatch_alarms{node="monitor",plant="a",state="unacknowledged"}']
+    assert (raised, shown['reactorwatch_alarms{node="monitor",plant="b",state="unacknowledged"}']) == (1, 0)
+
+
+def test_the_page_of_a_fleet_has_so_many_plants_and_one_that_leaves_makes_room(
+    port: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
+    monkeypatch.setattr("reactorwatch.runtime.metrics.MOST_SHOWN", 2)
+    with served(MetricsConfig(port=port), FleetMetrics("monitor"), "monitor") as metrics:
+        assert metrics is not None
+        for plant in "abc":
+            metrics.watch(plant, lambda: None)
+        metrics.leave("a")
+        metrics.watch("d", lambda: None)
+        for plant in "abcd":
+            metrics.published(Publication(f"reactor/{plant}/health/monitor", HEALTH))
+        rows = [name for name in page(port) if name.startswith("reactorwatch_rows_total")]
+    assert rows == [f'reactorwatch_rows_total{{node="monitor",plant="{plant}"}}' for plant in "bd"]
 
 
 def test_a_disk_that_is_gone_leaves_its_number_out(port: int) -> None:
