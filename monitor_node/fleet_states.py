@@ -51,7 +51,7 @@ class FleetStates:
         try:
             with replacing(folder / f".{ENDING}") as probe:
                 probe.write_bytes(b"")
-            (folder / f".{ENDING}").unlink()
+            (folder / f".{ENDING}").unlink(missing_ok=True)  # another one that starts just now may have tried, too
         except OSError as error:
             raise InputError(f"state folder {folder}: cannot be written to: {error.strerror}") from error
         except InputError as error:

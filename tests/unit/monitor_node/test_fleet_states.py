@@ -9,6 +9,21 @@ from monitor_node.fleet_states import FleetStates
 from reactorwatch.errors import InputError
 
 
+def test_monitors_that_start_at_the_same_moment_do_not_refuse_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each tries whether it can write there; the other one takes that trial away before this one does."""
+    unlink = Path.unlink
+
+    def after_the_other(self: Path, missing_ok: bool = False) -> None:
+        if self.name == ".state":
+            unlink(self)
+        unlink(self, missing_ok)
+
+    monkeypatch.setattr(Path, "unlink", after_the_other)
+    FleetStates(tmp_path).close()
+
+
 def test_what_was_put_is_there_when_it_is_closed_the_newest_of_each_plant(tmp_path: Path) -> None:
     states = FleetStates(tmp_path)
     for number in range(100):
