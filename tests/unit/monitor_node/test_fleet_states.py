@@ -16,7 +16,7 @@ def test_monitors_that_start_at_the_same_moment_do_not_refuse_the_folder(
     unlink = Path.unlink
 
     def after_the_other(self: Path, missing_ok: bool = False) -> None:
-        if self.name == ".state":
+        if self.name == "..state":
             unlink(self)
         unlink(self, missing_ok)
 
