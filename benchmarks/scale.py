@@ -45,8 +45,8 @@ from benchmarks.fleet.traffic import (
     route,
 )
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet_config import FleetConfig
-from monitor_node.fleet_node import PASSING, FleetNode, watch
+from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet.node import PASSING, FleetNode, watch
 from monitor_node.quiet.slots import NEVER_NS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication

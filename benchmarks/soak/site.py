@@ -18,7 +18,7 @@ from benchmarks.link_cuts import Proxy, Router
 from benchmarks.soak import publisher, stranger
 from benchmarks.soak.plan import PERIOD_MIN, TRAINING_ROWS, Blow, Plan
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet_config import FleetConfig
+from monitor_node.fleet.config import FleetConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.runtime.config import BusConfig

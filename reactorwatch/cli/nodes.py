@@ -124,10 +124,10 @@ def monitor(
     """Watch a plant, or a fleet of them: predict signals, raise alarms."""
     from contextlib import nullcontext
 
-    from monitor_node import fleet_node
     from monitor_node.__main__ import run
     from monitor_node.config import MonitorConfig
-    from monitor_node.fleet_config import FleetConfig
+    from monitor_node.fleet.config import FleetConfig
+    from monitor_node.fleet.node import run as run_fleet
     from reactorwatch.cli.supervise import diagnosing, diagnosis_settings
     from reactorwatch.runtime.config import LogConfig, section
 
@@ -142,7 +142,7 @@ def monitor(
         for option, given in (("--plant", name), ("--diagnose", diagnose)):
             if given is not None:
                 raise InputError(f"{option} is for the monitor of one plant; leave it out with --plants")
-        fleet_node.run(config_of_monitor, fleet, bus, _metrics(tables))
+        run_fleet(config_of_monitor, fleet, bus, _metrics(tables))
         return
     if shard is not None:
         raise InputError("--shard is a part of the plants that --plants names; give both")

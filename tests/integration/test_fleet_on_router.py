@@ -17,7 +17,7 @@ import msgspec
 import pytest
 
 from benchmarks.link_cuts import Proxy
-from monitor_node.fleet_config import FleetConfig
+from monitor_node.fleet.config import FleetConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message

@@ -7,7 +7,7 @@ import pytest
 
 from monitor_node.arrivals import Past
 from monitor_node.config import MonitorConfig
-from monitor_node.shards import Crew, Shard, home
+from monitor_node.fleet.shards import Crew, Shard, home
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmState, CommandReply, Health, Sample
 from reactorwatch.errors import InputError
@@ -538,7 +538,7 @@ def test_what_is_too_large_takes_no_room_while_it_is_held_and_is_refused_afterwa
 def test_more_than_can_be_held_is_judged_rather_than_lost(
     runs: dict[str, list[Encoded]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("monitor_node.fleet.MOST_HELD", 60)
+    monkeypatch.setattr("monitor_node.fleet.monitor.MOST_HELD", 60)
     monitor = fleet()
     monitor.hold()
     for message in runs["a"][:59]:

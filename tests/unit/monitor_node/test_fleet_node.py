@@ -7,12 +7,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from monitor_node import fleet_node, fleet_pasts
 from monitor_node.core import Monitor
-from monitor_node.fleet_config import FleetConfig
-from monitor_node.fleet_node import LOOK_EVERY_NS, FleetNode
-from monitor_node.fleet_states import FleetStates
-from monitor_node.shards import Crew, Shard, home
+from monitor_node.fleet import node as fleet_node
+from monitor_node.fleet import pasts
+from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet.node import LOOK_EVERY_NS, FleetNode
+from monitor_node.fleet.shards import Crew, Shard, home
+from monitor_node.fleet.states import FleetStates
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
 from reactorwatch.runtime.bus import Exchange, MemoryBus
@@ -56,7 +57,7 @@ class Bench:
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Bench]:
     """One of two monitors, both of whose shards it has, or a single one."""
     for name in ("SETTLE_S", "RETURN_S", "LOOK_AGAIN_S"):
-        monkeypatch.setattr(fleet_pasts, name, 0.0)
+        monkeypatch.setattr(pasts, name, 0.0)
     bench = Bench(tmp_path, getattr(request, "param", "1/2"))
     for _ in range(101):  # the other was never seen
         bench.tick()
@@ -103,7 +104,7 @@ def test_while_the_router_is_gone_and_until_the_others_had_their_time_nothing_is
 def test_while_the_router_is_gone_for_long_more_than_can_be_held_is_judged(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("monitor_node.fleet.MOST_HELD", 60)
+    monkeypatch.setattr("monitor_node.fleet.monitor.MOST_HELD", 60)
     run = run_of("a", 1, span_min=10.0)
     bench.bus.has_router = False
     bench.tick()

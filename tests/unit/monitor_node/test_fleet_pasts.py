@@ -4,8 +4,8 @@ import threading
 
 import pytest
 
-from monitor_node import fleet_pasts
-from monitor_node.fleet_pasts import Pasts
+from monitor_node.fleet import pasts
+from monitor_node.fleet.pasts import Pasts
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 
@@ -36,7 +36,7 @@ class CutOff(MemoryBus):
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("SETTLE_S", "RETURN_S", "LOOK_AGAIN_S"):
-        monkeypatch.setattr(fleet_pasts, name, 0.0)
+        monkeypatch.setattr(pasts, name, 0.0)
 
 
 def test_who_is_cut_off_takes_nobody_s_plants_over_until_the_others_are_to_be_seen_again() -> None:

@@ -21,13 +21,13 @@ from collections.abc import Callable, Iterable, Iterator
 from monitor_node.arrivals import Arrivals, Past, cut
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet_alarms import AlarmsBefore
-from monitor_node.fleet_dues import NEVER_NS
-from monitor_node.fleet_recent import Recent
-from monitor_node.fleet_strangers import PROVEN_MESSAGES, PROVEN_ROWS, Strangers
-from monitor_node.fleet_watched import State, WatchedPlants
+from monitor_node.fleet.alarms import AlarmsBefore
+from monitor_node.fleet.dues import NEVER_NS
+from monitor_node.fleet.recent import Recent
+from monitor_node.fleet.shards import Crew
+from monitor_node.fleet.strangers import PROVEN_MESSAGES, PROVEN_ROWS, Strangers
+from monitor_node.fleet.watched import State, WatchedPlants
 from monitor_node.recorded_lives import SILENCE
-from monitor_node.shards import Crew
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
@@ -234,7 +234,7 @@ class FleetMonitor:
         Args:
             plant: its name.
             now_ns: now.
-            vouched: whether it is certain that there is such a plant; if not, see `fleet_strangers`.
+            vouched: whether it is certain that there is such a plant; if not, see `strangers`.
         """
         if plant in self._met:
             if vouched:

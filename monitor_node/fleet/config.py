@@ -2,7 +2,7 @@
 
 import msgspec
 
-from monitor_node import shards
+from monitor_node.fleet import shards
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 

@@ -6,19 +6,19 @@ from pathlib import Path
 
 import structlog
 
-from monitor_node import shards
 from monitor_node.alarm_commands import COMMANDS
 from monitor_node.alarm_kpis import are_of_nothing
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet import FleetMonitor
-from monitor_node.fleet_absence import Absence
-from monitor_node.fleet_config import FleetConfig
-from monitor_node.fleet_pasts import Pasts
-from monitor_node.fleet_states import FleetStates
+from monitor_node.fleet import shards
+from monitor_node.fleet.absence import Absence
+from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet.monitor import FleetMonitor
+from monitor_node.fleet.pasts import Pasts
+from monitor_node.fleet.shards import Crew
+from monitor_node.fleet.states import FleetStates
 from monitor_node.health import NODE
 from monitor_node.monitor_state import OtherSettingsError
-from monitor_node.shards import Crew
 from monitor_node.state_file import DAMAGED, OTHER_SETTINGS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from queue import Empty, SimpleQueue
 
 from monitor_node.arrivals import Past
-from monitor_node.fleet_states import FleetStates
+from monitor_node.fleet.states import FleetStates
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus import Bus

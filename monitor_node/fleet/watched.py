@@ -10,7 +10,7 @@ import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet_dues import Dues
+from monitor_node.fleet.dues import Dues
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.plants import QuietPlants
 from reactorwatch.contract.codec import Encoded, Publication
