@@ -1,6 +1,6 @@
 FROM python:3.13-slim
 
-# A home of its own: compiled kernels are kept there. /recordings and /state are made here so that new
+# A home of its own: compiled kernels and models are kept there. /recordings and /state are made here so that new
 # volumes belong to the user.
 RUN useradd --create-home --uid 1000 reactorwatch \
     && install --directory --owner=reactorwatch /recordings /state

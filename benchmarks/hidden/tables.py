@@ -51,13 +51,17 @@ COLUMNS: tuple[tuple[str, Cell], ...] = (
 
 
 def rows_of(found: Mapping[str, Sequence[Judged]]) -> list[list[str]]:
-    """A row for each class, and for each group of classes of which all are there."""
+    """A row for each class, for each group of classes of which all are there, and for all in which causes are hidden."""
     rows = [[name, *(cell(Score.of(judged)) for _, cell in COLUMNS)] for name, judged in found.items()]
     for group in dict.fromkeys(item.group for item in CLASSES if item.group):
         members = [item.name for item in CLASSES if item.group == group]
         if all(name in found for name in members):
             together = Score.of([item for name in members for item in found[name]])
             rows.append([group, *(cell(together) for _, cell in COLUMNS)])
+    hidden = [item.name for item in CLASSES if item.kind in ("single", "pair") and item.name in found]
+    if len(hidden) > 1:
+        together = Score.of([item for name in hidden for item in found[name]])
+        rows.append(["all with one cause or two", *(cell(together) for _, cell in COLUMNS)])
     return rows
 
 
