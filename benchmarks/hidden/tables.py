@@ -51,7 +51,7 @@ COLUMNS: tuple[tuple[str, Cell], ...] = (
 
 
 def rows_of(found: Mapping[str, Sequence[Judged]]) -> list[list[str]]:
-    """A row for each class, for each group of classes of which all are there, and for all in which causes are hidden."""
+    """A row for each class, each group of classes of which all are there, and all in which causes are hidden."""
     rows = [[name, *(cell(Score.of(judged)) for _, cell in COLUMNS)] for name, judged in found.items()]
     for group in dict.fromkeys(item.group for item in CLASSES if item.group):
         members = [item.name for item in CLASSES if item.group == group]
