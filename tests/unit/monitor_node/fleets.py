@@ -1,6 +1,6 @@
 """Fleets that a test makes: plants, monitors, and what each plant's own monitor would have said."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import msgspec
 
@@ -10,7 +10,7 @@ from monitor_node.fleet.monitor import FleetMonitor
 from monitor_node.fleet.shards import WHOLE, Crew, Shard
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Health
+from reactorwatch.contract.messages_pb2 import Alarm, Health
 
 from .samples import leaking_run, samples
 
@@ -50,3 +50,23 @@ def of(plant: str, said: Iterable[Publication]) -> list[Publication]:
     """What was said of a plant, without how its monitor does."""
     begin = f"{keys.ROOT}/{plant}/"
     return [item for item in said if item.key.startswith(begin) and not isinstance(item.message, Health)]
+
+
+def alarms(said: list[Publication]) -> list[tuple[str, str, int]]:
+    """Key, event and time of each alarm."""
+    return [(i.key, i.message.event, i.message.time_ns) for i in said if isinstance(i.message, Alarm)]
+
+
+def noting(asked: list[tuple[str, bool]]) -> Callable[[str, bool], bool]:
+    """Notes whose past is asked for, and promises that it will be told."""
+
+    def ask_past(plant: str, taken_over: bool) -> bool:
+        asked.append((plant, taken_over))
+        return True
+
+    return ask_past
+
+
+def shard_token(number: int) -> str:
+    """Of one of two monitors that share a fleet."""
+    return Crew(PLANTS, Shard(number, 2), str(number)).token
