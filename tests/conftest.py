@@ -17,6 +17,11 @@ hypothesis.settings.register_profile("reactorwatch", deadline=None, derandomize=
 hypothesis.settings.load_profile("reactorwatch")
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than there are cores: half of the time tests wait, for processes to start or for what a cut lasts."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
 @pytest.fixture(scope="session")
 def daisy_csv() -> Path:
     """The measured record "CSTR" of the DaISy database, which is not part of this repository."""
