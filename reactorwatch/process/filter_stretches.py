@@ -65,8 +65,7 @@ def together(runs: Sequence[Stretches]) -> list[Innovations]:
     """What runs of some filters of the same model say. No filter is in two of them."""
     found: dict[int, Innovations] = {}
     waiting: dict[int, Stretch] = {}
-    done = dict.fromkeys(range(len(runs)), 0)
-    for number in done:
+    for number in range(len(runs)):
         _go_on(runs, number, None, waiting, found)
     while waiting:
         first = next(iter(waiting.values()))
