@@ -161,9 +161,7 @@ class _Scan:
         return bool(middles)
 
     def _try(self, best: Explained, known: dict[float, Fit], values: Sequence[float]) -> None:
-        for begin in range(0, len(values), LANES):
-            part = values[begin : begin + LANES]
-            known.update(zip(part, _at_all(self._search, best, self._place, self._number, part), strict=True))
+        known.update(zip(values, _at_all(self._search, best, self._place, self._number, values), strict=True))
 
     def _to_a_side(self, here: float, side: float) -> Iterator[float]:
         """Values to try, within the bounds, further and further away."""

@@ -62,7 +62,7 @@ def doubt_of(run: Run, inputs: Array, leads_to: NDArray[np.intp] | None = None) 
     """
     if run.missing is None:
         return None
-    to = np.arange(run.time_min.size) if leads_to is None else leads_to
+    to = slice(None) if leads_to is None else leads_to
     others = np.vstack([inputs[:1], inputs[:-1]])
     others[:, : run.inputs.shape[1]] = run.inputs[to]
     return Doubt.behind(run.time_min, run.inputs, run.missing).of_rows(to)._replace(inputs=others)

@@ -87,8 +87,7 @@ class Sized:
         if noise.wandering:
             sized = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
         self._filtered = sized
-        self._filter = Filter(self.model, self._levels_of(noise))
-        self._spare: list[Filter] = []
+        self._filters = [Filter(self.model, self._levels_of(noise))]  # twins, as many as went at once so far
         self._errors = self._filtered.errors.with_noise(self.levels)
         self.noise = noise
 
@@ -119,14 +118,16 @@ class Sized:
 
     @noise.setter
     def noise(self, noise: Noise) -> None:
-        self._noise, self._filter.noise = noise, self._levels_of(noise)
-        self._errors.noise, self._errors.changes = self.levels, noise.times
-        self._filter.change(noise.times)
+        self._noise, levels = noise, self._levels_of(noise)
+        for item in self._filters:
+            item.noise = levels
+            item.change(noise.times)
+        self._errors.noise, self._errors.changes = levels, noise.times
 
     @property
     def levels(self) -> NoiseLevels:
         """The noise as the filter has it, of all its states."""
-        return self._filter.noise
+        return self._filters[0].noise
 
     def size_symbols(self, effect: Effect) -> tuple[ca.SX, ca.SX] | None:
         """The inputs that are the size of an effect, as balances and outputs have it; None if it has none."""
@@ -191,9 +192,11 @@ class Sized:
         first = min(_rows_of(known, rows) for known, rows in zip(begun, several, strict=True))
         if first == several[0].time_min.size:
             return [known.found for known in begun if known is not None]
+        while len(self._filters) < len(several):
+            self._filters.append(self._filters[0].twin())
         runs = []
         for filtering, (time_min, inputs, measured, doubt, _), known in zip(
-            self._filters(len(several)), several, begun, strict=True
+            self._filters, several, begun, strict=False
         ):
             rest, start = slice(first, None), None
             if known is not None and first:
@@ -210,15 +213,6 @@ class Sized:
             both = zip(known.found, new, strict=True)
             found.append(Innovations(*(np.concatenate([before[:first], more]) for before, more in both)))
         return found
-
-    def _filters(self, count: int) -> list[Filter]:
-        """So many, with the noise that holds now."""
-        while len(self._spare) < count - 1:
-            self._spare.append(self._filter.twin())
-        for item in self._spare[: count - 1]:
-            item.noise = self.levels
-            item.change(self._noise.times)
-        return [self._filter, *self._spare[: count - 1]]
 
     def tuned(
         self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float], nearby: Noise | None = None

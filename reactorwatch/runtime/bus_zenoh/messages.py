@@ -26,11 +26,13 @@ class Reader:
     """Reads what comes, in one thread.
 
     Nearly all comes with the same encoding, and to ask Zenoh for its text takes longer than to ask whether it is.
+
+    Args:
+        encoding: that is expected first.
     """
 
-    def __init__(self) -> None:
-        self._encoding = zenoh.Encoding.ZENOH_BYTES
-        self._text = encoding_text(self._encoding)
+    def __init__(self, encoding: zenoh.Encoding = zenoh.Encoding.ZENOH_BYTES) -> None:
+        self._encoding, self._text = encoding, encoding_text(encoding)
 
     def read(self, sample: zenoh.Sample, now_ns: int) -> tuple[tuple[int, int] | None, Encoded]:
         """A message that has come, and before it who published it as which number, if he told."""
@@ -54,7 +56,7 @@ def encoding_text(encoding: zenoh.Encoding) -> str:
 
 def numbered(sample: zenoh.Sample, now_ns: int) -> Numbered | Encoded:
     """A message that has come by itself, see `Reader`; with its number if it has one."""
-    who, message = Reader().read(sample, now_ns)
+    who, message = Reader(sample.encoding).read(sample, now_ns)
     return message if who is None else Numbered(*who, message)
 
 

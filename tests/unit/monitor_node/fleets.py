@@ -15,6 +15,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, Health
 from .samples import leaking_run, samples
 
 PLANTS = "reactor/*"
+SECOND_NS = 1_000_000_000
 QUICK = MonitorConfig(training_min=20.0, isolation=False)
 
 

@@ -9,9 +9,7 @@ from monitor_node.fleet.shards import Shard, home
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 
-from .fleets import alarms, fleet, noting, of, row_by_row
-
-SECOND_NS = 1_000_000_000
+from .fleets import SECOND_NS, alarms, fleet, noting, of, row_by_row
 
 
 def places_of(run: list[Encoded], time_ns: int) -> int:

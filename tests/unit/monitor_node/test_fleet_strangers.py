@@ -6,9 +6,7 @@ from monitor_node.arrivals import Past
 from monitor_node.fleet.shards import Shard, home
 from reactorwatch.contract.codec import Encoded
 
-from .fleets import fleet, noting, run_of, shard_token
-
-SECOND_NS = 1_000_000_000
+from .fleets import SECOND_NS, fleet, noting, run_of, shard_token
 
 TEN_MINUTES_NS = 600 * SECOND_NS
 
