@@ -166,9 +166,15 @@ def _role(config: BusConfig) -> Role | None:
 
 
 class _Listening:
-    """Who says that he is alive, and what each says of himself, with how far his clock is ahead of ours in seconds."""
+    """Who says that he is alive, and what each says of himself, with how far his clock is ahead of ours in seconds.
 
-    def __init__(self, bus: ZenohBus, plant: str) -> None:
+    Whatever comes late makes a clock seem behind, and one that was recovered, or crossed a busy network, came late. So
+    of two messages the later clock is the truer, and a clock behind by what a message may be late by is listened to
+    until a message says better, or to the end.
+    """
+
+    def __init__(self, bus: ZenohBus, plant: str, timeout_s: float) -> None:
+        self._timeout_s = timeout_s
         self.alive: set[str] = set()
         self.said: dict[str, tuple[Health, float]] = {}
         self._settled: set[str] = set()
@@ -176,10 +182,10 @@ class _Listening:
         bus.watch_alive(keys.all_of(plant, keys.ALIVE), self._on_token)
         bus.subscribe(keys.key(plant, keys.HEALTH, "*"), self._on_health)
 
-    def wait(self, timeout_s: float) -> None:
-        """Until all who are expected have spoken; twice, if a clock seems to be off."""
+    def wait(self) -> None:
+        """Until all who are expected have spoken, and their clocks are known."""
         with self._changed:
-            self._changed.wait_for(lambda: set(NODES) <= self._settled & self.alive, timeout_s)
+            self._changed.wait_for(lambda: set(NODES) <= self._settled & self.alive, self._timeout_s)
 
     def _on_token(self, key: str, is_alive: bool) -> None:
         topic = keys.parse(key)
@@ -198,17 +204,17 @@ class _Listening:
             with self._changed:
                 offset_s = (health.time_ns - message.received_ns) / 1e9
                 before = self.said.get(topic.name)
-                if before is not None:  # one that was recovered came late, so the later of two clocks is the truer
+                if before is not None:
                     offset_s = max(offset_s, before[1])
-                if before is not None or abs(offset_s) <= LARGEST_OFFSET_S:
+                if offset_s >= -LARGEST_OFFSET_S or (before is not None and offset_s < -self._timeout_s):
                     self._settled.add(topic.name)
                 self.said[topic.name] = health, offset_s
                 self._changed.notify_all()
 
 
 def _nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Finding]:
-    listening = _Listening(bus, plant)
-    listening.wait(timeout_s)
+    listening = _Listening(bus, plant, timeout_s)
+    listening.wait()
     alive, said = set(listening.alive), dict(listening.said)
     expected = [node for node in NODES if node != "plant" or "replay" not in alive]
     for node in (*expected, *sorted(alive - set(expected))):

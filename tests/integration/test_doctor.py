@@ -1,12 +1,13 @@
 """`reactorwatch doctor` on deployments with one thing wrong: it names the thing, and nothing else is wrong."""
 
 import datetime
+import itertools
 import json
 import os
 import shutil
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,20 +31,24 @@ from .site import WITHIN_S, Site, make, settings
 SHORTLY_S = 0.3
 """For what never comes."""
 
+A_WHILE_S = 5.0
+"""For what never comes, beside what has to."""
+
 
 def now() -> datetime.datetime:
     return datetime.datetime.now(datetime.UTC)
 
 
 @contextmanager
-def nodes(buses: dict[str, ZenohBus], late_s: float = 0.0, version: str = __version__) -> Iterator[None]:
-    """Nodes that are alive and say so again and again, with a clock that is late."""
+def nodes(buses: dict[str, ZenohBus], late_s: Sequence[float] = (0.0,), version: str = __version__) -> Iterator[None]:
+    """Nodes that are alive and say so again and again, so late one message after another."""
     stopped = threading.Event()
 
     def speak(node: str, bus: ZenohBus) -> None:
         bus.announce(keys.key("cstr", keys.ALIVE, node))
+        lateness_s = itertools.cycle(late_s)
         while not stopped.wait(0.05):
-            time_ns = round((now().timestamp() - late_s) * 1e9)
+            time_ns = round((now().timestamp() - next(lateness_s)) * 1e9)
             health = Health(time_ns=time_ns, node=node, version=version, phase="watching")
             bus.publish(encode(Publication(keys.key("cstr", keys.HEALTH, node), health)))
 
@@ -158,17 +163,22 @@ def test_a_plant_that_the_router_has_no_rules_for_is_told(tmp_path: Path) -> Non
 
 def test_a_node_that_is_not_there_is_told(site: Site, tmp_path: Path) -> None:
     with nodes({node: site.join(f"cstr/{node}") for node in ("plant", "monitor")}):
-        assert set(wrong(settings(site.folder, "cstr/viewer"), tmp_path, SHORTLY_S)) == {"recorder"}
+        assert set(wrong(settings(site.folder, "cstr/viewer"), tmp_path, A_WHILE_S)) == {"recorder"}
 
 
 def test_a_clock_that_is_off_and_another_version_are_told(site: Site, tmp_path: Path) -> None:
     others = {node: site.join(f"cstr/{node}") for node in ("plant", "recorder")}
-    with nodes(others), nodes({"monitor": site.join("cstr/monitor")}, late_s=60.0, version="0.0.1"):
+    with nodes(others), nodes({"monitor": site.join("cstr/monitor")}, late_s=[3600.0], version="0.0.1"):
         found = wrong(settings(site.folder, "cstr/viewer"), tmp_path)
     assert set(found) == {"monitor"}
     assert "NTP" in found["monitor"].cure
     assert f"same version as here, {__version__}" in found["monitor"].cure
-    assert "its clock -60." in found["monitor"].found
+    assert "its clock -36" in found["monitor"].found
+
+
+def test_messages_that_come_late_are_not_taken_for_a_clock_that_is_off(site: Site, tmp_path: Path) -> None:
+    with nodes({node: site.join(f"cstr/{node}") for node in NODES}, late_s=[4.0, 3.0, 5.0, 0.0]):
+        assert wrong(settings(site.folder, "cstr/viewer"), tmp_path) == {}
 
 
 def test_a_disk_without_room_is_told(tmp_path: Path) -> None:
