@@ -22,8 +22,8 @@ from reactorwatch.process.filter_errors import Ways
 from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import Array
 
-SETTLED = 0.05
-"""In log likelihood: a step that gains less ends the search."""
+SETTLED, WELL_SETTLED = 0.05, 0.005
+"""In log likelihood: a rough fit ends with a step that gains less, and any fit where none promises the second."""
 
 MOST_STEPS = 12
 """Of a fit."""
@@ -110,7 +110,7 @@ class Hypothesis:
             steps: at most; fewer than `MOST_STEPS` are for a rough fit.
         """
         best = self.at(run, start)
-        damping = _DAMPING
+        damping, enough = _DAMPING, WELL_SETTLED if steps == MOST_STEPS else SETTLED
         differences = self._least_differences()
         for _ in range(steps):
             with np.errstate(over="ignore", invalid="ignore"):
@@ -125,13 +125,18 @@ class Hypothesis:
             information, gradient = information / np.outer(scale, scale), gradient / scale
             before = best
             for _ in range(_TRIES):
-                change = np.linalg.lstsq(information + damping * np.eye(scale.size), gradient, rcond=1e-12)[0] / scale
-                trial = self.at(run, self._moved(best.theta, change))
+                scaled = np.linalg.lstsq(information + damping * np.eye(scale.size), gradient, rcond=1e-12)[0]
+                promised = float(scaled @ (gradient - 0.5 * information @ scaled))
+                if promised < enough:
+                    break
+                trial = self.at(run, self._moved(best.theta, scaled / scale))
                 if trial.loss < best.loss:
                     best, damping = trial, damping * _LESS_DAMPING
                     break
                 damping *= _MORE_DAMPING
-            if best.loss > before.loss - SETTLED:
+            gained = before.loss - best.loss
+            # A step that gains what was promised leaves nothing to gain: all is as good as linear there.
+            if gained < SETTLED or abs(gained - promised) < enough:
                 break
             if any(course.numbers for course in self.courses):
                 differences = self._widened(self._inverse(g), differences)

@@ -2,8 +2,10 @@
 
 Its innovations change with them in jumps, so there is no slope to climb: they are scanned, widely first and then about
 the best. Where the deviation sets in decides as well where the memory of the effect stands from then on, and so an
-onset that is somewhat off may explain nothing; it is scanned over the whole record, by itself, once a size is known
-that gains something, after every row in which an input moves, for each leaves the memory elsewhere.
+onset that is somewhat off may explain little; it is looked for by itself, once a size is known, among the rows after
+each in which an input moves, for each leaves the memory elsewhere. As soon as an input has moved far, the memory is the
+same whenever the deviation set in. So what an onset explains is roughly what a run without the deviation explains
+before it, and one with it all along after it; those that are best so are tried, and some all over the record.
 """
 
 from collections.abc import Sequence
@@ -12,14 +14,14 @@ import numpy as np
 
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.run import Run
-from diagnosis.sized import loss_of
+from diagnosis.sized import loss_of, row_losses
 from reactorwatch.process.machine_code import LANES
 from reactorwatch.process.model import Array
 
 _SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
 _FINELY = ((1.06, 25), (1.006, 25), (1.0006, 25))
 _USUAL = 24  # of the sizes that an effect usually has
-_MOST_ONSETS, _NEAREST_ROWS = 800, 30
+_LIKELY_ONSETS, _ALL_OVER, _NEAREST_ROWS = 48, 32, 30
 _LEAST_GAIN = 5.0  # in log likelihood
 
 
@@ -75,20 +77,27 @@ def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
     sizes = np.geomspace(usual[0], usual[-1], _USUAL)
     best = _best_of(run, hypothesis, best, 0, [np.append(size, best.theta[0][1:]) for size in sizes])
     if course.numbers:
-        best = _moved(run, hypothesis, best, _after_moves(run))
+        best = _moved(run, hypothesis, best, _likely(run, hypothesis, best))
         rows = course.period_min * np.arange(-_NEAREST_ROWS, _NEAREST_ROWS + 1)
         best = _moved(run, hypothesis, best, best.theta[0][1] + rows)
     return sized(run, hypothesis, best, 0, _SIZES + _FINELY)
 
 
-def _after_moves(run: Run) -> Array:
-    """Between rows, each after one in which an input moved; not too many."""
+def _likely(run: Run, hypothesis: Hypothesis, best: Fit) -> Array:
+    """Onsets to try, increasing: between rows, each after one in which an input moved."""
     moved = np.flatnonzero(np.any(np.diff(run.inputs, axis=0) != 0.0, axis=1))[:-1] + 1
-    moved = moved[:: max(-(-moved.size // _MOST_ONSETS), 1)]
-    return np.asarray(0.5 * (run.time_min[moved] + run.time_min[moved + 1]))
+    always = hypothesis.at(run, (np.array([best.theta[0][0], run.time_min[0]]),))
+    never = hypothesis.without(run, best, 0)
+    lost = np.cumsum(row_losses(never) - row_losses(always.w))[moved]
+    chosen = np.zeros(moved.size, dtype=np.bool_)
+    chosen[np.argsort(lost)[:_LIKELY_ONSETS]] = True
+    chosen[:: max(-(-moved.size // _ALL_OVER), 1)] = True
+    return np.asarray(0.5 * (run.time_min[moved] + run.time_min[moved + 1]))[chosen]
 
 
 def _moved(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> Fit:
+    if not onsets.size:
+        return best
     size = best.theta[0][0]
     late = hypothesis.at(run, (np.array([size, np.max(onsets)]),))  # until an onset the filter runs as with a later one
     return _best_of(run, hypothesis, best, 0, [np.array([size, onset]) for onset in onsets], late)
