@@ -12,7 +12,7 @@ from diagnosis import jumping
 from diagnosis.adequacy import DOUBTFUL, minus_log10_p
 from diagnosis.courses import Constant, Step
 from diagnosis.hypothesis import Hypothesis
-from diagnosis.search import SETTLED_NOISE, Explained, Found, Search
+from diagnosis.search import FAR_OUT, SETTLED_NOISE, Explained, Found, Search
 from reactorwatch.process.effects.base import Effect
 
 OTHERS, ROUNDS = 2, 2
@@ -52,7 +52,7 @@ def _uncovered(search: Search, known: Found) -> Explained | None:
     held, found = search.noise, best
     for item in asked:
         search.settle(item)
-        item = _set_in(search, item) if _jumps(item) else search.refitted(item)
+        item = _set_in(search, item, best) if _jumps(item) else search.refitted(item)
         if item.bic < found.bic:
             held, found = search.noise, item
     search.noise = held
@@ -68,25 +68,29 @@ def _as_usual(search: Search, effect: Effect) -> Explained:
     return search.explained(constant, (np.array([effect.typical]),))
 
 
-def _set_in(search: Search, item: Explained) -> Explained:
+def _set_in(search: Search, item: Explained, best: Explained) -> Explained:
     """An effect that acts in jumps, set in when that explains most, with the noise that it needs itself.
 
-    It begins with little noise: a process that is noisy enough for the wrong size hides how far off that is.
+    It begins with little noise: a process that is noisy enough for the wrong size hides how far off that is. Where it
+    is far from the best even so, it is not looked at more closely.
     """
     sized, run = item.hypothesis.sized, search.run
     quiet = (QUIET_SHARE * state.scale for state in sized.model.states)
     process_sd = tuple(min(sd, least) for sd, least in zip(search.noise.process_sd, quiet, strict=False))
     search.noise = replace(search.noise, process_sd=process_sd)
     item = search.refitted(item)
-    for _ in range(ROUNDS):
+    courses = [Hypothesis(sized, (course,)) for course in (Constant(run.time_min), Step(run.time_min))]
+    for closely in range(1 + ROUNDS):
         before = item.bic
-        for course in (Constant(run.time_min), Step(run.time_min)):
-            other = Hypothesis(sized, (course,))
-            numbers = [item.fit.theta[0][0], *(number.lower for number in course.numbers)]
-            fit = jumping.finely(run, other, other.at(run, (np.array(numbers),)))
-            item = min(item, search.judged(other, fit), key=lambda each: each.bic)
+        for hypothesis in courses:
+            if closely and hypothesis.courses[0].name == item.hypothesis.courses[0].name:
+                fit = jumping.finely(run, hypothesis, item.fit)
+            else:
+                numbers = [item.fit.theta[0][0], *(number.lower for number in hypothesis.courses[0].numbers)]
+                fit = jumping.roughly(run, hypothesis, hypothesis.at(run, (np.array(numbers),)))
+            item = min(item, search.judged(hypothesis, fit), key=lambda each: each.bic)
         search.settle(item)
         item = search.refitted(item)
-        if item.bic > before - SETTLED_NOISE:
+        if item.bic > (before - SETTLED_NOISE if closely else best.bic + FAR_OUT):
             break
     return item

@@ -8,7 +8,8 @@ same whenever the deviation set in. So what an onset explains is roughly what a 
 before it, and one with it all along after it; those that are best so are tried, and some all over the record.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -20,8 +21,10 @@ from reactorwatch.process.model import Array
 
 _SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
 _FINELY = ((1.06, 25), (1.006, 25), (1.0006, 25))
+_NEARER = ((1.3, 12), (1.06, 9))
+_BESIDE = ((1.06, 48),)
 _USUAL = 24  # of the sizes that an effect usually has
-_LIKELY_ONSETS, _ALL_OVER, _NEAREST_ROWS = 48, 32, 30
+_LIKELY_ONSETS, _ALL_OVER, _NEAREST_ROWS, _ONSETS = 48, 32, 30, 6
 _LEAST_GAIN = 5.0  # in log likelihood
 
 
@@ -65,8 +68,8 @@ def sized(run: Run, hypothesis: Hypothesis, best: Fit, place: int, scans: Sequen
     return best
 
 
-def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
-    """With the best onset for its size, if it is a step, and then the best size to a tenth of a permille.
+def roughly(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
+    """With one of the sizes that the effect usually has, or one near it, and if it is a step with a likely onset.
 
     Args:
         run: the record.
@@ -76,10 +79,30 @@ def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
     course, usual = hypothesis.courses[0], hypothesis.sized.effects[0].starts
     sizes = np.geomspace(usual[0], usual[-1], _USUAL)
     best = _best_of(run, hypothesis, best, 0, [np.append(size, best.theta[0][1:]) for size in sizes])
+    best = sized(run, hypothesis, best, 0, _NEARER)
     if course.numbers:
-        best = _moved(run, hypothesis, best, _likely(run, hypothesis, best))
+        best = _best_onset(run, hypothesis, best, _likely(run, hypothesis, best))
+        best = sized(run, hypothesis, best, 0, _NEARER)
+    return best
+
+
+def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
+    """With the best size, to a tenth of a permille, and if it is a step the best onset beside it.
+
+    With a size that is a little off another onset may seem best, so sizes are tried with each of the best few.
+
+    Args:
+        run: the record.
+        hypothesis: one such effect, constant or as a step.
+        best: roughly, with a size that gains something.
+    """
+    course = hypothesis.courses[0]
+    if course.numbers:
         rows = course.period_min * np.arange(-_NEAREST_ROWS, _NEAREST_ROWS + 1)
-        best = _moved(run, hypothesis, best, best.theta[0][1] + rows)
+        onsets = np.concatenate([_likely(run, hypothesis, best), best.theta[0][1] + rows])
+        tried = [sized(run, hypothesis, item, 0, _BESIDE) for item in _moved(run, hypothesis, best, np.sort(onsets))]
+        best = min([best, *tried], key=lambda item: item.loss)
+        best = _best_onset(run, hypothesis, best, best.theta[0][1] + rows)
     return sized(run, hypothesis, best, 0, _SIZES + _FINELY)
 
 
@@ -95,23 +118,35 @@ def _likely(run: Run, hypothesis: Hypothesis, best: Fit) -> Array:
     return np.asarray(0.5 * (run.time_min[moved] + run.time_min[moved + 1]))[chosen]
 
 
-def _moved(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> Fit:
+def _moved(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> list[Fit]:
+    """With the best few of these onsets, the best first; one of those that leave the same path."""
     if not onsets.size:
-        return best
-    size = best.theta[0][0]
+        return []
+    size, found = best.theta[0][0], dict[float, Fit]()
     late = hypothesis.at(run, (np.array([size, np.max(onsets)]),))  # until an onset the filter runs as with a later one
-    return _best_of(run, hypothesis, best, 0, [np.array([size, onset]) for onset in onsets], late)
+    for item in _tried(run, hypothesis, best, 0, [np.array([size, onset]) for onset in onsets], late):
+        found[round(item.loss, 1)] = item
+        if len(found) > _ONSETS:
+            del found[max(found)]
+    return [found[loss] for loss in sorted(found)]
 
 
-def _best_of(
-    run: Run, hypothesis: Hypothesis, best: Fit, place: int, several: Sequence[Array], like: Fit | None = None
-) -> Fit:
-    """The best of a fit and of others with other numbers of one effect; see `Hypothesis.at` for what they are like."""
+def _best_onset(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> Fit:
+    return min([best, *_moved(run, hypothesis, best, onsets)[:1]], key=lambda item: item.loss)
+
+
+def _best_of(run: Run, hypothesis: Hypothesis, best: Fit, place: int, several: Sequence[Array]) -> Fit:
+    """The best of a fit and of others with other numbers of one effect."""
+    return min(chain([best], _tried(run, hypothesis, best, place, several, best)), key=lambda item: item.loss)
+
+
+def _tried(
+    run: Run, hypothesis: Hypothesis, best: Fit, place: int, several: Sequence[Array], like: Fit
+) -> Iterator[Fit]:
+    """Fits with other numbers of one effect, a few at a time; see `Hypothesis.at` for what they are like."""
     for begin in range(0, len(several), LANES):
         thetas = [
             [numbers if other == place else item for other, item in enumerate(best.theta)]
             for numbers in several[begin : begin + LANES]
         ]
-        tried = hypothesis.at_all(run, thetas, best if like is None else like)
-        best = min([best, *tried], key=lambda item: item.loss)
-    return best
+        yield from hypothesis.at_all(run, thetas, like)

@@ -21,7 +21,8 @@ def test_an_onset_that_no_slope_leads_to_is_found() -> None:
     run = run_of("valve_stiction:step:6.0@150.23min", rows=3000)
     hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
     truth = hypothesis.at(run, (np.array([6.0, 150.23]),))
-    found = jumping.finely(run, hypothesis, hypothesis.at(run, (np.array([6.3, 40.0]),)))
+    roughly = jumping.roughly(run, hypothesis, hypothesis.at(run, (np.array([6.3, 40.0]),)))
+    found = jumping.finely(run, hypothesis, roughly)
     assert found.loss <= truth.loss + 1e-6
     # When it began to stick shows only in where it stands from the next move on that it does not follow.
     np.testing.assert_allclose(found.found.x[1600:, 2], truth.found.x[1600:, 2], atol=0.01)
