@@ -1,0 +1,46 @@
+"""Where the process itself is noisy, sizes are off by as much as their intervals say."""
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import chi2
+
+from diagnosis.courses import Constant
+from diagnosis.hypothesis import Hypothesis
+from diagnosis.record_checks import run_of
+from diagnosis.sized import Sized
+from diagnosis.wandering import Noise
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
+from tests.hidden_effect.catalogue import HiddenEffect, named
+from tests.hidden_effect.draw import draw
+from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES
+
+SPAN_MIN = 150.0
+SEED = 6000
+SMALLEST_SD = (1e-4, 0.01)
+UNLUCKY = 1e-3
+"""So seldom would right intervals fail on either side."""
+
+
+def off_in_sd(hidden_effect: HiddenEffect, seed: int) -> float:
+    """What the size of a constant cause is off by, in standard deviations that its fit says."""
+    circumstances = replace(NAMED_CIRCUMSTANCES["more process noise"], span_min=SPAN_MIN)
+    hidden = draw(seed, (hidden_effect,), circumstances, ("constant",))
+    run = run_of(hidden.record, cstr())
+    effect = next(item for item in EFFECTS if item.name == hidden_effect.name)
+    sized = Sized(cstr(), (effect,), Noise(circumstances.noise_sd, (0.0, 0.0)))
+    hypothesis = Hypothesis(sized, (Constant(run.time_min),))
+    truth = hidden.courses[0].size
+    fit = hypothesis.at(run, (np.array([truth]),))
+    for _ in range(2):
+        sized.noise = sized.tuned(run, hypothesis.signals(fit), SMALLEST_SD)
+        fit = hypothesis.fit(run, fit.theta)
+    return float((fit.theta[0][0] - truth) / np.sqrt(hypothesis.covariance(run, fit)[0, 0]))
+
+
+def test_sizes_scatter_about_the_truth_as_their_standard_deviations_say() -> None:
+    """Also where the concentration is disturbed and noise levels say, as here mostly, that it is not."""
+    smooth = [item for item in named() if not next(one for one in EFFECTS if one.name == item.name).jumps]
+    squares = [off_in_sd(item, SEED + place) ** 2 for place, item in enumerate(smooth)]
+    assert chi2.ppf(UNLUCKY, len(squares)) < sum(squares) < chi2.isf(UNLUCKY, len(squares))
