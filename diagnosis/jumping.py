@@ -1,17 +1,18 @@
 """The size and the onset of an effect that acts in jumps, such as a valve that sticks.
 
 Its innovations change with them in jumps, so there is no slope to climb: they are scanned, widely first and then about
-the best. Where the deviation sets in decides as well where the memory of the effect stands from then on, and so an
-onset that is somewhat off may explain little; it is looked for by itself, once a size is known, among the rows after
-each in which an input moves, for each leaves the memory elsewhere. As soon as an input has moved far, the memory is the
-same whenever the deviation set in. So what an onset explains is roughly what a run without the deviation explains
-before it, and one with it all along after it; those that are best so are tried, and some all over the record.
+the best. Where the deviation sets in decides as well where the memory of the effect stands from then on, so every row
+after one in which an input moves may be another onset, and with a size that is somewhat off the wrong one may seem
+best. But as soon as an input has moved far, the memory is the same whenever the deviation set in. So what an onset
+explains is roughly what a run without the deviation explains before it, and one with it all along after it: a run for
+each size tells of all onsets, and only the likely ones are tried.
 """
 
 from collections.abc import Iterator, Sequence
 from itertools import chain
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.run import Run
@@ -23,6 +24,7 @@ _SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side
 _FINELY = ((1.06, 25), (1.006, 25), (1.0006, 25))
 _NEARER = ((1.3, 12), (1.06, 9))
 _BESIDE = ((1.06, 48),)
+_ABOUT = np.geomspace(0.8, 1.25, 24)
 _USUAL = 24  # of the sizes that an effect usually has
 _LIKELY_ONSETS, _ALL_OVER, _NEAREST_ROWS, _ONSETS = 48, 32, 30, 6
 _LEAST_GAIN = 5.0  # in log likelihood
@@ -76,14 +78,18 @@ def roughly(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
         hypothesis: one such effect, constant or as a step.
         best: where it begins.
     """
-    course, usual = hypothesis.courses[0], hypothesis.sized.effects[0].starts
+    usual = hypothesis.sized.effects[0].starts
     sizes = np.geomspace(usual[0], usual[-1], _USUAL)
-    best = _best_of(run, hypothesis, best, 0, [np.append(size, best.theta[0][1:]) for size in sizes])
-    best = sized(run, hypothesis, best, 0, _NEARER)
-    if course.numbers:
-        best = _best_onset(run, hypothesis, best, _likely(run, hypothesis, best))
-        best = sized(run, hypothesis, best, 0, _NEARER)
-    return best
+    if not hypothesis.courses[0].numbers:
+        best = _best_of(run, hypothesis, best, 0, [np.array([size]) for size in sizes])
+        return sized(run, hypothesis, best, 0, _NEARER)
+    for numbers in (sizes, best.theta[0][0] * _ABOUT):
+        profiles = _profiles(run, hypothesis, best, numbers)
+        likely = [
+            np.array([size, _between(run)[np.argmin(lost)]]) for size, lost in zip(numbers, profiles, strict=True)
+        ]
+        best = _best_of(run, hypothesis, best, 0, likely)
+    return sized(run, hypothesis, _best_onset(run, hypothesis, best, _likely(run, hypothesis, best)), 0, _NEARER)
 
 
 def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
@@ -103,19 +109,38 @@ def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
         tried = [sized(run, hypothesis, item, 0, _BESIDE) for item in _moved(run, hypothesis, best, np.sort(onsets))]
         best = min([best, *tried], key=lambda item: item.loss)
         best = _best_onset(run, hypothesis, best, best.theta[0][1] + rows)
-    return sized(run, hypothesis, best, 0, _SIZES + _FINELY)
+    return sized(run, hypothesis, best, 0, _FINELY)
 
 
 def _likely(run: Run, hypothesis: Hypothesis, best: Fit) -> Array:
-    """Onsets to try, increasing: between rows, each after one in which an input moved."""
-    moved = np.flatnonzero(np.any(np.diff(run.inputs, axis=0) != 0.0, axis=1))[:-1] + 1
-    always = hypothesis.at(run, (np.array([best.theta[0][0], run.time_min[0]]),))
-    never = hypothesis.without(run, best, 0)
-    lost = np.cumsum(row_losses(never) - row_losses(always.w))[moved]
-    chosen = np.zeros(moved.size, dtype=np.bool_)
+    """Onsets to try with its size, increasing."""
+    onsets = _between(run)
+    (lost,) = _profiles(run, hypothesis, best, best.theta[0][:1])
+    chosen = np.zeros(onsets.size, dtype=np.bool_)
     chosen[np.argsort(lost)[:_LIKELY_ONSETS]] = True
-    chosen[:: max(-(-moved.size // _ALL_OVER), 1)] = True
-    return np.asarray(0.5 * (run.time_min[moved] + run.time_min[moved + 1]))[chosen]
+    chosen[:: max(-(-onsets.size // _ALL_OVER), 1)] = True
+    return onsets[chosen]
+
+
+def _between(run: Run) -> Array:
+    """Between rows, each after one in which an input moved."""
+    moved = _moves(run)
+    return np.asarray(0.5 * (run.time_min[moved] + run.time_min[moved + 1]))
+
+
+def _moves(run: Run) -> NDArray[np.intp]:
+    return np.flatnonzero(np.any(np.diff(run.inputs, axis=0) != 0.0, axis=1))[:-1] + 1
+
+
+def _profiles(run: Run, hypothesis: Hypothesis, best: Fit, sizes: Array) -> list[Array]:
+    """Of each size what it loses, roughly and up to a constant, with each of the onsets between rows."""
+    never = row_losses(hypothesis.without(run, best, 0))
+    always = _tried(run, hypothesis, best, 0, [np.array([size, run.time_min[0]]) for size in sizes], best)
+    found = []
+    for item in always:
+        gained = never - row_losses(item.w)
+        found.append(np.cumsum(gained)[_moves(run)] - np.sum(gained))
+    return found
 
 
 def _moved(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> list[Fit]:

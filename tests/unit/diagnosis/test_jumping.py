@@ -17,15 +17,17 @@ STICKS = next(effect for effect in EFFECTS if effect.name == "valve_stiction")
 NOISE = Noise((0.002, 0.3), (0.0, 0.0))
 
 
-def test_an_onset_that_no_slope_leads_to_is_found() -> None:
-    run = run_of("valve_stiction:step:6.0@150.23min", rows=3000)
+@pytest.mark.parametrize(("size", "onset_min"), [(6.0, 150.23), (5.3, 212.07), (3.65, 211.78), (7.33, 175.97)])
+def test_an_onset_that_no_slope_leads_to_is_found(size: float, onset_min: float) -> None:
+    run = run_of(f"valve_stiction:step:{size}@{onset_min}min", rows=3000)
     hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
-    truth = hypothesis.at(run, (np.array([6.0, 150.23]),))
+    truth = hypothesis.at(run, (np.array([size, onset_min]),))
     roughly = jumping.roughly(run, hypothesis, hypothesis.at(run, (np.array([6.3, 40.0]),)))
     found = jumping.finely(run, hypothesis, roughly)
     assert found.loss <= truth.loss + 1e-6
     # When it began to stick shows only in where it stands from the next move on that it does not follow.
-    np.testing.assert_allclose(found.found.x[1600:, 2], truth.found.x[1600:, 2], atol=0.01)
+    after = slice(int(10.0 * onset_min) + 100, None)
+    np.testing.assert_allclose(found.found.x[after, 2], truth.found.x[after, 2], atol=0.01)
 
 
 def test_a_size_is_found_between_the_two_moves_that_it_lies_between() -> None:
