@@ -52,6 +52,9 @@ ROUNDS = 5
 SETTLED_NOISE = 10.0
 """In BIC: a noise that gains less is not worth another round."""
 
+NOISES = 3
+"""Near so many that were found last the next one is sought; with the first rows', as many as go in lanes."""
+
 _NEAR = 4.0
 _SMALLER = 0.3  # of what the linear size is
 _SHARE = 0.3  # of what the best lead promises: linear promises of memory are rough
@@ -126,6 +129,7 @@ class Search:
         self.run = without(run, gross_outliers(run.measured))
         self._sized: dict[tuple[str, ...], Sized] = {}
         self._nothing: tuple[Noise, float] | None = None
+        self._settled: list[Noise] = []  # taken last
         self._period_min = float(np.median(np.diff(run.time_min)))
         self.noise = self._first_noise()
         self.screen = Screen(model, effects, self.run)
@@ -225,7 +229,9 @@ class Search:
     def settle(self, best: Explained) -> None:
         """Take the noise that a hypothesis needs for that of all."""
         signals = best.hypothesis.signals(best.fit)
-        self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd, self.noise)
+        before = [self.noise, *(item for item in self._settled if item != self.noise)][:NOISES]
+        self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd, before)
+        self._settled = [self.noise, *(item for item in self._settled if item != self.noise)][:NOISES]
 
     def _settled_anew(self, best: Explained) -> bool:
         """Whether another noise goes with its numbers than with the rougher ones it was found with; then it holds."""

@@ -212,9 +212,9 @@ class Sized:
         return found
 
     def tuned(
-        self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float], nearby: Noise | None = None
+        self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float], nearby: Sequence[Noise] = ()
     ) -> Noise:
-        """The noise under which the run is likeliest with these deviations; the search may begin nearby."""
+        """The noise under which the run is likeliest with these deviations; the search may begin near one of some."""
         rows, _ = self._laid_out(run, signals)
         times = self._noise.times
         # It begins anew with a short memory: a model that lacks something makes it seem long, and there it would stay.
@@ -230,7 +230,7 @@ class Sized:
             tuple(times),
             first_sd,
             rows.doubt,
-            self._levels_of(nearby) if nearby is not None and not nearby.wandering else None,
+            [self._levels_of(item) for item in nearby if not item.wandering],
         )
         of_sensors = len(found.process_sd) - len(times)
         wandering = learned(self._noise.wandering, found.process_sd[of_sensors:], times, self._period_min)
