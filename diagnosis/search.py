@@ -9,6 +9,7 @@ a model, Annals of Statistics 6) with the noise of the best.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import log
 from typing import TypeAlias
 
@@ -17,7 +18,7 @@ import numpy as np
 from diagnosis import jumping
 from diagnosis.courses import Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
-from diagnosis.knots import best_resolved
+from diagnosis.knots import best_resolved, fine
 from diagnosis.memory_screen import MemoryScreen
 from diagnosis.outliers import gross_outliers, outliers, without
 from diagnosis.run import Run
@@ -259,6 +260,10 @@ class Search:
     def _followed(self, effect: Effect, signals: Sequence[Signal]) -> list[Followed]:
         return self.sized((effect,)).follow_all(self.run, [[signal] for signal in signals])
 
+    @cached_property
+    def _grid(self) -> Free:
+        return fine(self.run.time_min)
+
     def resolved(self, item: Explained, steps: int = MOST_STEPS) -> Explained:
         """With as many knots as its free curves need."""
         hypothesis = item.hypothesis
@@ -266,7 +271,7 @@ class Search:
             if not isinstance(course, Free) or place == hypothesis.sized.late:
                 continue
             courses, theta = list(item.hypothesis.courses), list(item.fit.theta)
-            courses[place], theta[place] = best_resolved(self.run, item.hypothesis, item.fit, place)
+            courses[place], theta[place] = best_resolved(self._grid, self.run, item.hypothesis, item.fit, place)
             if courses[place].coefficients != course.coefficients:
                 other = self.fit(Hypothesis(hypothesis.sized, courses), theta, steps, scan=False)
                 item = min(item, other, key=lambda item: item.bic)
