@@ -14,6 +14,8 @@ from reactorwatch.runtime.loopback import free_endpoint
 
 REACTORWATCH = str(Path(sys.executable).with_name("reactorwatch"))
 PATIENCE_S = 60.0
+COMMAND_WITHIN_S = 300.0
+"""A diagnosis is half a minute of computing, and a busy machine takes several times that."""
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 Start = Callable[..., subprocess.Popen[str]]
@@ -26,7 +28,12 @@ def command() -> Command:
 
     def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            [REACTORWATCH, *map(str, arguments)], capture_output=True, text=True, timeout=120, check=False, cwd=cwd
+            [REACTORWATCH, *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            timeout=COMMAND_WITHIN_S,
+            check=False,
+            cwd=cwd,
         )
 
     return run

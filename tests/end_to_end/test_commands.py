@@ -157,7 +157,7 @@ def test_a_node_without_a_router_waits_says_so_and_can_be_stopped(endpoint: str,
     assert "waiting for a router" in line
     assert endpoint in line
     process.send_signal(signal.SIGTERM)
-    assert process.wait(30) == 0
+    assert process.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -173,7 +173,7 @@ def test_up_runs_until_it_is_stopped_and_closes_its_files(
     assert sampled.wait(PATIENCE_S)
     listener.close()
     process.send_signal(number)
-    assert process.wait(60) == 0
+    assert process.wait(PATIENCE_S) == 0
     (recording,) = folder.glob("*.mcap")
     assert recording.name.startswith("R-101-")
     assert not list(folder.glob("*.part"))
@@ -187,7 +187,7 @@ def test_the_plant_obeys_commands_on_the_bus(bus: ZenohBus, endpoint: str, start
 
     def ask(name: str, message: SetInput | InjectFault) -> CommandReply:
         question = Encoded(keys.key("cstr", keys.COMMAND, name), *encode_message(message))
-        (answer,) = bus.ask(question, 10.0)
+        (answer,) = bus.ask(question, PATIENCE_S)
         return CommandReply.FromString(answer.payload)
 
     assert ask("set_input", SetInput(signal="qc", value=95.0)).accepted
@@ -197,7 +197,7 @@ def test_the_plant_obeys_commands_on_the_bus(bus: ZenohBus, endpoint: str, start
     assert ask("inject_fault", InjectFault(specification="coolant_flow:step:-0.05")).accepted
     assert not ask("inject_fault", InjectFault(specification="magic:step:1")).accepted
     process.send_signal(signal.SIGINT)
-    assert process.wait(30) == 0
+    assert process.wait(PATIENCE_S) == 0
 
 
 def test_a_node_that_is_not_there_is_not_alive(bus: ZenohBus, endpoint: str, command: Command) -> None:
