@@ -31,8 +31,8 @@ COMMANDS = (
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_explains_itself(command: Command, name: str) -> None:
-    done = command(name, "--help")
+def test_every_command_explains_itself(called: Command, name: str) -> None:
+    done = called(name, "--help")
     assert done.returncode == 0
     assert done.stdout.startswith(f"Usage: reactorwatch {name} ")
 
@@ -118,6 +118,28 @@ def record_csv(tmp_path: Path) -> Path:
     ],
 )
 def test_what_is_wrong_is_told_in_one_line_and_nothing_is_written(
+    called: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
+) -> None:
+    check_told_in_one_line(called, tmp_path, record_csv, arguments, expected)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["fly"], "No such command 'fly'"),
+        (["backtest", "BAD.csv"], "row 3"),
+        (["monitor", "--config", "nowhere.toml"], "nowhere.toml: cannot be read"),
+        (["diagnose", "RECORD", "-o", "BAD.txt"], "is a file, the name of a folder was expected"),
+    ],
+    ids=["what the command is", "what it reads", "of a node", "where it writes"],
+)
+def test_a_process_of_its_own_tells_the_same(
+    command: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
+) -> None:
+    check_told_in_one_line(command, tmp_path, record_csv, arguments, expected)
+
+
+def check_told_in_one_line(
     command: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
 ) -> None:
     (tmp_path / "BAD.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,x,440\n")

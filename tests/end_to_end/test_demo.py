@@ -20,8 +20,6 @@ from recorder.mcap_file import read_messages
 
 from .conftest import COMMAND_WITHIN_S, REACTORWATCH
 
-pytestmark = pytest.mark.xdist_group("demo")  # it is run once
-
 B = TypeVar("B", bound=Message)
 ONSET_MIN, SPAN_MIN = 150.0, 200.0
 
