@@ -38,6 +38,8 @@ BATCHES_PER_S = 100
 SOONEST_S, LATEST_S = 0.5, 4.0
 PATIENCE_S = 60.0
 FLUSHED_BYTES = 20_000
+KEPT = 30 * RATE_PER_S // SIGNALS
+"""Messages on a key that the publisher remembers: of half a minute, as a busy machine is slow to start a recorder."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +138,7 @@ def recorder(folder: Path, endpoint: str, tokens: "Tokens") -> Iterator[subproce
 def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Killed]:
     """Kill a recorder so many times, at random moments, and look at what is there in the end."""
     random = np.random.default_rng(seed)
-    config = BusConfig(endpoint=free_endpoint())
+    config = BusConfig(endpoint=free_endpoint(), cache_messages=KEPT)
     hub = router(config)
     bus = connect(config, "kills", StopSignal())
     assert bus is not None

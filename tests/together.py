@@ -1,8 +1,9 @@
 """Which tests one worker has all of, when there are several workers.
 
 Tests of a file share what is made once for them: a demonstration that was run, a cluster, a record that was diagnosed.
-Several workers would each make it. So the files named here go to one worker each, those with the most tests first; all
-other tests go one by one to whoever is free.
+Several workers would each make it. And where no machine code of a diagnosis was ever made, whoever diagnoses first
+makes it, for a quarter of a minute; it is on the disk for those that come after. So the files named here are one piece
+of work, which is begun first; all other tests go one by one to whoever is free.
 
 The marks of pytest-xdist for this, `xdist_group`, group nothing with pytest 9.2 (pytest-dev/pytest-xdist#1386).
 """
@@ -10,10 +11,12 @@ The marks of pytest-xdist for this, `xdist_group`, group nothing with pytest 9.2
 import pytest
 from xdist.scheduler import LoadScopeScheduling
 
-FILES = frozenset(
+DIAGNOSING = frozenset(
     {
         "tests/end_to_end/test_demo.py",
         "tests/end_to_end/test_diagnose.py",
+        "tests/end_to_end/test_documents.py",
+        "tests/end_to_end/test_many_files.py",
         "tests/hidden_effect/test_found.py",
         "tests/hidden_effect/test_outside.py",
     }
@@ -21,12 +24,11 @@ FILES = frozenset(
 
 
 def scheduling(config: pytest.Config, log: object) -> LoadScopeScheduling:
-    """A file of these is one piece of work, and so is each other test."""
+    """How tests are given to workers: what has the most tests first."""
     made = LoadScopeScheduling(config, log)
     made._split_scope = _piece_of_work
     return made
 
 
 def _piece_of_work(test: str) -> str:
-    file = test.partition("::")[0]
-    return file if file in FILES else test
+    return "diagnosing" if test.partition("::")[0] in DIAGNOSING else test
