@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from tests.together import DIAGNOSING
+from tests.together import PIECES
 
 ROOT = Path(__file__).parents[2]
 
 
 def test_each_of_the_files_is_there() -> None:
-    assert {path for path in DIAGNOSING if not (ROOT / path).is_file()} == set()
+    assert {path for path in PIECES if not (ROOT / path).is_file()} == set()
