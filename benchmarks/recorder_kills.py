@@ -181,6 +181,7 @@ def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Kil
                 killed_ns.append(time.time_ns())
                 process.send_signal(signal.SIGKILL)
         with recorder(folder, config.endpoint, tokens) as process:
+            pace.wait()
             process.terminate()  # the last start recovers, too
             process.wait(PATIENCE_S)
     finally:
