@@ -231,6 +231,7 @@ class Sized:
             first_sd,
             rows.doubt,
             [self._levels_of(item) for item in nearby if not item.wandering],
+            lacking=True,
         )
         of_sensors = len(found.process_sd) - len(times)
         wandering = learned(self._noise.wandering, found.process_sd[of_sensors:], times, self._period_min)

@@ -114,6 +114,8 @@ def tune_with(
     first_sd: Mapping[str, float],
     doubt: Doubt | None = None,
     nearby: Sequence[NoiseLevels] = (),
+    *,
+    lacking: bool = False,
 ) -> tuple[NoiseLevels, dict[str, float]]:
     """The noise levels, and positive parameters of the model, under which a record is likeliest.
 
@@ -128,9 +130,11 @@ def tune_with(
         doubt: ways on which nobody knows when inputs changed; None: there are none.
         nearby: noise levels that may be near, at most three; where some are likelier than what the first rows say, the
             search begins there.
+        lacking: whether the model may lack something that acts later on, which then passes for process noise, so that
+            noisier processes are tried too. Else what disturbs a record for a while is not to be learned from it.
     """
     smallest = np.asarray(smallest_sd, dtype=float)
-    return _Tuning(model, time_min, inputs, measured, smallest, learned, first_sd, doubt).found(nearby)
+    return _Tuning(model, time_min, inputs, measured, smallest, learned, first_sd, doubt).found(nearby, lacking)
 
 
 class _Tuning:
@@ -165,12 +169,13 @@ class _Tuning:
         one = Filter(model, first)
         self._filters = [one, *(one.twin() for _ in range(LANES - 1))]
 
-    def found(self, nearby: Sequence[NoiseLevels]) -> tuple[NoiseLevels, dict[str, float]]:
+    def found(self, nearby: Sequence[NoiseLevels], lacking: bool) -> tuple[NoiseLevels, dict[str, float]]:
         """The best noise levels, and the best values of what else was to be learned."""
         best = self._climbed(self._without_outliers(self._begun()))
         if self._rows > FIRST_ROWS:
             self._take(self._rows)
-            starts = [best.theta, *(self._near(levels) for levels in nearby), *self._noisier(best.theta)]
+            starts = [best.theta, *(self._near(levels) for levels in nearby)]
+            starts += self._noisier(best.theta) if lacking else []
             best = min(self._tried(starts[:LANES]), key=lambda trial: trial.loss)
             best = self._climbed(self._without_outliers(best))
         climbed = best
@@ -191,7 +196,7 @@ class _Tuning:
         return np.concatenate([sensors, np.log(states), np.log([item.value for item in self._learned])])
 
     def _noisier(self, theta: Array) -> list[Array]:
-        """With a process noise that moves every state alike: what is not in the model may act later on."""
+        """With a process noise that moves every state alike."""
         found = [theta.copy() for _ in SHARES]
         for item, share in zip(found, SHARES, strict=True):
             item[self._of_states] = np.where(self._apart > 0.0, item[self._of_states], np.log(share * self._scales))
