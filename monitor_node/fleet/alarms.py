@@ -30,11 +30,8 @@ class AlarmsBefore:
 
     def hear(self, plant: str, message: Encoded) -> None:
         """Note what another monitor says of an alarm of a plant."""
-        try:
-            alarm = decode(message.payload, message.encoding)
-        except DecodeError:
-            return
-        if isinstance(alarm, Alarm) and alarm.alarm in self._names:
+        alarm = alarm_of(message)
+        if alarm is not None and alarm.alarm in self._names:
             self._said.setdefault(plant, {})[alarm.alarm] = alarm
 
     def of(self, plant: str) -> list[Alarm]:
@@ -94,6 +91,15 @@ class AlarmsBefore:
             return False
         said = (before.get(topic.plant, {}).get(alarm.alarm) for before in (self._said, self._ours))
         return any(_covers(before, alarm) for before in said if before is not None)
+
+
+def alarm_of(message: Encoded) -> Alarm | None:
+    """What a message says of an alarm; None: nothing."""
+    try:
+        alarm = decode(message.payload, message.encoding)
+    except DecodeError:
+        return None
+    return alarm if isinstance(alarm, Alarm) else None
 
 
 def _covers(before: Alarm, alarm: Alarm) -> bool:

@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Iterator
 from monitor_node.arrivals import Arrivals, Past, cut
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.alarms import AlarmsBefore
+from monitor_node.fleet.alarms import AlarmsBefore, alarm_of
 from monitor_node.fleet.dues import NEVER_NS
 from monitor_node.fleet.recent import Recent
 from monitor_node.fleet.shards import Crew
@@ -182,13 +182,26 @@ class FleetMonitor:
         """Judge what came meanwhile, and what comes.
 
         Args:
-            others: plants of ours that others have watched meanwhile.
+            others: plants of ours that others have watched meanwhile, as far as that is known; who has told alarms of
+                one has, too.
             now_ns: now.
         """
         held, self._held = self._held or [], None
-        for plant in others:
+        for plant in {*others, *self._told_by_others(held)}:
             self.rejoin(plant, now_ns)
         return self._judged(held, now_ns)
+
+    def _told_by_others(self, messages: Iterable[Encoded]) -> set[str]:
+        """Plants of ours of which alarms were told of rows that we have not judged."""
+        found = set()
+        for message in messages:
+            topic = keys.parse(message.key)
+            if topic is None or topic.kind != keys.ALARM:
+                continue
+            alarm, own = alarm_of(message), self._here.alone(topic.plant)
+            if alarm is not None and own is not None and alarm.time_ns > (own.last_ns or 0):
+                found.add(topic.plant)
+        return found
 
     def monitor(self, plant: str) -> Monitor:
         """The monitor of a plant.
