@@ -194,14 +194,16 @@ class Hypothesis:
     ) -> Array:
         """What the whitened innovations lose as the numbers grow, shape (values from the third row on, freedom).
 
-        Where an output is late, the equations of the filter's errors hold roughly for what is beside it.
+        Where an output is late, the equations of the filter's errors hold roughly for what is beside it. They know
+        nothing of the rows in which a size that moves the clock grows.
         """
         late = self.sized.late
-        if ways is None and (late is None or (rough and len(self.courses) > 1)):
+        apart = [bool(course.numbers) and self.sized.moves_clock(place) for place, course in enumerate(self.courses)]
+        if ways is None and not all(apart) and (late is None or (rough and len(self.courses) > 1)):
             ways = self.sized.ways(run, self._signals(fit.theta), fit.found)
         columns = []
         for place, (course, numbers, moved) in enumerate(zip(self.courses, fit.theta, differences, strict=True)):
-            if place == late or ways is None:
+            if place == late or ways is None or apart[place]:
                 columns.append(self._slope_by_differences(run, fit, place, moved))
                 continue
             over_row, at_row = course.derivatives(numbers, moved)
@@ -211,6 +213,7 @@ class Hypothesis:
         return np.concatenate(columns, axis=1)
 
     def _slope_by_differences(self, run: Run, fit: Fit, place: int, moved: Array) -> Array:
+        """A number of which this tells less than is known of it beforehand is taken for one that changes nothing."""
         course, signals = self.courses[place], []
         size = _SHARE * self.sized.effects[place].typical
         steps = [*(size,) * course.coefficients, *moved.tolist()]
@@ -218,8 +221,13 @@ class Hypothesis:
             theta = [item.copy() for item in fit.theta]
             theta[place][number] += step
             signals.append(self._signals(theta))
-        before, followed = clipped(fit.w[2:]), self.sized.follow_all(run, signals)
+        base = self._signals(fit.theta)
+        begun = [Known(fit.found, _alike(item, base)) for item in signals]
+        before, followed = clipped(fit.w[2:]), self.sized.follow_all(run, signals, begun)
         columns = [(before - clipped(item.w[2:])).ravel() / step for step, item in zip(steps, followed, strict=True)]
+        for column, known in zip(columns[course.coefficients :], course.numbers, strict=True):
+            if float(column @ column) * (known.upper - known.lower) ** 2 < 1.0:
+                column[:] = 0.0
         return np.stack(columns, axis=1)
 
     def signatures(self, run: Run, fit: Fit, place: int, course: Course) -> Array:

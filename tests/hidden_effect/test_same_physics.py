@@ -23,8 +23,8 @@ ONSET_MIN = 12.537
 OF_ORDER_ONE = np.array([0.002, 0.3])
 
 LAGS = ("jacket_lag", "valve_lag", "temperature_lag")
-APPROXIMATE = {"concentration_delay": 0.01, "sample_timing": 0.003}
-"""Of what an effect makes: the past is remembered by some polynomials; a late stamp is exact once it stays so late."""
+APPROXIMATE = {"concentration_delay": 0.01}
+"""Of what an effect makes: the past is remembered by some polynomials."""
 
 QUICK_LAG, QUICK_DELAY = 0.15, 0.06
 """The same of a lag or a delay much shorter than a row."""
