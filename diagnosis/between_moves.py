@@ -46,7 +46,7 @@ def _walked(run: Run, hypothesis: Hypothesis, best: Fit, place: int, steps: int)
             for onset in middles_min[near[(near >= 0) & (near < middles_min.size)]]
         ]
         likeliest = min(hypothesis.at_all(run, trials, best), key=lambda item: item.loss, default=best)
-        if likeliest.loss > best.loss - LEAST_GAIN:
+        if not likeliest.loss < best.loss - LEAST_GAIN:
             break
         best = hypothesis.fit(run, likeliest.theta, steps)
     return best
