@@ -1,9 +1,9 @@
 """What does a recorder lose that is killed (SIGKILL) under load?
 
-A publisher sends 5,000 samples a second through a real router. A recorder of its own process is killed at a random
-moment, started again, killed again; each start recovers what the kill before it left. Afterwards every file is read: by
-the sequence numbers nothing may be missing between its first sample and its last, and its last may be a second older
-than the kill.
+A publisher sends 5,000 samples a second through a real router. A recorder of its own process, once it keeps up with
+that, is killed at a random moment, started again, killed again; each start recovers what the kill before it left.
+Afterwards every file is read: by the sequence numbers nothing may be missing between its first sample and its last, and
+its last may be a second older than the kill.
 
     python benchmarks/recorder_kills.py [how many kills]
 """
@@ -23,7 +23,7 @@ import numpy as np
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Publication, decode, encode
+from reactorwatch.contract.codec import Encoded, Publication, decode, encode
 from reactorwatch.runtime import logs
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
 from reactorwatch.runtime.config import BusConfig
@@ -38,6 +38,10 @@ BATCHES_PER_S = 100
 SOONEST_S, LATEST_S = 0.5, 4.0
 PATIENCE_S = 60.0
 FLUSHED_BYTES = 20_000
+HEALTH_S = 0.2
+KEEPS_UP_MS = 100.0
+KEPT = 30 * RATE_PER_S // SIGNALS
+"""Messages on a key that the publisher remembers: of half a minute, as a busy machine is slow to start a recorder."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +122,34 @@ class Tokens:
             self._changed.notify_all()
 
 
+class Pace:
+    """Whether a recorder writes what comes about as soon as it comes; only then does a kill cost what it has to."""
+
+    def __init__(self, bus: ZenohBus) -> None:
+        self._changed = threading.Condition()
+        self._since_ns = 0
+        self._keeps_up = False
+        bus.subscribe(keys.key("cstr", keys.HEALTH, "recorder"), self._on_health)
+
+    def wait(self) -> None:
+        """Wait until it says so, from now on."""
+        with self._changed:
+            self._since_ns, self._keeps_up = time.time_ns(), False
+            assert self._changed.wait_for(lambda: self._keeps_up, PATIENCE_S), "the recorder does not keep up"
+
+    def _on_health(self, message: Encoded) -> None:
+        health = decode(message.payload, message.encoding)
+        assert isinstance(health, messages.Health)
+        with self._changed:
+            self._keeps_up |= health.time_ns > self._since_ns and health.lag_ms < KEEPS_UP_MS
+            self._changed.notify_all()
+
+
 @contextlib.contextmanager
 def recorder(folder: Path, endpoint: str, tokens: "Tokens") -> Iterator[subprocess.Popen[bytes]]:
     """A recorder that is alive, after the one before is known to be gone."""
     settings = folder / "settings.toml"
-    settings.write_text(f'[bus]\nendpoint = "{endpoint}"\n[recorder]\nout = "{folder}"\n')
+    settings.write_text(f'[bus]\nendpoint = "{endpoint}"\n[recorder]\nout = "{folder}"\nhealth_period_s = {HEALTH_S}\n')
     tokens.wait(alive=False)
     process = subprocess.Popen([sys.executable, "-m", "recorder", str(settings)], stderr=subprocess.DEVNULL)
     try:
@@ -136,11 +163,12 @@ def recorder(folder: Path, endpoint: str, tokens: "Tokens") -> Iterator[subproce
 def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Killed]:
     """Kill a recorder so many times, at random moments, and look at what is there in the end."""
     random = np.random.default_rng(seed)
-    config = BusConfig(endpoint=free_endpoint())
+    config = BusConfig(endpoint=free_endpoint(), cache_messages=KEPT)
     hub = router(config)
     bus = connect(config, "kills", StopSignal())
     assert bus is not None
     tokens = Tokens(bus)  # on the publisher's own link, where the subscription is known before the token
+    pace = Pace(bus)
     publisher = Publisher(bus, rate_per_s)
     alive_at, killed_ns = [], []
     try:
@@ -148,10 +176,12 @@ def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Kil
             with recorder(folder, config.endpoint, tokens) as process:
                 alive_at.append(publisher.sequence + 1)  # the row that is being published may be half heard
                 wait_for_a_flush(folder, publisher)  # it has been told what was before, and writes
+                pace.wait()
                 time.sleep(random.uniform(SOONEST_S, LATEST_S))
                 killed_ns.append(time.time_ns())
                 process.send_signal(signal.SIGKILL)
         with recorder(folder, config.endpoint, tokens) as process:
+            pace.wait()
             process.terminate()  # the last start recovers, too
             process.wait(PATIENCE_S)
     finally:

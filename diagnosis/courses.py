@@ -276,7 +276,7 @@ class Free(Course):
         super().__init__(time_min)
         self.coefficients = knots
         self.knots_min = np.linspace(self.begin_min, self.end_min, knots)
-        self._value = np.stack([np.interp(time_min, self.knots_min, row) for row in np.eye(knots)], axis=1)
+        self._value = hats((time_min - self.begin_min) / (self.end_min - self.begin_min), knots)
         means = 0.5 * (self._value[1:] + self._value[:-1]) * self._step[:, None]
         self._area = np.concatenate([np.zeros((1, knots)), np.cumsum(means, axis=0)])
 
@@ -291,3 +291,20 @@ class Free(Course):
         found = {"size": size}
         found |= {f"time_{place}": float(time_min) for place, time_min in enumerate(self.knots_min, start=1)}
         return found | {f"value_{place}": float(value) / (size or 1.0) for place, value in enumerate(values, start=1)}
+
+
+def hats(share: Array, count: int) -> Array:
+    """Functions that are straight between knots at even distances, 1 in one and 0 in the others.
+
+    Args:
+        share: where, 0 at the first knot and 1 at the last, within; shape (n,).
+        count: of knots, at least 2.
+
+    Returns:
+        Shape (n, count).
+    """
+    place = share * (count - 1)
+    knot = np.minimum(place.astype(np.intp), count - 2)
+    rows, found = np.arange(share.size), np.zeros((share.size, count))
+    found[rows, knot], found[rows, knot + 1] = 1.0 - (place - knot), place - knot
+    return found

@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnosis.courses import Signal
+from diagnosis.courses import Signal, hats
 from diagnosis.forcing_filter import Linear, smoothed, whitened
 from diagnosis.run import Run, doubt_of
 from diagnosis.size_inputs import SizedModel, with_size_inputs
@@ -158,7 +158,7 @@ class Forcing:
         for place in self.sees:
             low, high = float(np.min(z[:, place])), float(np.max(z[:, place]))
             if high > low:
-                now, then = (_hats((item[:, place] - low) / (high - low)) for item in (z, after))
+                now, then = (hats((item[:, place] - low) / (high - low), KNOTS) for item in (z, after))
                 over_row.append(0.5 * (now + then))
                 at_row.append(now)
                 count += KNOTS
@@ -219,12 +219,6 @@ def _ticks(values: Array, span_min: float) -> Array:
     """A clock that goes as far as an input moves, and over the record as far as time."""
     moved = np.abs(np.diff(values, prepend=values[0]))
     return np.asarray(moved * (span_min / max(float(np.sum(moved)), 1e-300)))
-
-
-def _hats(share: Array) -> Array:
-    """Functions that are straight between knots in [0, 1], shape (rows, knots)."""
-    knots = np.linspace(0.0, 1.0, KNOTS)
-    return np.stack([np.interp(share, knots, row) for row in np.eye(KNOTS)], axis=1)
 
 
 def _bending() -> Array:

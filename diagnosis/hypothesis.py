@@ -135,8 +135,8 @@ class Hypothesis:
                     break
                 damping *= _MORE_DAMPING
             gained = before.loss - best.loss
-            # A step that gains what was promised leaves nothing to gain: all is as good as linear there.
-            if gained < SETTLED or abs(gained - promised) < enough:
+            # A whole step that gains what was promised leaves nothing to gain: all is as good as linear there.
+            if gained < SETTLED or (damping < _DAMPING and abs(gained - promised) < enough):
                 break
             if any(course.numbers for course in self.courses):
                 differences = self._widened(self._inverse(g), differences)

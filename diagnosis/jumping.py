@@ -24,9 +24,9 @@ _SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side
 _FINELY = ((1.06, 25), (1.006, 25), (1.0006, 25))
 _NEARER = ((1.3, 12), (1.06, 9))
 _BESIDE = ((1.06, 48),)
-_ABOUT = np.geomspace(0.8, 1.25, 24)
-_USUAL = 24  # of the sizes that an effect usually has
-_LIKELY_ONSETS, _ALL_OVER, _NEAREST_ROWS, _ONSETS = 48, 32, 30, 6
+_USUAL, _ABOUT = 24, np.geomspace(0.8, 1.25, 24)  # sizes: of those that an effect usually has, and in shares of one
+_LIKELY_ONSETS, _ALL_OVER, _NEAREST_ROWS = 48, 32, 30  # tried with one size: how many, of how many, and how near
+_ONSETS = 6  # that sizes are tried with
 _LEAST_GAIN = 5.0  # in log likelihood
 
 
@@ -74,21 +74,18 @@ def roughly(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
     """With one of the sizes that the effect usually has, or one near it, and if it is a step with a likely onset.
 
     Args:
-        run: the record.
+        run: the record; where no input moves before its last row no onset is looked for.
         hypothesis: one such effect, constant or as a step.
         best: where it begins.
     """
-    usual = hypothesis.sized.effects[0].starts
+    usual, onsets = hypothesis.sized.effects[0].starts, _between(run)
     sizes = np.geomspace(usual[0], usual[-1], _USUAL)
-    if not hypothesis.courses[0].numbers:
-        best = _best_of(run, hypothesis, best, 0, [np.array([size]) for size in sizes])
+    if not hypothesis.courses[0].numbers or not onsets.size:
+        best = _best_of(run, hypothesis, best, 0, [np.append(size, best.theta[0][1:]) for size in sizes])
         return sized(run, hypothesis, best, 0, _NEARER)
-    for numbers in (sizes, best.theta[0][0] * _ABOUT):
-        profiles = _profiles(run, hypothesis, best, numbers)
-        likely = [
-            np.array([size, _between(run)[np.argmin(lost)]]) for size, lost in zip(numbers, profiles, strict=True)
-        ]
-        best = _best_of(run, hypothesis, best, 0, likely)
+    for tried in (sizes, best.theta[0][0] * _ABOUT):
+        lost = zip(tried, _profiles(run, hypothesis, best, tried), strict=True)
+        best = _best_of(run, hypothesis, best, 0, [np.array([size, onsets[np.argmin(item)]]) for size, item in lost])
     return sized(run, hypothesis, _best_onset(run, hypothesis, best, _likely(run, hypothesis, best)), 0, _NEARER)
 
 

@@ -5,11 +5,12 @@ that is wrong. All counts are compared at once, by the equations linearised abou
 nearly one of a fine grid, so the sums of the fine grid's signatures serve for all.
 """
 
+from functools import cache
 from math import log
 
 import numpy as np
 
-from diagnosis.courses import Free
+from diagnosis.courses import Free, hats
 from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
 from diagnosis.sized import clipped
@@ -22,10 +23,16 @@ GRID = 161
 _RIDGE = 1e-9
 
 
-def best_resolved(run: Run, hypothesis: Hypothesis, fit: Fit, place: int) -> tuple[Free, Array]:
+def fine(time_min: Array) -> Free:
+    """The fine grid's curve over such rows."""
+    return Free(time_min, GRID)
+
+
+def best_resolved(grid: Free, run: Run, hypothesis: Hypothesis, fit: Fit, place: int) -> tuple[Free, Array]:
     """The curve with the number of knots that promises the least BIC, and its values there.
 
     Args:
+        grid: `fine`, of the record's rows.
         run: the record.
         hypothesis: with a free curve at `place`, of an effect that makes no output late.
         fit: of it.
@@ -33,7 +40,6 @@ def best_resolved(run: Run, hypothesis: Hypothesis, fit: Fit, place: int) -> tup
     """
     curve = hypothesis.courses[place]
     assert isinstance(curve, Free)
-    grid = Free(run.time_min, GRID)
     values = np.interp(grid.knots_min, curve.knots_min, fit.theta[place])
     g = hypothesis.signatures(run, fit, place, grid)
     information = g.T @ g
@@ -41,15 +47,22 @@ def best_resolved(run: Run, hypothesis: Hypothesis, fit: Fit, place: int) -> tup
     information += _RIDGE * np.trace(information) / GRID * np.eye(GRID)
     promised: list[tuple[float, Array]] = []
     for count in range(FEWEST_KNOTS, MOST_KNOTS + 1):
-        on_grid = _on_grid(grid, count)
+        on_grid = _on_grid(count)
         a = on_grid.T @ sought
-        theta = np.asarray(np.linalg.lstsq(on_grid.T @ information @ on_grid, a, rcond=1e-12)[0], dtype=np.float64)
+        theta = _solved(on_grid.T @ information @ on_grid, a)
         promised.append((count * log(run.values) - float(a @ theta), theta))
     _, theta = min(promised, key=lambda item: item[0])
     return Free(run.time_min, theta.size), theta
 
 
-def _on_grid(grid: Free, count: int) -> Array:
+def _solved(information: Array, a: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.solve(information, a))
+    except np.linalg.LinAlgError:  # the record says nothing of the effect
+        return np.asarray(np.linalg.lstsq(information, a, rcond=1e-12)[0])
+
+
+@cache
+def _on_grid(count: int) -> Array:
     """What curves with one knot at 1 and the others at 0 are in the grid's knots, shape (GRID, count)."""
-    knots = np.linspace(grid.begin_min, grid.end_min, count)
-    return np.stack([np.interp(grid.knots_min, knots, row) for row in np.eye(count)], axis=1)
+    return hats(np.linspace(0.0, 1.0, GRID), count)

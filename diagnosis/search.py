@@ -9,6 +9,7 @@ a model, Annals of Statistics 6) with the noise of the best.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import log
 from typing import TypeAlias
 
@@ -17,7 +18,7 @@ import numpy as np
 from diagnosis import between_moves, jumping
 from diagnosis.courses import Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
-from diagnosis.knots import best_resolved
+from diagnosis.knots import best_resolved, fine
 from diagnosis.memory_screen import MemoryScreen
 from diagnosis.outliers import gross_outliers, outliers, without
 from diagnosis.run import Run
@@ -51,6 +52,9 @@ ROUNDS = 5
 
 SETTLED_NOISE = 10.0
 """In BIC: a noise that gains less is not worth another round."""
+
+NOISES = 3
+"""Near so many that were found last the next one is sought; with the first rows', as many as go in lanes."""
 
 _NEAR = 4.0
 _SMALLER = 0.3  # of what the linear size is
@@ -126,6 +130,7 @@ class Search:
         self.run = without(run, gross_outliers(run.measured))
         self._sized: dict[tuple[str, ...], Sized] = {}
         self._nothing: tuple[Noise, float] | None = None
+        self._settled: list[Noise] = []  # taken last
         self._period_min = float(np.median(np.diff(run.time_min)))
         self.noise = self._first_noise()
         self.screen = Screen(model, effects, self.run)
@@ -225,7 +230,9 @@ class Search:
     def settle(self, best: Explained) -> None:
         """Take the noise that a hypothesis needs for that of all."""
         signals = best.hypothesis.signals(best.fit)
-        self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd, self.noise)
+        before = [self.noise, *(item for item in self._settled if item != self.noise)][:NOISES]
+        self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd, before)
+        self._settled = [self.noise, *(item for item in self._settled if item != self.noise)][:NOISES]
 
     def _settled_anew(self, best: Explained) -> bool:
         """Whether another noise goes with its numbers than with the rougher ones it was found with; then it holds."""
@@ -253,6 +260,10 @@ class Search:
     def _followed(self, effect: Effect, signals: Sequence[Signal]) -> list[Followed]:
         return self.sized((effect,)).follow_all(self.run, [[signal] for signal in signals])
 
+    @cached_property
+    def _grid(self) -> Free:
+        return fine(self.run.time_min)
+
     def resolved(self, item: Explained, steps: int = MOST_STEPS) -> Explained:
         """With as many knots as its free curves need."""
         hypothesis = item.hypothesis
@@ -260,7 +271,7 @@ class Search:
             if not isinstance(course, Free) or place == hypothesis.sized.late:
                 continue
             courses, theta = list(item.hypothesis.courses), list(item.fit.theta)
-            courses[place], theta[place] = best_resolved(self.run, item.hypothesis, item.fit, place)
+            courses[place], theta[place] = best_resolved(self._grid, self.run, item.hypothesis, item.fit, place)
             if courses[place].coefficients != course.coefficients:
                 other = self.fit(Hypothesis(hypothesis.sized, courses), theta, steps, scan=False)
                 item = min(item, other, key=lambda item: item.bic)

@@ -168,19 +168,16 @@ class Sized:
         return [self._judged(run, by, item) for (_, by), item in zip(laid, found, strict=True)]
 
     def _judged(self, run: Run, by: Moved | None, found: Innovations) -> Followed:
-        known, least = np.isfinite(run.measured), np.array(self.noise.measurement_sd)
-        unseen = np.zeros_like(known)
+        measured, unseen, least = run.measured, np.zeros(run.measured.shape, dtype=np.bool_), self.noise.measurement_sd
         if by is not None and self.late is not None:
             output = self._output(self.late)
             found = gathered(found, by, output)
-            unseen[:, output] = by.before & known[:, output]
-            known[by.before, output] = False
-        # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
-        good = np.isfinite(found.whitened) & (found.conditional_sd > 0.0) & (found.conditional_sd < _CLUELESS * least)
-        begins = [int(np.argmax(np.any(known, axis=1))), *run.breaks]
-        known[begins] = unseen[begins] = False
-        # What was true before the beginning counts as expected: a longer delay must neither gain nor lose by it.
-        loss, w = _judged(known, unseen, good, found.whitened, found.conditional_sd, least)
+            # What was true before the beginning counts as expected: a longer delay must neither gain nor lose by it.
+            unseen[:, output], measured = by.before & np.isfinite(measured[:, output]), measured.copy()
+            measured[by.before, output] = np.nan
+        begins = np.array([int(np.argmax(np.any(np.isfinite(measured), axis=1))), *run.breaks], dtype=np.intp)
+        unseen[begins] = False
+        loss, w = _judged(measured, unseen, begins, found.whitened, found.conditional_sd, np.array(least))
         return Followed(float(loss), w, found)
 
     def _filtered_rows(self, several: Sequence[Filled], begun: Sequence[Known | None]) -> list[Innovations]:
@@ -219,9 +216,9 @@ class Sized:
         return found
 
     def tuned(
-        self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float], nearby: Noise | None = None
+        self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float], nearby: Sequence[Noise] = ()
     ) -> Noise:
-        """The noise under which the run is likeliest with these deviations; the search may begin nearby."""
+        """The noise under which the run is likeliest with these deviations; the search may begin near one of some."""
         rows, _ = self._laid_out(run, signals)
         times = self._noise.times
         # It begins anew with a short memory: a model that lacks something makes it seem long, and there it would stay.
@@ -237,7 +234,7 @@ class Sized:
             tuple(times),
             first_sd,
             rows.doubt,
-            self._levels_of(nearby) if nearby is not None and not nearby.wandering else None,
+            [self._levels_of(item) for item in nearby if not item.wandering],
         )
         of_sensors = len(found.process_sd) - len(times)
         wandering = learned(self._noise.wandering, found.process_sd[of_sensors:], times, self._period_min)
@@ -312,22 +309,22 @@ def clipped(w: Array) -> Array:
 
 @compiled
 def _judged(
-    known: NDArray[np.bool_],
-    unseen: NDArray[np.bool_],
-    good: NDArray[np.bool_],
-    whitened: Array,
-    sd: Array,
-    least: Array,
+    measured: Array, unseen: NDArray[np.bool_], begins: NDArray[np.intp], whitened: Array, sd: Array, least: Array
 ) -> tuple[float, Array]:
     """Loss and whitened innovations, in one pass: it is done as often as a filter runs."""
     w = np.full(whitened.shape, np.nan)
+    begun = np.zeros(whitened.shape[0], dtype=np.bool_)
+    begun[begins] = True
     losses = spread = 0.0
     for row in range(whitened.shape[0]):
         for output in range(whitened.shape[1]):
-            if known[row, output]:
-                value = whitened[row, output] if good[row, output] else LOST
-                if good[row, output]:
-                    spread += np.log(sd[row, output])
+            if np.isfinite(measured[row, output]) and not begun[row]:
+                # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
+                value, of_value = whitened[row, output], sd[row, output]
+                if np.isfinite(value) and 0.0 < of_value < _CLUELESS * least[output]:
+                    spread += np.log(of_value)
+                else:
+                    value = LOST
                 w[row, output], size = value, abs(value)
                 losses += 0.5 * size * size if size < HUBER else HUBER * (size - 0.5 * HUBER)
             elif unseen[row, output]:

@@ -259,11 +259,14 @@ class RecordingFiles:
         log.info("black box", file=str(path), alarm=stretch.alarm, messages=count)
 
     def _delete_oldest(self, now_ns: int, needed_since_ns: int | None) -> None:
+        writer = self._writer  # before the others are listed: what it writes may become one of them
         finished = []
         for path in (*self._finished(), *damaged(self._series)):
-            told = path.stat()
-            finished.append(Finished(path, told.st_size, told.st_mtime_ns))
-        for path in to_delete(finished, self.size_bytes, self._limits, now_ns, needed_since_ns):
+            if writer is None or path != writer.path:
+                told = path.stat()
+                finished.append(Finished(path, told.st_size, told.st_mtime_ns))
+        writing_bytes = writer.size_bytes if writer is not None else None
+        for path in to_delete(finished, writing_bytes, self._limits, now_ns, needed_since_ns):
             path.unlink()
             log.info("deleted", file=str(path), why="the limits of what is kept")
 

@@ -33,13 +33,17 @@ class Limits:
 
 
 def to_delete(
-    finished: Iterable[Finished], writing_bytes: int, limits: Limits, now_ns: int, needed_since_ns: int | None = None
+    finished: Iterable[Finished],
+    writing_bytes: int | None,
+    limits: Limits,
+    now_ns: int,
+    needed_since_ns: int | None = None,
 ) -> list[Path]:
     """What has to go.
 
     Args:
         finished: all recordings that are whole; the one that is being written is not among them and is never deleted.
-        writing_bytes: its size.
+        writing_bytes: its size; None: none is being written.
         limits: see there.
         now_ns: by the clock that the ends are of.
         needed_since_ns: what ended since then stays, whatever the limits say; None: nothing is needed.
@@ -48,7 +52,9 @@ def to_delete(
         The files, oldest first.
     """
     by_age = sorted(finished, key=lambda item: (item.ended_ns, item.path))
-    left, size = len(by_age) + 1, writing_bytes + sum(item.size_bytes for item in by_age)
+    left, size = len(by_age), sum(item.size_bytes for item in by_age)
+    if writing_bytes is not None:
+        left, size = left + 1, size + writing_bytes
     gone = []
     for item in by_age:
         within = left <= limits.files and size <= limits.size_bytes and now_ns - item.ended_ns <= limits.age_ns

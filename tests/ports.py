@@ -2,18 +2,18 @@
 
 import socket
 
-LOOPBACK = "127.0.0.1"
+from reactorwatch.runtime.loopback import LOOPBACK, free_port, keep
 
 
 def three_free_ports() -> int:
     """The first of three in a row."""
     while True:
-        with socket.socket() as first, socket.socket() as second, socket.socket() as third:
-            first.bind((LOOPBACK, 0))
-            number = int(first.getsockname()[1])
-            try:
-                second.bind((LOOPBACK, number + 1))
-                third.bind((LOOPBACK, number + 2))
-            except (OSError, OverflowError):
-                continue
-            return number
+        first = free_port()
+        try:
+            for port in (first + 1, first + 2):
+                with socket.socket() as probe:
+                    probe.bind((LOOPBACK, port))  # else it may be kept for somebody else
+                keep(port)
+        except (OSError, OverflowError):
+            continue
+        return first

@@ -9,7 +9,6 @@ import structlog
 from monitor_node.alarm_commands import COMMANDS
 from monitor_node.alarm_kpis import are_of_nothing
 from monitor_node.config import MonitorConfig
-from monitor_node.core import Monitor
 from monitor_node.fleet import shards
 from monitor_node.fleet.absence import Absence
 from monitor_node.fleet.config import FleetConfig
@@ -17,6 +16,7 @@ from monitor_node.fleet.monitor import FleetMonitor
 from monitor_node.fleet.pasts import Pasts
 from monitor_node.fleet.shards import Crew
 from monitor_node.fleet.states import FleetStates
+from monitor_node.fleet.watched import WatchedPlants
 from monitor_node.health import NODE
 from monitor_node.monitor_state import OtherSettingsError
 from monitor_node.state_file import DAMAGED, OTHER_SETTINGS
@@ -296,7 +296,8 @@ def run(
     for setting in ("alarm_state_file", "state_file"):
         if getattr(config, setting) is not None:
             raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
-    Monitor(config, 0, points=fleet.points, model=model_on_the_bus(config.model))  # or they make none
+    # Settings that make no monitor are refused now, and nobody waits for what has to be compiled.
+    WatchedPlants(config, 0, model_on_the_bus(config.model), points=fleet.points).prepare()
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
     with served(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop, passing=PASSING, crowded=True)

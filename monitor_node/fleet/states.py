@@ -27,6 +27,11 @@ MOST_WAITING = 100
 LEFT_S = 600.0
 """What was being written for so long was left by a writer that was killed."""
 
+
+class _OfAnotherError(Exception):
+    """Another has written the state meanwhile."""
+
+
 _Mark: TypeAlias = tuple[int, int]  # by which a file is known: time and size
 
 
@@ -134,6 +139,10 @@ class FleetStates:
     def _path(self, plant: str) -> Path:
         return self._folder / f"{plant}{ENDING}"
 
+    def _check_ours(self, plant: str) -> None:
+        if self.is_of_another(plant):
+            raise _OfAnotherError
+
     def _note(self, plant: str) -> None:
         """The state of a plant as it is now is known here."""
         mark = _mark_of(self._path(plant))
@@ -164,15 +173,16 @@ class FleetStates:
     def _written(self, plant: str, state: bytes) -> str | None:
         """Write a state; returns why that was not possible."""
         path = self._path(plant)
-        if self.is_of_another(plant):
-            self._lost.append(plant)
-            return None
         try:
-            with replacing(path) as temporary, temporary.open("wb") as file:
-                file.write(state)
-                file.flush()
-                os.fsync(file.fileno())
+            with replacing(path) as temporary:
+                with temporary.open("wb") as file:
+                    file.write(state)
+                    file.flush()
+                    os.fsync(file.fileno())
+                self._check_ours(plant)  # only now: a disk takes its time, and who was frozen meanwhile more
             self._note(plant)
+        except _OfAnotherError:
+            self._lost.append(plant)
         except InputError as error:
             return str(error)
         except OSError as error:

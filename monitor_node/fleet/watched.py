@@ -11,6 +11,7 @@ import msgspec
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.dues import Dues
+from monitor_node.identification.rls import RecursiveLeastSquares
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.plants import QuietPlants
 from reactorwatch.contract.codec import Encoded, Publication
@@ -63,6 +64,16 @@ class WatchedPlants:
     def quiet(self) -> list[str]:
         """Those in which nothing happens just now."""
         return [] if self._quiet is None else self._quiet.plants
+
+    def prepare(self) -> None:
+        """Have the machine code made that is made at its first use.
+
+        On a new machine that takes ten seconds and more, and would come while plants wait to be judged: the other
+        monitors of the fleet would take us for gone.
+        """
+        RecursiveLeastSquares(1).update([1.0], 1.0)
+        if self._quiet is not None:
+            self._quiet.prepare()
 
     # --- coming and going ------------------------------------------------------------------------------------
 

@@ -37,7 +37,7 @@ PLANT = "demo"
 NODES = ("recorder", "monitor", "plant")
 """In the order in which they are started."""
 START_WITHIN_S = 60.0
-DRAIN_WITHIN_S = 20.0
+DRAIN_WITHIN_S = 60.0
 LOOK_EVERY_S = 0.1
 SETTINGS_FILE = "settings.toml"
 DIAGNOSIS_FOLDER = "diagnosis"

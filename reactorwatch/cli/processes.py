@@ -23,7 +23,9 @@ MODULES = {
     "diagnosis": "reactorwatch.cli.live_diagnosis",
     "recorder": "recorder",
 }
-STOP_WITHIN_S = 15.0
+STOP_WITHIN_S = 60.0
+"""A node that is asked to stop hears for up to 5 s what is still on its way, and has up to 11 s to send its last words;
+on a busy machine all of that takes longer."""
 
 
 class Processes:

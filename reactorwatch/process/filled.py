@@ -50,6 +50,8 @@ def filled(time_min: Array, inputs: Array, measured: Array, doubt: Doubt | None 
         doubt: ways on which nobody knows when inputs changed; None: there are none.
     """
     step = np.diff(time_min)
+    if not np.any(step > LONGEST_ROW_MIN):
+        return Filled(time_min, inputs, measured, doubt, np.arange(time_min.size))
     pieces = np.where((step > LONGEST_ROW_MIN) & (step <= LONGEST_GAP_MIN), np.ceil(step / LONGEST_ROW_MIN), 1.0)
     if doubt is not None:
         pieces[doubt.rows[1:]] = 1.0

@@ -253,7 +253,7 @@ class Filter:
             self.state = start
         rows, near = record.following(self._time_min, self._inputs, self._breaks)
         count, n, n_x = len(rows), self._n_y, self._n_x
-        told, memory = np.full((count, 5 * n + 1), nan), np.full((count, self._memory.size), nan)
+        told, memory = np.empty((count, 5 * n + 1)), np.empty((count, self._memory.size))
         ends = [*np.flatnonzero(~near).tolist(), count]
         row = 0
         while row < count:
@@ -261,8 +261,6 @@ class Filter:
             if self._time_min is not None and near[row]:
                 part = slice(row, ends[bisect_left(ends, row)])
                 done = yield Stretch(self.code, self._memory, rows[part], self._constants, memory[part], told[part])
-                if row + done < part.stop:
-                    told[row + done], memory[row + done] = nan, nan
             if done:
                 self._memory[:] = memory[row + done - 1]
                 row += done
@@ -282,10 +280,8 @@ class Filter:
         doubt, accept = record.doubt, record.accept[row].tolist()
         other = (doubt.inputs[row].tolist(), doubt.times_min(row)) if doubt is not None and doubt.rows[row] else None
         found = self.update(float(time_min), inputs, values, gate=record.gate, accept=accept, doubt=other)
-        if found is not self._nothing:
-            told[row], memory[row] = self._told, self._memory
-        elif self._time_min is not None:
-            memory[row] = self._memory
+        said, known = found is not self._nothing, self._time_min is not None
+        told[row], memory[row] = self._told if said else nan, self._memory if said or known else nan
 
     @cached_property
     def code(self) -> RowCode:

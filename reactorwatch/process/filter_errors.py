@@ -141,7 +141,7 @@ class FilterErrors:
             kept[self.model.lasting, self.model.lasting] = 1.0
             F = np.where(anew, kept, F)
             G, H, D, K = (np.where(anew, 0.0, item) for item in (G, H, D, K))
-        return Ways(F, G, H, D, K, L_inverse, w)
+        return Ways(*(np.ascontiguousarray(item) for item in (F, G, H, D, K, L_inverse, w)))  # for the kernels
 
     def about(self, time_min: Array, inputs: Array, x: Array, doubt: Doubt | None = None) -> "Path":
         """The equations along a path that need not be a filter's.

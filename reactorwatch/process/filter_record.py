@@ -90,14 +90,15 @@ class FilterRecord:
     def following(
         self, before_min: float | None, inputs: Sequence[float], breaks: Sequence[float]
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """The rows and which are near, now that it is known what came before.
+        """The rows, which are only to be read, and which are near, now that it is known what came before.
 
         Args:
             before_min: time of the row before the first one; None if there is none.
             inputs: that held there.
             breaks: times at which the right-hand side jumps, increasing.
         """
-        rows, near, times, n_u = self.rows.copy(), self.near.copy(), self.time_min, self.inputs.shape[1]
+        near, times, n_u = self.near.copy(), self.time_min, self.inputs.shape[1]
+        rows = self.rows if before_min is None and not breaks else self.rows.copy()
         first, second = 2 * n_u + 1, 2 * n_u + 2
         near[0] = False
         if before_min is not None:

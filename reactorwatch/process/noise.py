@@ -39,8 +39,8 @@ from reactorwatch.process.model import Array, ProcessModel
 SHARES = (0.3, 0.03, 0.003)
 """Process noise to begin with, in scales of the state per square root of a minute; the noisiest finds its way best."""
 
-LEAST_SHARE = 1e-5
-"""Less is none."""
+LEAST_SHARE, AS_GOOD_AS_NONE = 1e-5, 3e-4
+"""Less is none; and so little that it is as good as none, though steps lead out of it."""
 
 CLIP = 4.0
 """Standard deviations beyond which it does not matter how far off a value is."""
@@ -58,6 +58,9 @@ DIFFERENCE = 0.01
 
 SETTLED = 0.2
 """In log likelihood: a smaller gain ends the search."""
+
+LEAST_PROMISED = 0.02
+"""In log likelihood: a step that promises less is not tried."""
 
 LEAST_GAIN = 2.0
 """In log likelihood: less does not make a plant noisy."""
@@ -110,7 +113,7 @@ def tune_with(
     learned: Sequence[str],
     first_sd: Mapping[str, float],
     doubt: Doubt | None = None,
-    nearby: NoiseLevels | None = None,
+    nearby: Sequence[NoiseLevels] = (),
 ) -> tuple[NoiseLevels, dict[str, float]]:
     """The noise levels, and positive parameters of the model, under which a record is likeliest.
 
@@ -123,8 +126,8 @@ def tune_with(
         learned: names of the parameters; the search begins at their values.
         first_sd: by name of a state, its process noise to begin with, where it is not one of those that move alike.
         doubt: ways on which nobody knows when inputs changed; None: there are none.
-        nearby: noise levels that may be near; where they are likelier than what the first rows say, the search begins
-            there.
+        nearby: noise levels that may be near, at most three; where some are likelier than what the first rows say, the
+            search begins there.
     """
     smallest = np.asarray(smallest_sd, dtype=float)
     return _Tuning(model, time_min, inputs, measured, smallest, learned, first_sd, doubt).found(nearby)
@@ -162,28 +165,37 @@ class _Tuning:
         one = Filter(model, first)
         self._filters = [one, *(one.twin() for _ in range(LANES - 1))]
 
-    def found(self, nearby: NoiseLevels | None) -> tuple[NoiseLevels, dict[str, float]]:
+    def found(self, nearby: Sequence[NoiseLevels]) -> tuple[NoiseLevels, dict[str, float]]:
         """The best noise levels, and the best values of what else was to be learned."""
         best = self._climbed(self._without_outliers(self._begun()))
         if self._rows > FIRST_ROWS:
             self._take(self._rows)
-            starts = [best.theta] + ([self._near(nearby)] if nearby is not None else [])
-            best = min(self._tried(starts), key=lambda trial: trial.loss)
+            starts = [best.theta, *(self._near(levels) for levels in nearby), *self._noisier(best.theta)]
+            best = min(self._tried(starts[:LANES]), key=lambda trial: trial.loss)
             best = self._climbed(self._without_outliers(best))
+        climbed = best
         for index in self._of_states:
             theta = best.theta.copy()
             theta[index] = self._lowest[index]
             (without,) = self._tried([theta])
             if without.loss < best.loss + LEAST_GAIN:
                 best = without
-        theta = self._stepped(best, range(self._n_y)).theta
-        return self._levels(theta), self._changes(theta)
+        if best is not climbed:  # the sensors now have to account for more
+            best, _ = self._stepped(best, range(self._n_y))
+        return self._levels(best.theta), self._changes(best.theta)
 
     def _near(self, levels: NoiseLevels) -> Array:
         """Theta there, with noise in every state: out of none no step leads."""
         sensors = np.maximum(np.log(levels.measurement_sd), self._lowest[: self._n_y])
-        states = np.maximum(np.array(levels.process_sd)[self._states], SHARES[-1] * self._scales)
+        states = np.maximum(np.array(levels.process_sd)[self._states], AS_GOOD_AS_NONE * self._scales)
         return np.concatenate([sensors, np.log(states), np.log([item.value for item in self._learned])])
+
+    def _noisier(self, theta: Array) -> list[Array]:
+        """With a process noise that moves every state alike: what is not in the model may act later on."""
+        found = [theta.copy() for _ in SHARES]
+        for item, share in zip(found, SHARES, strict=True):
+            item[self._of_states] = np.where(self._apart > 0.0, item[self._of_states], np.log(share * self._scales))
+        return found
 
     def _take(self, rows: int) -> None:
         """Go on with so many rows from the beginning."""
@@ -203,8 +215,11 @@ class _Tuning:
     def _climbed(self, best: _Trial) -> _Trial:
         """The best that steps of scoring find."""
         for _ in range(MOST_STEPS):
-            before, best = best.loss, self._stepped(best, range(best.theta.size))
-            if best.loss > before - SETTLED:
+            before = best.loss
+            best, promised = self._stepped(best, range(best.theta.size))
+            gained = before - best.loss
+            # A step that gains what was promised leaves nothing to gain: all is as good as quadratic there.
+            if gained < SETTLED or abs(gained - promised) < 0.5 * SETTLED:
                 break
         return best
 
@@ -222,8 +237,11 @@ class _Tuning:
             tried.append(trial)
         return min(tried, key=lambda trial: trial.loss)
 
-    def _stepped(self, best: _Trial, chosen: range) -> _Trial:
-        """After a step of scoring in the chosen components of theta; `best` if no step is better."""
+    def _stepped(self, best: _Trial, chosen: range) -> tuple[_Trial, float]:
+        """After a step of scoring in the chosen components of theta; `best` if none is better.
+
+        And what the step promised; of one that was shortened nobody knows what is behind it, so none at all.
+        """
         near = self._tried([best.theta + DIFFERENCE * (np.arange(best.theta.size) == index) for index in chosen])
         of_w = np.stack([(trial.w - best.w) / DIFFERENCE for trial in near])
         of_d = np.stack([(trial.d - best.d) / DIFFERENCE for trial in near])
@@ -235,13 +253,18 @@ class _Tuning:
         gradient[~free], information[~free], information[:, ~free] = 0.0, 0.0, 0.0
         step = np.zeros(best.theta.size)
         step[chosen] = -np.linalg.solve(information + np.diag(_RIDGE * np.diag(information) + 1.0), gradient)
-        step *= min(1.0, LONGEST_STEP / max(float(np.max(np.abs(step))), LONGEST_STEP))
+        longest = float(np.max(np.abs(step)))
+        whole = longest <= LONGEST_STEP
+        step *= min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP))
         for _ in range(MOST_CUTS):
+            promised = -float(step[chosen] @ (gradient + 0.5 * information @ step[chosen]))
+            if promised < LEAST_PROMISED:
+                break
             (trial,) = self._tried([np.clip(best.theta + step, self._lowest, self._highest)])
             if trial.loss < best.loss:
-                return trial
-            step *= _CUT
-        return best
+                return trial, promised if whole else -inf
+            step, whole = _CUT * step, False
+        return best, 0.0
 
     def _levels(self, theta: Array) -> NoiseLevels:
         sds, of_states = np.exp(theta), np.zeros(len(self._filters[0].model.states))

@@ -31,8 +31,8 @@ COMMANDS = (
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_every_command_explains_itself(command: Command, name: str) -> None:
-    done = command(name, "--help")
+def test_every_command_explains_itself(called: Command, name: str) -> None:
+    done = called(name, "--help")
     assert done.returncode == 0
     assert done.stdout.startswith(f"Usage: reactorwatch {name} ")
 
@@ -118,6 +118,28 @@ def record_csv(tmp_path: Path) -> Path:
     ],
 )
 def test_what_is_wrong_is_told_in_one_line_and_nothing_is_written(
+    called: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
+) -> None:
+    check_told_in_one_line(called, tmp_path, record_csv, arguments, expected)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["fly"], "No such command 'fly'"),
+        (["backtest", "BAD.csv"], "row 3"),
+        (["monitor", "--config", "nowhere.toml"], "nowhere.toml: cannot be read"),
+        (["diagnose", "RECORD", "-o", "BAD.txt"], "is a file, the name of a folder was expected"),
+    ],
+    ids=["what the command is", "what it reads", "of a node", "where it writes"],
+)
+def test_a_process_of_its_own_tells_the_same(
+    command: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
+) -> None:
+    check_told_in_one_line(command, tmp_path, record_csv, arguments, expected)
+
+
+def check_told_in_one_line(
     command: Command, tmp_path: Path, record_csv: Path, arguments: list[str], expected: str
 ) -> None:
     (tmp_path / "BAD.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,x,440\n")
@@ -157,7 +179,7 @@ def test_a_node_without_a_router_waits_says_so_and_can_be_stopped(endpoint: str,
     assert "waiting for a router" in line
     assert endpoint in line
     process.send_signal(signal.SIGTERM)
-    assert process.wait(30) == 0
+    assert process.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -173,7 +195,7 @@ def test_up_runs_until_it_is_stopped_and_closes_its_files(
     assert sampled.wait(PATIENCE_S)
     listener.close()
     process.send_signal(number)
-    assert process.wait(60) == 0
+    assert process.wait(PATIENCE_S) == 0
     (recording,) = folder.glob("*.mcap")
     assert recording.name.startswith("R-101-")
     assert not list(folder.glob("*.part"))
@@ -187,7 +209,7 @@ def test_the_plant_obeys_commands_on_the_bus(bus: ZenohBus, endpoint: str, start
 
     def ask(name: str, message: SetInput | InjectFault) -> CommandReply:
         question = Encoded(keys.key("cstr", keys.COMMAND, name), *encode_message(message))
-        (answer,) = bus.ask(question, 10.0)
+        (answer,) = bus.ask(question, PATIENCE_S)
         return CommandReply.FromString(answer.payload)
 
     assert ask("set_input", SetInput(signal="qc", value=95.0)).accepted
@@ -197,7 +219,7 @@ def test_the_plant_obeys_commands_on_the_bus(bus: ZenohBus, endpoint: str, start
     assert ask("inject_fault", InjectFault(specification="coolant_flow:step:-0.05")).accepted
     assert not ask("inject_fault", InjectFault(specification="magic:step:1")).accepted
     process.send_signal(signal.SIGINT)
-    assert process.wait(30) == 0
+    assert process.wait(PATIENCE_S) == 0
 
 
 def test_a_node_that_is_not_there_is_not_alive(bus: ZenohBus, endpoint: str, command: Command) -> None:

@@ -18,9 +18,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Estimate, Faul
 from reactorwatch.records.record import to_time_ns
 from recorder.mcap_file import read_messages
 
-from .conftest import REACTORWATCH
-
-pytestmark = pytest.mark.xdist_group("demo")  # it is run once
+from .conftest import COMMAND_WITHIN_S, REACTORWATCH
 
 B = TypeVar("B", bound=Message)
 ONSET_MIN, SPAN_MIN = 150.0, 200.0
@@ -31,7 +29,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The folder of a demonstration, run as fast as it goes, and what it said."""
     folder = tmp_path_factory.mktemp("demo") / "run"
     command = [REACTORWATCH, "demo", "--out", str(folder), "--speed", "max", "--duration", f"{SPAN_MIN:g}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=COMMAND_WITHIN_S, check=False)
     logs = "\n".join(path.read_text() for path in folder.glob("*.log"))
     assert done.returncode == 0, f"{done.stdout}\n{done.stderr}\n{logs}"
     return folder, done.stdout

@@ -205,8 +205,8 @@ def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, c
         ("qc=85..900", "limits of qc must be within 0..500 l/min, got 85..900"),
     ],
 )
-def test_limits_that_cannot_be_are_told_in_a_line(folder: Path, command: Command, limits: str, said: str) -> None:
-    done = command("diagnose", "leak.csv", "-o", "nothing", "--limits", limits, cwd=folder)
+def test_limits_that_cannot_be_are_told_in_a_line(folder: Path, called: Command, limits: str, said: str) -> None:
+    done = called("diagnose", "leak.csv", "-o", "nothing", "--limits", limits, cwd=folder)
     assert (done.returncode, done.stdout, done.stderr) == (2, "", f"reactorwatch: {said}\n")
     assert not (folder / "nothing").exists()
 

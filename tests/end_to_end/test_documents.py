@@ -66,9 +66,9 @@ def test_the_readme_s_make_commands_are_targets_that_set_up_by_themselves() -> N
 
 
 @pytest.mark.parametrize("line", [line for line in COMMAND_LINES if line.startswith("reactorwatch ")])
-def test_every_command_line_of_the_readme_names_a_command_and_options_that_exist(line: str, command: Command) -> None:
+def test_every_command_line_of_the_readme_names_a_command_and_options_that_exist(line: str, called: Command) -> None:
     name, *arguments = shlex.split(line)[1:]
-    described = command(name, "--help")
+    described = called(name, "--help")
     assert described.returncode == 0
     for option in (argument for argument in arguments if argument.startswith("-")):
         assert re.search(rf"(?<![\w-]){re.escape(option)}(?![\w-])", described.stdout), f"{name} has no {option}"

@@ -23,7 +23,7 @@ from tests.cluster import dask_cluster
 
 from .conftest import PATIENCE_S, REACTORWATCH, Command
 
-FILES, MORE_FILES = 5, 16
+FILES, MORE_FILES = 5, 8
 
 HEARS_CTRL_C = (
     "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_DFL); os.execv(sys.argv[1], sys.argv[1:])"
@@ -108,9 +108,9 @@ def test_imported_recordings_of_a_folder_are_one_each(folder: Path, command: Com
     assert [item["file"] for item in objects(done)] == [str(tmp_path / f"{number}.mcap") for number in range(2)]
 
 
-def test_options_that_cannot_be_meant_are_told_once_and_not_for_each_file(folder: Path, command: Command) -> None:
+def test_options_that_cannot_be_meant_are_told_once_and_not_for_each_file(folder: Path, called: Command) -> None:
     for options in (("--tolerance", "pH=1"), ("--limits", "p=1..2"), ("--uncertain", "K9=2%"), ("--model", "no.json")):
-        done = command("diagnose", "run-*.csv", "-o", "nothing", *options, cwd=folder)
+        done = called("diagnose", "run-*.csv", "-o", "nothing", *options, cwd=folder)
         assert (done.returncode, done.stdout, len(done.stderr.splitlines())) == (2, "", 1), options
         assert not (folder / "nothing").exists()
 

@@ -10,7 +10,7 @@ import pytest
 from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 
-from .conftest import Command, Start, WaitAlive
+from .conftest import PATIENCE_S, Command, Start, WaitAlive
 
 
 def test_the_equations_reproduce_the_record(daisy_csv: Path, tmp_path: Path, command: Command) -> None:
@@ -35,7 +35,7 @@ def test_replayed_it_is_watched_recorded_and_drawn(
     assert replayed.returncode == 0, replayed.stderr
     for node in (monitor, recorder):
         node.send_signal(signal.SIGTERM)
-        assert node.wait(60) == 0
+        assert node.wait(PATIENCE_S) == 0
     exported = tmp_path / "exported.csv"
     assert command("export", recording, "-o", exported).returncode == 0
     measured, back = read_csv(daisy_csv), read_csv(exported)

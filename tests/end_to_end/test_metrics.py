@@ -14,9 +14,10 @@ from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import LOOPBACK
 from reactorwatch.runtime.metrics import PORT_AFTER
 from reactorwatch.runtime.serve import StopSignal
-from tests.ports import LOOPBACK, three_free_ports
+from tests.ports import three_free_ports
 
 from .conftest import PATIENCE_S, Start
 
@@ -52,7 +53,7 @@ def test_every_node_of_up_has_a_page_with_what_it_has_counted(endpoint: str, sta
     assert all_heard.wait(PATIENCE_S)
     pages = {}
     for node in NODES:
-        with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER[node]}/metrics", timeout=10) as answer:
+        with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER[node]}/metrics", timeout=PATIENCE_S) as answer:
             families = text_string_to_metric_families(answer.read().decode())
             pages[node] = {
                 sample.name: sample.value

@@ -101,9 +101,9 @@ def test_up_lets_in_who_has_a_certificate_and_nobody_else(site: Path, tmp_path: 
     ],
 )
 def test_what_cannot_be_is_told_in_a_line_and_nothing_is_written(
-    site: Path, tmp_path: Path, command: Command, arguments: list[str], said: str
+    site: Path, tmp_path: Path, called: Command, arguments: list[str], said: str
 ) -> None:
-    done: subprocess.CompletedProcess[str] = command(
+    done: subprocess.CompletedProcess[str] = called(
         *(item.replace("SITE", str(site)) for item in arguments), "--out", "runs", cwd=tmp_path
     )
     assert (done.returncode, done.stdout) == (2, "")

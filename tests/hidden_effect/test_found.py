@@ -55,14 +55,12 @@ def at_least(count: int, share: float) -> int:
     return int(binom.ppf(UNLUCKY, count, share))
 
 
-@pytest.mark.xdist_group("hidden effects")
 @pytest.mark.parametrize("name", NAMES)
 def test_the_cause_is_named_or_listed(name: str) -> None:
     _, said, judged = found(name)
     assert judged.listed, f"{said.verdict}: {[item.cause for item in said.causes]}, {said.alternatives}"
 
 
-@pytest.mark.xdist_group("hidden effects")
 @pytest.mark.parametrize("name", NAMES)
 def test_on_rows_that_the_fit_did_not_see_the_extended_model_is_nearly_as_good_as_the_sensors(name: str) -> None:
     hidden, said, _ = found(name)
@@ -74,20 +72,17 @@ def test_on_rows_that_the_fit_did_not_see_the_extended_model_is_nearly_as_good_a
     assert said.gain.delta_bic > 10.0
 
 
-@pytest.mark.xdist_group("hidden effects")
 def test_as_many_are_named_first_as_promised() -> None:
     judged = [found(name)[2] for name in NAMES]
     assert sum(item.first for item in judged) >= at_least(len(judged), 0.97)
 
 
-@pytest.mark.xdist_group("hidden effects")
 def test_so_many_sizes_are_within_their_95_percent_intervals() -> None:
     inside = [inside for name in NAMES for inside in found(name)[2].size_inside]
     assert len(inside) >= len(NAMES) // 2
     assert sum(inside) >= at_least(len(inside), 0.95)
 
 
-@pytest.mark.xdist_group("hidden effects")
 def test_the_onset_of_a_step_is_found_to_the_row() -> None:
     jumping = {effect.name for effect in EFFECTS if effect.jumps}  # a valve that sticks shows it when it should move
     errors = [error for name in NAMES if name not in jumping for error in found(name)[2].onset_errors]
@@ -96,7 +91,6 @@ def test_the_onset_of_a_step_is_found_to_the_row() -> None:
     assert max(errors) < 1.0
 
 
-@pytest.mark.xdist_group("hidden effects")
 @pytest.mark.parametrize("name", NAMES[:2])
 def test_what_is_said_can_be_written_as_json(name: str) -> None:
     said = replace(found(name)[1], curves=None)

@@ -3,8 +3,6 @@
 from dataclasses import replace
 from functools import cache
 
-import pytest
-
 from diagnosis.diagnose import diagnose
 from diagnosis.result import UNKNOWN
 from reactorwatch.process.cstr import cstr
@@ -27,7 +25,6 @@ def found(name: str) -> Judged:
     return judge(hidden, diagnose(hidden.record, cstr()), seconds=0.0)
 
 
-@pytest.mark.xdist_group("outside")
 def test_what_is_called_unknown_is_told_in_the_right_place() -> None:
     unknown = {name: found(name) for name in NAMES if found(name).verdict == UNKNOWN}
     wrong = {name: judged.location for name, judged in unknown.items() if not judged.right_place}
@@ -35,7 +32,6 @@ def test_what_is_called_unknown_is_told_in_the_right_place() -> None:
     assert not wrong
 
 
-@pytest.mark.xdist_group("outside")
 def test_as_many_are_unknown_in_the_right_place_as_promised() -> None:
     right = [judged.verdict == UNKNOWN and judged.right_place for judged in map(found, NAMES)]
     assert sum(right) >= at_least(len(right), 0.85)

@@ -60,7 +60,7 @@ def run_nodes(services: Services, bus: ZenohBus, outside: Callable[[str], Mappin
         assert estimated.wait(PATIENCE_S)
         for process in reversed(running):
             process.terminate()
-            assert process.wait(30) == 0
+            assert process.wait(PATIENCE_S) == 0
     finally:
         for process in running:
             if process.poll() is None:

@@ -17,7 +17,7 @@ from reactorwatch.cli.processes import MODULES, Processes, write_settings
 from reactorwatch.cli.sources import messages
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
-from reactorwatch.contract.messages_pb2 import Alarm, Health, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Health, Sample
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
@@ -52,6 +52,7 @@ class LiveRun:
 
     def __init__(self, folder: Path, duration_min: float, speed: float, **monitor: Any) -> None:
         self.folder, self.recording = folder, folder / "run.mcap"
+        self._last_min = duration_min - PERIOD_MIN  # of the plant's rows
         self.config = BusConfig(endpoint=free_endpoint())
         self.monitor = MonitorConfig(training_min=15.0, health_period_s=0.5, **monitor)
         self.plant = PlantConfig(
@@ -62,7 +63,7 @@ class LiveRun:
             faults=(f"coolant_flow:step:-0.08@{0.6 * duration_min}min",),
             wait_for=("monitor", "recorder"),
         )
-        recorder = RecorderConfig(out=str(self.recording), linger_s=1.0, black_box_min=0.0)
+        recorder = RecorderConfig(out=str(self.recording), linger_s=2.0, black_box_min=0.0)
         settings = folder / "settings.toml"
         tables = {"bus": self.config, "plant": self.plant, "monitor": self.monitor, "recorder": recorder}
         write_settings(settings, tables)
@@ -75,10 +76,10 @@ class LiveRun:
         """The monitor's last."""
         self._changed = threading.Condition()
         self._first_ns: int | None = None
-        self._now_min = 0.0
+        self._now_min = self._judged_min = 0.0
         self._alive: set[str] = set()
         self.bus.watch_alive(f"reactor/{PLANT}/alive/*", self._on_alive)
-        for kind in (keys.SAMPLE, keys.ALARM, keys.HEALTH):
+        for kind in (keys.SAMPLE, keys.ESTIMATE, keys.ALARM, keys.HEALTH):
             self.bus.subscribe(keys.all_of(PLANT, kind), self._on_message)
 
     def start(self, node: str) -> "subprocess.Popen[bytes]":
@@ -108,8 +109,9 @@ class LiveRun:
             assert self._changed.wait_for(condition, WITHIN_S), f"not within {WITHIN_S:g} s"
 
     def end(self, plant: "subprocess.Popen[bytes]") -> None:
-        """Wait for the plant's end, and end the others."""
+        """Wait for the plant's end, and until the monitor has judged its last row, and end the others."""
         assert plant.wait(WITHIN_S) == 0
+        self.wait(lambda: self._judged_min > self._last_min - 0.5 * PERIOD_MIN)
         assert self.nodes.stop(["monitor", "recorder"]) == {"monitor": 0, "recorder": 0}
 
     def recorded_alarms(self) -> list[Change]:
@@ -135,6 +137,8 @@ class LiveRun:
             if isinstance(body, Sample) and _is_of_plant(body) and message.key.endswith("/T"):
                 self._first_ns = self._first_ns or body.time_ns
                 self._now_min = (body.time_ns - self._first_ns) / MINUTE_NS
+            elif isinstance(body, Estimate) and self._first_ns is not None:
+                self._judged_min = max(self._judged_min, (body.time_ns - self._first_ns) / MINUTE_NS)
             elif isinstance(body, Alarm):
                 self.alarms.append(body)
             elif isinstance(body, Health) and body.node == "monitor":

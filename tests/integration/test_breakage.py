@@ -111,13 +111,24 @@ def test_a_flood_of_garbage_and_of_large_payloads_is_refused_and_takes_no_memory
 
 def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun, tmp_path: Path) -> None:
     """It has a clock of its own, and lives for the middle half of the run."""
-    _, plant = run.start_all()
-    other = msgspec.structs.replace(run.plant, seed=99, zero_ns=0, duration_min=0.5 * DURATION_MIN, wait_for=())
+    other = msgspec.structs.replace(run.plant, seed=99, zero_ns=0, duration_min=0.5 * DURATION_MIN, wait_for=("leave",))
     settings = tmp_path / "other.toml"
     write_settings(settings, {"bus": run.config, "plant": other})
-    run.wait_until(10.0)
-    second = subprocess.Popen([sys.executable, "-m", "plant_node", str(settings)], stderr=subprocess.DEVNULL)
-    assert second.wait(WITHIN_S) == 0
+    run.start("recorder")
+    run.start("monitor")
+    # It is started before, as a busy machine takes longer for that than the run lasts.
+    second = subprocess.Popen([sys.executable, "-m", "plant_node", str(settings)], stderr=subprocess.PIPE, text=True)
+    try:
+        assert second.stderr is not None
+        assert any("leave" in line for line in second.stderr), "it does not wait"
+        plant = run.nodes.start("plant")
+        run.wait_until(10.0)
+        run.bus.announce(keys.key(PLANT, keys.ALIVE, "leave"))
+        second.communicate(timeout=WITHIN_S)
+        assert second.returncode == 0
+    finally:
+        second.kill()
+        second.communicate()
     run.end(plant)
     assert run.health.refused_by_reason["out_of_place"] > 300
     assert run.recorded_alarms() == run.expected_alarms()

@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -31,8 +32,8 @@ from .site import WITHIN_S, Site, make, settings
 SHORTLY_S = 0.3
 """For what never comes."""
 
-A_WHILE_S = 5.0
-"""For what never comes, beside what has to."""
+A_WHILE_S = 3.0
+"""For what never comes, beside what has to: if a busy machine does not bring that in time, the doctor looks again."""
 
 
 def now() -> datetime.datetime:
@@ -70,6 +71,14 @@ def wrong(
     return {item.check: item for item in examine(config, plant, folder, room_mb, timeout_s, now()) if item.cure}
 
 
+def wrong_of_what_is_there(config: BusConfig, folder: Path, there: set[str]) -> dict[str, Finding]:
+    """What is wrong once nodes that are there have come through, beside one that is not, by check."""
+    latest = time.monotonic() + WITHIN_S
+    while set(found := wrong(config, folder, A_WHILE_S)) & there:
+        assert time.monotonic() < latest, found
+    return found
+
+
 def test_nothing_is_wrong_with_a_site_where_all_is_well(site: Site, tmp_path: Path) -> None:
     with nodes({node: site.join(f"cstr/{node}") for node in NODES}):
         for who in ("plant", "monitor", "recorder", "operator", "engineer", "viewer"):
@@ -94,12 +103,14 @@ def test_what_the_doctor_says_is_heard_by_no_node(site: Site, tmp_path: Path) ->
     recorder = site.join("cstr/recorder")
     recorder.subscribe("reactor/cstr/**", heard.append)
     plant = site.join("cstr/plant")
-    found = examine(settings(site.folder, "cstr/plant"), "cstr", tmp_path, 0.0, SHORTLY_S, now())
-    assert Finding("heard", "what we publish comes through: sample, fault") in list(found)
+    with nodes({node: site.join(f"cstr/{node}") for node in NODES}):
+        found = list(examine(settings(site.folder, "cstr/plant"), "cstr", tmp_path, 0.0, WITHIN_S, now()))
+    assert Finding("heard", "what we publish comes through: sample, fault") in found
     plant.publish(Encoded("reactor/cstr/sample/T", b"measured", ""))
     site.leave(plant)
     site.leave(recorder)
-    assert [message.payload for message in heard] == [b"measured"]
+    of_nodes = {keys.key("cstr", keys.HEALTH, node) for node in NODES}
+    assert [message.payload for message in heard if message.key not in of_nodes] == [b"measured"]
 
 
 def test_a_router_that_is_not_there_is_told(tmp_path: Path) -> None:
@@ -163,7 +174,8 @@ def test_a_plant_that_the_router_has_no_rules_for_is_told(tmp_path: Path) -> Non
 
 def test_a_node_that_is_not_there_is_told(site: Site, tmp_path: Path) -> None:
     with nodes({node: site.join(f"cstr/{node}") for node in ("plant", "monitor")}):
-        assert set(wrong(settings(site.folder, "cstr/viewer"), tmp_path, A_WHILE_S)) == {"recorder"}
+        found = wrong_of_what_is_there(settings(site.folder, "cstr/viewer"), tmp_path, {"plant", "monitor"})
+    assert set(found) == {"recorder"}
 
 
 def test_a_clock_that_is_off_and_another_version_are_told(site: Site, tmp_path: Path) -> None:

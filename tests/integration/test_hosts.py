@@ -10,8 +10,8 @@ from threading import Thread
 
 import pytest
 
-NAMES = ("rw-north", "rw-south")
-LINKS = ("rw-veth-n", "rw-veth-s")
+NAMES = (f"rw-n-{os.getpid()}", f"rw-s-{os.getpid()}")  # others may run these tests on this machine, too
+LINKS = (f"rwn{os.getpid()}", f"rws{os.getpid()}")
 ADDRESSES = ("10.213.77.1", "10.213.77.2")
 ENDPOINTS = tuple(f"tcp/{address}:7447" for address in ADDRESSES)
 WITHIN_S = 60.0

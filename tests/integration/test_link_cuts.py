@@ -33,6 +33,9 @@ from reactorwatch.runtime.loopback import free_endpoint
 from recorder.look import look_over
 from recorder.mcap_file import recordings_in
 
+KEPT = 60_000
+"""On a key: what is published in a minute, more than any cut lasts, also where processes are slow to start."""
+
 
 @pytest.fixture
 def router() -> Iterator[Router]:
@@ -52,13 +55,13 @@ def router() -> Iterator[Router]:
 def test_a_cut_link_costs_no_sample_and_none_its_place(
     tmp_path: Path, whose: Whose, manner: Manner, span_s: float
 ) -> None:
-    found = cut(tmp_path, whose, manner, span_s, cache_messages=60_000)  # more than is published meanwhile
+    found = cut(tmp_path, whose, manner, span_s, cache_messages=KEPT)
     assert found.published > RATE_PER_S * span_s
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
 
 
 def test_a_router_that_is_killed_and_started_again_costs_no_sample(tmp_path: Path) -> None:
-    found = kill_router(tmp_path, 2.0)
+    found = kill_router(tmp_path, 2.0, cache_messages=KEPT)
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
 
 
@@ -122,7 +125,7 @@ def test_who_begins_to_listen_late_hears_what_was_before(tmp_path: Path, router:
 def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
     tmp_path: Path, router: Router, killed: bool
 ) -> None:
-    bus = connected(BusConfig(endpoint=router.config.endpoint, cache_messages=60_000))  # all that is published here
+    bus = connected(BusConfig(endpoint=router.config.endpoint, cache_messages=KEPT))
     tokens, heard = Tokens(bus), Heard(bus)
     publisher = Publisher(bus, RATE_PER_S)
     try:
@@ -146,7 +149,7 @@ def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
 
 def test_a_stuck_recorder_costs_another_nothing_and_gets_it_all_later(tmp_path: Path) -> None:
     """Its process is stopped for longer than it takes until a link that takes nothing is closed; the other hears on."""
-    for found in stick(tmp_path, 3.0):
+    for found in stick(tmp_path, 3.0, cache_messages=KEPT):
         assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
 
 

@@ -58,6 +58,7 @@ class Operator:
         self._wait_until(lambda: "reactor/cstr/alive/plant" not in self.alive, "token")
         last = self.messages("reactor/cstr/health/plant")[-1]
         assert isinstance(last, Health)
+        self._wait_until(lambda: len(self.heard) >= last.published, "all that it published")
         return last
 
     def _wait_until(self, condition: Callable[[], bool], what: str) -> None:

@@ -2,6 +2,8 @@
 
 import json
 import subprocess
+import time
+from collections.abc import Callable
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Health
@@ -10,11 +12,21 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 
 from ..end_to_end.conftest import REACTORWATCH
-from .site import Site
+from .site import WITHIN_S, Site
 
 
 def status(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([REACTORWATCH, "status", *arguments], capture_output=True, text=True, check=False)
+
+
+def status_once(is_whole: Callable[[str], bool], *arguments: str) -> str:
+    """What it prints after half a second: called again while a busy machine has not brought all by then."""
+    latest = time.monotonic() + WITHIN_S
+    while True:
+        done = status(*arguments, "--seconds", "0.5")
+        assert done.returncode == 0, done.stderr
+        if is_whole(done.stdout) or time.monotonic() > latest:
+            return done.stdout
 
 
 def test_a_viewer_sees_the_nodes_and_the_alarms_of_its_plant(site: Site) -> None:
@@ -29,9 +41,10 @@ def test_a_viewer_sees_the_nodes_and_the_alarms_of_its_plant(site: Site) -> None
     health = Health(time_ns=1, node="monitor", phase="watching")
     monitor.publish(encode(Publication("reactor/cstr/health/monitor", health)))
     settings = str(site.folder / "cstr" / "viewer" / "settings.toml")
-    done = status("--config", settings, "--json", "--seconds", "0.5")
-    assert done.returncode == 0, done.stderr
-    (plant,) = json.loads(done.stdout)["plants"]
+    said = status_once(
+        lambda text: all(word in text for word in ("watching", "true", "ewma/T")), "--config", settings, "--json"
+    )
+    (plant,) = json.loads(said)["plants"]
     assert plant["plant"] == "cstr"
     assert [(node["node"], node["alive"], node["phase"]) for node in plant["nodes"]] == [("monitor", True, "watching")]
     assert [alarm["alarm"] for alarm in plant["alarms"]] == ["ewma/T"]
@@ -45,12 +58,13 @@ def test_without_certificates_all_plants_are_shown() -> None:
         for plant in ("a", "b"):
             speaker.announce(f"reactor/{plant}/alive/plant")
         assert not speaker.ask(Encoded("reactor/a/command/list_alarms", b"", ""), 5.0)  # the tokens are known by now
-        done = status("--endpoint", config.endpoint, "--once", "--seconds", "0.5")
+        said = status_once(
+            lambda text: "nobody" not in text and text.count("│ plant") == 2, "--endpoint", config.endpoint, "--once"
+        )
     finally:
         speaker.close()
         bus.close()
-    assert done.returncode == 0, done.stderr
-    rows = [line.split()[1:5:2] for line in done.stdout.splitlines() if line.startswith("│")]
+    rows = [line.split()[1:5:2] for line in said.splitlines() if line.startswith("│")]
     assert rows == [["a", "plant"], ["b", "plant"]]
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.link_cuts import Proxy, Router, connected
+from benchmarks.link_cuts import Heard, Proxy, Router, connected
 from monitor_node.alarm_commands import COMMANDS
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -19,6 +19,7 @@ from plant_node.record import plant_from
 from reactorwatch.cli.processes import settings_text
 from reactorwatch.cli.verification import run
 from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal, serve
@@ -30,6 +31,10 @@ PLANT = PlantConfig(
     seed=5, speed=600.0, duration_min=60.0, faults=("coolant_flow:step:-0.08@30min",), wait_for=("monitor", "recorder")
 )
 MONITOR = MonitorConfig(training_min=15.0)
+ROWS = 600
+FIRST_JUDGED = 53
+"""Fifty rows give the scaling, three more the first regressor."""
+OF_RECORDER = keys.key("cstr", keys.HEALTH, "recorder")
 
 
 def watch(bus_config: BusConfig, stop: StopSignal) -> None:
@@ -45,45 +50,53 @@ def watch(bus_config: BusConfig, stop: StopSignal) -> None:
         )
 
 
-class Rows:
-    """How many rows of the plant were published."""
+class Counter:
+    """How many messages came."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._count = 0
+        self.count = 0
 
     def hear(self, _: object) -> None:
         with self._changed:
-            self._count += 1
+            self.count += 1
             self._changed.notify_all()
 
     def wait(self, count: int) -> None:
         with self._changed:
-            assert self._changed.wait_for(lambda: self._count >= count, WITHIN_S), "the plant stands still"
+            assert self._changed.wait_for(lambda: self.count >= count, WITHIN_S), f"{self.count} of {count}"
 
 
 def test_a_run_that_was_recorded_over_a_cut_link_is_exact(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path, rows = tmp_path / "run.mcap", Rows()
+    path, published, judged, said = tmp_path / "run.mcap", Counter(), Counter(), Counter()
     about = {"settings": settings_text({"monitor": MONITOR})}
-    config = RecorderConfig(out=str(path), about=about, black_box_min=0.0, linger_s=2.0)
+    config = RecorderConfig(out=str(path), about=about, black_box_min=0.0, health_period_s=0.2)
     endpoint = free_endpoint()
     direct = BusConfig(endpoint=endpoint)
     with contextlib.closing(Router(endpoint)), contextlib.closing(connected(direct)) as bus:
         proxy = Proxy(endpoint)
         watching, recording = StopSignal(), StopSignal()
-        bus.subscribe(keys.key("cstr", keys.SAMPLE, "T"), rows.hear)
+        heard = Heard(bus)
+        bus.subscribe(keys.key("cstr", keys.SAMPLE, "T"), published.hear)
+        bus.subscribe(keys.key("cstr", keys.ESTIMATE, "T"), judged.hear)
+        bus.subscribe("reactor/cstr/**", lambda message: None if message.key == OF_RECORDER else said.hear(message))
         with (
             contextlib.closing(proxy),
             running(lambda: record(config, BusConfig(endpoint=proxy.endpoint), recording), recording),
-            running(lambda: watch(direct, watching), watching),
-            contextlib.closing(connected(direct)) as plant_bus,
         ):
-            plant = PlantNode(plant_from(PLANT), PLANT, lambda _: None)
-            with running(lambda: serve_plant(plant, PLANT, plant_bus, StopSignal()), StopSignal()):
-                rows.wait(250)
-                with proxy.cut("closed"):
-                    rows.wait(400)
-                rows.wait(600)
+            with (
+                running(lambda: watch(direct, watching), watching),
+                contextlib.closing(connected(direct)) as plant_bus,
+            ):
+                plant = PlantNode(plant_from(PLANT), PLANT, lambda _: None)
+                with running(lambda: serve_plant(plant, PLANT, plant_bus, StopSignal()), StopSignal()):
+                    published.wait(250)
+                    with proxy.cut("closed"):
+                        published.wait(400)
+                    published.wait(ROWS)
+                judged.wait(ROWS - FIRST_JUDGED)
+            bus.ask(Encoded(keys.key("cstr", keys.COMMAND, "nothing"), b"", ""), WITHIN_S)  # then all of it is here
+            assert heard.wait(said.count)
     assert run(path, None, None, as_json=True) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert (told["exact"], told["rows"], told["notes"]) == (True, 600, [])
+    assert (told["exact"], told["rows"], told["notes"]) == (True, ROWS, [])

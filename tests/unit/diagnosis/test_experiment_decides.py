@@ -14,7 +14,6 @@ LIMITS = {"qc": (95.0, 112.0), "T": (425.0, 455.0)}
 NARROW = {"kind": "random-steps", "low": 102.41, "high": 104.41}
 
 
-@pytest.mark.xdist_group("experiments")
 @pytest.mark.parametrize(
     ("cause", "size", "rival", "seed"),
     [

@@ -5,7 +5,7 @@ import pytest
 
 from diagnosis.courses import Free
 from diagnosis.hypothesis import Hypothesis
-from diagnosis.knots import best_resolved
+from diagnosis.knots import best_resolved, fine
 from diagnosis.search import Explained, Search
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
@@ -35,7 +35,7 @@ def test_it_has_the_knots_of_the_truth(shares: list[float], begun: int) -> None:
     fitted = curve(search, "coolant_flow", begun)
     search.settle(fitted)
     fitted = search.refitted(fitted)
-    course, theta = best_resolved(search.run, fitted.hypothesis, fitted.fit, 0)
+    course, theta = best_resolved(fine(search.run.time_min), search.run, fitted.hypothesis, fitted.fit, 0)
     assert course.coefficients == len(shares)
     np.testing.assert_allclose(theta, -0.06 * np.array(shares), atol=0.003)
 

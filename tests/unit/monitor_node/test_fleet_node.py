@@ -18,10 +18,9 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.metrics import FleetMetrics
+from tests.running import WITHIN_S
 
 from .fleets import PLANTS, QUICK, fleet, row_by_row, run_of
-
-WITHIN_S = 30.0
 
 
 class Linked(MemoryBus):

@@ -8,8 +8,7 @@ from monitor_node.fleet import pasts
 from monitor_node.fleet.pasts import Pasts
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-
-WITHIN_S = 30.0
+from tests.running import WITHIN_S
 
 
 class CutOff(MemoryBus):

@@ -84,6 +84,20 @@ def test_who_was_replaced_writes_over_no_newer_state_and_is_told_so(tmp_path: Pa
     assert again.of_others(["a"]) == []
 
 
+def test_who_is_replaced_while_he_writes_writes_over_no_newer_state(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one that is frozen in the middle of it."""
+    (tmp_path / "a.state").write_bytes(b"before")
+    states = FleetStates(tmp_path)
+    states.read("a")
+    monkeypatch.setattr("os.fsync", lambda _descriptor: (tmp_path / "a.state").write_bytes(b"of another"))
+    states.put("a", b"too late")
+    states.close()
+    assert (states.lost(), (tmp_path / "a.state").read_bytes()) == (["a"], b"of another")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.state"]
+
+
 def test_what_is_being_written_is_read_unless_another_has_written_since(tmp_path: Path) -> None:
     states = FleetStates(tmp_path)
     states.read("a")

@@ -2,7 +2,7 @@
 
 import os
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode
 from reactorwatch.errors import InputError
+from recorder.chores import Chores
 from recorder.entry import Entry
 from recorder.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record, recordings_in
 from recorder.mcap_scan import Scan
@@ -242,6 +243,21 @@ def test_damaged_remains_count_and_are_deleted_in_their_turn_and_what_people_sav
     fed.stop()
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"mine.mcap.part.damaged", "run-recovered.mcap", "run.mcap", "run-2.mcap", "run-3.mcap"}
+
+
+def test_no_more_is_deleted_by_who_comes_to_it_when_the_last_file_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a machine does that is busy with other things."""
+    late: list[Callable[[], None]] = []
+    monkeypatch.setattr(Chores, "add", lambda _self, _what, chore: late.append(chore))
+    fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, keep_files=3.0, black_box_min=0.0)
+    fed.hear(samples(130), SECOND)
+    fed.stop()
+    for chore in late:
+        chore()
+    assert late
+    assert {path.name for path in tmp_path.iterdir()} == {"run.mcap", "run-2.mcap", "run-3.mcap"}
 
 
 def raising(folder: Path) -> Fed:

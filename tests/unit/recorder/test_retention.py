@@ -32,6 +32,11 @@ def test_the_oldest_go_until_the_rest_and_the_file_being_written_are_within_limi
     assert [path.stem for path in to_delete(FILES, 50, limits, now_ns=40)] == gone
 
 
+def test_when_no_file_is_being_written_none_goes_for_it() -> None:
+    assert to_delete(FILES, None, Limits(files=3, size_bytes=300), 40) == []
+    assert [path.stem for path in to_delete(FILES, None, Limits(files=2), 40)] == ["a"]
+
+
 def test_what_a_black_box_still_needs_stays() -> None:
     assert [path.stem for path in to_delete(FILES, 50, Limits(files=1), 40, needed_since_ns=20)] == ["a"]
 

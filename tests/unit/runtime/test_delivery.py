@@ -10,8 +10,8 @@ from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime import in_order
 from reactorwatch.runtime.delivery import Delivery, Numbered
 from reactorwatch.runtime.in_order import Gap
+from tests.running import WITHIN_S
 
-WITHIN_S = 20.0
 SECOND = 10**9
 
 

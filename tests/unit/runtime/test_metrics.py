@@ -11,8 +11,10 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import MetricsConfig, section
+from reactorwatch.runtime.loopback import LOOPBACK
 from reactorwatch.runtime.metrics import PORT_AFTER, FleetMetrics, Metrics, served
-from tests.ports import LOOPBACK, three_free_ports
+from tests.ports import three_free_ports
+from tests.running import WITHIN_S
 
 HEALTH = Health(
     time_ns=1_700_000_000_500_000_000,
@@ -46,7 +48,7 @@ def page(port: int, node: str = "monitor") -> dict[str, float]:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     from prometheus_client.parser import text_string_to_metric_families
 
-    with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER[node]}/metrics", timeout=10) as answer:
+    with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER[node]}/metrics", timeout=WITHIN_S) as answer:
         text = answer.read().decode()
     found = {}
     for family in text_string_to_metric_families(text):
@@ -198,9 +200,7 @@ def test_the_page_goes_with_the_node(port: int) -> None:
 
 def test_a_port_that_is_taken_is_told_with_the_node_and_the_address(port: int) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    with socket.socket() as other:
-        other.bind((LOOPBACK, port + 1))
-        other.listen()
+    with socket.create_server((LOOPBACK, port + 1)):
         metrics = served(MetricsConfig(port=port), Metrics("R-101", "monitor"), "monitor")
         said = rf"\[metrics\] port {port}: the monitor cannot listen at 127\.0\.0\.1:{port + 1}: "
         with pytest.raises(InputError, match=said), metrics:

@@ -77,7 +77,7 @@ def test_every_message_is_handed_over_in_order() -> None:
     thread = listening(node, exchange)
     for number in range(5000):
         speaker.publish(Encoded(f"in/{number}", b"", ""))
-    thread.join(20)
+    thread.join(WITHIN_S)
     assert not thread.is_alive()
     assert [message.key for message in node.heard] == [f"in/{number}" for number in range(5000)]
 
@@ -111,7 +111,7 @@ def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(
     for number in range(count):
         speaker.publish(Encoded(f"in/{number}", bytes(1000), ""))
         ahead[0] = max(ahead[0], number + 1 - handled[0])
-    thread.join(60)
+    thread.join(WITHIN_S)
     assert not thread.is_alive()
     assert len(node.heard) == count
     assert ahead[0] <= 100 + 2
@@ -122,7 +122,7 @@ def test_a_stop_wakes_a_loop_that_waits_for_nothing() -> None:
     thread = threading.Thread(target=serve, args=(node, MemoryBus(Exchange()), stop))
     thread.start()
     stop.set()
-    thread.join(20)
+    thread.join(WITHIN_S)
     assert not thread.is_alive()
     assert node.stopped
 
@@ -271,12 +271,12 @@ def test_messages_that_come_together_are_bounded_likewise(
         kwargs={"subscriptions": ("in/**",), "on_messages": on_messages, "on_ready": ready.set},
     )
     thread.start()
-    assert ready.wait(10)
+    assert ready.wait(WITHIN_S)
     for number in range(0, count, 10):
         bus.hand_over([Encoded(f"in/{number}", bytes(1000), "")] * 10)
         ahead[0] = max(ahead[0], number + 10 - handled[0])
     stop.set()
-    thread.join(60)
+    thread.join(WITHIN_S)
     assert not thread.is_alive()
     assert handled[0] == count
     assert ahead[0] <= 100 + 20

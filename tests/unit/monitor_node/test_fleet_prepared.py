@@ -1,0 +1,46 @@
+"""A fleet's monitor compiles before it joins: what took seconds while plants wait would look as if it were gone."""
+
+from collections import defaultdict
+from types import ModuleType
+from typing import Any
+
+import numba
+import pytest
+
+from monitor_node.fleet.watched import WatchedPlants
+from monitor_node.identification import information
+from monitor_node.quiet import plants
+from reactorwatch.contract import sample_bytes
+
+from .fleets import QUICK, SECOND_NS, fleet, row_by_row, run_of
+
+LONG_COMPILED: tuple[tuple[ModuleType, str], ...] = (
+    (plants, "judge"),
+    (plants, "take_samples"),
+    (plants, "silent_from"),
+    (information, "learn_one"),
+    (sample_bytes, "_read"),
+)
+
+
+def test_what_is_called_while_plants_are_watched_was_compiled_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numba compiles a kernel anew for arguments of other types."""
+    types: defaultdict[str, set[Any]] = defaultdict(set)
+    for module, name in LONG_COMPILED:
+        kernel = getattr(module, name)
+
+        def noting(*arguments: Any, name: str = name, kernel: Any = kernel) -> Any:
+            types[name].add(tuple(map(numba.typeof, arguments)))
+            return kernel(*arguments)
+
+        monkeypatch.setattr(module, name, noting)
+    WatchedPlants(QUICK, 0, None, points=False).prepare()
+    before = {name: set(found) for name, found in types.items()}
+    watching = fleet()
+    messages = row_by_row([run_of("a", 1), run_of("b", 2)])
+    for begin in range(0, len(messages), 60):
+        watching.on_messages(messages[begin : begin + 60], SECOND_NS)
+        watching.on_tick(SECOND_NS)
+    assert watching.quiet
+    assert set(before) == {name for _, name in LONG_COMPILED}
+    assert types == before

@@ -1,0 +1,28 @@
+"""A free port of the loopback address stays free for who named it."""
+
+import errno
+import socket
+
+import pytest
+
+from reactorwatch.runtime.loopback import LOOPBACK, free_port, keep
+from tests.ports import three_free_ports
+
+
+def test_a_port_is_kept_from_who_asks_for_any_and_can_be_had_by_name() -> None:
+    port = free_port()
+    with socket.socket() as anybody, pytest.raises(OSError, match="in use") as refused:
+        anybody.bind((LOOPBACK, port))
+    assert refused.value.errno == errno.EADDRINUSE
+    with socket.create_server((LOOPBACK, port)) as server:
+        assert server.getsockname()[1] == port
+
+
+def test_a_port_that_somebody_listens_at_is_not_kept() -> None:
+    with socket.create_server((LOOPBACK, 0)) as server, pytest.raises(OSError, match="in use"):
+        keep(server.getsockname()[1])
+
+
+def test_three_free_ports_are_kept_for_whoever_asked_first() -> None:
+    first, second = three_free_ports(), three_free_ports()
+    assert not {*range(first, first + 3)} & {*range(second, second + 3)}
