@@ -118,7 +118,7 @@ class Forcing:
 
     def about(self, reference: Reference, run: Run) -> "Linearised":
         """The forcing about a path."""
-        inputs = self._sized.inputs(run.inputs, [reference.size])
+        inputs = self._sized.inputs(run.time_min, run.inputs, [reference.size])
         path = self._errors.about(run.time_min, inputs, reference.x, doubt_of(run, inputs))
         rows, n_x = reference.x.shape
         F, G, D = np.zeros((rows, n_x, n_x)), np.zeros((rows, n_x)), path.D[:, :, 0]

@@ -113,7 +113,7 @@ def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovation
         first += 1
     try:
         whole = sized.whole
-        inputs = whole.inputs(run.inputs, signals)[first:]
+        inputs = whole.inputs(run.time_min, run.inputs, signals)[first:]
         start = found.x[first][: sized.own_states]  # memory is short: it begins at rest
         run_freely = Simulator(whole.model).run
         outputs[first:] = run_freely(run.time_min[first:], inputs, start, beginning_with(known)).outputs

@@ -183,18 +183,22 @@ class Hypothesis:
 
     def _least_information(self) -> Array:
         """What is known of the numbers beforehand: where they can be. Some records do not tell an onset at all."""
-        widths: list[float] = []
-        for effect, course in zip(self.sized.effects, self.courses, strict=True):
-            widths += [effect.upper - effect.lower] * course.coefficients
-            widths += [number.upper - number.lower for number in course.numbers]
-        return np.diag(np.square(1.0 / np.array(widths)))
+        widths = [self._widths(place) for place in range(len(self.courses))]
+        return np.diag(np.concatenate(widths) ** -2.0)
+
+    def _widths(self, place: int) -> Array:
+        """Of where the numbers of an effect can be."""
+        effect, course = self.sized.effects[place], self.courses[place]
+        of_numbers = [number.upper - number.lower for number in course.numbers]
+        return np.array([effect.upper - effect.lower] * course.coefficients + of_numbers)
 
     def _slope(
         self, run: Run, fit: Fit, differences: Sequence[Array], ways: Ways | None = None, rough: bool = False
     ) -> Array:
         """What the whitened innovations lose as the numbers grow, shape (values from the third row on, freedom).
 
-        Where an output is late, the equations of the filter's errors hold roughly for what is beside it.
+        Where an output is late, the equations of the filter's errors hold roughly for what is beside it. They know
+        nothing of the rows in which a size that moves the clock grows, and these are all that tells its onset.
         """
         late = self.sized.late
         if ways is None and (late is None or (rough and len(self.courses) > 1)):
@@ -204,23 +208,35 @@ class Hypothesis:
             if place == late or ways is None:
                 columns.append(self._slope_by_differences(run, fit, place, moved))
                 continue
-            over_row, at_row = course.derivatives(numbers, moved)
-            column = self.column(place)
-            g = signatures.shown(ways, column, over_row[1:-1], at_row[2:])
-            columns.append(g.reshape(-1, course.freedom))
+            apart = bool(course.numbers) and self.sized.moves_clock(place)
+            shape = numbers[course.coefficients :]
+            over_row, at_row = course.basis(shape) if apart else course.derivatives(numbers, moved)
+            g = signatures.shown(ways, self.column(place), over_row[1:-1], at_row[2:])
+            columns.append(g.reshape(-1, over_row.shape[1]))
+            if apart:
+                columns.append(self._slope_by_differences(run, fit, place, moved, course.coefficients))
         return np.concatenate(columns, axis=1)
 
-    def _slope_by_differences(self, run: Run, fit: Fit, place: int, moved: Array) -> Array:
+    def _slope_by_differences(self, run: Run, fit: Fit, place: int, moved: Array, first: int = 0) -> Array:
+        """By the numbers of one effect, from the first that is asked for on.
+
+        What tells less of an onset than is known of it beforehand is no more than rounding, and leads astray.
+        """
         course, signals = self.courses[place], []
         size = _SHARE * self.sized.effects[place].typical
         steps = [*(size,) * course.coefficients, *moved.tolist()]
-        for number, step in enumerate(steps):
+        for number in range(first, course.freedom):
             theta = [item.copy() for item in fit.theta]
-            theta[place][number] += step
+            theta[place][number] += steps[number]
             signals.append(self._signals(theta))
-        before, followed = clipped(fit.w[2:]), self.sized.follow_all(run, signals)
-        columns = [(before - clipped(item.w[2:])).ravel() / step for step, item in zip(steps, followed, strict=True)]
-        return np.stack(columns, axis=1)
+        as_it_is = self._signals(fit.theta)
+        begun = [Known(fit.found, _alike(item, as_it_is)) for item in signals]
+        before, followed = clipped(fit.w[2:]), self.sized.follow_all(run, signals, begun)
+        moves = zip(steps[first:], followed, strict=True)
+        found = np.stack([(before - clipped(item.w[2:])).ravel() / step for step, item in moves], axis=1)
+        told = np.sum(found**2, axis=0) >= self._widths(place)[first:] ** -2.0
+        told[: course.coefficients - first] = True
+        return np.asarray(found * told)
 
     def signatures(self, run: Run, fit: Fit, place: int, course: Course) -> Array:
         """What the whitened innovations lose as the coefficients of another course of one of its effects grow.

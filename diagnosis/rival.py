@@ -119,7 +119,7 @@ class Rival:
         hypothesis, theta = self._going_on(time_min)
         signals = [course.signal(numbers) for course, numbers in zip(hypothesis.courses, theta, strict=True)]
         try:
-            return self._simulator.run(time_min, hypothesis.sized.whole.inputs(inputs, signals), start)
+            return self._simulator.run(time_min, hypothesis.sized.whole.inputs(time_min, inputs, signals), start)
         except SimulationError:
             return None
 

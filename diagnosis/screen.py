@@ -133,10 +133,11 @@ class Screen:
 
     def _explained(self, hypothesis: Hypothesis, fit: Fit, place: int) -> Array:
         """What a fitted deviation does to the innovations of a filter that does not know it, shape (rows, n_y)."""
-        if place == hypothesis.sized.late or hypothesis.sized.effects[place].jumps:
+        sized = hypothesis.sized
+        if place == sized.late or sized.effects[place].jumps or sized.moves_clock(place):
             return clipped(hypothesis.without(self._run, fit, place)[2:]) - clipped(fit.w[2:])
         signals = hypothesis.signals(fit)
-        ways = hypothesis.sized.ways(self._run, signals, fit.found)
+        ways = sized.ways(self._run, signals, fit.found)
         over_row, at_row = signals[place]
         return signatures.shown(ways, hypothesis.column(place), over_row[1:-1, None], at_row[2:, None])[:, :, 0]
 
@@ -158,7 +159,7 @@ class Screen:
         nothing = np.zeros(self._run.time_min.size)
         by_effect = dict(zip(sized.effects, signals, strict=True))
         sizes = [by_effect.get(effect, Signal(nothing, nothing)) for effect in self.direct]
-        return of_all.errors, of_all.inputs(self._run.known_inputs, sizes)
+        return of_all.errors, of_all.inputs(self._run.time_min, self._run.known_inputs, sizes)
 
     def _beside(self, sized: Sized) -> FilterErrors:
         """A filter's model with all direct effects beside those that are in it."""

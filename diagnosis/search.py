@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from diagnosis import jumping
+from diagnosis import between_moves, jumping
 from diagnosis.courses import Free, Signal
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.knots import best_resolved, fine
@@ -311,9 +311,8 @@ class Search:
         self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True
     ) -> Explained:
         """A hypothesis, fitted from a start; see there and, if sizes that act in jumps are looked for, `jumping`."""
-        if scan:
-            return self.judged(hypothesis, jumping.fitted(self.run, hypothesis, start, steps))
-        return self.judged(hypothesis, hypothesis.fit(self.run, start, steps))
+        best = jumping.fitted(self.run, hypothesis, start, steps) if scan else hypothesis.fit(self.run, start, steps)
+        return self.judged(hypothesis, between_moves.walked(self.run, hypothesis, best, steps))
 
     def _elsewhere(self, lead: Lead, best: Explained) -> bool:
         """Whether a lead of the best's own cause and course begins where its fit is not."""

@@ -7,6 +7,7 @@ from functools import cached_property, lru_cache
 import casadi as ca
 import numpy as np
 
+from diagnosis import clock_shift
 from diagnosis.courses import Signal
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import NoiseLevels
@@ -23,11 +24,13 @@ class SizedModel:
         model: the process.
         of_rates: the symbols of the first, one an effect.
         of_outputs: those of the second.
+        moves_clock: of each effect, whether it does, so that the first is how fast the size grows (`clock_shift`).
     """
 
     model: ProcessModel
     of_rates: tuple[ca.SX, ...]
     of_outputs: tuple[ca.SX, ...]
+    moves_clock: tuple[bool, ...]
 
     @cached_property
     def errors(self) -> FilterErrors:
@@ -35,10 +38,11 @@ class SizedModel:
         unknown = NoiseLevels((1.0,) * len(self.model.outputs), (0.0,) * len(self.model.states))
         return FilterErrors(self.model, unknown, self.of_rates, self.of_outputs)
 
-    def inputs(self, inputs: Array, signals: Sequence[Signal]) -> Array:
+    def inputs(self, time_min: Array, inputs: Array, signals: Sequence[Signal]) -> Array:
         """The inputs of a record with the sizes beside them, shape (rows, n_u + 2 effects)."""
-        columns = [item for signal in signals for item in (signal.over_row, signal.at_row)]
-        return np.column_stack([inputs, *columns])
+        shifts = zip(signals, self.moves_clock, strict=True)
+        felt = [clock_shift.felt(signal, time_min) if moves else signal for signal, moves in shifts]
+        return np.column_stack([inputs, *(item for signal in felt for item in signal)])
 
 
 @lru_cache(maxsize=COMPILED)
@@ -52,16 +56,19 @@ def with_size_inputs(model: ProcessModel, effects: tuple[Effect, ...]) -> SizedM
     Raises:
         ValueError: the model lacks what an effect acts on.
     """
-    of_rates, of_outputs = [], []
+    of_rates, of_outputs, moves_clock = [], [], []
     for number, effect in enumerate(effects, start=1):
         size = ca.SX.sym("size")
         extended = effect.apply(model, size)
+        moves_clock.append(bool(ca.depends_on(extended.clock_ahead, size)))
         largest = max(abs(effect.lower), abs(effect.upper))  # bounds are those of a size; a sine swings about zero
+        bounds = {"felt": np.inf if moves_clock[-1] else largest, "seen": largest}
         felt, seen = (
-            variable(f"{effect.name}.{number}.{where}", effect.unit, (-largest, largest), effect.typical, effect.label)
-            for where in ("felt", "seen")
+            variable(f"{effect.name}.{number}.{where}", effect.unit, (-bound, bound), effect.typical, effect.label)
+            for where, bound in bounds.items()
         )
-        model = extended.substitute(size, felt.symbol)
+        ahead = ca.substitute(extended.clock_ahead, size, felt.symbol * model.clock.now)
+        model = replace(extended.substitute(size, felt.symbol), clock_ahead=ahead)
         outputs = tuple(
             replace(item, expression=ca.substitute(was.expression, size, seen.symbol))
             for item, was in zip(model.outputs, extended.outputs, strict=True)
@@ -69,4 +76,4 @@ def with_size_inputs(model: ProcessModel, effects: tuple[Effect, ...]) -> SizedM
         model = replace(model, outputs=outputs, inputs=(*model.inputs, felt, seen))
         of_rates.append(felt.symbol)
         of_outputs.append(seen.symbol)
-    return SizedModel(model, tuple(of_rates), tuple(of_outputs))
+    return SizedModel(model, tuple(of_rates), tuple(of_outputs), tuple(moves_clock))

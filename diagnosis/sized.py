@@ -137,11 +137,15 @@ class Sized:
         place = names.index(effect)
         return self._filtered.of_rates[place], self._filtered.of_outputs[place]
 
+    def moves_clock(self, place: int) -> bool:
+        """Whether one of the effects does, see `clock_shift`."""
+        late = self.late
+        return place != late and self._filtered.moves_clock[place - (late is not None and late < place)]
+
     def inputs(self, run: Run, signals: Sequence[Signal]) -> Array:
         """Those of the filter: with the sizes beside them, shape (rows, n_u + 2 effects)."""
-        return self._filtered.inputs(
-            run.known_inputs, [item for place, item in enumerate(signals) if place != self.late]
-        )
+        prompt = [item for place, item in enumerate(signals) if place != self.late]
+        return self._filtered.inputs(run.time_min, run.known_inputs, prompt)
 
     def follow(self, run: Run, signals: Sequence[Signal]) -> Followed:
         """What the filter makes of a run with these deviations."""

@@ -24,7 +24,7 @@ from reactorwatch.compiled import compiled
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_step import exponential
-from reactorwatch.process.integrate import LONGEST_STEP_MIN, symbolic_step
+from reactorwatch.process.integrate import LONGEST_STEP_MIN, passed_min, symbolic_step
 from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array, ProcessModel
 
@@ -320,7 +320,8 @@ def piece_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
     """(x, u, p, t, h) -> x after two steps, and its derivatives by x and by the sizes.
 
     With A and B the Jacobians of the right-hand side at the ends of a step, the derivative by x is the exponential of
-    the mean of A, as in the filter, and that by the sizes follows from the trapezoidal rule.
+    the mean of A, as in the filter, and that by the sizes follows from the trapezoidal rule. That the states go on for
+    less while a size moves the clock is not in it.
     """
     size = ca.vertcat(*sizes)
     x, u, p = model.arguments()
@@ -335,8 +336,9 @@ def piece_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
         end = step(point, u, p, begin, middle, half)[0]
         A, B = slope(point, u, p, begin, middle)
         A_end, B_end = slope(end, u, p, begin + half, middle)
-        E = exponential(0.5 * half * (A + A_end))
-        F, G, point = E @ F, E @ (G + 0.5 * half * B) + 0.5 * half * B_end, end
+        passed = passed_min(model, u, p, begin, middle, half)
+        E = exponential(0.5 * passed * (A + A_end))
+        F, G, point = E @ F, E @ (G + 0.5 * passed * B) + 0.5 * passed * B_end, end
     return ca.Function("piece", [x, u, p, t, h], [ca.densify(item) for item in ca.cse([point, F, G])])
 
 

@@ -14,7 +14,7 @@ from math import inf, nan
 import casadi as ca
 import numpy as np
 
-from reactorwatch.process.integrate import symbolic_step
+from reactorwatch.process.integrate import passed_min, symbolic_step
 from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import ProcessModel
@@ -110,7 +110,8 @@ def _predicted(
     for begin, h in ((now - second - first, first), (now - second, second)):
         middle = begin + 0.5 * h
         after = step(x, u, p, begin, middle, h)[0]
-        M = 0.5 * h * (slope(x, u, p, begin, middle) + slope(after, u, p, begin + h, middle))
+        passed = passed_min(model, u, p, begin, middle, h)
+        M = 0.5 * passed * (slope(x, u, p, begin, middle) + slope(after, u, p, begin + h, middle))
         F, x = exponential(M) @ F, after
     return x, F @ P @ F.T + ca.diag(q * (first + second))
 

@@ -54,6 +54,16 @@ class SimulationError(ValueError):
     """The equations cannot be integrated further; the text says where."""
 
 
+def passed_min(model: ProcessModel, u: ca.SX, p: ca.SX, t: ca.SX, middle: ca.SX, h: ca.SX) -> ca.SX:
+    """How long the states go on in a step of the clock from t to t + h; see `ProcessModel.clock_ahead`."""
+    clock = model.clock
+    if not ca.depends_on(model.clock_ahead, ca.vertcat(clock.now, clock.middle)):
+        return h
+    _, inputs, parameters = model.arguments()
+    ahead = ca.Function("ahead", [inputs, parameters, clock.now, clock.middle], [model.clock_ahead])
+    return h - (ahead(u, p, t + h, middle) - ahead(u, p, t, middle))
+
+
 def symbolic_step(model: ProcessModel) -> ca.Function:
     """One step as a CasADi function (x, u, p, t, t_middle, h) -> (x at t + h, error estimate over scale).
 
@@ -62,11 +72,11 @@ def symbolic_step(model: ProcessModel) -> ca.Function:
     rhs = model.function("rhs")
     x, u, p = model.arguments()
     t, middle, h = ca.SX.sym("t"), ca.SX.sym("t_middle"), ca.SX.sym("h")
-    slopes: list[ca.SX] = []
+    passed, slopes = passed_min(model, u, p, t, middle, h), list[ca.SX]()
     for time, weights in zip(_TIMES, _STAGES, strict=True):
-        slopes.append(rhs(x + h * _weighted(weights, slopes), u, p, t + time * h, middle)[0])
-    after = x + h * _weighted(_FIFTH_ORDER, slopes)
-    error = h * _weighted(_ERROR, slopes)
+        slopes.append(rhs(x + passed * _weighted(weights, slopes), u, p, t + time * h, middle)[0])
+    after = x + passed * _weighted(_FIFTH_ORDER, slopes)
+    error = passed * _weighted(_ERROR, slopes)
     scales = ca.DM([state.scale * (MEMORY_SLACK if state.name in model.at_rest else 1) for state in model.states])
     return ca.Function(
         "step",

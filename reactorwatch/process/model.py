@@ -119,6 +119,7 @@ class ProcessModel:
         terms: parts of the balances that effects act on or need, by name, as they stand in `rhs`.
         at_rest: by name of a state, where it rests while the other states, inputs and parameters are what they are.
         resets: by name of a state, what it becomes when a row begins: of the states before and the inputs from then on.
+        clock_ahead: by how many minutes the clock is ahead of the states; while that grows, they go on for less.
     """
 
     name: str
@@ -132,6 +133,7 @@ class ProcessModel:
     terms: Mapping[str, ca.SX] = field(default_factory=dict)
     at_rest: Mapping[str, ca.SX] = field(default_factory=dict)
     resets: Mapping[str, ca.SX] = field(default_factory=dict)
+    clock_ahead: ca.SX = field(default_factory=lambda: ca.SX(0))
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):
@@ -255,11 +257,13 @@ class ProcessModel:
         """The same model with all its expressions changed."""
         shown = [output.expression for output in self.outputs]
         named = (self.terms, self.at_rest, self.resets)
-        changed = iter(change([*self.rhs, *shown, *(item for items in named for item in items.values())]))
+        of_states = (item for items in named for item in items.values())
+        changed = iter(change([*self.rhs, *shown, self.clock_ahead, *of_states]))
         return replace(
             self,
             rhs=tuple(next(changed) for _ in self.rhs),
             outputs=tuple(replace(output, expression=next(changed)) for output in self.outputs),
+            clock_ahead=next(changed),
             terms={name: next(changed) for name in self.terms},
             at_rest={name: next(changed) for name in self.at_rest},
             resets={name: next(changed) for name in self.resets},

@@ -90,6 +90,17 @@ def test_an_input_that_went_in_straight_lines_is_a_matter_of_timing_by_half_a_ro
     assert cause.parameters["size"].value == pytest.approx(0.05, abs=0.005)
 
 
+@pytest.mark.parametrize("case", ["medium", "low noise", "irregular"])
+def test_when_stamps_became_late_is_known_as_well_as_the_interval_says(case: str) -> None:
+    record = hidden(case, "sample_timing")
+    said = diagnose(record.record, cstr())
+    (cause,) = said.causes
+    assert (cause.cause, cause.profile) == ("sample_timing", "step")
+    onset = cause.parameters["onset"]
+    assert abs(onset.value - record.courses[0].onset_min) < 2.6 * onset.sd  # 99 %
+    assert onset.sd < 2.0  # the input moves every minute
+
+
 def test_a_single_spike_in_the_first_row_or_anywhere_is_no_finding() -> None:
     record = hidden("medium").record
     T, C = record.columns["T"].copy(), record.columns["C"].copy()

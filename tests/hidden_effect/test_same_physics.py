@@ -3,6 +3,10 @@
 import numpy as np
 import pytest
 
+from diagnosis.courses import Step
+from diagnosis.run import Run
+from diagnosis.sized import Sized
+from diagnosis.wandering import Noise
 from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
@@ -23,8 +27,8 @@ ONSET_MIN = 12.537
 OF_ORDER_ONE = np.array([0.002, 0.3])
 
 LAGS = ("jacket_lag", "valve_lag", "temperature_lag")
-APPROXIMATE = {"concentration_delay": 0.01, "sample_timing": 0.003}
-"""Of what an effect makes: the past is remembered by some polynomials; a late stamp is exact once it stays so late."""
+APPROXIMATE = {"concentration_delay": 0.01}
+"""Of what an effect makes: the past is remembered by some polynomials."""
 
 QUICK_LAG, QUICK_DELAY = 0.15, 0.06
 """The same of a lag or a delay much shorter than a row."""
@@ -64,3 +68,15 @@ def test_an_effect_is_what_the_equations_by_hand_say(effect: Effect, profile: Pr
 def test_a_lag_shorter_than_a_row_is_right_but_for_its_shape(effect: Effect) -> None:
     bound = QUICK_LAG if effect.name in LAGS else QUICK_DELAY
     assert relative_error(effect, HAND[effect.name].smallest) < bound
+
+
+@pytest.mark.parametrize("onset_min", [ONSET_MIN, 12.9701, 13.0])
+@pytest.mark.parametrize("size", [0.06, 0.1])
+def test_a_filter_that_knows_when_the_stamps_became_late_has_nothing_to_correct(size: float, onset_min: float) -> None:
+    """The command changes at 13 min."""
+    timing = next(item for item in EFFECTS if item.name == "sample_timing")
+    by_hand = play(Plan(TIME, COMMAND, {"sample_timing": HiddenCourse("step", size, onset_min)}))
+    run = Run(TIME, COMMAND[:, None], np.stack([by_hand.concentration, by_hand.temperature], axis=1))
+    knowing = Sized(cstr(), (timing,), Noise((0.002, 0.3), (0.001, 0.3)))
+    followed = knowing.follow(run, [Step(TIME).signal(np.array([size, onset_min]))])
+    assert np.nanmax(np.abs(followed.w)) < 1e-3

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import casadi as ca
 
-from reactorwatch.process.model import Parameter, ProcessModel, Variable
+from reactorwatch.process.model import Clock, Parameter, ProcessModel, Variable
 from reactorwatch.process.profiles import CONSTANT, Profile
 
 TIMING = "timing"
@@ -98,7 +98,7 @@ class Effect(ABC):
         )
         symbols = {"size": size.symbol}
         symbols |= {item.name: new.symbol for item, new in zip(profile.parameters, shape, strict=True)}
-        extended = self.apply(model, profile.expression(model.clock, symbols))
+        extended = self.apply(model, self.course(model.clock, profile, symbols))
         return replace(
             extended,
             parameters=(*extended.parameters, size, *shape),
@@ -107,6 +107,10 @@ class Effect(ABC):
                 *(f"{prefix}.{item.name}" for item in profile.parameters if item.breakpoint),
             ),
         )
+
+    def course(self, clock: Clock, profile: Profile, symbols: dict[str, ca.SX]) -> ca.SX:
+        """m(t) with a profile, an expression of the clock and of the symbols of its size and other numbers."""
+        return profile.expression(clock, symbols)
 
     def label_with(self, profile: Profile) -> str:
         """What a person calls this effect with that profile."""

@@ -7,7 +7,8 @@ import casadi as ca
 from reactorwatch.process.effects.base import TIMING, Effect
 from reactorwatch.process.integrate import symbolic_step
 from reactorwatch.process.memory import positive
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import Clock, ProcessModel
+from reactorwatch.process.profiles import Profile
 
 STEPS = 2
 """Of the integrator, over m."""
@@ -16,15 +17,19 @@ STEPS = 2
 class SampleTiming(Effect):
     """The plant has felt the input of a row for m already when the row is measured.
 
-    The state of a row is taken for that at the moment from which on its input acts, and that is what passes into the
-    state of the next row, with no time lost or gained. What is measured lies m later: y_k = h(Phi_m(x_k, u_k)). As long
-    as m is constant and at most the time until the next row, that is exact, however irregular the rows; a larger m
-    would need the input of later rows. While m changes, the plant's own time seems to run slower or faster, and the
-    state is off for as long as the plant remembers.
+    At any time t the plant feels the input that is stamped t + m(t); what is measured is stamped in time. The state of
+    a row is taken for that at the moment from which on its input acts, m before the row, and what is measured lies m
+    later: y_k = h(Phi_m(x_k, u_k)). So while m grows the states go on for less than the clock does
+    (`ProcessModel.clock_ahead`), from one row to the next for the time between them less what m has grown by. A shift
+    that sets in cannot act before it does, so m is at most the time since its onset: while less than m has gone by, the
+    states stand still. That is exact for a constant m and for a step, however irregular the rows, as long as m is at
+    most the time until the next row; a larger m would need the input of later rows. Of a course that grows slowly m is
+    taken at the row instead of m before it, which is off by m times its growth.
 
     An input that is interpolated between the rows instead of held is, to first order, held with m of half a period.
 
-    Of effects in one model this must come last: the outputs are those of the model that it is applied to, m later.
+    Of effects in one model this must come last: the outputs are those of the model that it is applied to, m later, and
+    what sets in with the others does so in that model's time.
     """
 
     name = "sample_timing"
@@ -48,4 +53,12 @@ class SampleTiming(Effect):
         return replace(
             model,
             outputs=tuple(replace(item, expression=y) for item, y in zip(model.outputs, later, strict=True)),
+            clock_ahead=model.clock_ahead + size,
         )
+
+    def course(self, clock: Clock, profile: Profile, symbols: dict[str, ca.SX]) -> ca.SX:
+        """See `Effect`; at most the time since the onset."""
+        late = positive(super().course(clock, profile, symbols))
+        if "onset" not in symbols:
+            return late
+        return ca.fmin(late, ca.fmax(clock.now - symbols["onset"], 0))

@@ -8,9 +8,10 @@ import pytest
 from reactorwatch.process.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.level_control import with_level_control
 from reactorwatch.process.model import Array
+from reactorwatch.process.profiles import RAMP
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process.by_hand import duty, run
-from tests.unit.process.effect_named import extended
+from tests.unit.process.effect_named import effect_of, extended
 
 TIMES: Array = np.cumsum(np.append(0.0, np.random.default_rng(8).choice([0.05, 0.1, 0.2], 150)))
 FLOWS = np.repeat(np.random.default_rng(9).uniform(92, 108, 31), 5)[: TIMES.size]
@@ -84,6 +85,34 @@ def test_an_input_that_is_stamped_late_has_acted_before(late: float) -> None:
     between = np.ravel(np.column_stack([switched, TIMES]))
     truth = run(lambda t, x, qc: reactor(x, qc), START, between, np.repeat(FLOWS, 2))
     assert np.all(np.abs(found - truth[1::2]) < ERROR)
+
+
+def felt_earlier(switched_min: Array) -> Array:
+    """What is measured at the rows if the plant feels the input of each from a time of its own on."""
+    between = np.unique(np.concatenate([TIMES, switched_min]))
+    flows = FLOWS[np.searchsorted(switched_min, between, side="right") - 1]
+    return run(lambda t, x, qc: reactor(x, qc), START, between, flows)[np.searchsorted(between, TIMES)]
+
+
+@pytest.mark.parametrize("before_min", [0.01, 0.03, 0.3])
+def test_stamps_that_become_late_are_felt_earlier_from_then_on_and_no_earlier(before_min: float) -> None:
+    """It happens so long before an input changes: twice that change is felt at once, or nearly so."""
+    late, onset_min = 0.04, TIMES[75] - before_min
+    truth = felt_earlier(np.where(onset_min < TIMES, np.maximum(TIMES - late, onset_min), TIMES))
+    found = Simulator(extended("sample_timing", late, onset_min=onset_min)).run(TIMES, FLOWS, START).outputs
+    assert np.all(np.abs(found - truth) < ERROR)
+
+
+def test_stamps_that_become_ever_later_are_felt_ever_earlier() -> None:
+    """To first order in how fast: the rest is the shift times its growth, here 0.0002 min, times 60 K/min."""
+    size, begin, end = 0.04, 5.0, 13.0
+    values = {f"sample_timing.{name}": value for name, value in {"size": size, "onset": begin, "end": end}.items()}
+    model = effect_of("sample_timing").extend(cstr(), RAMP).with_values(values)
+    found = Simulator(model).run(TIMES, FLOWS, START).outputs
+    growth = size / (end - begin)
+    rising = (TIMES + growth * begin) / (1 + growth)  # is felt what is stamped later by as much as it has grown by then
+    truth = felt_earlier(np.where(begin > TIMES, TIMES, np.maximum(rising, TIMES - size)))
+    assert np.all(np.abs(found - truth) < [1.2e-5, 0.012])
 
 
 def test_an_input_that_is_interpolated_is_held_and_stamped_half_a_period_late_to_first_order() -> None:
