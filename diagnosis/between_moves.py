@@ -34,8 +34,7 @@ def walked(run: Run, hypothesis: Hypothesis, best: Fit, steps: int) -> Fit:
 
 
 def _walked(run: Run, hypothesis: Hypothesis, best: Fit, place: int, steps: int) -> Fit:
-    moved = np.flatnonzero(np.any(np.diff(run.inputs, axis=0) != 0.0, axis=1)) + 1
-    moves_min = np.concatenate([run.time_min[:1], run.time_min[moved], run.time_min[-1:]])
+    moves_min = np.concatenate([run.time_min[:1], run.time_min[run.moves], run.time_min[-1:]])
     middles_min = 0.5 * (moves_min[1:] + moves_min[:-1])
     for _ in range(MOST_ROUNDS):
         size, onset_min = best.theta[place]

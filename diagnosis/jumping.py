@@ -12,7 +12,6 @@ from collections.abc import Iterator, Sequence
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.run import Run
@@ -121,12 +120,8 @@ def _likely(run: Run, hypothesis: Hypothesis, best: Fit) -> Array:
 
 def _between(run: Run) -> Array:
     """Between rows, each after one in which an input moved."""
-    moved = _moves(run)
+    moved = run.moves[:-1]
     return np.asarray(0.5 * (run.time_min[moved] + run.time_min[moved + 1]))
-
-
-def _moves(run: Run) -> NDArray[np.intp]:
-    return np.flatnonzero(np.any(np.diff(run.inputs, axis=0) != 0.0, axis=1))[:-1] + 1
 
 
 def _profiles(run: Run, hypothesis: Hypothesis, best: Fit, sizes: Array) -> list[Array]:
@@ -136,7 +131,7 @@ def _profiles(run: Run, hypothesis: Hypothesis, best: Fit, sizes: Array) -> list
     found = []
     for item in always:
         gained = never - row_losses(item.w)
-        found.append(np.cumsum(gained)[_moves(run)] - np.sum(gained))
+        found.append(np.cumsum(gained)[run.moves[:-1]] - np.sum(gained))
     return found
 
 

@@ -42,6 +42,11 @@ class Run:
         return breaks if self.missing is None else np.concatenate([breaks, np.flatnonzero(self.missing)])
 
     @property
+    def moves(self) -> NDArray[np.intp]:
+        """Rows in which an input is another than in the row before."""
+        return np.flatnonzero(np.any(np.diff(self.inputs, axis=0) != 0.0, axis=1)) + 1
+
+    @property
     def values(self) -> int:
         """How many values were measured."""
         return int(np.count_nonzero(np.isfinite(self.measured)))
