@@ -230,9 +230,12 @@ class Search:
     def settle(self, best: Explained) -> None:
         """Take the noise that a hypothesis needs for that of all."""
         signals = best.hypothesis.signals(best.fit)
-        before = [self.noise, *(item for item in self._settled if item != self.noise)][:NOISES]
-        self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd, before)
-        self._settled = [self.noise, *(item for item in self._settled if item != self.noise)][:NOISES]
+        self.noise = best.hypothesis.sized.tuned(self.run, signals, self._smallest_sd, self._beside(self.noise))
+        self._settled = self._beside(self.noise)
+
+    def _beside(self, noise: Noise) -> list[Noise]:
+        """A noise, and others that were taken last."""
+        return [noise, *(item for item in self._settled if item != noise)][:NOISES]
 
     def _settled_anew(self, best: Explained) -> bool:
         """Whether another noise goes with its numbers than with the rougher ones it was found with; then it holds."""

@@ -87,8 +87,7 @@ def onsets(ways: Ways, beta: Array, gamma: Array, mean: Array) -> Onsets:
 
 
 def _common(ways: Ways) -> tuple[Array, Array, Array, Array]:
-    F, H, K, L_inverse = (np.ascontiguousarray(item) for item in (ways.F, ways.H, ways.K, ways.L_inverse))
-    return F, H, K, L_inverse
+    return ways.F, ways.H, ways.K, ways.L_inverse
 
 
 def _of_sizes(ways: Ways) -> tuple[Array, Array]:

@@ -36,6 +36,8 @@ _LONGEST_PIECE_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a piece is two steps; times
 class Ways:
     """From each row but the last to the next one: the first axis has one place a way.
 
+    They have no gaps in memory, but G and D of some sizes among more.
+
     Attributes:
         F: d state / d state before, shape (n_x, n_x).
         G: d state / d sizes, shape (n_x, sizes).
@@ -141,7 +143,7 @@ class FilterErrors:
             kept[self.model.lasting, self.model.lasting] = 1.0
             F = np.where(anew, kept, F)
             G, H, D, K = (np.where(anew, 0.0, item) for item in (G, H, D, K))
-        return Ways(*(np.ascontiguousarray(item) for item in (F, G, H, D, K, L_inverse, w)))  # for the kernels
+        return Ways(*(np.ascontiguousarray(item) for item in (F, G, H, D, K, L_inverse, w)))  # once, for all kernels
 
     def about(self, time_min: Array, inputs: Array, x: Array, doubt: Doubt | None = None) -> "Path":
         """The equations along a path that need not be a filter's.
