@@ -16,5 +16,7 @@ RUN pip install --no-cache-dir '.[metrics]'
 
 USER reactorwatch
 WORKDIR /home/reactorwatch
+# Else each new container compiles for half a minute in the middle of a watch.
+RUN reactorwatch compile
 STOPSIGNAL SIGTERM
 ENTRYPOINT ["reactorwatch"]

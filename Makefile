@@ -11,7 +11,7 @@ READY := .venv/.ready
 help: ## what there is to make
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / \t/' | expand -t 12
 
-setup: $(READY) ## create .venv with everything in it
+setup: $(READY) ## create .venv with everything in it, and compile the numerical kernels
 
 $(READY): pyproject.toml
 	@if command -v uv >/dev/null 2>&1; then \
@@ -22,6 +22,7 @@ $(READY): pyproject.toml
 		$(BIN)/python -m pip install --quiet --upgrade 'pip>=25.1' && \
 		$(BIN)/python -m pip install --quiet --editable . --group dev; \
 	fi
+	@$(BIN)/reactorwatch compile
 	@touch $@
 
 demo: $(READY) ## run a reactor with a fault in it, watch, record and draw it

@@ -22,7 +22,7 @@ cause has grown or shrunk meanwhile. Evaluated together with the present record 
 from math import sqrt
 
 import numpy as np
-from scipy.stats import norm
+from scipy import special
 
 from diagnosis.courses import Constant, Course, Sine
 from diagnosis.hypothesis import Fit, Hypothesis
@@ -150,4 +150,4 @@ def probability(expected: float, evidence: float) -> float:
     >>> round(probability(30.0, 30.0), 3)
     0.966
     """
-    return float(norm.cdf((expected - LISTED) / max(2.0 * sqrt(evidence), 1e-9)))
+    return float(special.ndtr((expected - LISTED) / max(2.0 * sqrt(evidence), 1e-9)))

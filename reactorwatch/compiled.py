@@ -21,13 +21,18 @@ Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 def compiled(kernel: Kernel) -> Kernel:
     """Compile a numerical kernel to machine code at its first call, and keep the result on disk.
 
+    Where no folder for it can be written to, each process compiles it for itself.
+
     Args:
         kernel: a function of numbers and NumPy arrays, in the subset of Python that Numba compiles.
 
     Returns:
         The compiled function; it is called like the original.
     """
-    return cast(Kernel, numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel))
+    try:
+        return cast(Kernel, numba.njit(cache=True, fastmath=False, error_model="numpy")(kernel))
+    except RuntimeError:  # Numba's word for it: no locator available
+        return cast(Kernel, numba.njit(cache=False, fastmath=False, error_model="numpy")(kernel))
 
 
 def _call_at(_typing: Any, address: Any, numbers: Any) -> Any:

@@ -223,7 +223,8 @@ def _run(
             continue
         if starts[k]:
             for back in range(1, output_lags + 1):
-                own[k - back] = y[k - back]
+                for o in range(outputs):  # a slice would take two seconds to compile
+                    own[k - back, o] = y[k - back, o]
         for o in range(outputs):
             total = parameters[o, parameters.shape[1] - 1] if offset else 0.0
             for lag in range(output_lags):

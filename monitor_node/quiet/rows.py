@@ -318,7 +318,8 @@ def judge(
     memory, noise = scratch[0].memory.size, scratch[0].variance.size
     new, constants = np.empty(3 + 2 * row_values.shape[1]), np.empty(parameters.size + noise)
     after, told = np.empty(memory), np.empty(5 * outputs + 1)
-    constants[: parameters.size] = parameters
+    for place in range(parameters.size):  # a slice would take two seconds to compile
+        constants[place] = parameters[place]
     keeps, kept = times.shape[1], ring.shape[2] > 0
     for k in range(rows.size):
         slot = rows[k]

@@ -11,10 +11,8 @@ import numpy as np
 from diagnosis.diagnose import diagnose
 from diagnosis.record_checks import run_of
 from diagnosis.report.machine import with_differences
-from diagnosis.report.page import as_page
 from diagnosis.result import Diagnosis, Experiment
 from diagnosis.uncertain import stated
-from reactorwatch.cli.diagnosis_drawing import write_drawing
 from reactorwatch.cli.options import existing_recording
 from reactorwatch.cli.sources import process_model, record, signals_of
 from reactorwatch.process import effects_of
@@ -120,6 +118,10 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     Raises:
         InputError: the folder cannot be made or written to.
     """
+    # Imported where a report is wanted: Rerun and Jinja take longer to import than most records to diagnose.
+    from diagnosis.report.page import as_page
+    from reactorwatch.cli.diagnosis_drawing import write_drawing
+
     assert case.folder is not None
     folder = make_folder(case.folder, "--out")
     catalogue, on_the_bus = effects_of(case.model), case.model.name == PLANT

@@ -1,0 +1,41 @@
+"""`compile`: make the machine code that is otherwise made when it is first needed.
+
+Numerical kernels are compiled at their first call and kept on disk (`reactorwatch.compiled`, `process.machine_code`).
+On a new machine that call comes in the middle of a watch or of a diagnosis, and takes half a minute in all. So all
+that compiles is run here once, over a short simulated record: by `make setup`, by the images, or by hand.
+"""
+
+import typer
+
+ROWS = 600
+"""Of the record: a diagnosis takes some hundreds, and the monitor sees a fault after its training."""
+
+FAULT = "coolant_flow:step:-0.1@30min"
+TRAINING_MIN = 15.0
+
+
+def add_to(app: typer.Typer) -> None:
+    """Register the command."""
+    app.command("compile")(compile_kernels)
+
+
+def compile_kernels() -> None:
+    """Compile the numerical kernels once, so that no first start has to: half a minute on a new machine."""
+    from diagnosis.diagnose import diagnose
+    from monitor_node import backtest
+    from monitor_node.config import MonitorConfig
+    from monitor_node.fleet.watched import WatchedPlants
+    from plant_node.config import PlantConfig
+    from plant_node.record import simulate_record
+    from reactorwatch.cli.progress import task
+    from reactorwatch.contract.codec import encode
+    from reactorwatch.process.cstr import cstr
+    from recorder.player import samples_of
+
+    record = simulate_record(PlantConfig(seed=1, faults=(FAULT,)), ROWS)
+    with task("compiling"):
+        for reference in ("auto", "arx"):
+            config = MonitorConfig(training_min=TRAINING_MIN, reference=reference)
+            backtest.run(map(encode, samples_of(record, config.plant)), config)
+        WatchedPlants(MonitorConfig(), 0, None, points=False).prepare()
+        diagnose(record, cstr())

@@ -1,0 +1,53 @@
+"""After `reactorwatch compile` no monitor and no diagnosis compiles a kernel: each is loaded from the disk."""
+
+import subprocess
+import sys
+
+import numba
+import pytest
+
+from reactorwatch.compiled import compiled
+
+PROGRAM = """
+import numba
+
+kernels, njit = [], numba.njit
+
+
+def register(*function, **options):
+    if function:  # of Numba itself
+        return njit(*function, **options)
+
+    def wrap(kernel):
+        kernels.append(njit(**options)(kernel))
+        return kernels[-1]
+
+    return wrap
+
+
+numba.njit = register
+from reactorwatch.cli import compilation
+
+compilation.FAULT = "feed_temperature:step:3@40min"
+compilation.compile_kernels()
+print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
+print([kernel.__name__ for kernel in kernels if kernel.stats.cache_misses])
+"""
+
+
+def test_another_record_finds_every_kernel_compiled() -> None:
+    command = [sys.executable, "-m", "reactorwatch", "compile"]
+    subprocess.run(command, check=True, capture_output=True)
+    run = subprocess.run([sys.executable, "-c", PROGRAM], check=True, capture_output=True, text=True)
+    hits, missed = run.stdout.splitlines()
+    assert int(hits) > 10
+    assert missed == "[]"
+
+
+def test_a_kernel_compiles_where_no_folder_can_be_written_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.core.caching.CacheImpl, "_locator_classes", [])
+
+    def double(x: float) -> float:
+        return 2.0 * x
+
+    assert compiled(double)(2.0) == 4.0
