@@ -6,6 +6,7 @@ python -m monitor_node [settings.toml]
 import sys
 import time
 from collections.abc import Callable
+from math import inf
 from pathlib import Path
 
 import structlog
@@ -152,7 +153,8 @@ def run(
                 bus,
                 stop,
                 subscriptions=(keys.all_of(config.plant, keys.SAMPLE),),
-                history=node.resumed,  # what was published since it was stored
+                # What was published since it was stored, however long ago that is; what it knows is passed over.
+                history_s=inf if node.resumed else 0.0,
                 on_told=node.caught_up,
                 commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
                 on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),

@@ -83,7 +83,7 @@ def record(
                     bus,
                     stop,
                     subscriptions=(config.key_expression,),
-                    history=True,
+                    history_s=bus_config.history_s,
                     on_gap=node.on_gap,
                     commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
                     on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),

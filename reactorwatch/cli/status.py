@@ -25,6 +25,8 @@ SECOND_NS = 1_000_000_000
 WINDOW_S = 10
 """Rates are of so many whole seconds, the one that is running left out."""
 REFRESH_S = 1.0
+HISTORY_S = 60.0
+"""Of health: longer than any node waits until it publishes it again."""
 ANSWER_WITHIN_S = 2.0
 
 
@@ -150,7 +152,7 @@ def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as
 def _listening(bus: ZenohBus, plant: str) -> Board:
     board = Board(time.time_ns())
     bus.watch_alive(keys.all_of(plant, keys.ALIVE), board.on_token)
-    bus.subscribe(keys.all_of(plant, keys.HEALTH), board.on_message, history=True)
+    bus.subscribe(keys.all_of(plant, keys.HEALTH), board.on_message, history_s=HISTORY_S)
     for kind in (keys.SAMPLE, keys.ALARM):
         bus.subscribe(keys.all_of(plant, kind), board.on_message)
     return board

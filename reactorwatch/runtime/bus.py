@@ -49,7 +49,7 @@ class Bus(Protocol):
         handler: Callable[[Encoded], None],
         *,
         on_gap: Callable[[Gap], None] | None = None,
-        history: bool = False,
+        history_s: float = 0.0,
         on_told: Callable[[], None] | None = None,
     ) -> None:
         """Call the handler, from a thread of the bus, with everything published on matching keys.
@@ -61,7 +61,8 @@ class Bus(Protocol):
             key_expression: the keys.
             handler: gets the messages.
             on_gap: gets told, from a thread of the bus, what was published and never came.
-            history: whether what was published before, and is still remembered, comes first.
+            history_s: what was published up to this many seconds before comes first, as far as publishers remember it;
+                `inf`: all that they remember, 0: nothing.
             on_told: called, from a thread of the bus and between the messages, when that has all come.
         """
 
@@ -71,7 +72,7 @@ class Bus(Protocol):
         handler: Callable[[list[Encoded]], None],
         *,
         on_gap: Callable[[Gap], None] | None = None,
-        history: bool = False,
+        history_s: float = 0.0,
         on_told: Callable[[], None] | None = None,
     ) -> None:
         """As `subscribe`, of as many messages at a time as have come, up to about `MOST_GATHERED`."""
@@ -181,7 +182,7 @@ class MemoryBus:
         handler: Callable[[Encoded], None],
         *,
         on_gap: Callable[[Gap], None] | None = None,
-        history: bool = False,
+        history_s: float = 0.0,
         on_told: Callable[[], None] | None = None,
     ) -> None:
         """See `Bus`; nothing is lost here, and nothing remembered."""
@@ -196,12 +197,12 @@ class MemoryBus:
         handler: Callable[[list[Encoded]], None],
         *,
         on_gap: Callable[[Gap], None] | None = None,
-        history: bool = False,
+        history_s: float = 0.0,
         on_told: Callable[[], None] | None = None,
     ) -> None:
         """See `Bus`; here they come one by one."""
         self.subscribe(
-            key_expression, lambda message: handler([message]), on_gap=on_gap, history=history, on_told=on_told
+            key_expression, lambda message: handler([message]), on_gap=on_gap, history_s=history_s, on_told=on_told
         )
 
     @property

@@ -153,7 +153,7 @@ def serve(
     stop: StopSignal,
     *,
     subscriptions: tuple[str, ...] = (),
-    history: bool = False,
+    history_s: float = 0.0,
     on_gap: Callable[[Gap, int], list[Publication]] | None = None,
     on_told: Callable[[], None] | None = None,
     on_messages: Callable[[list[Encoded], int], list[Publication]] | None = None,
@@ -171,7 +171,7 @@ def serve(
         bus: an open bus; it stays open.
         stop: ends the loop; what is in the inbox by then is still handled.
         subscriptions: key expressions whose publications go to `node.on_message`.
-        history: whether those from before do, too, as far as they are remembered.
+        history_s: whether those from before do, too, see `Bus.subscribe`.
         on_gap: told, in its turn between the messages, what was published on them and never came, and what time it is.
         on_told: called, in its turn between the messages, when those from before have all come.
         on_messages: gets the publications instead, as many at a time as have come, in their order.
@@ -201,7 +201,7 @@ def serve(
             expression,
             receive,
             on_gap=receive if on_gap is not None else None,
-            history=history,
+            history_s=history_s,
             on_told=(lambda: receive(_TOLD)) if on_told is not None else None,
         )
     for expression in tokens:

@@ -87,7 +87,7 @@ def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], N
             try:
                 recording = stream_to(data, shown.bind, f"{plant}-{time.time_ns()}")
                 dashboard = LiveDashboard(recording, lambda: process.poll() is not None, time.time_ns())
-                serve(dashboard, bus, stop, subscriptions=(f"{keys.ROOT}/{plant}/**",), history=True)
+                serve(dashboard, bus, stop, subscriptions=(f"{keys.ROOT}/{plant}/**",), history_s=bus_config.history_s)
                 recording.disconnect()
             finally:
                 bus.close()

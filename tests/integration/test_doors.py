@@ -200,7 +200,7 @@ def test_a_recorder_of_the_whole_plant_is_told_what_was_before(site: Site) -> No
     heard: list[Encoded] = []
     site.join("cstr/plant").publish(sample(b"measured"))
     site.heard_until(lambda message: message.payload == b"measured")
-    site.join("cstr/recorder").subscribe("reactor/cstr/**", heard.append, history=True)
+    site.join("cstr/recorder").subscribe("reactor/cstr/**", heard.append, history_s=60.0)
     site.close_readers()
     assert [message.payload for message in heard] == [b"measured"]
 
@@ -239,8 +239,8 @@ def test_what_a_plant_remembers_is_not_told_to_a_reader_of_another(site: Site) -
     foreign: list[Encoded] = []
     site.join("cstr/plant").publish(sample(b"measured"))
     site.heard_until(lambda message: message.payload == b"measured")
-    site.join("cstr/viewer").subscribe("reactor/cstr/sample/**", own.append, history=True)
-    site.join("other/viewer").subscribe("reactor/cstr/sample/**", foreign.append, history=True)
+    site.join("cstr/viewer").subscribe("reactor/cstr/sample/**", own.append, history_s=60.0)
+    site.join("other/viewer").subscribe("reactor/cstr/sample/**", foreign.append, history_s=60.0)
     site.close_readers()
     assert [message.payload for message in own] == [b"measured"]
     assert not foreign

@@ -113,7 +113,7 @@ def test_who_begins_to_listen_late_hears_what_was_before(tmp_path: Path, router:
         if len(heard) >= 2000 * SIGNALS:
             enough.set()
 
-    late.subscribe(keys.all_of("cstr", keys.SAMPLE), hear, history=True)
+    late.subscribe(keys.all_of("cstr", keys.SAMPLE), hear, history_s=60.0)
     assert enough.wait(PATIENCE_S)
     publisher.close()
     late.close()

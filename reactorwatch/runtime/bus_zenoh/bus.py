@@ -4,9 +4,10 @@ import contextlib
 import secrets
 import threading
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from typing import Any
+from math import isfinite
+from typing import Any, NamedTuple
 
 import structlog
 import zenoh
@@ -72,6 +73,18 @@ class _Key:
     stream: str
 
 
+class _Answers(NamedTuple):
+    """What publishers remember.
+
+    Attributes:
+        messages: they have published.
+        are_complete: whether every publisher has answered in time.
+    """
+
+    messages: list[Numbered]
+    are_complete: bool
+
+
 class ZenohBus:
     """See `reactorwatch.runtime.bus.Bus`."""
 
@@ -134,7 +147,7 @@ class ZenohBus:
         handler: Callable[[Encoded], None],
         *,
         on_gap: Callable[[Gap], None] | None = None,
-        history: bool = False,
+        history_s: float = 0.0,
         on_told: Callable[[], None] | None = None,
     ) -> None:
         """See `Bus`."""
@@ -154,7 +167,7 @@ class ZenohBus:
 
         self._listen(key_expression, on_sample)
         if delivery is not None:
-            self._begin(delivery, key_expression, history=history, on_told=on_told)
+            self._begin(delivery, key_expression, history_s, on_told)
         elif on_told is not None:
             on_told()
 
@@ -164,7 +177,7 @@ class ZenohBus:
         handler: Callable[[list[Encoded]], None],
         *,
         on_gap: Callable[[Gap], None] | None = None,
-        history: bool = False,
+        history_s: float = 0.0,
         on_told: Callable[[], None] | None = None,
     ) -> None:
         """See `Bus`.
@@ -200,7 +213,7 @@ class ZenohBus:
 
         threading.Thread(target=empty, name="gather", daemon=True).start()
         if delivery is not None:
-            self._begin(delivery, key_expression, history=history, on_told=on_told)
+            self._begin(delivery, key_expression, history_s, on_told)
         elif on_told is not None:
             on_told()
 
@@ -227,20 +240,31 @@ class ZenohBus:
         return subscriber
 
     def _begin(
-        self, delivery: Delivery, key_expression: str, *, history: bool, on_told: Callable[[], None] | None
+        self, delivery: Delivery, key_expression: str, history_s: float, on_told: Callable[[], None] | None
     ) -> None:
         """Ask for what was before, and let what comes go on."""
         # The subscriber's own question for what was before left out keys that were being published on meanwhile.
-        for last in self._remembered(key_expression, "_max=1"):
-            delivery.tell_last(last)
-        if history:
-            began, since_s = time.monotonic(), self._config.history_s
-            for _ in range(MOST_ASKED):
-                for came in self._remembered(key_expression, f"_time=[now(-{since_s}s)..]"):
-                    delivery.tell(came)
-                if delivery.is_told():
-                    break
-                since_s = time.monotonic() - began + HEARTBEAT_S
+        for _ in range(MOST_ASKED):
+            answers = self._remembered(key_expression, "_max=1")
+            for last in answers.messages:
+                delivery.tell_last(last)
+            if answers.are_complete:
+                break
+        began, missing = time.monotonic(), history_s > 0.0
+        since_s = history_s
+        for _ in range(MOST_ASKED):
+            if not missing:
+                break
+            answers = self._remembered(key_expression, _published_since(since_s))
+            for came in answers.messages:
+                delivery.tell(came)
+            missing = not (answers.are_complete and delivery.is_told())
+            waited_s = time.monotonic() - began
+            since_s = HEARTBEAT_S + waited_s if answers.are_complete else history_s + waited_s
+        if missing or not answers.are_complete:
+            log.warning(
+                "publishers did not answer in time; what they published before may be missing", keys=key_expression
+            )
         # In a thread of its own: the handler may wait for who called us.
         threading.Thread(target=delivery.begin, args=(on_told,), daemon=True).start()
 
@@ -255,10 +279,13 @@ class ZenohBus:
     def recall(self, key_expression: str) -> list[Encoded]:
         """See `Bus`."""
         order: InOrder[Encoded] = InOrder(gathering=True)
-        lately = f"_time=[now(-{self._config.history_s}s)..]"
         with contextlib.suppress(zenoh.ZError):  # it is closed
-            for came in self._remembered(key_expression, lately):
-                order.tell(came.publisher, came.stream, came.message.key, came.number, came.message)
+            for _ in range(MOST_ASKED):
+                answers = self._remembered(key_expression, _published_since(self._config.history_s))
+                for came in answers.messages:
+                    order.tell(came.publisher, came.stream, came.message.key, came.number, came.message)
+                if answers.are_complete:
+                    break
         told = list(order.gathered(0))
         while (due_ns := order.due_ns()) is not None:  # what is missing is not waited for
             told += order.overdue(due_ns)
@@ -267,23 +294,28 @@ class ZenohBus:
     def _asked_again(self, stream: str, since_s: float) -> list[Numbered]:
         """What publishers remember of a stream."""
         try:
-            return list(self._remembered(f"{stream}/**", f"_time=[now(-{since_s + LONGEST_WAY_S}s)..]"))
+            return self._remembered(f"{stream}/**", _published_since(since_s + LONGEST_WAY_S)).messages
         except zenoh.ZError as error:  # the bus is being closed, for instance
             log.info("cannot ask for what is missing", stream=stream, why=first_line(error))
             return []
 
-    def _remembered(self, key_expression: str, which: str) -> Iterator[Numbered]:
-        """What publishers remember of what they have published."""
+    def _remembered(self, key_expression: str, which: str) -> "_Answers":
+        """Ask the publishers for what they remember of what they have published."""
         replies = self._session.get(
             f"{spelled(key_expression)}/{MEMORY}?{which}",
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=HISTORY_WITHIN_S,
         )
+        messages, complete = list[Numbered](), True
         for reply in replies:
-            came = numbered(reply.ok, time.time_ns()) if reply.ok is not None else None
+            if reply.ok is None:  # on a busy machine: Zenoh's word that one of them did not answer in time
+                complete = False
+                continue
+            came = numbered(reply.ok, time.time_ns())
             if isinstance(came, Numbered):
-                yield came
+                messages.append(came)
+        return _Answers(messages, complete)
 
     def _declare(self, key: str) -> _Key:
         stream = stream_of(key)
@@ -361,6 +393,11 @@ class ZenohBus:
             self._voice.close()
         for delivery in self._deliveries:
             delivery.close()
+
+
+def _published_since(seconds: float) -> str:
+    """What to ask a publisher's memory for."""
+    return f"_time=[now(-{seconds}s)..]" if isfinite(seconds) else ""
 
 
 def _say_gap(gap: Gap) -> None:

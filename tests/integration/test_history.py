@@ -1,0 +1,59 @@
+"""A subscriber hears what was published before, however long that is ago and however late publishers answer."""
+
+import contextlib
+import math
+from queue import SimpleQueue
+
+import pytest
+import zenoh
+
+from benchmarks.link_cuts import Router, connected
+from benchmarks.recorder_kills import PATIENCE_S
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.runtime.bus_zenoh import bus as bus_module
+from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.loopback import free_endpoint
+
+KEYS = ("reactor/cstr/sample/C", "reactor/cstr/sample/T")
+PUBLISHED = [Encoded(KEYS[number % 2], str(number).encode(), "") for number in range(200)]
+
+
+class SlowPublisher:
+    """A session that leaves the first questions for what was published unanswered, until they time out."""
+
+    def __init__(self, config: BusConfig, unanswered: int) -> None:
+        self.asked = 0
+        self._unanswered, self._held = unanswered, list[zenoh.Query]()
+        settings = zenoh.Config()
+        settings.insert_json5("mode", '"client"')
+        settings.insert_json5("connect/endpoints", f'["{config.endpoint}"]')
+        settings.insert_json5("scouting/multicast/enabled", "false")
+        self.session = zenoh.open(settings)
+        self._queryable = self.session.declare_queryable("reactor/cstr/sample/x/@adv/**", self._on_query)
+
+    def _on_query(self, query: zenoh.Query) -> None:
+        self.asked += 1
+        if self.asked <= self._unanswered:
+            self._held.append(query)
+        else:
+            query.drop()
+
+
+@pytest.mark.parametrize("unanswered", [0, 1, 2], ids=["at once", "last numbers late", "history late, too"])
+def test_an_answer_that_does_not_come_in_time_is_asked_for_again(
+    monkeypatch: pytest.MonkeyPatch, unanswered: int
+) -> None:
+    monkeypatch.setattr(bus_module, "HISTORY_WITHIN_S", 0.5)
+    with contextlib.closing(Router(free_endpoint())) as router:
+        publisher, late = connected(router.config), connected(router.config)
+        slow = SlowPublisher(router.config, unanswered)
+        for message in PUBLISHED:
+            publisher.publish(message)
+        heard, complete = SimpleQueue[Encoded](), SimpleQueue[bool]()
+        late.subscribe("reactor/cstr/sample/**", heard.put, history_s=math.inf, on_told=lambda: complete.put(True))
+        assert complete.get(timeout=PATIENCE_S)
+        assert [heard.get(timeout=PATIENCE_S).payload for _ in PUBLISHED] == [item.payload for item in PUBLISHED]
+        assert slow.asked == unanswered + 2
+        slow.session.close()
+        publisher.close()
+        late.close()
