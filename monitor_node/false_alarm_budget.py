@@ -23,7 +23,7 @@ not.
 from math import comb, exp, isfinite, log, sqrt
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from monitor_node.charts.base import Array
 from monitor_node.charts.run_length.design import LONGEST_DESIGN, SHORTEST, cusum_limit, ewma_limit, mewma_limit
@@ -64,6 +64,7 @@ def point_probability(arl0: float, raise_count: int, window: int) -> float:
         raise_count: see `persistence`.
         window: see `persistence`.
     """
+    from scipy import optimize  # only here: to import it is a tenth of a start
 
     def off(log_p: float) -> float:
         return false_alarm_rate(raise_count, window, exp(log_p)) * arl0 - 1.0
@@ -106,6 +107,8 @@ def cusum_height(arl0: float, k: float, learned: Prewhitening) -> float:
         k: the allowance.
         learned: the training.
     """
+    from scipy import optimize  # only here: to import it is a tenth of a start
+
     places, weights = np.polynomial.hermite_e.hermegauss(15)
     shift, log_scale = np.meshgrid(places / sqrt(learned.rows), places * sqrt(_scale_variance(learned, 0.0)))
     share = np.outer(weights, weights) / weights.sum() ** 2

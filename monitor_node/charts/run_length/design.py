@@ -13,7 +13,7 @@ from functools import cache
 from math import exp, log
 
 import msgspec
-from scipy import optimize, special
+from scipy import special
 
 from monitor_node.charts.run_length.cusum import LARGEST_LIMIT, cusum
 from monitor_node.charts.run_length.ewma import ewma
@@ -140,6 +140,8 @@ def t2_limit(arl0: float, dimension: int) -> float:
 
 def _root(run_length: Callable[[float], float], arl0: float, step: float, largest: float) -> float:
     """The limit at which a run length that rises with the limit is arl0."""
+    from scipy import optimize  # only here: to import it is a tenth of a start
+
     low, high = 1e-3, step
     while run_length(high) < arl0:
         low, high = high, high + step
@@ -150,6 +152,8 @@ def _root(run_length: Callable[[float], float], arl0: float, step: float, larges
 
 def _fastest(run_length: Callable[[float], float], lowest: float, highest: float, accuracy: float = 2e-3) -> float:
     """The parameter, to three digits, at which a run length is shortest; searched on a logarithmic scale."""
+    from scipy import optimize  # only here: to import it is a tenth of a start
+
     found = optimize.minimize_scalar(
         lambda x: run_length(exp(x)), bounds=(log(lowest), log(highest)), method="bounded", options={"xatol": accuracy}
     )

@@ -29,7 +29,7 @@ from functools import lru_cache
 from math import log
 
 import numpy as np
-from scipy import interpolate, optimize, special
+from scipy import special
 
 from monitor_node.charts.base import Array
 from monitor_node.charts.run_length.design import LONGEST_DESIGN, SHORTEST
@@ -54,6 +54,8 @@ def parameter_limit(arl0: float, dimension: int, weight: float, freedom: float, 
     Raises:
         InputError: an argument out of its range, or a training so short that no limit gives that run length.
     """
+    from scipy import optimize  # only here: to import it is a tenth of a start
+
     within("arl0", arl0, SHORTEST * (1.0 + reference_share), LONGEST_DESIGN)
     rates = _rates(dimension, weight)
     half = 0.5 * (freedom - dimension + 1.0)
@@ -76,6 +78,8 @@ class _Rates:
     """Log of the rate of false alarms of a known chart, by the log of its limit."""
 
     def __init__(self, dimension: int, weight: float) -> None:
+        from scipy import interpolate  # only here: to import it is a tenth of a start
+
         heights, rates = [], []
         height = _FIRST_HEIGHT
         while height < LARGEST_LIMIT:
