@@ -19,6 +19,8 @@ class Backtest:
     """What came of it.
 
     Attributes:
+        input: name of the input.
+        outputs: names of the outputs.
         rows: of samples.
         first_ns: time of the first sample; 0 without rows.
         last_ns: time of the last sample.
@@ -27,8 +29,11 @@ class Backtest:
         alarm_messages: every change of an alarm, in order.
         refused: counts by reason.
         notes: what people are to be told of the training.
+        left_out: signals that are not watched, each with the reason.
     """
 
+    input: str
+    outputs: tuple[str, ...]
     rows: int
     first_ns: int
     last_ns: int
@@ -37,6 +42,7 @@ class Backtest:
     alarm_messages: list[Alarm]
     refused: dict[str, int]
     notes: list[str]
+    left_out: dict[str, str]
 
     @property
     def raised(self) -> list[tuple[Alarm, int | None]]:
@@ -80,6 +86,8 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
             keep(publications)
     keep(monitor.finish())
     return Backtest(
+        input=config.input,
+        outputs=config.outputs,
         rows=monitor.rows,
         first_ns=monitor.first_ns or 0,
         last_ns=monitor.last_ns or 0,
@@ -88,4 +96,5 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
         alarm_messages=alarms,
         refused=dict(monitor.refusals.by_reason),
         notes=monitor.notes,
+        left_out=monitor.left_out,
     )

@@ -28,18 +28,25 @@ class ChartDesign:
     Args:
         config: of the monitor.
         learned: from the training, one an output.
-        e: the training's prewhitened residuals, shape (n, outputs), without NaN.
+        e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
+        judged: which outputs are judged; the others have charts of their own that nothing is fed to, and no part in
+            those of all outputs.
         arl0: run length of each alarm without a fault, in rows.
 
     Attributes:
         widths: of the Shewhart limits, one an output, in standard deviations.
     """
 
-    def __init__(self, config: MonitorConfig, learned: list[Prewhitening], e: Array, arl0: float) -> None:
-        self._config, self._learned, self._e, self._arl0 = config, learned, e, arl0
+    def __init__(
+        self, config: MonitorConfig, learned: list[Prewhitening], e: Array, judged: list[bool], arl0: float
+    ) -> None:
+        self._config, self._learned, self._arl0 = config, learned, arl0
         self._p = budget.point_probability(arl0, config.raise_count, config.window)
         self._memory = _long_memory(e, config.ewma_weight)
-        self._covariance = _correlation(e)
+        self._together = np.flatnonzero(judged)
+        e = e[:, self._together]
+        self._e = e[np.all(np.isfinite(e), axis=1)]
+        self._covariance = _correlation(self._e)
         self.widths = [budget.shewhart_width(self._p, item) for item in learned]
 
     def of_each(self, name: str) -> list[SignalChart]:
@@ -56,13 +63,14 @@ class ChartDesign:
 
     def of_all(self, name: str) -> VectorChart:
         """A chart of that name of all outputs together."""
-        weight, count = self._config.mewma_weight, len(self._learned)
-        mean = [0.0] * count
+        weight, count = self._config.mewma_weight, self._together.size
+        mean, learned = [0.0] * count, [self._learned[place] for place in self._together]
         if name == Mewma.name:
-            covariance = self._covariance * np.outer(self._memory, self._memory)
-            return Mewma(mean, covariance, weight, budget.joint_limit(self._arl0, count, weight, self._learned))
+            memory = np.array(self._memory)[self._together]
+            covariance = self._covariance * np.outer(memory, memory)
+            return Mewma(mean, covariance, weight, budget.joint_limit(self._arl0, count, weight, learned))
         if name == T2.name:
-            return T2(mean, self._covariance, budget.joint_limit(1.0 / self._p, count, 1.0, self._learned))
+            return T2(mean, self._covariance, budget.joint_limit(1.0 / self._p, count, 1.0, learned))
         model = PcaModel.fit(self._e, count - 1, self._p)
         return PcaT2(model) if name == PcaT2.name else PcaSpe(model)
 
@@ -86,6 +94,7 @@ def _long_memory(e: Array, weight: float) -> list[float]:
     """
     found = []
     for column in e.T:
+        column = column[np.isfinite(column)]
         average, squares = 0.0, 0.0
         for value in column.tolist():
             average += weight * (value - average)

@@ -12,6 +12,7 @@ A chart with a memory begins anew when its alarm is cleared, so that false alarm
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,22 +129,30 @@ class _OfEach:
 
 
 class _OfAll:
-    """A chart of all outputs together."""
+    """A chart of all outputs together.
 
-    def __init__(self, chart: VectorChart, signals: tuple[str, ...]) -> None:
-        self._chart, self._signals = chart, signals
+    Args:
+        chart: the chart.
+        signals: names of the outputs.
+        judged: which of them the chart looks at.
+    """
+
+    def __init__(self, chart: VectorChart, signals: tuple[str, ...], judged: list[bool]) -> None:
+        self._chart = chart
+        self._signals = tuple(compress(signals, judged))
+        self._judged = None if all(judged) else judged  # None: all
         self._last: list[float] = []
         self._judgement: Judgement | None = None
 
     @classmethod
-    def from_bytes(cls, name: str, data: bytes, signals: tuple[str, ...]) -> "_OfAll":
+    def from_bytes(cls, name: str, data: bytes, signals: tuple[str, ...], judged: list[bool]) -> "_OfAll":
         """The chart that goes on where it was."""
         if name == Mewma.name:
-            return cls(Mewma.from_state(MewmaState.from_bytes(data)), signals)
+            return cls(Mewma.from_state(MewmaState.from_bytes(data)), signals, judged)
         if name == T2.name:
-            return cls(T2.from_state(T2State.from_bytes(data)), signals)
+            return cls(T2.from_state(T2State.from_bytes(data)), signals, judged)
         model = PcaModel.from_bytes(data)
-        return cls(PcaT2(model) if name == PcaT2.name else PcaSpe(model), signals)
+        return cls(PcaT2(model) if name == PcaT2.name else PcaSpe(model), signals, judged)
 
     def to_bytes(self) -> bytes:
         """All that the chart is and remembers."""
@@ -151,6 +160,8 @@ class _OfAll:
 
     def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
         """Take a row in; whether the chart is out. A row in which an output is missing is left out."""
+        if self._judged is not None:
+            e, known = list(compress(e, self._judged)), list(compress(known, self._judged))
         if False in known or True in withheld:
             self._judgement = None
             return False
@@ -203,6 +214,8 @@ class ChartWatch:
             for pair in alarm_names(config)
         }
         self._watched: dict[str, _Watched] = {}
+        self._judged: list[bool] = []
+        self._chosen: list[ChartName] = []
         self._passed: list[float] = []
         self.widths: list[float] = []
         """Of the Shewhart limits, one an output, in standard deviations; they are shown about the predictions."""
@@ -213,22 +226,35 @@ class ChartWatch:
         ranks: tuple[PriorityName, ...] = ("low", "medium", "high", "critical")
         return max((self._config.priorities.get(name, "medium") for name in self._config.outputs), key=ranks.index)
 
+    def choose(self, judged: list[bool]) -> int:
+        """Choose the charts that can be made; returns how many alarms of theirs chance can raise.
+
+        Args:
+            judged: which outputs are judged.
+        """
+        self._judged = judged
+        count = sum(judged)
+        self._chosen = [
+            name for name in dict.fromkeys(pair[0] for pair in self._alarms) if name in OF_EACH or count > 1
+        ]
+        return sum(count if name in OF_EACH else 1 for name in self._chosen)
+
     def start(self, learned: list[Prewhitening], e: Array, arl0: float) -> None:
-        """Make the charts.
+        """Make the charts, after `choose`.
 
         Args:
             learned: from the training, one an output.
-            e: the training's prewhitened residuals, shape (n, outputs), without NaN.
+            e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
             arl0: run length of each alarm without a fault, in rows.
         """
         config = self._config
-        design = ChartDesign(config, learned, e, arl0)
+        design = ChartDesign(config, learned, e, self._judged, arl0)
         self.widths, self._passed = design.widths, [item.passed for item in learned]
 
         def made(name: str) -> _OfEach | _OfAll:
             if name in OF_EACH:
                 return _OfEach(name, Bank(design.of_each(name)), config.outputs, self._passed)
-            return _OfAll(design.of_all(name), config.outputs)
+            return _OfAll(design.of_all(name), config.outputs, self._judged)
 
         self._watch(made)
 
@@ -239,14 +265,14 @@ class ChartWatch:
         return ChartsState(charts, list(self.widths), list(self._passed))
 
     def restore(self, state: ChartsState) -> None:
-        """Go on, bit for bit, where charts of the same settings were when `state` was taken; after the board.
+        """Go on, bit for bit, where charts of the same settings were when `state` was taken; after board and `choose`.
 
         Raises:
             ValueError: the state is damaged.
         """
         signals = self._config.outputs
         self.widths, self._passed = list(state.widths), list(state.passed)
-        names = {chart for chart, _ in self._alarms}
+        names = set(self._chosen)
         if set(state.charts) != names or not len(self.widths) == len(self._passed) == len(signals):
             raise ValueError(f"there must be the charts {', '.join(sorted(names))}, got {', '.join(state.charts)}")
 
@@ -254,14 +280,14 @@ class ChartWatch:
             data = state.charts[name]
             if name in OF_EACH:
                 return _OfEach.from_bytes(name, data, signals, self._passed)
-            return _OfAll.from_bytes(name, data, signals)
+            return _OfAll.from_bytes(name, data, signals, self._judged)
 
         self._watch(made)
 
     def _watch(self, made: Callable[[str], _OfEach | _OfAll]) -> None:
         """Give the charts of each name their alarms and keys."""
         self._watched = {}
-        for name in dict.fromkeys(chart for chart, _ in self._alarms):
+        for name in self._chosen:
             pairs = [pair for pair in self._alarms if pair[0] == name]
             alarms = [self._alarms[pair] for pair in pairs]
             paths = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]

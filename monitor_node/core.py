@@ -22,6 +22,7 @@ from monitor_node.refusals import Refusals
 from monitor_node.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, unusable
 from monitor_node.sample_run import Held, SampleRun
 from monitor_node.told_again import ToldAgain
+from monitor_node.training import NO_VALUE
 from monitor_node.watch import PlantWatch
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
@@ -350,6 +351,12 @@ class Monitor:
     def expected_false_alarms(self) -> float:
         """Alarms that chance alone would have raised by now, on average."""
         return self._watch.expected_false_alarms
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """Signals that are not watched, each with the reason: those that never came and those not fit to be learned."""
+        never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
+        return dict.fromkeys(never_came, NO_VALUE) | self._watch.left_out
 
     @property
     def notes(self) -> list[str]:

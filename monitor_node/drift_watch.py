@@ -6,6 +6,7 @@ budget of false alarms.
 """
 
 from collections.abc import Callable
+from itertools import compress
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import Explanation
@@ -56,22 +57,26 @@ class DriftWatch:
         self.wanted = told or bool(self._alarms)
         """Whether the models have to adapt at all."""
 
-    @property
-    def chance_alarms(self) -> int:
-        """How many of its alarms chance can raise."""
-        return len(self._alarms)
+    def chance_alarms(self, judged: list[bool]) -> int:
+        """How many of its alarms chance can raise.
 
-    def start(self, predictors: list[ArxPredictor], arl0: float) -> list[str]:
+        Args:
+            judged: which outputs are judged.
+        """
+        return sum(judged) if self._alarms else 0
+
+    def start(self, predictors: list[ArxPredictor], judged: list[bool], arl0: float) -> list[str]:
         """Begin to compare; returns what people are to be told where that is not possible.
 
         Args:
             predictors: one an output, with references.
+            judged: which outputs are judged.
             arl0: run length of each alarm without a fault, in rows.
         """
         notes: list[str] = []
         if not self.wanted:
             return notes
-        for signal, predictor in zip(self._outputs, predictors, strict=True):
+        for signal, predictor in compress(zip(self._outputs, predictors, strict=True), judged):
             try:
                 predictor.compare(arl0)
             except InputError as error:

@@ -20,7 +20,7 @@ from monitor_node.watch_state import WatchState
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 
-MAGIC, VERSION = b"reactorwatch monitor", 1
+MAGIC, VERSION = b"reactorwatch monitor", 2
 _DIGEST_BYTES = 16
 _HEAD_BYTES = len(MAGIC) + 2
 

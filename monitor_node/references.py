@@ -205,8 +205,8 @@ class ProcessReference:
 
 def _typical(sds: Array) -> list[float]:
     """What each column mostly is; 1 where it is not known."""
-    typical: list[float] = np.nan_to_num(np.nanmedian(sds, axis=0), nan=1.0).tolist()
-    return typical
+    known = [column[np.isfinite(column)] for column in sds.T]
+    return [float(np.median(column)) if column.size else 1.0 for column in known]
 
 
 class ArxReference:

@@ -52,6 +52,9 @@ class SignalWatch:
         stuck: which outputs' sensors are stuck: what they show is no measurement.
     """
 
+    CHANCE_ALARMS = 2
+    """Alarms of one output that chance can raise."""
+
     def __init__(self, config: MonitorConfig, board: AlarmBoard) -> None:
         self._board = board
         outputs = config.outputs
@@ -71,16 +74,16 @@ class SignalWatch:
         self._none = (False,) * len(outputs)
         self._note_stuck()
 
-    @staticmethod
-    def chance_alarms(config: MonitorConfig) -> int:
-        """How many of its alarms chance can raise."""
-        return 2 * len(config.outputs)
+    @property
+    def silent(self) -> list[bool]:
+        """Which signals are silent, the input first."""
+        return [silence.standing for silence in self._silences[1:]]
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """Learn from the training.
 
         Args:
-            values: readings of each output, in order of time; NaN where missing.
+            values: readings of each output, in order of time; NaN where missing, and in all of an output left out.
             e: prewhitened residuals of each output; NaN where there are none.
             arl0: run length of each alarm without a fault, in rows.
         """
@@ -143,8 +146,10 @@ class SignalWatch:
             publications += self._tell(0, change)
             for silence in silences[1:]:
                 silence.excuse(time_ns)
+        is_complete = all(value == value for value in values)  # NaN is not equal to itself
+        unknown_ns = None if is_complete else silences[0].unknown_allowed_ns()
         for index, value in enumerate(values, start=1):
-            change = silences[index].update(time_ns, present=value == value)  # NaN is not equal to itself
+            change = silences[index].update(time_ns, present=value == value, unknown_allowed_ns=unknown_ns)
             if change is not NOTHING:
                 publications += self._tell(index, change)
         return publications

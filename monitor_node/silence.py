@@ -13,14 +13,17 @@ samples, as in the retransmission timer of Jacobson (1988), Congestion avoidance
 are allowed `limit` periods; irregular ones and those that arrive in bursts more, by themselves. A silence is learned as
 no more than what was allowed, so that one does not spoil what was known; and yet a plant that goes on more slowly is
 taken as it is after two or three. In receipt time it is never less than `least_s`, within which networks and computers
-may hold anything up. Until `LEARN_FROM` spacings are known, nothing is silent.
+may hold anything up. Until `LEARN_FROM` spacings are known, the plant is not silent.
 
 If the transport held samples up and the plant was never silent, the live alarm is cleared by the next row, as soon as
 it was raised, and a replay, rightly, does not have it.
 
 One `Silence` watches the plant: every row is a sign of life, and so is every sample received. One more a signal watches
 that signal in the rows, which go on without it, with NaN: a dead sensor. A gap in all rows is no fault of any single
-sensor, so these are excused then, and only one alarm is raised:
+sensor, so these are excused then, and only one alarm is raised.
+
+A signal of which fewer than `LEARN_FROM` spacings are known, or that has never come at all, is measured by the plant's
+rows: it is silent after `UNKNOWN_ROWS` of their usual spacings without a value.
 
 >>> from math import isnan, nan
 >>> plant, sensor = Silence(), Silence()
@@ -51,6 +54,10 @@ LEARN_FROM = 32
 
 MEMORY = 32
 """Spacings over which the usual one is forgotten."""
+
+UNKNOWN_ROWS = 100.0
+"""Usual spacings of the plant's rows within which every signal has to come. An analyser may give one value in fifty
+rows; a signal that does not come within these is not published, or its sensor is dead."""
 
 DEVIATIONS = 2.0
 """Mean deviations that a usual spacing may be longer than the mean."""
@@ -98,6 +105,10 @@ class Spacing(msgspec.Struct, forbid_unknown_fields=True):
         if self.count < LEARN_FROM:
             return None
         return int(limit * (self.mean_ns + DEVIATIONS * self.deviation_ns))
+
+    def usual_ns(self) -> float | None:
+        """Usual spacing; None while too little is known."""
+        return None if self.count < LEARN_FROM else self.mean_ns + DEVIATIONS * self.deviation_ns
 
     @property
     def steady_ns(self) -> float | None:
@@ -179,7 +190,12 @@ class Silence:
 
     # --- in the time of the samples --------------------------------------------------------------------------
 
-    def update(self, time_ns: int, *, present: bool) -> Change:
+    def unknown_allowed_ns(self) -> int | None:
+        """How long a signal of which too little is known may be missing, if this is the plant; None: not known yet."""
+        usual_ns = self._rows.usual_ns()
+        return None if usual_ns is None else int(max(UNKNOWN_ROWS, self._limit) * usual_ns)
+
+    def update(self, time_ns: int, *, present: bool, unknown_allowed_ns: int | None = None) -> Change:
         """Take the next row in.
 
         A row that is not later than the last sample means that the plant's clock was set back: spacings are counted
@@ -188,6 +204,7 @@ class Silence:
         Args:
             time_ns: of the row.
             present: whether what is watched has a value in it.
+            unknown_allowed_ns: how long it may be missing while its own spacing is not known; None: for ever.
         """
         last_ns = self._last_ns
         if last_ns is None or time_ns <= last_ns:
@@ -198,6 +215,8 @@ class Silence:
             self._last_ns = time_ns  # there is nothing to learn
             return NOTHING
         allowed_ns = rows.allowed_ns(self._limit)
+        if allowed_ns is None and unknown_allowed_ns is not None:
+            allowed_ns = max(unknown_allowed_ns, int(self._limit * rows.mean_ns))
         raised_ns = None
         if allowed_ns is not None and spacing_ns > allowed_ns and not self.standing:
             self.standing, raised_ns = True, last_ns + allowed_ns

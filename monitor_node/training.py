@@ -4,6 +4,9 @@ The rows are kept until the training ends. Then the filter of the process model 
 model is taken, whichever the settings ask for; stretches that were themselves disturbed are left out; and the residuals
 that remain teach what is normal. A training of which too much is disturbed is refused, and begins anew. After
 `MOST_REFUSALS` the next one is taken whole: a plant that never rests has to be watched as well.
+
+A signal that does not come, or of which too little can be learned, is left out with the reason, and the others are
+watched. Without values of the input the identified models predict each output from its own past alone.
 """
 
 from collections import deque
@@ -18,6 +21,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.predictor import ArxPredictor
 from monitor_node.prewhitening import Prewhitening, learn
 from monitor_node.references import ArxReference, ProcessReference, Reference, tuned
+from monitor_node.sampling import TOLERANCE
 from monitor_node.stored_state import StoredState, packed, packed_times, unpacked, unpacked_times
 from monitor_node.undisturbed import Undisturbed, undisturbed
 from reactorwatch.contract.messages_pb2 import Check
@@ -43,16 +47,24 @@ AS_WELL = 1.5
 identified one. The doubt is in its favour: where the input goes beyond the training, it still holds."""
 
 
+NO_VALUE = "no value of it has come"
+"""Why a signal that never came is left out."""
+
+NOTHING_LEARNED = Prewhitening(0.0, (), 1.0, FEWEST_ROWS, 0.5 / FEWEST_ROWS, 0.0)
+"""Stands for an output that is left out: no value of it is judged."""
+
+
 class Trained(NamedTuple):
     """What a training came to.
 
     Attributes:
         reference: that rows are expected by from now on.
         learned: what chance does to its residuals, one an output.
-        e: those residuals, prewhitened, shape (n, outputs), of rows that are complete.
+        e: those residuals, prewhitened, shape (n, outputs); NaN where there is none.
         measured: the outputs in rows that were not disturbed, shape (n, outputs); NaN elsewhere.
         checks: what can be said of the training, for people.
         refused: why it has to begin anew; empty if it is fit.
+        left_out: signals that cannot be watched, each with the reason.
     """
 
     reference: Reference
@@ -61,6 +73,7 @@ class Trained(NamedTuple):
     measured: Array
     checks: list[Check]
     refused: str
+    left_out: dict[str, str]
 
 
 class TrainingState(StoredState, frozen=True):
@@ -127,10 +140,14 @@ class Training:
         for index, value in enumerate(values):
             self._known[index] += isfinite(value)
 
-    @property
-    def enough(self) -> bool:
-        """Whether there are enough rows to learn from."""
-        return min(self._known) >= FEWEST_ROWS
+    def is_enough(self, silent: list[bool]) -> bool:
+        """Whether there are enough rows to learn from; outputs that are silent are not waited for.
+
+        Args:
+            silent: one an output.
+        """
+        counts = [known for known, is_silent in zip(self._known, silent, strict=True) if not is_silent]
+        return min(counts, default=0) >= FEWEST_ROWS
 
     def finish(self, *, last_chance: bool) -> Trained:
         """Learn; the rows are then forgotten.
@@ -142,25 +159,39 @@ class Training:
         time_min = np.array([row[0] for row in rows]) / MINUTE_NS
         inputs = np.array([row[1] for row in rows])
         measured = np.array([row[2] for row in rows])
+        outputs = self._config.outputs
+        left_out = _too_few_values(outputs, measured)
+        measured[:, [name in left_out for name in outputs]] = np.nan
         reference, z, found = self._reference(time_min, inputs, measured)
-        refused = _refused(self._config.outputs, z, found)
-        if refused and last_chance and _enough(z):
+        if isinstance(reference, ArxReference) and (why := _too_few_values((self._config.input,), inputs[:, None])):
+            left_out |= why
+        left_out |= _too_few_residuals(outputs, z, left_out)
+        judged = [name not in left_out for name in outputs]
+        refused = _refused(outputs, found, judged) if any(judged) else "; ".join(dict.fromkeys(left_out.values()))
+        if refused and last_chance and any(judged):
             refused, found = "", [Undisturbed(np.isfinite(column), [], [], 0) for column in z.T]
-        usable = np.column_stack([item.usable for item in found])
+        usable = np.column_stack([item.usable for item in found]) & np.array(judged)
         z = np.where(usable, z, np.nan)
         smallest = _smallest(self._config, reference)
-        learned = [learn(column, sd) for column, sd in zip(z.T, smallest, strict=True)]
+        learned = [
+            learn(column, sd) if is_judged else NOTHING_LEARNED
+            for column, sd, is_judged in zip(z.T, smallest, judged, strict=True)
+        ]
         e = np.column_stack([_whitened(column, item) for column, item in zip(z.T, learned, strict=True)])
-        complete = e[np.all(np.isfinite(e), axis=1)]
-        checks = [Check(name="training", result=refused or _left_out(self._config.outputs, time_min, found) or "ok")]
-        return Trained(reference, learned, complete, np.where(usable, measured, np.nan), checks, refused)
+        checks = [Check(name="training", result=refused or _left_out(outputs, time_min, found, judged) or "ok")]
+        checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
+        return Trained(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
 
     def _reference(self, time_min: Array, inputs: Array, measured: Array) -> tuple[Reference, Array, list[Undisturbed]]:
         """The reference, its residuals in its own standard deviations, and what can be learned from them."""
         smallest = [MINOR * sd for sd in _smallest(self._config, None)]
-        identified, found = _twice(lambda rows: self._identified(time_min, inputs, rows), measured, smallest)
-        if self._model is None:
-            return ArxReference(inputs), identified, found
+        known_input = inputs
+        if np.count_nonzero(np.isfinite(inputs)) < FEWEST_ROWS:
+            known_input = np.zeros(inputs.size)
+            self._predict_without_input(time_min, measured)
+        identified, found = _twice(lambda rows: self._identified(time_min, known_input, rows), measured, smallest)
+        if self._model is None or not np.isfinite(inputs).any():
+            return ArxReference(known_input), identified, found
         process: list[ProcessReference] = []
 
         def innovations(rows: Array) -> Array:
@@ -171,7 +202,17 @@ class Training:
         residuals = z * np.array(process[-1].typical_sd)
         if self._config.reference == "process" or _as_well(residuals, identified):
             return process[-1], z, found_by_process
-        return ArxReference(inputs), identified, found
+        return ArxReference(known_input), identified, found
+
+    def _predict_without_input(self, time_min: Array, measured: Array) -> None:
+        """Let the identified models learn the rows once more, with an input that never moves."""
+        spacings = np.diff(time_min, prepend=np.nan)
+        period = float(np.nanmedian(spacings)) if spacings.size > 1 else 0.0
+        follows = (np.abs(spacings - period) <= TOLERANCE * period).tolist()
+        times_ns = [round(minutes * MINUTE_NS) for minutes in time_min.tolist()]
+        for predictor, column in zip(self._predictors, measured.T.tolist(), strict=True):
+            for time_ns, value, is_next in zip(times_ns, column, follows, strict=True):
+                predictor.put_by(time_ns, 0.0, value, follows=is_next)
 
     def _identified(self, time_min: Array, inputs: Array, measured: Array) -> Array:
         """The residuals of the identified models."""
@@ -231,23 +272,40 @@ def _as_well(process: Array, identified: Array) -> bool:
     return True
 
 
-def _enough(z: Array) -> bool:
-    return bool(np.min(np.count_nonzero(np.isfinite(z), axis=0)) >= FEWEST_ROWS)
+def _too_few_values(names: tuple[str, ...], columns: Array) -> dict[str, str]:
+    """Signals that hardly ever came, each with the reason."""
+    counts = np.count_nonzero(np.isfinite(columns), axis=0).tolist()
+    return {
+        name: NO_VALUE
+        if not count
+        else f"only {count} of {len(columns)} rows have a value of it, {FEWEST_ROWS} are needed"
+        for name, count in zip(names, counts, strict=True)
+        if count < FEWEST_ROWS
+    }
 
 
-def _refused(outputs: tuple[str, ...], z: Array, found: list[Undisturbed]) -> str:
-    if not _enough(z):
-        return (
-            f"of too few rows could be told what to expect, {FEWEST_ROWS} are needed: do rows come one by one period?"
-        )
-    refused = [name for name, item in zip(outputs, found, strict=True) if item.refused]
+def _too_few_residuals(outputs: tuple[str, ...], z: Array, left_out: dict[str, str]) -> dict[str, str]:
+    """Outputs that came, but could hardly ever be predicted, each with the reason."""
+    counts = np.count_nonzero(np.isfinite(z), axis=0).tolist()
+    return {
+        name: f"of too few rows could be told what to expect of {name}, {count} of {len(z)} where {FEWEST_ROWS} are "
+        "needed: do rows come one by one period?"
+        for name, count in zip(outputs, counts, strict=True)
+        if count < FEWEST_ROWS and name not in left_out
+    }
+
+
+def _refused(outputs: tuple[str, ...], found: list[Undisturbed], judged: list[bool]) -> str:
+    refused = [name for name, item, is_judged in zip(outputs, found, judged, strict=True) if item.refused and is_judged]
     return f"more than a third of it was disturbed in {' and '.join(refused)}" if refused else ""
 
 
-def _left_out(outputs: tuple[str, ...], time_min: Array, found: list[Undisturbed]) -> str:
+def _left_out(outputs: tuple[str, ...], time_min: Array, found: list[Undisturbed], judged: list[bool]) -> str:
     """What was left out, for people; empty if nothing was."""
     told = []
-    for name, item in zip(outputs, found, strict=True):
+    for name, item, is_judged in zip(outputs, found, judged, strict=True):
+        if not is_judged:
+            continue
         for (first, last), shift in zip(item.stretches, item.shifts, strict=True):
             digits = max(0, 2 - int(log10(max(time_min[-1] - time_min[0], 1.0))))
             since, until = time_min[first] - time_min[0], time_min[last] - time_min[0]

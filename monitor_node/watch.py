@@ -12,7 +12,7 @@ from math import isfinite, nan
 from monitor_node import false_alarm_budget
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alignment import Row
-from monitor_node.chart_watch import ChartWatch, alarm_names
+from monitor_node.chart_watch import ChartWatch
 from monitor_node.config import MonitorConfig
 from monitor_node.drift_watch import DriftWatch
 from monitor_node.predictor import ArxPredictor
@@ -21,7 +21,7 @@ from monitor_node.references import ArxReference, ArxReferenceState, ProcessRefe
 from monitor_node.sampling import SamplingPeriod
 from monitor_node.signal_watch import SignalWatch
 from monitor_node.suspicion import Suspicion
-from monitor_node.training import MOST_REFUSALS, Trained, Training
+from monitor_node.training import MOST_REFUSALS, NO_VALUE, Trained, Training
 from monitor_node.watch_state import WatchedState, WatchState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
@@ -48,6 +48,7 @@ class PlantWatch:
         model: that the plant may be watched by; None: there is none.
         notes: what people are to be told, oldest first; whoever tells them empties it.
         rows_watched: rows that were judged.
+        left_out: signals that are not watched, each with the reason; known when the training ends.
         signals: the watch over the signals themselves.
     """
 
@@ -62,7 +63,7 @@ class PlantWatch:
         self._charts = ChartWatch(config, board)
         self.signals = SignalWatch(config, board)
         self._drift = DriftWatch(config, board, told=points)
-        self._chance_alarms = len(alarm_names(config)) + self.signals.chance_alarms(config) + self._drift.chance_alarms
+        self._chance_alarms = 0
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
         self._refusals = 0
@@ -73,9 +74,11 @@ class PlantWatch:
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
         self._withheld = (False,) * len(config.outputs)
+        self._judged = [True] * len(config.outputs)
         self._begin_training(None)
         self.notes: list[str] = []
         self.rows_watched = 0
+        self.left_out: dict[str, str] = {}
 
     # --- what survives a restart -----------------------------------------------------------------------------
 
@@ -96,6 +99,7 @@ class PlantWatch:
         return WatchedState(
             reference.state,
             [(check.name, check.result) for check in self._checks],
+            dict(self.left_out),
             [whitener.state for whitener in self._whiteners],
             self._charts.state,
             None if self._suspicion is None else self._suspicion.state,
@@ -130,6 +134,7 @@ class PlantWatch:
         outputs = len(self._config.outputs)
         if not len(learned) == len(watched.withheld) == outputs:
             raise ValueError(f"the state must be of {outputs} outputs, got {len(learned)}")
+        self._leave_out(watched.left_out)
         self._judge_by(self._reference_of(watched.reference), learned, watched.arl0)
         self._whiteners = [Prewhitener.from_state(item) for item in watched.whiteners]
         self._charts.restore(watched.charts)
@@ -213,7 +218,7 @@ class PlantWatch:
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
         trained_min = (time_ns - self._began_ns) / MINUTE_NS
-        if trained_min >= config.training_min and self._training.enough:
+        if trained_min >= config.training_min and self._training.is_enough(self.signals.silent[1:]):
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
                 self._refusals += 1
@@ -238,7 +243,18 @@ class PlantWatch:
                 if isfinite(residual):
                     publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
 
+    def _leave_out(self, left_out: dict[str, str]) -> None:
+        """Watch all signals but these."""
+        self.left_out = dict(left_out)
+        self._judged = [name not in left_out for name in self._config.outputs]
+        self._chance_alarms = (
+            self._charts.choose(self._judged)
+            + SignalWatch.CHANCE_ALARMS * sum(self._judged)
+            + self._drift.chance_alarms(self._judged)
+        )
+
     def _start(self, trained: Trained) -> None:
+        self._leave_out(trained.left_out)
         arl0 = false_alarm_budget.share_arl0(
             self._config.false_alarms_per_30_days, self._chance_alarms, self._sampling.period_ns / MINUTE_NS
         )
@@ -247,7 +263,7 @@ class PlantWatch:
         self._whiteners = [Prewhitener(item) for item in trained.learned]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
-        self.notes += self._drift.start(self._predictors, self._arl0)
+        self.notes += self._drift.start(self._predictors, self._judged, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
 
@@ -273,6 +289,10 @@ class PlantWatch:
     ) -> None:
         reference = self._reference
         assert reference is not None
+        if self.left_out:
+            self._note_late_signals(input_value, values)
+            input_value = 0.0 if self._config.input in self.left_out else input_value  # as in the training
+            values = [value if judged else nan for value, judged in zip(values, self._judged, strict=True)]
         publications.extend(self.signals.look(time_ns, values, units))
         stuck = self.signals.stuck
         if True in stuck:
@@ -310,6 +330,15 @@ class PlantWatch:
         publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._suspicion.update(time_ns, input_value, values, units, stuck))
+
+    def _note_late_signals(self, input_value: float, values: list[float]) -> None:
+        """Say once of each signal that was left out for want of values that it comes now."""
+        for name, value in zip((self._config.input, *self._config.outputs), (input_value, *values), strict=True):
+            if self.left_out.get(name) == NO_VALUE and isfinite(value):
+                self.left_out[name] = "its first value came after the training"
+                self.notes.append(
+                    f"{name} comes now, and is not watched: start the monitor without its state to learn it"
+                )
 
     def _estimates(
         self,

@@ -17,6 +17,7 @@ class WatchedState(StoredState, frozen=True):
     Attributes:
         reference: that rows are expected by.
         checks: what was said of the training: name and result of each.
+        left_out: signals that are not watched, each with the reason.
         whiteners: one an output.
         charts: all of them.
         suspicion: None: causes are not looked for.
@@ -28,6 +29,7 @@ class WatchedState(StoredState, frozen=True):
 
     reference: ProcessReferenceState | ArxReferenceState
     checks: list[tuple[str, str]]
+    left_out: dict[str, str]
     whiteners: list[PrewhitenerState]
     charts: ChartsState
     suspicion: SuspicionState | None

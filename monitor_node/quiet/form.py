@@ -159,7 +159,7 @@ class QuietForm:
         state = monitor.state
         watched, alignment = state.watch.watched, state.alignment
         board = msgspec.msgpack.decode(state.board, type=BoardState)
-        if watched is None or not isinstance(watched.reference, ProcessReferenceState):
+        if watched is None or watched.left_out or not isinstance(watched.reference, ProcessReferenceState):
             return None
         if not _is_at_rest(board, self._alarms) or not is_in_order(alignment) or not run_on(state.runs, alignment):
             return None
@@ -262,6 +262,7 @@ class QuietForm:
         watched = WatchedState(
             reference_of(p, len(self._model.states)),
             list(rest.checks),
+            {},
             [whitener_of(p, place) for place in outputs],
             self._charts(p),
             looked,

@@ -13,6 +13,7 @@ from reactorwatch.cli.batch import Answer, Kind, Row, as_table
 from reactorwatch.cli.options import existing_recording
 from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.sources import messages, plant_of, zero_of
+from reactorwatch.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -69,11 +70,14 @@ def answer(job: Job) -> Answer:
     """Run the monitor over a file.
 
     Raises:
-        InputError: the file cannot be read, or settings do not fit together.
+        InputError: the file cannot be read or has no value of any output, or settings do not fit together.
     """
     plant = plant_of(existing_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
     result = run(messages(job.at, plant, job.columns), settings)
+    if set(settings.outputs) <= result.left_out.keys():
+        reasons = "; ".join(f"{name}: {result.left_out[name]}" for name in settings.outputs)
+        raise InputError(f"{job.at}: there is no output to watch ({reasons})")
     zero_ns = zero_of(job.at, result.first_ns)
     found = backtest_object(result, zero_ns)
     if job.as_json:

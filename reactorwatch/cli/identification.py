@@ -1,6 +1,7 @@
 """`identify`: what a record says of a linear model, for machines and for people."""
 
 import msgspec
+import numpy as np
 
 from monitor_node.identification.families import Arx, Family, OutputError
 from monitor_node.identification.identify import Identification
@@ -32,8 +33,7 @@ def one(
     """
     found = identify_model(
         measured.time_min,
-        measured.columns[INPUT],
-        _column(measured, output),
+        *_columns(measured, output),
         model=model,
         order=order,
         delay=delay,
@@ -59,8 +59,7 @@ def compare(measured: Record, output: str, order: int, delay: int, *, neural: bo
     if order < 1:
         raise InputError(f"order must be at least 1, got {order}")
     selection = select(
-        measured.columns[INPUT],
-        _column(measured, output),
+        *_columns(measured, output),
         measured.time_min,
         families=families,
         orders=range(1, order + 1),
@@ -69,10 +68,18 @@ def compare(measured: Record, output: str, order: int, delay: int, *, neural: bo
     return _selection_json(selection, output) if as_json else f"{selection.table()}\n\n{selection.reason}"
 
 
-def _column(measured: Record, output: str) -> Array:
+def _columns(measured: Record, output: str) -> tuple[Array, Array]:
+    """Values of the input and of the output.
+
+    Raises:
+        InputError: there is no such output, or one of the two has no value.
+    """
     if output not in ("C", "T"):
         raise InputError(f"--output must be C or T, got {output!r}")
-    return measured.columns[output]
+    for signal in (INPUT, output):
+        if not np.isfinite(measured.columns[signal]).any():
+            raise InputError(f"{measured.name}: {signal} has no measured value, so no model of {output} can be fitted")
+    return measured.columns[INPUT], measured.columns[output]
 
 
 def _selection_json(selection: Selection, output: str) -> str:

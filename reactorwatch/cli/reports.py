@@ -27,6 +27,11 @@ def backtest_object(result: Backtest, zero_ns: int) -> dict[str, Any]:
         "span_min": to_minutes(result.last_ns, result.first_ns),
         "trained_until_min": minutes(result.watching_since_ns),
         "expected_false_alarms": float(f"{result.expected_false_alarms:.3g}"),
+        "signals": {
+            "inputs": [name for name in (result.input,) if name not in result.left_out],
+            "outputs": [name for name in result.outputs if name not in result.left_out],
+            "left_out": [{"signal": name, "why": why} for name, why in result.left_out.items()],
+        },
         "alarms": [
             {
                 "alarm": alarm.alarm,
@@ -50,6 +55,7 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     """The same for people."""
     said = backtest_object(result, zero_ns)
     lines = [f"{file}: {said['samples']} rows over {said['span_min']:g} min"]
+    lines += [f"  {name} is not watched: {why}" for name, why in result.left_out.items()]
     if said["trained_until_min"] is None:
         lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
     else:
