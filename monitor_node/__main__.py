@@ -109,6 +109,8 @@ class MonitorNode(Monitor):
                 )
         while self.notes:
             log.warning(self.notes.pop(0))
+        while self.failures.tracebacks:
+            log.debug("traceback", traceback=self.failures.tracebacks.pop(0))
         if self._alarm_file is not None:
             self._try(self._alarm_file.store)
         if self._file is not None and self._file.is_due(now_ns):

@@ -15,6 +15,7 @@ from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarm_commands import obey
 from monitor_node.alignment import Aligner, Row
 from monitor_node.config import MonitorConfig
+from monitor_node.failures import Failures
 from monitor_node.health import NODE, health_of
 from monitor_node.monitor_state import MonitorState, opened, sealed, settings_of
 from monitor_node.receipt import HEARD_AGAIN_NS, STALL_NS, Receipt
@@ -46,6 +47,7 @@ class Monitor:
 
     Attributes:
         refusals: what could not be used.
+        failures: errors of this software in the work on the plant.
         alarms: of the plant.
         first_ns: time of the first row; None before it.
         last_ns: time of the last row; None before the first.
@@ -60,6 +62,7 @@ class Monitor:
         self._points, self._model = points, model
         self._settings: dict[str, Any] | None = None
         self.refusals = Refusals()
+        self.failures = Failures()
         self._signals = (config.input, *config.outputs)
         self._signal_by_key = {keys.key(config.plant, keys.SAMPLE, signal): signal for signal in self._signals}
         self._places = {signal: place for place, signal in enumerate(self._signals)}
@@ -67,7 +70,7 @@ class Monitor:
         self._runs = [SampleRun() for _ in self._signals]
         self._told_again: ToldAgain | None = None
         self.alarms = AlarmBoard(config)
-        self._watch = PlantWatch(config, self.alarms, points=points, model=model)
+        self._watch = self._new_watch(self.alarms)
         self._units = dict.fromkeys(self._signals, "")
         self._heard_from_ns: dict[str, int] = {}
         self._output_units = [""] * len(config.outputs)
@@ -182,7 +185,7 @@ class Monitor:
         if self._ticked and now_ns - self._due_ns() > STALL_NS:
             self._stalls += 1
         self._ticked = True
-        publications = self._watch.signals.check(now_ns)
+        publications = self._check_silence(now_ns)
         self._published += len(publications)
         if now_ns >= self._health_due_ns:
             self._health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
@@ -245,6 +248,7 @@ class Monitor:
             self.received,
             self._published,
             self.refusals.by_reason,
+            self.failures.by_stage,
         )
 
     def restore(self, state: MonitorState) -> None:
@@ -255,7 +259,7 @@ class Monitor:
         """
         board = AlarmBoard(self.config)
         try:
-            watch = PlantWatch(self.config, board, points=self._points, model=self._model)
+            watch = self._new_watch(board)
             board.from_bytes(state.board)
             watch.restore(state.watch, self._start_ns)
         except ValueError as error:
@@ -269,6 +273,7 @@ class Monitor:
         self._watching_since_ns, self._snapshot_due_ns = state.watching_since_ns, state.snapshot_due_ns
         self.received, self._published = state.received, state.published
         self.refusals.by_reason = state.refused
+        self.failures.restore(state.failures)
 
     def _learned_with(self) -> dict[str, Any]:
         if self._settings is None:
@@ -361,7 +366,10 @@ class Monitor:
     @property
     def notes(self) -> list[str]:
         """What people are to be told of the training; whoever tells them empties it."""
-        return self._watch.notes
+        notes, failures = self._watch.notes, self.failures.notes
+        notes += failures
+        failures.clear()
+        return notes
 
     # --- what a recording tells beside the samples -----------------------------------------------------------
 
@@ -399,14 +407,49 @@ class Monitor:
         if self.first_ns is None or time_ns < self.first_ns:
             self.first_ns = time_ns
         self.last_ns = time_ns
-        self._watch.update(row, self._output_units, publications)
-        publications.extend(self.alarms.end_row(time_ns))
+        try:
+            self._watch.update(row, self._output_units, publications)
+            publications.extend(self.alarms.end_row(time_ns))
+        except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
+            self._start_again("row", error)
         if self._watching_since_ns is None and self._watch.watching:
             self._watching_since_ns = time_ns
         if due_ns is None or not 0 <= due_ns - time_ns <= self._snapshot_ns:
-            if due_ns is not None:
-                publications.extend(self._watch.snapshots(time_ns))
             self._snapshot_due_ns = time_ns + self._snapshot_ns
+            if due_ns is not None:
+                publications.extend(self._snapshots(time_ns))
+
+    def _snapshots(self, time_ns: int) -> list[Publication]:
+        try:
+            return self._watch.snapshots(time_ns)
+        except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
+            self._start_again("models", error)
+            return []
+
+    def _check_silence(self, now_ns: int) -> list[Publication]:
+        try:
+            return self._watch.signals.check(now_ns)
+        except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
+            self._start_again("silence", error)
+            return []
+
+    # --- after an error of this software ---------------------------------------------------------------------
+
+    def _new_watch(self, board: AlarmBoard) -> PlantWatch:
+        return PlantWatch(self.config, board, points=self._points, model=self._model, failures=self.failures)
+
+    def _start_again(self, stage: str, error: Exception) -> None:
+        """Contain an error: count it and learn the plant again, as its memory may be inconsistent.
+
+        The alarms stay as they are; an active one is cleared when it is found to be over.
+        """
+        self.failures.add(stage, error, "the plant is learned again, its alarms stay")
+        alarms = self.alarms.all_alarms()
+        notes, receipts_ns = self._watch.notes, self._watch.signals.receipts_ns
+        self._watch = self._new_watch(self.alarms)
+        self._watch.notes, self._watch.signals.receipts_ns = notes, receipts_ns
+        self._watching_since_ns = None
+        self.go_on_from_alarms(alarms)
 
     def _health(self, now_ns: int, phase: str) -> Publication:
         health = health_of(
@@ -421,6 +464,7 @@ class Monitor:
             heard_from_ns=self._heard_from_ns,
             not_stored=self.not_stored,
             stalls=self._stalls,
+            failures=self.failures.by_stage,
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

@@ -22,6 +22,7 @@ def health_of(
     heard_from_ns: Mapping[str, int],
     not_stored: int,
     stalls: int,
+    failures: Mapping[str, int],
 ) -> Health:
     """How a plant's monitor does.
 
@@ -37,6 +38,7 @@ def health_of(
         heard_from_ns: by signal, the time of its first sample.
         not_stored: how often what is remembered could not be stored.
         stalls: how often the clock was looked at more than a second late.
+        failures: number of contained errors of this software, by stage.
     """
     return Health(
         time_ns=now_ns,
@@ -58,4 +60,5 @@ def health_of(
         heard_from_ns=heard_from_ns,
         not_stored=not_stored,
         stalls=stalls,
+        failures=failures,
     )

@@ -11,7 +11,7 @@ same fault some rows later, the fit goes on from where it was.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from math import inf, log, pi, sqrt
+from math import inf, isfinite, log, pi, sqrt
 
 import numpy as np
 
@@ -259,7 +259,8 @@ def _begun(scan: Scan, window: Window) -> list[Fit]:
     log_volume = np.log(np.sum(likely / np.sqrt(1.0 + values)[:, None], axis=0) / window.span_min)
     found = []
     for number, place in enumerate(places.tolist()):
-        if information[place, number] > 0.0:
+        # A filter that was far off may leave numbers that overflow: of such a hypothesis nothing can be said.
+        if information[place, number] > 0.0 and isfinite(log_volume[number] + ratio[place, number]):
             onset_min = float(scan.onset_min[place])
             is_ramp = PROFILES[number // (ratio.shape[1] // len(PROFILES))] is RAMP
             span = float(window.time_min[scan.rows - 1]) - onset_min if is_ramp else 1.0

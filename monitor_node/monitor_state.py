@@ -50,6 +50,7 @@ class MonitorState(StoredState, frozen=True):
         received: messages so far.
         published: likewise.
         refused: by reason, likewise.
+        failures: contained errors of this software, by stage.
     """
 
     settings: dict[str, Any]
@@ -66,6 +67,7 @@ class MonitorState(StoredState, frozen=True):
     received: int
     published: int
     refused: dict[str, int]
+    failures: dict[str, int] = msgspec.field(default_factory=dict)
 
 
 def settings_of(config: MonitorConfig, model: ProcessModel | None, *, points: bool) -> dict[str, Any]:

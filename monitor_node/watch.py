@@ -15,6 +15,7 @@ from monitor_node.alignment import Row
 from monitor_node.chart_watch import ChartWatch
 from monitor_node.config import MonitorConfig
 from monitor_node.drift_watch import DriftWatch
+from monitor_node.failures import Failures
 from monitor_node.predictor import ArxPredictor
 from monitor_node.prewhitening import Prewhitener, Prewhitening
 from monitor_node.references import ArxReference, ArxReferenceState, ProcessReference, ProcessReferenceState, Reference
@@ -40,6 +41,7 @@ class PlantWatch:
         board: the alarms of the plant.
         points: whether estimates, charts' points and models are to be published.
         model: as for `Monitor`.
+        failures: where errors of the search for causes are counted; None: in an object of its own.
 
     Raises:
         InputError: the settings ask for the process model of a plant that it is not of.
@@ -53,9 +55,16 @@ class PlantWatch:
     """
 
     def __init__(
-        self, config: MonitorConfig, board: AlarmBoard, *, points: bool = True, model: ProcessModel | None = None
+        self,
+        config: MonitorConfig,
+        board: AlarmBoard,
+        *,
+        points: bool = True,
+        model: ProcessModel | None = None,
+        failures: Failures | None = None,
     ) -> None:
         self._config = config
+        self._failures = Failures() if failures is None else failures
         self._board = board
         self._points = points
         self.model = _model(config, model)
@@ -269,11 +278,29 @@ class PlantWatch:
 
     def _judge_by(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
         """From now on rows are judged by this reference."""
-        config = self._config
         self._reference, self._arl0 = reference, arl0
         self._whitened_sds = [item.sd for item in learned]
-        if config.isolation and isinstance(reference, ProcessReference) and reference.model.name == cstr().name:
-            self._suspicion = Suspicion(config, self._board, reference)  # its causes are those of the reactor
+        self._suspicion = self._new_suspicion(reference)
+
+    def _new_suspicion(self, reference: Reference) -> Suspicion | None:
+        if not (self._config.isolation and isinstance(reference, ProcessReference)):
+            return None
+        if reference.model.name != cstr().name:  # the causes are those of the reactor
+            return None
+        return Suspicion(self._config, self._board, reference)
+
+    def _search_causes(
+        self, time_ns: int, input_value: float, values: list[float], units: list[str], stuck: list[bool]
+    ) -> list[Publication]:
+        """Look for the causes of alarms; an error there costs what the search remembers, and no alarm."""
+        assert self._suspicion is not None
+        try:
+            return self._suspicion.update(time_ns, input_value, values, units, stuck)
+        except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+            self._failures.add("isolation", error, "the search for the cause of this alarm starts again")
+            assert self._reference is not None
+            self._suspicion = self._new_suspicion(self._reference)
+            return []
 
     # --- watching --------------------------------------------------------------------------------------------
 
@@ -329,7 +356,7 @@ class PlantWatch:
         self._charts.update(time_ns, e, withheld, scales, units, publications, points=self._points)
         publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
-            publications.extend(self._suspicion.update(time_ns, input_value, values, units, stuck))
+            publications.extend(self._search_causes(time_ns, input_value, values, units, stuck))
 
     def _note_late_signals(self, input_value: float, values: list[float]) -> None:
         """Say once of each signal that was left out for want of values that it comes now."""

@@ -395,3 +395,7 @@ class FleetMonitor:
     def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
         """What people are to be told: plant and line."""
         return self._here.reports(now_ns)
+
+    def tracebacks(self) -> Iterator[tuple[str, str]]:
+        """Plant and traceback of each contained error that was reported."""
+        return self._here.tracebacks()

@@ -166,6 +166,8 @@ class FleetNode(FleetMonitor):
             self._report_ns = now_ns + REPORT_EVERY_NS
             for plant, line in self.reports(now_ns):
                 log.warning(line, plant=plant)
+            for plant, text in self.tracebacks():
+                log.debug("traceback", plant=plant, traceback=text)
             if self.forgotten > self._forgotten_told:
                 self._forgotten_told = self.forgotten
                 log.warning("plants were forgotten that showed no token and said nothing more", so_far=self.forgotten)

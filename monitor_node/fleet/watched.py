@@ -203,6 +203,12 @@ class WatchedPlants:
             while monitor.notes:
                 yield plant, monitor.notes.pop(0)
 
+    def tracebacks(self) -> Iterator[tuple[str, str]]:
+        """Plant and traceback of each contained error that was reported."""
+        for plant, monitor in self._monitors.items():
+            while monitor.failures.tracebacks:
+                yield plant, monitor.failures.tracebacks.pop(0)
+
     # --- within ----------------------------------------------------------------------------------------------
 
     def _is_quiet(self, plant: str) -> bool:
@@ -224,7 +230,11 @@ class WatchedPlants:
         if self._quiet is None or monitor.rows < self._look_at_row.get(plant, 0):
             return False
         self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
-        if not self._quiet.take(plant, monitor):
+        try:
+            if not self._quiet.take(plant, monitor):
+                return False
+        except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
+            monitor.failures.add("demotion", error, "the plant keeps a monitor of its own")
             return False
         self._notes += [(plant, note) for note in monitor.notes]
         self._forget(plant)

@@ -67,6 +67,7 @@ class Rest(NamedTuple):
     Attributes:
         board: its alarms; None if none ever came up.
         refused: counts by reason.
+        failures: contained errors of this software, by stage.
         runs: of equal readings in the training, one an output, as MessagePack.
         units: of the signals.
         checks: what was said of the training.
@@ -77,6 +78,7 @@ class Rest(NamedTuple):
 
     board: AlarmBoard | None
     refused: dict[str, int] | None
+    failures: dict[str, int] | None
     runs: bytes
     units: tuple[str, ...]
     checks: tuple[tuple[str, str], ...]
@@ -193,6 +195,7 @@ class QuietForm:
         rest = Rest(
             None if self._never_came_up(board) else monitor.alarms,
             state.refused or None,
+            state.failures or None,
             msgspec.msgpack.encode([(item.runs, item.arl0) for item in state.watch.signals.stuck]),
             tuple(state.units[signal] for signal in self._signals),
             tuple(watched.checks),
@@ -295,6 +298,7 @@ class QuietForm:
             int(p["received"]),
             int(p["published"]),
             dict(rest.refused or {}),
+            dict(rest.failures or {}),
         )
 
     def _charts(self, p: np.void) -> ChartsState:

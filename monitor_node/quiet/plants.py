@@ -159,7 +159,10 @@ class QuietPlants:
         slot = self._slots.of[plant]
         p, rows = self._slots.plants[slot], self._slots.newest(slot)
         monitor = Monitor(msgspec.structs.replace(self._config, plant=plant), 0, points=False, model=self._model)
-        monitor.restore(self._form.read(plant, p, self._slots.rest(slot), rows, [row.time_ns for row in waiting]))
+        try:
+            monitor.restore(self._form.read(plant, p, self._slots.rest(slot), rows, [row.time_ns for row in waiting]))
+        except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
+            monitor.failures.add("promotion", error, "the plant is learned again")
         monitor.caught_up()
         p["health_due_ns"] = self._slots.health_due_ns[slot]
         monitor.receipt = Receipt(*(p[name].item() for name in Receipt._fields))
@@ -316,6 +319,7 @@ class QuietPlants:
             heard_from_ns=dict(zip(self._signals, p["heard_from_ns"].tolist(), strict=True)),
             not_stored=int(p["not_stored"]),
             stalls=int(p["stalls"]),
+            failures=rest.failures or {},
         )
         p["lag_ns"] = 0
         return Publication(keys.key(plant, keys.HEALTH, NODE), health)

@@ -267,7 +267,7 @@ class Reconstruction(_message.Message):
     def __init__(self, time_ns: _Optional[int] = ..., value: _Optional[float] = ..., sd: _Optional[float] = ..., unit: _Optional[str] = ..., measured: _Optional[float] = ..., cause: _Optional[str] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("time_ns", "node", "version", "phase", "uptime_s", "received", "lost", "late", "refused", "refused_by_reason", "lag_ms", "duplicated", "out_of_order", "published", "rows", "incomplete_rows", "heard_from_ns", "not_stored", "stalls")
+    __slots__ = ("time_ns", "node", "version", "phase", "uptime_s", "received", "lost", "late", "refused", "refused_by_reason", "lag_ms", "duplicated", "out_of_order", "published", "rows", "incomplete_rows", "heard_from_ns", "not_stored", "stalls", "failures")
     class RefusedByReasonEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -276,6 +276,13 @@ class Health(_message.Message):
         value: int
         def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
     class HeardFromNsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: int
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
+    class FailuresEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
         VALUE_FIELD_NUMBER: _ClassVar[int]
@@ -301,6 +308,7 @@ class Health(_message.Message):
     HEARD_FROM_NS_FIELD_NUMBER: _ClassVar[int]
     NOT_STORED_FIELD_NUMBER: _ClassVar[int]
     STALLS_FIELD_NUMBER: _ClassVar[int]
+    FAILURES_FIELD_NUMBER: _ClassVar[int]
     time_ns: int
     node: str
     version: str
@@ -320,7 +328,8 @@ class Health(_message.Message):
     heard_from_ns: _containers.ScalarMap[str, int]
     not_stored: int
     stalls: int
-    def __init__(self, time_ns: _Optional[int] = ..., node: _Optional[str] = ..., version: _Optional[str] = ..., phase: _Optional[str] = ..., uptime_s: _Optional[float] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ..., late: _Optional[int] = ..., refused: _Optional[int] = ..., refused_by_reason: _Optional[_Mapping[str, int]] = ..., lag_ms: _Optional[float] = ..., duplicated: _Optional[int] = ..., out_of_order: _Optional[int] = ..., published: _Optional[int] = ..., rows: _Optional[int] = ..., incomplete_rows: _Optional[int] = ..., heard_from_ns: _Optional[_Mapping[str, int]] = ..., not_stored: _Optional[int] = ..., stalls: _Optional[int] = ...) -> None: ...
+    failures: _containers.ScalarMap[str, int]
+    def __init__(self, time_ns: _Optional[int] = ..., node: _Optional[str] = ..., version: _Optional[str] = ..., phase: _Optional[str] = ..., uptime_s: _Optional[float] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ..., late: _Optional[int] = ..., refused: _Optional[int] = ..., refused_by_reason: _Optional[_Mapping[str, int]] = ..., lag_ms: _Optional[float] = ..., duplicated: _Optional[int] = ..., out_of_order: _Optional[int] = ..., published: _Optional[int] = ..., rows: _Optional[int] = ..., incomplete_rows: _Optional[int] = ..., heard_from_ns: _Optional[_Mapping[str, int]] = ..., not_stored: _Optional[int] = ..., stalls: _Optional[int] = ..., failures: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
 class Fault(_message.Message):
     __slots__ = ("time_ns", "cause", "specification", "active", "onset_ns")

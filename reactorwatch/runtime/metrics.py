@@ -135,6 +135,12 @@ class Metrics:
         for reason, count in sorted(health.refused_by_reason.items()):
             refused.add_metric([*values, reason], count)
         yield refused
+        failures = CounterMetricFamily(
+            f"{PREFIX}_failures", "Errors of this software that the node contained", labels=[*names, "stage"]
+        )
+        for stage, count in sorted(health.failures.items()):
+            failures.add_metric([*values, stage], count)
+        yield failures
 
     def _gauge(self, name: str, meaning: str, value: float) -> "Metric":
         from prometheus_client.metrics_core import GaugeMetricFamily
