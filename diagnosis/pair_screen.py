@@ -98,6 +98,8 @@ class PairScreen:
         w = ways.w.ravel()
         blocks = [*self._slow(ways), *self._remembered(memory, w)]
         blocks += self._swinging(ways, blocks, w)
+        if not blocks:
+            return []
         return self._ranked(blocks, w, count)
 
     def _slow(self, ways: Ways) -> Iterator[Block]:

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from diagnosis.impossible_values import check_values, typical_value
 from diagnosis.run import Run
 from diagnosis.units import check_units
 from reactorwatch.errors import InputError
@@ -29,7 +30,7 @@ def run_of(record: Record, model: ProcessModel) -> Run:
     Missing inputs are taken to be as they were.
 
     Raises:
-        InputError: too few rows, a signal that is missing, constant or outside its bounds.
+        InputError: too few rows; a signal that is missing, constant or in another unit; a value that it cannot have.
     """
     name = record.name
     if record.rows < FEWEST_ROWS:
@@ -67,6 +68,7 @@ def run_of(record: Record, model: ProcessModel) -> Run:
             )
         _check_bounds(name, item.name, item.unit, values, item.lower, item.upper)
         inputs.append(values)
+    check_values(record, model)
     if all(np.ptp(values) <= LEAST_MOVE * item.scale for values, item in zip(inputs, model.inputs, strict=True)):
         raise InputError(
             f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} all the time; "
@@ -80,7 +82,7 @@ def run_of(record: Record, model: ProcessModel) -> Run:
 
 
 def _check_bounds(name: str, signal: str, unit: str, values: Array, lower: float, upper: float) -> None:
-    typical = float(np.median(values))
+    typical = typical_value(values)
     if not lower <= typical <= upper:
         hint = "; is it in degrees C? then add 273.15" if unit == "K" and lower <= typical + 273.15 <= upper else ""
         rule = f"{signal} must be in [{lower:g}, {upper:g}] {unit}"

@@ -93,7 +93,7 @@ class _Trial:
 def located(
     model: ProcessModel, effects: Sequence[Effect], run: Run, nominal: Fit, noise: NoiseLevels
 ) -> Located | None:
-    """Where an effect acts that nothing explains; None if the run says nothing of it.
+    """Where an effect acts that nothing explains; None if the run says nothing of it, or no place is known.
 
     Args:
         model: of the plant; uncertain parameters as the record has them.
@@ -106,6 +106,8 @@ def located(
     carriers = [effect for effect in (*effects, *balance_losses(model)) if effect.extend(model).state_names == own]
     if input_answers(run, nominal):
         carriers = [effect for effect in carriers if not _shows_input(effect.extend(model))]
+    if not carriers:
+        return None
     reference = _reference(model, run, nominal)
     first = [_first(Forcing(model, effect), reference, run, noise) for effect in carriers]
     places = _best_of_places(first)[:PLACES]

@@ -5,6 +5,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from diagnosis.impossible_values import check_values
 from plant_node.initial_state import carried_over
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
@@ -27,6 +28,7 @@ def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record
     """
     for text in faults:
         model = parse_fault(text, effects_of(model)).extend(model, end_min=float(measured.time_min[-1]))
+    check_values(measured, model)
     inputs = np.column_stack([measured.columns[name] for name in model.input_names])
     first = {name: float(measured.columns[name][0]) for name in model.output_names}
     if not np.all(np.isfinite(list(first.values()))):

@@ -63,7 +63,9 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None, required: tup
         values = _parsed_by_row(path, text, layout)
     time_min = values[:, 0] / layout.units_per_minute
     signals = {signal: values[:, number].copy() for number, signal in enumerate(layout.signals, start=1)}
-    return Record(time_min=time_min, columns=signals, name=path.name)
+    lines_below_header = text.rstrip("\n").count("\n") + 1 - layout.header_lines
+    first_row = layout.header_lines + 1 if lines_below_header == len(values) else None  # None: blank lines between
+    return Record(time_min=time_min, columns=signals, name=path.name, first_row=first_row)
 
 
 def write_csv(path: Path, record: Record) -> None:

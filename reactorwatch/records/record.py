@@ -35,12 +35,14 @@ class Record:
             input of row k is held over [t_k, t_k+1).
         name: where it came from, for messages.
         zero_ns: the time that its minutes count from, in nanoseconds since 1970-01-01 UTC; 0: not known.
+        first_row: number of the first row in the file, as a text editor counts lines; None: the rows are no lines.
     """
 
     time_min: NDArray[np.float64]
     columns: dict[str, NDArray[np.float64]]
     name: str
     zero_ns: int = 0
+    first_row: int | None = None
 
     def __post_init__(self) -> None:
         for signal, values in self.columns.items():

@@ -1,0 +1,68 @@
+"""Any catalogue will do for a diagnosis: none, one effect, or only such as have memory."""
+
+import json
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from diagnosis.diagnose import diagnose
+from diagnosis.report.machine import as_object
+from diagnosis.report.page import as_page
+from diagnosis.report.plain import as_text
+from diagnosis.result import NAMED, NOMINAL, UNKNOWN
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.records.record import Record
+from tests.unit.diagnosis.linear_tank import NOISE_SD, PERIOD_MIN, Shift, follows, tank
+from tests.unit.diagnosis.runs import record_of
+
+LEVELS = np.repeat([4.0, 7.0, 3.0, 6.0, 2.0, 8.0, 5.0, 4.0, 6.0, 3.0], 60)
+
+
+def tank_record(gain: float) -> Record:
+    """What the level shows of a tank whose input acts with another gain."""
+    level = follows(gain * LEVELS, gain * LEVELS[0])
+    noise = NOISE_SD * np.random.default_rng(1).standard_normal(level.size)
+    return Record(PERIOD_MIN * np.arange(level.size, dtype=np.float64), {"u": LEVELS, "h": level + noise}, "tank")
+
+
+def named(*names: str) -> tuple[Effect, ...]:
+    """Those effects of the reactor."""
+    return tuple(effect for effect in EFFECTS if effect.name in names)
+
+
+@pytest.mark.parametrize(
+    ("effects", "gain", "verdict"),
+    [
+        (None, 1.0, NOMINAL),
+        (None, 1.2, UNKNOWN),
+        ((), 1.0, NOMINAL),
+        ((), 1.2, UNKNOWN),
+        ((Shift(),), 1.0, NOMINAL),
+        ((Shift(),), 1.2, NAMED),  # a free shift does what another gain does
+    ],
+)
+def test_a_model_of_ones_own_is_diagnosed_with_whatever_catalogue(
+    effects: Sequence[Effect] | None, gain: float, verdict: str
+) -> None:
+    found = diagnose(tank_record(gain), tank(), effects)
+    assert (found.verdict, bool(found.causes)) == (verdict, verdict == NAMED)
+    assert found.significant == found.practical == (verdict != NOMINAL)
+    assert json.loads(json.dumps(as_object(found, "a.csv", 1.0)))["verdict"] == verdict
+    assert as_text(found, "a.csv", effects or ()).startswith("a.csv")
+    assert as_page(found, tank(), effects or (), "a.csv", "m.json", "x.csv", on_the_bus=False).startswith(
+        "<!doctype html>"
+    )
+
+
+@pytest.mark.parametrize(
+    "names",
+    [(), ("valve_stiction",), ("temperature_lag",), ("jacket_lag", "temperature_lag"), ("concentration_delay",)],
+)
+def test_what_a_small_catalogue_does_not_explain_is_unknown(names: tuple[str, ...]) -> None:
+    record = record_of("coolant_flow:step:-0.05@30min", "temperature_bias:step:2@20min", rows=450)
+    found = diagnose(record, cstr(), named(*names))
+    assert (found.verdict, found.causes) == (UNKNOWN, ())
+    assert found.location
