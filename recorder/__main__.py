@@ -19,13 +19,14 @@ from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.black_box import BlackBox
 from recorder.config import RecorderConfig
 from recorder.core import NODE, Recorder
-from recorder.disk_alarm import COMMANDS, DISK_ALARM
 from recorder.files import RecordingFiles
 from recorder.filing import Filing
 from recorder.head import Head
 from recorder.node import Decisions, RecorderNode
+from recorder.own_alarms import COMMANDS, PRIORITIES
 from recorder.part_file import PartFile
 from recorder.retention import DAY_NS, Limits
+from recorder.room import Room
 from recorder.series import Series
 
 HISTORY_MARGIN_NS = 10_000_000_000
@@ -138,7 +139,7 @@ def begin(
 
 def black_box_for(config: RecorderConfig) -> BlackBox:
     """The black box that the settings ask for."""
-    return BlackBox(round(config.black_box_min * MINUTE_NS), own=DISK_ALARM)
+    return BlackBox(round(config.black_box_min * MINUTE_NS), own=tuple(PRIORITIES))
 
 
 def node_for(
@@ -157,9 +158,11 @@ def node_for(
         config.rotate_mb * _MB,
         start_ns,
     )
+    own = [keys.key(config.plant, keys.ALARM, name) for name in PRIORITIES]
+    room = Room(config.most_keys, (*own, keys.key(config.plant, keys.HEALTH, NODE)))
     return RecorderNode(
         Recorder(config.plant, start_ns, known, known_until_ns),
-        Decisions(filing, Head(), black_box),
+        Decisions(filing, Head(room.most_repeated), black_box, room),
         files,
         health_period_ns=round(config.health_period_s * 1e9),
         start_ns=start_ns,

@@ -42,7 +42,7 @@ def test_alarms_without_an_end_do_not_make_a_stretch_without_an_end() -> None:
 
 
 def test_what_is_no_new_alarm_of_the_plant_keeps_nothing() -> None:
-    box = BlackBox(N, own="recording/disk")
+    box = BlackBox(N, own=("recording/disk",))
     for message in (raised(event="cleared"), raised("recording/disk"), messages.Sample(), messages.Health()):
         box.on_message(message, 1000)
     assert box.close() is None
