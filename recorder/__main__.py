@@ -16,6 +16,7 @@ from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.entry import main
 from reactorwatch.runtime.metrics import Metrics, served
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+from recorder.ages import BootClock, read_boot_clock
 from recorder.black_box import BlackBox
 from recorder.config import RecorderConfig
 from recorder.core import NODE, Recorder
@@ -96,12 +97,17 @@ def record(
             bus.close()
 
 
-def files_for(config: RecorderConfig, open_part: Callable[[Path], PartFile] = PartFile) -> RecordingFiles:
+def files_for(
+    config: RecorderConfig,
+    open_part: Callable[[Path], PartFile] = PartFile,
+    read_clock: Callable[[], BootClock] = read_boot_clock,
+) -> RecordingFiles:
     """The files that the settings ask for.
 
     Args:
         config: the settings.
         open_part: see `RecordingFiles`.
+        read_clock: see `RecordingFiles`.
 
     Raises:
         InputError: as `run`.
@@ -113,7 +119,8 @@ def files_for(config: RecorderConfig, open_part: Callable[[Path], PartFile] = Pa
         **config.about,
     }
     limits = Limits(config.keep_mb * _MB, config.keep_days * DAY_NS, config.keep_files)
-    return RecordingFiles(series_for(config), about, limits, synced=config.fsync != "never", open_part=open_part)
+    synced = config.fsync != "never"
+    return RecordingFiles(series_for(config), about, limits, synced=synced, open_part=open_part, read_clock=read_clock)
 
 
 def begin(

@@ -78,11 +78,11 @@ class BlackBox:
         ended, self._open = self._open, None
         return ended
 
-    def needed_since_ns(self, now_ns: int) -> int | None:
-        """What was received since then must not be deleted: an alarm came, or may come now; None: all may be."""
+    def needed_ns(self, now_ns: int) -> int | None:
+        """The last span of time of which nothing must be deleted: an alarm came, or may come now; None: all may be."""
         if not self._around_ns:
             return None
-        return min(now_ns - self._around_ns, self._open.from_ns if self._open is not None else now_ns)
+        return max(self._around_ns, now_ns - self._open.from_ns if self._open is not None else 0)
 
     @property
     def reach_ns(self) -> int:

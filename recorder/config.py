@@ -27,7 +27,7 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         rotate_min: age of a file, in minutes, at which a new one is begun; inf: never.
         rotate_mb: its size, likewise.
         keep_mb: size of all files together beyond which the oldest is deleted; inf: never.
-        keep_days: age of a file, since its end, likewise.
+        keep_days: age of a file, since its end, likewise; only days in which the machine ran count.
         keep_files: how many there may be, likewise.
         most_keys: keys with messages of the product that a file has room for; a thousand take about 1.5 MB of
             memory. Messages on more keys are not recorded; the alarm `recording/keys` says so.

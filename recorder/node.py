@@ -158,7 +158,7 @@ class RecorderNode:
         self._room.start(len(head))
         self._files.begin(head, now_ns)
         self._filing.began(now_ns)
-        self._files.delete_oldest(now_ns, self._black_box.needed_since_ns(now_ns))
+        self._files.delete_oldest(self._black_box.needed_ns(now_ns))
 
     def _see_to_file(self, now_ns: int) -> list[Publication]:
         try:
@@ -185,7 +185,7 @@ class RecorderNode:
             return []
         self._next_try_ns = now_ns + RETRY_NS
         if not self._has_room():
-            self._files.delete_oldest(now_ns, self._black_box.needed_since_ns(now_ns))
+            self._files.delete_oldest(self._black_box.needed_ns(now_ns))
             return []
         try:
             self._begin(self._core.moment(now_ns), now_ns)
