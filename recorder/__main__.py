@@ -16,16 +16,18 @@ from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.entry import main
 from reactorwatch.runtime.metrics import Metrics, served
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+from recorder.ages import BootClock, read_boot_clock
 from recorder.black_box import BlackBox
 from recorder.config import RecorderConfig
 from recorder.core import NODE, Recorder
-from recorder.disk_alarm import COMMANDS, DISK_ALARM
 from recorder.files import RecordingFiles
 from recorder.filing import Filing
 from recorder.head import Head
 from recorder.node import Decisions, RecorderNode
+from recorder.own_alarms import COMMANDS, PRIORITIES
 from recorder.part_file import PartFile
 from recorder.retention import DAY_NS, Limits
+from recorder.room import Room
 from recorder.series import Series
 
 HISTORY_MARGIN_NS = 10_000_000_000
@@ -95,12 +97,17 @@ def record(
             bus.close()
 
 
-def files_for(config: RecorderConfig, open_part: Callable[[Path], PartFile] = PartFile) -> RecordingFiles:
+def files_for(
+    config: RecorderConfig,
+    open_part: Callable[[Path], PartFile] = PartFile,
+    read_clock: Callable[[], BootClock] = read_boot_clock,
+) -> RecordingFiles:
     """The files that the settings ask for.
 
     Args:
         config: the settings.
         open_part: see `RecordingFiles`.
+        read_clock: see `RecordingFiles`.
 
     Raises:
         InputError: as `run`.
@@ -112,7 +119,8 @@ def files_for(config: RecorderConfig, open_part: Callable[[Path], PartFile] = Pa
         **config.about,
     }
     limits = Limits(config.keep_mb * _MB, config.keep_days * DAY_NS, config.keep_files)
-    return RecordingFiles(series_for(config), about, limits, synced=config.fsync != "never", open_part=open_part)
+    synced = config.fsync != "never"
+    return RecordingFiles(series_for(config), about, limits, synced=synced, open_part=open_part, read_clock=read_clock)
 
 
 def begin(
@@ -138,7 +146,7 @@ def begin(
 
 def black_box_for(config: RecorderConfig) -> BlackBox:
     """The black box that the settings ask for."""
-    return BlackBox(round(config.black_box_min * MINUTE_NS), own=DISK_ALARM)
+    return BlackBox(round(config.black_box_min * MINUTE_NS), own=tuple(PRIORITIES))
 
 
 def node_for(
@@ -157,9 +165,11 @@ def node_for(
         config.rotate_mb * _MB,
         start_ns,
     )
+    own = [keys.key(config.plant, keys.ALARM, name) for name in PRIORITIES]
+    room = Room(config.most_keys, (*own, keys.key(config.plant, keys.HEALTH, NODE)))
     return RecorderNode(
         Recorder(config.plant, start_ns, known, known_until_ns),
-        Decisions(filing, Head(), black_box),
+        Decisions(filing, Head(room.most_repeated), black_box, room),
         files,
         health_period_ns=round(config.health_period_s * 1e9),
         start_ns=start_ns,

@@ -4,6 +4,7 @@ All times are those of receipt. Alarms that come up before the time after the la
 they are of one story; one that goes on and on is ended, and the next alarm begins a new one.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 from google.protobuf.message import Message
@@ -38,10 +39,10 @@ class BlackBox:
 
     Args:
         around_ns: how much is kept before and after an alarm; 0: nothing is.
-        own: alarms of this name are the recorder's, and of no plant.
+        own: alarms of these names are the recorder's, and of no plant.
     """
 
-    def __init__(self, around_ns: int, own: str = "") -> None:
+    def __init__(self, around_ns: int, own: Collection[str] = ()) -> None:
         self._around_ns = around_ns
         self._own = own
         self._open: Stretch | None = None
@@ -54,7 +55,7 @@ class BlackBox:
         """
         if not self._around_ns or not isinstance(message, messages.Alarm):
             return None
-        if message.event != RAISED or message.alarm == self._own:
+        if message.event != RAISED or message.alarm in self._own:
             return None
         over = self.over(received_ns)
         around = Stretch(received_ns - self._around_ns, received_ns + self._around_ns, received_ns, message.alarm)
@@ -77,11 +78,11 @@ class BlackBox:
         ended, self._open = self._open, None
         return ended
 
-    def needed_since_ns(self, now_ns: int) -> int | None:
-        """What was received since then must not be deleted: an alarm came, or may come now; None: all may be."""
+    def needed_ns(self, now_ns: int) -> int | None:
+        """The last span of time of which nothing must be deleted: an alarm came, or may come now; None: all may be."""
         if not self._around_ns:
             return None
-        return min(now_ns - self._around_ns, self._open.from_ns if self._open is not None else now_ns)
+        return max(self._around_ns, now_ns - self._open.from_ns if self._open is not None else 0)
 
     @property
     def reach_ns(self) -> int:

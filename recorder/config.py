@@ -6,8 +6,10 @@ import msgspec
 
 from reactorwatch.contract import keys
 from recorder.filing import Fsync
+from recorder.room import MOST_KEYS
 
 LONGEST_FLUSH_S = 1.0
+FEWEST_KEYS = 100
 
 
 class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -25,8 +27,10 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         rotate_min: age of a file, in minutes, at which a new one is begun; inf: never.
         rotate_mb: its size, likewise.
         keep_mb: size of all files together beyond which the oldest is deleted; inf: never.
-        keep_days: age of a file, since its end, likewise.
+        keep_days: age of a file, since its end, likewise; only days in which the machine ran count.
         keep_files: how many there may be, likewise.
+        most_keys: keys with messages of the product that a file has room for; a thousand take about 1.5 MB of
+            memory. Messages on more keys are not recorded; the alarm `recording/keys` says so.
         black_box_min: minutes before and after each alarm that are kept in a file of their own, which is never
             deleted; 0: none.
         resume_mb: with a full disk, recording goes on when there is this much room again.
@@ -46,6 +50,7 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     keep_mb: float = math.inf
     keep_days: float = math.inf
     keep_files: float = math.inf
+    most_keys: int = MOST_KEYS
     black_box_min: float = 10.0
     resume_mb: float = 50.0
     linger_s: float = 0.5
@@ -64,6 +69,8 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"{name} must be positive, or inf, got {getattr(self, name)!r}")
         if not self.keep_files >= 1.0:
             raise ValueError(f"keep_files must be at least 1, or inf, got {self.keep_files!r}")
+        if not FEWEST_KEYS <= self.most_keys <= MOST_KEYS:
+            raise ValueError(f"most_keys must be in [{FEWEST_KEYS}, {MOST_KEYS}], got {self.most_keys!r}")
         for name in ("black_box_min", "resume_mb"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and not negative, got {getattr(self, name)!r}")

@@ -6,8 +6,10 @@ kept without a schema, so that it spoils no reader's day, and is counted as refu
 
 from collections import Counter
 from collections.abc import Collection
+from functools import lru_cache
 from typing import Any, NamedTuple
 
+import structlog
 from google.protobuf.message import Message
 
 from reactorwatch import __version__
@@ -16,33 +18,59 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.in_order import Gap
-from recorder.disk_alarm import DiskAlarm
 from recorder.entry import Entry
+from recorder.own_alarms import DISK_ALARM, KEYS_ALARM, OwnAlarms
+from recorder.room import Channel
 from recorder.sequences import SequenceCheck
 
+log = structlog.get_logger()
+
 NODE = "recorder"
-MOST_KEYS = 10_000
-"""Different keys that are kept. More come from a publisher gone wild, and would fill memory and the file's index."""
+MOST_CHECKS = 60_000
+"""Keys of samples whose numbers are followed; of more, that key is forgotten whose last sample is the oldest."""
+NO_ROOM_NS = 60_000_000_000
+"""The alarm about keys clears when, for so long, nothing was left out."""
+LOG_AGAIN_NS = 60_000_000_000
+LONGEST_QUOTE = 200
+"""Letters of a key in a text: publishers choose them."""
 
 _NO_SAMPLE = messages.QUALITY_UNSPECIFIED  # which protobuf reads out of bytes that hold something else
 _LARGEST_COUNT = 2**64 - 1  # a sequence number may be any nonsense; the sum of what it skips must still fit its field
 
 
 class Kept(NamedTuple):
-    """An entry for the file, and the message that it holds; None if it is not the one that its encoding names."""
+    """An entry for the file, and the message that it holds; None if it is not the one that its encoding names.
+
+    Attributes:
+        entry: the entry.
+        message: the message.
+        has_known_key: whether the key is a key of the product.
+    """
 
     entry: Entry
     message: Message | None
+    has_known_key: bool = True
 
     @property
     def readable(self) -> bool:
         """Whether it is."""
         return self.message is not None
 
+    @property
+    def channel(self) -> Channel:
+        """The channel in the file that it needs."""
+        return Channel(self.entry.key, self.entry.encoding, self.readable and self.has_known_key)
+
 
 def fingerprint(key: str, payload: bytes) -> int:
     """What a message is known by, within this process."""
     return hash((key, payload))
+
+
+@lru_cache(maxsize=MOST_CHECKS)
+def is_key(key: str) -> bool:
+    """Whether a key is a key of the product."""
+    return keys.parse(key) is not None
 
 
 class Recorder:
@@ -67,11 +95,14 @@ class Recorder:
         self._longest_lag_ns = 0
         self._refused: Counter[str] = Counter()
         self._stopped = False
-        self._disk = DiskAlarm(plant)
-        self._checks: dict[str, SequenceCheck | None] = {}  # by key; None for a key that is not one of ours
+        self._alarms = OwnAlarms(plant)
+        self._checks: dict[str, SequenceCheck] = {}  # by key, in the order of their last samples
+        self._forgotten = SequenceCheck()  # the counts of keys that are followed no longer
+        self._no_room_ns = 0  # when a message was left out last
+        self._logged_ns: int | None = None  # when the log said so last
 
     def on_message(self, message: Encoded, now_ns: int) -> Kept | None:
-        """The entry for a message; None if it is on one key too many, or in a file already.
+        """The entry for a message; None if it is in a file already.
 
         The time of receipt never runs backwards, though a clock that is set may: the order in the file is the order
         in which things came.
@@ -83,18 +114,13 @@ class Recorder:
         received_ns = received_ns or now_ns
         self._longest_lag_ns = max(self._longest_lag_ns, now_ns - received_ns)
         self._last_ns = received_ns = max(received_ns, self._last_ns)
-        if key not in self._checks:
-            if len(self._checks) == MOST_KEYS:
-                self._refused["too many keys"] += 1
-                return None
-            self._checks[key] = SequenceCheck() if keys.parse(key) is not None else None
+        has_known_key = is_key(key)
         try:
             decoded: Any = decode(payload, encoding)
         except DecodeError as error:
             self._refused[error.reason] += 1
-            return Kept(Entry(key, payload, encoding, received_ns, received_ns), None)
-        check = self._checks[key]
-        if check is None:
+            return Kept(Entry(key, payload, encoding, received_ns, received_ns), None, has_known_key)
+        if not has_known_key:
             self._refused["key"] += 1
         time_ns = getattr(decoded, "time_ns", received_ns)
         if time_ns < 0:  # before 1970, which a file has no way to say
@@ -103,9 +129,22 @@ class Recorder:
         elif isinstance(decoded, messages.Sample):
             if decoded.quality == _NO_SAMPLE:
                 self._refused["payload"] += 1
-            elif check is not None:
-                check.update(decoded.sequence, time_ns)
-        return Kept(Entry(key, payload, encoding, received_ns, time_ns), decoded)
+            elif has_known_key:
+                self._check(key).update(decoded.sequence, time_ns)
+        return Kept(Entry(key, payload, encoding, received_ns, time_ns), decoded, has_known_key)
+
+    def _check(self, key: str) -> SequenceCheck:
+        """The count of a key's samples."""
+        check = self._checks.pop(key, None)
+        if check is None:
+            check = SequenceCheck()
+            if len(self._checks) >= MOST_CHECKS:
+                forgotten = self._checks.pop(next(iter(self._checks)))
+                self._forgotten.lost += forgotten.lost
+                self._forgotten.duplicated += forgotten.duplicated
+                self._forgotten.out_of_order += forgotten.out_of_order
+        self._checks[key] = check
+        return check
 
     def _is_known(self, key: str, payload: bytes, now_ns: int) -> bool:
         """Whether it is in a file already; it is passed over once."""
@@ -131,15 +170,38 @@ class Recorder:
         """So many messages were received and are not in a file, because it could not be written."""
         self._refused["disk"] += count
 
+    def leave_out(self, kept: Kept, now_ns: int) -> list[Publication]:
+        """Count a message for whose key the file has no room, and raise the alarm."""
+        self._refused["too many keys"] += 1
+        self._no_room_ns = now_ns
+        key = kept.entry.key[:LONGEST_QUOTE]
+        kind = "with messages of ours" if kept.channel.is_of_product else "with other messages"
+        if self._logged_ns is None or now_ns - self._logged_ns >= LOG_AGAIN_NS:
+            self._logged_ns = now_ns
+            log.warning("not recorded: too many keys", example=key, keys=kind, messages=self._refused["too many keys"])
+        if self._alarms.is_active(KEYS_ALARM):
+            return []
+        text = f"not everything is recorded: a file has no room for more keys {kind}, {key!r} for instance"
+        return [self._alarms.raise_alarm(KEYS_ALARM, text, now_ns), self.health(now_ns)]
+
+    def see_to_room(self, now_ns: int) -> list[Publication]:
+        """Clear the alarm about keys, if it is due."""
+        if not self._alarms.is_active(KEYS_ALARM) or now_ns - self._no_room_ns < NO_ROOM_NS:
+            return []
+        text = f"everything is recorded again; {self._refused['too many keys']} messages are missing so far"
+        return [self._alarms.clear(KEYS_ALARM, text, now_ns)]
+
     def stop_recording(self, why: str, now_ns: int) -> list[Publication]:
-        """The file cannot be written: what the plant's people are told."""
+        """The file cannot be written: raise the alarm."""
         self._stopped = True
-        return [self._disk.come_up(why, now_ns), self.health(now_ns)]
+        text = f"recording stopped: {why}; it goes on when there is room"
+        return [self._alarms.raise_alarm(DISK_ALARM, text, now_ns), self.health(now_ns)]
 
     def resume_recording(self, now_ns: int) -> list[Publication]:
-        """There is a file again: what they are told then."""
+        """There is a file again: clear the alarm."""
         self._stopped = False
-        return [self._disk.go(self._refused["disk"], now_ns), self.health(now_ns)]
+        text = f"recording goes on; {self._refused['disk']} messages are missing so far"
+        return [self._alarms.clear(DISK_ALARM, text, now_ns), self.health(now_ns)]
 
     @property
     def is_stopped(self) -> bool:
@@ -147,13 +209,13 @@ class Recorder:
         return self._stopped
 
     @property
-    def alarm(self) -> messages.Alarm:
-        """Its alarm as it is."""
-        return self._disk.now
+    def alarms(self) -> list[messages.Alarm]:
+        """Its alarms in their present state."""
+        return self._alarms.now
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """What people ask of its alarm, or do to it."""
-        return self._disk.obey(question, now_ns)
+        """Carry out a command about its alarms."""
+        return self._alarms.obey(question, now_ns)
 
     def health(self, now_ns: int, phase: str = "") -> Publication:
         """How it does; the lag is the longest between receipt and work since the last call.
@@ -163,7 +225,7 @@ class Recorder:
             phase: in a word; empty: by whether it can write.
         """
         phase = phase or ("not recording" if self._stopped else "recording")
-        checks = [check for check in self._checks.values() if check is not None]
+        checks = [self._forgotten, *self._checks.values()]
         self._reports += 1
         health = messages.Health(
             time_ns=now_ns,

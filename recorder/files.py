@@ -19,6 +19,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
+from recorder.ages import Ages, BootClock, read_boot_clock
 from recorder.black_box import BlackBox, Stretch
 from recorder.black_box_files import BlackBoxFiles
 from recorder.chores import Chores
@@ -45,6 +46,7 @@ class RecordingFiles:
         limits: of what is kept.
         synced: whether a file that is complete is synced.
         open_part: what opens the file that is written to.
+        read_clock: reads the clock since the machine's start, by which recordings are old.
 
     Raises:
         InputError: there is no such folder; the file that was asked for by name exists, or is being written.
@@ -58,6 +60,7 @@ class RecordingFiles:
         *,
         synced: bool = False,
         open_part: Callable[[Path], PartFile] = PartFile,
+        read_clock: Callable[[], BootClock] = read_boot_clock,
     ) -> None:
         self._series = series
         self._metadata = metadata
@@ -66,6 +69,7 @@ class RecordingFiles:
         self._open_part = open_part
         self._writer: RecordingWriter | None = None
         self._black_boxes = BlackBoxFiles(series)
+        self._ages = Ages(series.folder / f".{series.stem}.ages", read_clock)
         self._chores = Chores()
         self._begun = 0
         self._before = ""
@@ -73,6 +77,7 @@ class RecordingFiles:
         self._abandoned: list[Path] = []
         first = series.first(datetime.now(UTC))
         self._left = [] if not series.folder.is_dir() else remains_of(series)
+        self._ages.see((path.name, path.stat().st_mtime_ns) for path in self._kept_for_a_time())
         for copy in self._black_boxes.half_made():
             copy.unlink(missing_ok=True)
         if not self._left:
@@ -197,7 +202,8 @@ class RecordingFiles:
             self._writer.sync()
         self._writer.close()
         if self._last_ns:
-            os.utime(self._writer.path, ns=(self._last_ns, self._last_ns))  # by which it is old, or not yet
+            os.utime(self._writer.path, ns=(self._last_ns, self._last_ns))
+        self._ages.note(self._writer.path.name, self._writer.path.stat().st_mtime_ns)
         log.info("recorded", file=str(self._writer.path))
         self._writer = None
 
@@ -219,10 +225,15 @@ class RecordingFiles:
         """Have a stretch of time copied into a file of its own; flush before."""
         self._chores.add(f"the black box of {stretch.alarm}", lambda: self._black_box(stretch))
 
-    def delete_oldest(self, now_ns: int, needed_since_ns: int | None) -> None:
-        """Have what is beyond the limits deleted."""
+    def delete_oldest(self, needed_ns: int | None) -> None:
+        """Have what is beyond the limits deleted.
+
+        Args:
+            needed_ns: what ended in this last span of time stays; None: nothing is needed.
+        """
         if self._limits != Limits():
-            self._chores.add("deleting old recordings", lambda: self._delete_oldest(now_ns, needed_since_ns))
+            now_ns = self._ages.now_ns()
+            self._chores.add("deleting old recordings", lambda: self._delete_oldest(now_ns, needed_ns))
 
     def __enter__(self) -> Self:
         return self
@@ -239,6 +250,10 @@ class RecordingFiles:
         if not self._series.folder.is_dir():
             return []
         return [path for path in self._series.folder.iterdir() if self._series.owns(path.name) and path.is_file()]
+
+    def _kept_for_a_time(self) -> list[Path]:
+        """What the limits are of: recordings, and remains from which not all could be recovered."""
+        return [*self._finished(), *damaged(self._series)]
 
     def _black_box(self, stretch: Stretch) -> None:
         path = self._black_boxes.new(stretch)
@@ -258,17 +273,18 @@ class RecordingFiles:
                     raise  # else the file being written has got its name meanwhile
         log.info("black box", file=str(path), alarm=stretch.alarm, messages=count)
 
-    def _delete_oldest(self, now_ns: int, needed_since_ns: int | None) -> None:
+    def _delete_oldest(self, now_ns: int, needed_ns: int | None) -> None:
         writer = self._writer  # before the others are listed: what it writes may become one of them
-        finished = []
-        for path in (*self._finished(), *damaged(self._series)):
-            if writer is None or path != writer.path:
-                told = path.stat()
-                finished.append(Finished(path, told.st_size, told.st_mtime_ns))
+        there = [path for path in self._kept_for_a_time() if writer is None or path != writer.path]
+        stats = [(path, path.stat()) for path in there]
+        seen_ns = self._ages.see((path.name, stat.st_mtime_ns) for path, stat in stats)
+        finished = [Finished(path, stat.st_size, seen_ns[path.name], stat.st_mtime_ns) for path, stat in stats]
         writing_bytes = writer.size_bytes if writer is not None else None
+        needed_since_ns = None if needed_ns is None else now_ns - needed_ns
         for path in to_delete(finished, writing_bytes, self._limits, now_ns, needed_since_ns):
             path.unlink()
             log.info("deleted", file=str(path), why="the limits of what is kept")
+        self._ages.store()
 
 
 def is_alarm(topic: str) -> bool:

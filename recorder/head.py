@@ -9,12 +9,18 @@ from google.protobuf.message import Message
 
 from reactorwatch.contract import messages_pb2 as messages
 from recorder.entry import Entry
+from recorder.room import MOST_KEYS
 
 
 class Head:
-    """The last message of each model, alarm and fault."""
+    """The last message of each model, alarm and fault.
 
-    def __init__(self) -> None:
+    Args:
+        most: messages that are remembered; of more, the oldest are forgotten.
+    """
+
+    def __init__(self, most: int = MOST_KEYS // 2) -> None:
+        self._most = most
         self._last: dict[tuple[str, bool], Entry] = {}
 
     def remember(self, entry: Entry, message: Message) -> None:
@@ -27,6 +33,8 @@ class Head:
             return
         self._last.pop(name, None)
         self._last[name] = entry
+        if len(self._last) > self._most:
+            del self._last[next(iter(self._last))]
 
     def entries(self, begun_ns: int) -> list[Entry]:
         """What is to be said again, in the order in which it came.

@@ -95,6 +95,11 @@ class McapStream:
         self._describe(channel)
         return number
 
+    @property
+    def channel_count(self) -> int:
+        """Channels described so far."""
+        return len(self._channels)
+
     def add_message(self, channel: int, log_time: int, payload: bytes, publish_time: int, sequence: int = 0) -> None:
         """Append a message."""
         chunk = self._chunk

@@ -20,6 +20,7 @@ from recorder.mcap_chunks import REPEATED
 from recorder.mcap_scan import Stored
 from recorder.mcap_stream import McapStream
 from recorder.part_file import PART, PartFile, is_held
+from recorder.room import MOST_CHANNELS
 
 METADATA = "reactorwatch"
 NUMBER = "file"
@@ -181,18 +182,23 @@ class RecordingWriter:
         metadata = {REPEATED: "true"} if entry.repeated else {}
         kind = message_type(entry.encoding) if readable else None
         if kind is None:
-            return self._writer.add_channel(entry.key, entry.encoding, 0, metadata)
+            return self._add_channel(entry.key, entry.encoding, 0, metadata)
         schema = self._schema(kind.DESCRIPTOR.full_name, SchemaEncoding.Protobuf, _descriptors())
-        return self._writer.add_channel(entry.key, MessageEncoding.Protobuf, schema, metadata)
+        return self._add_channel(entry.key, MessageEncoding.Protobuf, schema, metadata)
+
+    def _add_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
+        """Describe a channel, if the format has a number left for it."""
+        if self._writer.channel_count >= MOST_CHANNELS:
+            reason = f"a file has room for {MOST_CHANNELS} keys, and {topic!r} is one more"
+            raise WriteError(f"recording {self._path}: {reason}", reason)
+        return self._writer.add_channel(topic, encoding, schema, metadata)
 
     def _copied_channel(self, stored: Stored) -> int:
         channel, schema = stored.channel, stored.schema
         number = self._schema(schema.name, schema.encoding, schema.data) if schema else 0
         name = (channel.topic, channel.message_encoding, number, *sorted(channel.metadata.items()))
         if name not in self._copies:
-            self._copies[name] = self._writer.add_channel(
-                channel.topic, channel.message_encoding, number, channel.metadata
-            )
+            self._copies[name] = self._add_channel(channel.topic, channel.message_encoding, number, channel.metadata)
         return self._copies[name]
 
     def _schema(self, name: str, encoding: str, data: bytes) -> int:

@@ -13,6 +13,7 @@ from recorder.files import RecordingFiles
 from recorder.filing import Filing
 from recorder.head import Head
 from recorder.mcap_writer import WriteError
+from recorder.room import Room
 
 RETRY_NS = 2_000_000_000
 """Between two looks for room on a full disk."""
@@ -25,6 +26,7 @@ class Decisions:
     filing: Filing
     head: Head
     black_box: BlackBox
+    room: Room
 
 
 class RecorderNode:
@@ -53,6 +55,7 @@ class RecorderNode:
     ) -> None:
         self._core = core
         self._filing, self._head, self._black_box = decide.filing, decide.head, decide.black_box
+        self._room = decide.room
         self._files = files
         self._health_period_ns = health_period_ns
         self._next_health_ns = start_ns
@@ -65,7 +68,7 @@ class RecorderNode:
         if kept is None:
             return []
         told = self._write(kept, now_ns)
-        if kept.message is not None:
+        if kept.message is not None and self._room.has(kept.channel):
             self._head.remember(kept.entry, kept.message)
             over = self._black_box.on_message(kept.message, kept.entry.log_time_ns)
             told += self._keep_for_good(over, now_ns)
@@ -92,12 +95,13 @@ class RecorderNode:
         told += self._keep_for_good(self._black_box.over(now_ns), now_ns)
         if now_ns >= self._next_health_ns:
             self._next_health_ns = now_ns + self._health_period_ns
+            told += self._core.see_to_room(now_ns)
             told.append(self._core.health(now_ns))
         return told
 
     def alarms(self) -> list[Alarm]:
         """Its alarms as they are."""
-        return [self._core.alarm]
+        return self._core.alarms
 
     def next_tick_ns(self) -> int:
         """The next of these."""
@@ -135,8 +139,11 @@ class RecorderNode:
             self._core.unrecorded(1)
             return []
         try:
-            if self._filing.is_full(now_ns, self._files.size_bytes):
+            crowded = self._room.needs_new_file(kept.channel, now_ns)
+            if crowded or self._filing.is_full(now_ns, self._files.size_bytes):
                 self._begin(kept.entry.log_time_ns, now_ns)
+            if not self._room.admit(kept.channel, now_ns):
+                return self._core.leave_out(kept, now_ns)
             self._files.write(kept)
         except InputError as error:
             self._core.unrecorded(1)
@@ -147,9 +154,11 @@ class RecorderNode:
     def _begin(self, begun_ns: int, now_ns: int) -> None:
         self._files.complete()
         self._filing.flushed()
-        self._files.begin(self._head.entries(begun_ns), now_ns)
+        head = self._head.entries(begun_ns)
+        self._room.start(len(head))
+        self._files.begin(head, now_ns)
         self._filing.began(now_ns)
-        self._files.delete_oldest(now_ns, self._black_box.needed_since_ns(now_ns))
+        self._files.delete_oldest(self._black_box.needed_ns(now_ns))
 
     def _see_to_file(self, now_ns: int) -> list[Publication]:
         try:
@@ -176,7 +185,7 @@ class RecorderNode:
             return []
         self._next_try_ns = now_ns + RETRY_NS
         if not self._has_room():
-            self._files.delete_oldest(now_ns, self._black_box.needed_since_ns(now_ns))
+            self._files.delete_oldest(self._black_box.needed_ns(now_ns))
             return []
         try:
             self._begin(self._core.moment(now_ns), now_ns)

@@ -1,4 +1,7 @@
-"""Which recordings are deleted, oldest first, so that those that are left keep within limits. Pure."""
+"""Which recordings are deleted, oldest first, so that those that are left keep within limits. Pure.
+
+All times are confirmed ones, see `ages`: no clock that is set deletes anything.
+"""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -10,11 +13,19 @@ DAY_NS = 86_400_000_000_000
 
 
 class Finished(NamedTuple):
-    """A recording that is whole; `ended_ns` is about when its last message was received."""
+    """A recording that is whole.
+
+    Attributes:
+        path: the file.
+        size_bytes: its size.
+        ended_ns: the confirmed time at which it was first seen whole.
+        modified_ns: the time that the file says it was modified at; it orders files that were first seen together.
+    """
 
     path: Path
     size_bytes: int
     ended_ns: int
+    modified_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -45,13 +56,13 @@ def to_delete(
         finished: all recordings that are whole; the one that is being written is not among them and is never deleted.
         writing_bytes: its size; None: none is being written.
         limits: see there.
-        now_ns: by the clock that the ends are of.
+        now_ns: the confirmed time.
         needed_since_ns: what ended since then stays, whatever the limits say; None: nothing is needed.
 
     Returns:
         The files, oldest first.
     """
-    by_age = sorted(finished, key=lambda item: (item.ended_ns, item.path))
+    by_age = sorted(finished, key=lambda item: (item.ended_ns, item.modified_ns, item.path))
     left, size = len(by_age), sum(item.size_bytes for item in by_age)
     if writing_bytes is not None:
         left, size = left + 1, size + writing_bytes

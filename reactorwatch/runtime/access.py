@@ -49,6 +49,13 @@ class Role:
     answers: tuple[str, ...] = ()
     asks: tuple[str, ...] = LISTS
 
+    @property
+    def key_space(self) -> tuple[str, ...]:
+        """Key expressions, below the plant's key, of all that it may publish."""
+        health = (f"{keys.HEALTH}/{node}" for node in self.nodes)
+        audit = (f"{keys.AUDIT}/{command}" for command in self.answers)
+        return (*self.publishes, *health, *audit)
+
 
 PROOF = "@doctor/**"
 """Below a kind: where `doctor` publishes to see whether it is heard; nobody else hears it, for no `**` reaches it."""
@@ -109,6 +116,9 @@ def role_of(name: str) -> tuple[str, Role] | None:
 def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
     """A router's settings `access_control`: nothing is allowed but what the roles of these plants may do.
 
+    A key is published on by one role alone (see `streams`): where a role's expression also names keys of another, these
+    are denied to it, which goes before what is allowed.
+
     Args:
         plants: their names.
     """
@@ -128,9 +138,7 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
             asks = [f"{root}/{keys.COMMAND}/{command}" for command in role.asks]
             own = [_rule(name, "ask", ("ingress",), ("query",), asks)]
             if role.nodes:
-                said = [f"{root}/{kind}" for kind in role.publishes]
-                said += [f"{root}/{keys.HEALTH}/{node}" for node in role.nodes]
-                said += [f"{root}/{keys.AUDIT}/{command}" for command in role.answers]
+                said = [f"{root}/{expression}" for expression in role.key_space]
                 memory = [f"{key}/{MEMORY}" for key in said]
                 proofs = [f"{root}/{kind}/{PROOF}" for kind in kinds_of(role)]
                 answers = [f"{root}/{keys.COMMAND}/{command}" for command in role.answers]
@@ -143,6 +151,18 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
                     _rule(name, "be asked", ("egress",), ("query",), [*everything[1:2], *answers]),
                     _rule(name, "know who listens", ("egress",), ("declare_liveliness_subscriber",), everything),
                 ]
+                others = [f"{root}/{expression}" for expression in key_space_of_others(role)]
+                if others:
+                    own.append(
+                        _rule(
+                            name,
+                            "leave to others",
+                            ("ingress",),
+                            ("put", "delete", "reply", "declare_queryable"),
+                            [*others, *(f"{key}/{MEMORY}" for key in others)],
+                            permission="deny",
+                        )
+                    )
             rules += own
             subjects.append({"id": name, "cert_common_names": [name]})
             used = [rules[0], *reading, *own]
@@ -156,12 +176,34 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
     }
 
 
+def key_space_of_others(role: Role) -> tuple[str, ...]:
+    """What other roles alone may publish among the keys that a role's own expressions name.
+
+    >>> [key_space_of_others(role) for role in ROLES if role.name == "monitor"]
+    [('alarm/recording/**',)]
+    """
+    return tuple(
+        narrow
+        for other in ROLES
+        if other is not role
+        for narrow in other.publishes
+        for wide in role.publishes
+        if narrow != wide and wide.endswith("/**") and narrow.startswith(wide.removesuffix("**"))
+    )
+
+
 def _rule(
-    who: str, what: str, flows: tuple[str, ...], messages: tuple[str, ...], key_expressions: list[str]
+    who: str,
+    what: str,
+    flows: tuple[str, ...],
+    messages: tuple[str, ...],
+    key_expressions: list[str],
+    *,
+    permission: str = "allow",
 ) -> dict[str, Any]:
     return {
         "id": f"{who}: {what}",
-        "permission": "allow",
+        "permission": permission,
         "flows": list(flows),
         "messages": list(messages),
         "key_exprs": key_expressions,

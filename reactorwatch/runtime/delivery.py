@@ -8,22 +8,11 @@ from typing import NamedTuple
 
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.in_order import Gap, InOrder
+from reactorwatch.runtime.streams import stream_of
 
 MOST_ASKED_FOR = 100
 """Streams whose publishers are asked again at once: of more than that something is missing when a network broke down,
 and then there would be no end of it."""
-
-
-STREAM_PARTS = 3  # of a key: root, plant and kind
-
-
-def stream_of(key: str) -> str:
-    """The stream that a key is in.
-
-    >>> stream_of("reactor/cstr/chart/ewma/T")
-    'reactor/cstr/chart'
-    """
-    return "/".join(key.split("/", STREAM_PARTS)[:STREAM_PARTS])
 
 
 class Numbered(NamedTuple):

@@ -3,8 +3,8 @@
 Zenoh keeps the order on each key. Across keys it does so as long as nothing is lost; but what is recovered after a cut,
 or told to a late listener, comes key by key: first all that is missing of one signal, then of the next. A row of
 samples would be taken apart by that, so a publisher numbers what it publishes. It does so in each *stream* by itself,
-which is all of one kind of one plant (`reactor/cstr/sample`), so that a listener to one kind knows whether a number is
-missing or was none of its business.
+which is all of one kind of one plant (`reactor/cstr/sample`) that one role may publish (see `streams`), so that a
+listener to one kind knows whether a number is missing or was none of its business.
 
 A message goes on when all before it in its stream have. While a number is missing those after it wait, until it is
 lost, and told as a gap. It is lost for certain when every key of the stream has come to a later one, because each key

@@ -57,8 +57,8 @@ class Site:
         self._joined: list[ZenohBus] = []
         self._heard: list[Encoded] = []
         self._changed = threading.Condition()
-        for kind in ("sample", "audit"):
-            self.router.subscribe(f"reactor/cstr/{kind}/*", self._on_message)  # no whole stream: each as it comes
+        for keys in ("sample/*", "audit/*", "alarm/recording/*"):
+            self.router.subscribe(f"reactor/cstr/{keys}", self._on_message)  # no whole stream: each as it comes
 
     def join(self, who: str, endpoint: str | None = None) -> ZenohBus:
         """A session of a holder, by the router's address or another that leads there."""

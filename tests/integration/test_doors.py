@@ -101,6 +101,36 @@ def test_nobody_but_the_plant_publishes_its_samples(site: Site, who: str) -> Non
     assert [message.payload for message in heard] == [b"measured"]
 
 
+@pytest.mark.parametrize("who", ["cstr/monitor", "cstr/plant", "cstr/viewer"])
+def test_no_role_but_the_recorder_publishes_the_recorder_s_alarms(site: Site, who: str) -> None:
+    """Though the monitor publishes all other alarms."""
+    key = "reactor/cstr/alarm/recording/disk"
+    intruder = site.join(who)
+    intruder.publish(Encoded(key, b"forged", ""))
+    site.leave(intruder)
+    site.join("cstr/recorder").publish(Encoded(key, b"raised", ""))
+    heard = site.heard_until(lambda message: message.payload == b"raised")
+    assert [message.payload for message in heard] == [b"raised"]
+
+
+def test_a_recorder_that_uses_the_monitor_s_numbers_suppresses_none_of_its_alarms(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard: list[Encoded] = []
+    monkeypatch.setattr("secrets.randbits", lambda _: 7)  # both publishers get the same name
+    viewer, monitor, recorder = (site.join(f"cstr/{who}") for who in ("viewer", "monitor", "recorder"))
+    viewer.subscribe("reactor/cstr/alarm/**", heard.append)
+    monitor.publish(Encoded("reactor/cstr/alarm/ewma/T", b"0", ""))
+    for _ in range(200):
+        recorder.publish(Encoded("reactor/cstr/alarm/recording/zz", b"forged", ""))
+    site.leave(recorder)
+    for number in range(1, 6):
+        monitor.publish(Encoded("reactor/cstr/alarm/ewma/T", b"%d" % number, ""))
+    site.leave(monitor)
+    site.close_readers()
+    assert [item.payload for item in heard if item.payload != b"forged"] == [b"%d" % number for number in range(6)]
+
+
 @pytest.mark.parametrize("who", ["cstr/engineer", "cstr/monitor", "other/plant"])
 def test_who_told_the_plant_what_cannot_be_forged(site: Site, who: str) -> None:
     intruder = site.join(who)

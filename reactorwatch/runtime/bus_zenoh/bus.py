@@ -28,8 +28,9 @@ from reactorwatch.runtime.bus_zenoh.messages import (
     spelled,
 )
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.delivery import STREAM_PARTS, Delivery, Numbered, stream_of
+from reactorwatch.runtime.delivery import Delivery, Numbered
 from reactorwatch.runtime.in_order import Gap, InOrder
+from reactorwatch.runtime.streams import STREAM_PARTS, keys_of, stream_of
 
 log = structlog.get_logger()
 
@@ -294,7 +295,7 @@ class ZenohBus:
     def _asked_again(self, stream: str, since_s: float) -> list[Numbered]:
         """What publishers remember of a stream."""
         try:
-            return self._remembered(f"{stream}/**", _published_since(since_s + LONGEST_WAY_S)).messages
+            return self._remembered(keys_of(stream), _published_since(since_s + LONGEST_WAY_S)).messages
         except zenoh.ZError as error:  # the bus is being closed, for instance
             log.info("cannot ask for what is missing", stream=stream, why=first_line(error))
             return []

@@ -6,7 +6,8 @@ import struct
 import zenoh
 
 from reactorwatch.contract.codec import LARGEST_PAYLOAD, Encoded
-from reactorwatch.runtime.delivery import STREAM_PARTS, Numbered
+from reactorwatch.runtime.delivery import Numbered
+from reactorwatch.runtime.streams import STREAM_PARTS
 
 LONGEST_ENCODING = 1000
 

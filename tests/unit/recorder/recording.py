@@ -7,6 +7,7 @@ from pathlib import Path
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Health
 from recorder.__main__ import begin, files_for
+from recorder.ages import BootClock
 from recorder.config import RecorderConfig
 from recorder.files import RecordingFiles
 from recorder.mcap_writer import part_of
@@ -18,12 +19,24 @@ MINUTE = 60 * SECOND
 
 
 @dataclass
+class Confirmed:
+    """The clock since the machine's start; `now_ns` is set by the test."""
+
+    now_ns: int
+    boot: str = "a boot"
+
+    def read(self) -> BootClock:
+        return BootClock(self.boot, self.now_ns)
+
+
+@dataclass
 class Fed:
     """A recorder that is driven as the loop drives it."""
 
     node: RecorderNode
     files: RecordingFiles
     now_ns: int
+    confirmed: Confirmed
     told: list[Publication] = field(default_factory=list)
 
     def hear(self, publications: Iterable[Publication], apart_ns: int) -> None:
@@ -37,9 +50,17 @@ class Fed:
         """Let nothing come for a while."""
         end_ns = self.now_ns + span_ns
         while (due_ns := self.node.next_tick_ns()) <= end_ns:
-            self.now_ns = max(self.now_ns, due_ns)
+            self._move_on(max(self.now_ns, due_ns))
             self.told += self.node.on_tick(self.now_ns)
-        self.now_ns = end_ns
+        self._move_on(end_ns)
+
+    def _move_on(self, now_ns: int) -> None:
+        self.confirmed.now_ns += now_ns - self.now_ns
+        self.now_ns = now_ns
+
+    def jump(self, span_ns: int) -> None:
+        """Set the machine's clock, which no other clock confirms."""
+        self.now_ns += span_ns
 
     def stop(self) -> None:
         """Ask it to end, and close its files."""
@@ -73,9 +94,11 @@ def recorder(
     *,
     known: Collection[int] = (),
     known_until_ns: int = 0,
+    boot: str = "a boot",
     **settings: object,
 ) -> Fed:
     """A recorder that has just begun."""
     config = RecorderConfig(out=str(out), **settings)  # type: ignore[arg-type]
-    files = files_for(config, open_part)
-    return Fed(begin(config, files, start_ns, known, known_until_ns), files, start_ns)
+    confirmed = Confirmed(start_ns, boot)
+    files = files_for(config, open_part, confirmed.read)
+    return Fed(begin(config, files, start_ns, known, known_until_ns), files, start_ns, confirmed)

@@ -42,19 +42,19 @@ def test_alarms_without_an_end_do_not_make_a_stretch_without_an_end() -> None:
 
 
 def test_what_is_no_new_alarm_of_the_plant_keeps_nothing() -> None:
-    box = BlackBox(N, own="recording/disk")
+    box = BlackBox(N, own=("recording/disk",))
     for message in (raised(event="cleared"), raised("recording/disk"), messages.Sample(), messages.Health()):
         box.on_message(message, 1000)
     assert box.close() is None
     off = BlackBox(0)
     off.on_message(raised(), 1000)
     assert off.close() is None
-    assert off.needed_since_ns(1000) is None
+    assert off.needed_ns(1000) is None
 
 
 def test_what_it_may_still_need_is_known() -> None:
     box = BlackBox(N)
-    assert box.needed_since_ns(5000) == 5000 - N  # of an alarm that comes now
+    assert box.needed_ns(5000) == N  # of an alarm that comes now
     box.on_message(raised(), 5000)
-    assert box.needed_since_ns(5500) == 5000 - N
+    assert box.needed_ns(5500) == 500 + N
     assert box.close() == Stretch(4400, 5600, 5000, "ewma/T")

@@ -33,6 +33,8 @@ def test_the_defaults_record_everything() -> None:
         ({"keep_mb": math.nan}, "keep_mb must be positive, or inf, got nan"),
         ({"keep_files": 0.0}, "keep_files must be at least 1, or inf, got 0.0"),
         ({"black_box_min": -1.0}, "black_box_min must be finite and not negative, got -1.0"),
+        ({"most_keys": 10}, r"most_keys must be in \[100, 60000\], got 10"),
+        ({"most_keys": 60_001}, r"most_keys must be in \[100, 60000\], got 60001"),
         ({"period": 1}, "unknown key 'period'"),
     ],
 )

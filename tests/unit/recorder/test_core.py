@@ -1,9 +1,11 @@
 """What the recorder makes of messages."""
 
+import pytest
+
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Encoded, Publication, encode, encode_message, encoding_of
-from recorder.core import MOST_KEYS, Recorder
+from recorder.core import Recorder
 from recorder.entry import Entry
 
 KEY = "reactor/cstr/sample/T"
@@ -62,12 +64,15 @@ def test_what_cannot_be_read_is_kept_as_it_is_and_counted_by_reason() -> None:
     assert (report.refused, report.received) == (5, 5)
 
 
-def test_a_flood_of_keys_is_refused_beyond_the_bound_and_the_known_ones_go_on() -> None:
+def test_the_counts_of_keys_that_are_followed_no_longer_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("recorder.core.MOST_CHECKS", 3)
     recorder = Recorder("cstr", 0)
-    for number in range(MOST_KEYS + 5):
-        recorder.on_message(Encoded(f"reactor/x/sample/{number}", b"", "?"), 0)
-    assert recorder.on_message(Encoded("reactor/x/sample/0", b"", "?"), 0) is not None
-    assert health(recorder).refused_by_reason["too many keys"] == 5
+    for number in range(10):
+        for sequence in (0, 2, 2):
+            sample = messages.Sample(sequence=sequence, time_ns=sequence, quality=GOOD)
+            recorder.on_message(encoded(sample, f"reactor/p{number}/sample/T"), 0)
+    report = health(recorder)
+    assert (report.lost, report.duplicated) == (10, 10)
 
 
 def test_health_tells_what_was_lost_by_key() -> None:

@@ -8,8 +8,8 @@ import pytest
 
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import decode
-from recorder.disk_alarm import DISK_ALARM
 from recorder.mcap_file import read_messages, recordings_in
+from recorder.own_alarms import DISK_ALARM
 from recorder.part_file import PartFile
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, recorder

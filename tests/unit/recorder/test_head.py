@@ -7,8 +7,8 @@ from recorder.entry import Entry
 from recorder.head import Head
 
 
-def remembered(*told: tuple[str, Message]) -> Head:
-    head = Head()
+def remembered(*told: tuple[str, Message], most: int = 100) -> Head:
+    head = Head(most)
     for number, (key, message) in enumerate(told):
         head.remember(Entry(key, message.SerializeToString(), "?", number, 100 + number), message)
     return head
@@ -28,3 +28,8 @@ def test_the_last_of_each_model_alarm_and_fault_is_said_again_and_nothing_else()
     entries = head.entries(1000)
     assert [entry.publish_time_ns - 100 for entry in entries] == [0, 5, 6, 7]
     assert {(entry.log_time_ns, entry.repeated) for entry in entries} == {(1000, True)}
+
+
+def test_of_more_than_it_may_hold_the_oldest_are_forgotten() -> None:
+    head = remembered(*((f"alarm/{number % 5}", messages.Alarm()) for number in range(20)), most=3)
+    assert [entry.key for entry in head.entries(1000)] == ["alarm/2", "alarm/3", "alarm/4"]

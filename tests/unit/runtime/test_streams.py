@@ -1,0 +1,94 @@
+"""A number counts only among messages of one role: no role can use up the numbers of another role's publisher."""
+
+import itertools
+from functools import cache
+
+import pytest
+
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.runtime.access import ROLES, access_control
+from reactorwatch.runtime.bus import matches
+from reactorwatch.runtime.delivery import Delivery, Numbered
+from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.streams import keys_of, stream_of
+
+ROOT = "reactor/cstr"
+KINDS = (
+    *(keys.SAMPLE, keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.RECONSTRUCTION),
+    *(keys.HEALTH, keys.FAULT, keys.AUDIT, "weather"),
+)
+NODES = [node for role in ROLES for node in role.nodes]
+COMMANDS = [command for role in ROLES for command in role.answers]
+NAMES = ("T", "ewma/T", "zz", "recording", "recording/disk", "recording/zz/a", "@doctor/x", *NODES, *COMMANDS)
+KEYS = [f"{ROOT}/{kind}" for kind in KINDS] + [f"{ROOT}/{kind}/{name}" for kind in KINDS for name in NAMES]
+PUBLISHERS = [role.name for role in ROLES if role.nodes]
+
+
+@cache
+def publishers(key: str) -> frozenset[str]:
+    """The roles that the router lets publish on a key, by its rules."""
+    rules = access_control(("cstr",))["rules"]
+    found = set()
+    for name in PUBLISHERS:
+        own = [rule for rule in rules if rule["id"].startswith(f"cstr.{name}:") and "put" in rule["messages"]]
+        permissions = {rule["permission"] for rule in own if any(matches(each, key) for each in rule["key_exprs"])}
+        if permissions == {"allow"}:
+            found.add(name)
+    return frozenset(found)
+
+
+def test_the_rules_let_one_role_alone_publish_on_a_key_but_for_doctor_s_proofs() -> None:
+    for key in KEYS:
+        assert len(publishers(key)) <= 1 or "@doctor" in key, key
+    assert set().union(*map(publishers, KEYS)) == set(PUBLISHERS)
+
+
+def test_all_keys_of_a_stream_are_of_the_same_role() -> None:
+    by_stream = itertools.groupby(sorted(KEYS, key=stream_of), key=stream_of)
+    for stream, group in by_stream:
+        roles = {publishers(key) for key in group if "@doctor" not in key}
+        assert len(roles) <= 1, (stream, roles)
+
+
+def test_proofs_of_doctor_and_keys_of_no_role_are_in_no_role_s_stream() -> None:
+    of_roles = {stream_of(key) for key in KEYS if publishers(key) and "@doctor" not in key}
+    assert of_roles.isdisjoint(stream_of(key) for key in KEYS if "@doctor" in key or not publishers(key))
+
+
+def test_all_that_one_node_publishes_of_one_kind_is_one_stream() -> None:
+    """Else a row of samples, or the alarms of one moment, would have no order after a cut."""
+    published = [key for key in KEYS if "@doctor" not in key]
+    for role, kind in itertools.product(PUBLISHERS, KINDS):
+        streams = {stream_of(key) for key in published if publishers(key) == {role} and key.split("/")[2] == kind}
+        assert len(streams) <= 1
+
+
+def test_publishers_are_asked_again_for_all_keys_of_a_stream() -> None:
+    assert all(matches(keys_of(stream_of(key)), key) for key in KEYS if "@doctor" not in key)
+
+
+@pytest.mark.parametrize("intruder", PUBLISHERS)
+@pytest.mark.parametrize("told_before", [False, True])
+def test_numbers_that_another_role_uses_up_suppress_no_message(intruder: str, *, told_before: bool) -> None:
+    """On each of its keys it sends 30 messages with the publisher's name and its next numbers, and as its last ones."""
+    own = [key for key in KEYS if intruder in publishers(key)]
+    for victim_key in (key for key in KEYS if publishers(key) and intruder not in publishers(key)):
+        heard: list[Encoded] = []
+        gaps: list[Gap] = []
+        delivery = Delivery(heard.extend, gaps.append)
+        near = [key for key in own if key.split("/")[2] == victim_key.split("/")[2]]
+        forged = [(1, 1 + number, Encoded(key, b"forged", "")) for key in near for number in range(30)]
+        if told_before:
+            delivery.receive([(1, 0, Encoded(victim_key, b"", ""))])
+            for publisher, number, message in forged:
+                delivery.tell_last(Numbered(publisher, number, message))
+            delivery.begin()
+        else:
+            delivery.begin()
+            delivery.receive([(1, 0, Encoded(victim_key, b"", ""))])
+        delivery.receive(forged)
+        delivery.receive([(1, number, Encoded(victim_key, b"", "")) for number in range(1, 6)])
+        delivery.close()
+        assert [item.key for item in heard].count(victim_key) == 6, victim_key
+        assert stream_of(victim_key) not in {gap.stream for gap in gaps}
