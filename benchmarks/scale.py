@@ -51,6 +51,7 @@ from monitor_node.quiet.slots import NEVER_NS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.runtime import bus_zenoh
+from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.logs import configure
@@ -181,16 +182,9 @@ def held(endpoint: str, plants: int) -> None:
     os._exit(0)
 
 
-class Nowhere:
-    """A bus that nobody listens to."""
-
-    def announce(self, key: str) -> None:
-        """Show nothing."""
-
-
 def without_bus(plants: int) -> float:
     """Samples a second from bytes to judgements."""
-    node = Counting(FAST, Nowhere(), StopSignal())
+    node = Counting(FAST, MemoryBus(Exchange()), StopSignal())
     node.learn(plants)
     messages = record()[SIGNALS * LEARNED_ROWS :]
     fleet = [
@@ -238,34 +232,43 @@ def bare(endpoint: str, expected: int, plants: int) -> None:
 
 
 def started(*arguments: object) -> "subprocess.Popen[str]":
-    """This program as another process, when it says that it is ready."""
-    process = subprocess.Popen(
-        [sys.executable, __file__, *map(str, arguments)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    assert process.stdout is not None
+    """Start this program as another process and wait until it is ready; its errors come out here."""
+    process = subprocess.Popen([sys.executable, __file__, *map(str, arguments)], stdout=subprocess.PIPE, text=True)
     if arguments[0] != "publish":
-        assert process.stdout.readline() == "ready\n", f"{arguments} did not start"
+        line = _line(process)
+        assert line == "ready\n", f"{arguments}: 'ready' was expected, got {line!r}"
     return process
 
 
-def told(process: "subprocess.Popen[str]") -> dict[str, Any]:
-    """What it says at its end."""
+def _line(process: "subprocess.Popen[str]") -> str:
+    """The next line that a process prints.
+
+    Raises:
+        SystemExit: the process ended without it; its errors are above.
+    """
     assert process.stdout is not None
-    found: dict[str, Any] = json.loads(process.stdout.readline())
+    line = process.stdout.readline()
+    if not line:
+        with process:  # closes its pipe
+            code = process.wait()
+        arguments = " ".join(map(str, process.args[2:] if isinstance(process.args, list) else ()))
+        raise SystemExit(f"scale.py {arguments}: ended with {code} and without a result, see above")
+    return line
+
+
+def told(process: "subprocess.Popen[str]") -> dict[str, Any]:
+    """The result that a process prints at its end."""
+    found: dict[str, Any] = json.loads(_line(process))
     return found
 
 
 def on_the_bus(endpoint: str, plants: int) -> float:
     """What is kept for a plant that is heard, and whose health is told, beside what its monitor keeps; in bytes."""
     process = started("held", endpoint, plants)
-    assert process.stdout is not None
     taken: list[int] = []
     for first in (0, plants // 2):
         if first:
-            assert process.stdout.readline() == "ready\n"
+            assert _line(process) == "ready\n"
         source = started("publish", endpoint, plants // 2, HELD_ROWS, HELD_PER_S, first)
         found = told(process)
         source.kill()

@@ -42,7 +42,7 @@ class MonitorNode(Monitor):
         start_ns: now.
 
     Raises:
-        InputError: a file that the settings name cannot be used, or the one of the alarms is damaged.
+        InputError: a file that the settings name cannot be used; that of the alarms, if no other has them.
 
     Attributes:
         resumed: whether it goes on from a stored state.
@@ -51,16 +51,24 @@ class MonitorNode(Monitor):
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
         super().__init__(config, start_ns, model=model_on_the_bus(config.model))
         self._said: dict[object, str] = {}
+        paths = [Path(name) for name in (config.alarm_state_file, config.state_file) if name is not None]
+        if len({path.resolve() for path in paths}) < len(paths):
+            raise InputError(f"state_file and alarm_state_file must be two files, got {paths[0]} for both")
+        self._alarm_file: AlarmFile | None = None
+        if config.alarm_state_file is not None:
+            self._alarm_file = AlarmFile(Path(config.alarm_state_file), self)
         self._file: StateFile | None = None
         if config.state_file is not None:
             self._file = StateFile(Path(config.state_file), self, config.state_every_s)
             log.info(self._file.load())
         self.resumed = self.rows > 0
-        self._alarm_file: AlarmFile | None = None
-        if config.alarm_state_file is not None:
-            self._alarm_file = AlarmFile(Path(config.alarm_state_file), self.alarms)
-            if not self.resumed:  # else what the state says of the alarms goes with what it learned
-                self._alarm_file.load()
+        if self._alarm_file is not None:
+            # The state's alarms belong to its rows; but the alarms of a state that was aside are older than the file.
+            line = self._alarm_file.load(
+                is_newest=not self.resumed or (self._file is not None and self._file.was_aside)
+            )
+            if line is not None:
+                log.warning(line)
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """See `Monitor`; alarms are stored and logged."""

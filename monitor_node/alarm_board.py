@@ -74,6 +74,7 @@ class AlarmBoard:
     def __init__(self, config: MonitorConfig) -> None:
         self._config = config
         self._alarms: dict[str, ChartAlarm] = {}
+        self._undeclared: dict[str, AlarmMemory] = {}  # of a stored state: settings may bring the alarm back
         self._incidents = Incidents(config.incident_min)
         self._kpis = KpiCounter()
         self._kpi_key = keys.key(config.plant, keys.ALARM_KPIS, KPIS)
@@ -257,7 +258,7 @@ class AlarmBoard:
             version=1,
             plant=self._config.plant,
             time_ns=self.time_ns,
-            alarms={name: alarm.memory for name, alarm in self._alarms.items()},
+            alarms=self._undeclared | {name: alarm.memory for name, alarm in self._alarms.items()},
             incident=self._incidents.state,
             kpis=self._kpis.state,
             suspects=self._suspects,
@@ -268,7 +269,7 @@ class AlarmBoard:
         return msgspec.msgpack.encode(state)
 
     def from_bytes(self, data: bytes) -> None:
-        """Go on from what `to_bytes` returned. Alarms that are not declared here are left out.
+        """Go on from what `to_bytes` returned. Alarms that are not declared here are only stored again.
 
         Raises:
             InputError: the bytes are not that, or of another plant; everything is as before.
@@ -284,9 +285,9 @@ class AlarmBoard:
             if not fits(memory.state, standing=memory.rule.standing):
                 stands = "stands" if memory.rule.standing else "does not stand"
                 raise InputError(f"is no alarm state: {name} is {memory.state}, but its condition {stands}")
-        for name, memory in state.alarms.items():
-            if name in self._alarms:
-                self._alarms[name].memory = memory
+        for name in state.alarms.keys() & self._alarms.keys():
+            self._alarms[name].memory = state.alarms[name]
+        self._undeclared = {name: memory for name, memory in state.alarms.items() if name not in self._alarms}
         self._note()
         self.time_ns = state.time_ns
         self._incidents.state = state.incident

@@ -294,6 +294,15 @@ class Monitor:
         """What was published before has all come: from now on no sample is one that was heard before a stop."""
         self._told_again = None
 
+    def restore_alarms(self, data: bytes) -> None:
+        """Restore the alarms alone, from what `AlarmBoard.to_bytes` returned.
+
+        Raises:
+            InputError: see `AlarmBoard.from_bytes`; everything is as before.
+        """
+        self.alarms.from_bytes(data)
+        self._watch.signals.go_on_from_alarms()
+
     def go_on_from_alarms(self, alarms: Iterable[Alarm]) -> None:
         """Go on from what another monitor of the plant said last of its alarms, where nothing else is left of it.
 

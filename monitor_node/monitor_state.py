@@ -1,9 +1,7 @@
 """All that a monitor remembers, as bytes: what they are made of, and how they are known to be whole and of this plant.
 
-The bytes are a word that says what they are, the version of this form, a digest of the rest, and the rest as
-MessagePack. Whatever is not exactly what was stored is refused: a wrong bit in a covariance would otherwise be believed
-for months. What was learned with other settings, or with another model of the plant, is refused as well, and the
-difference is named.
+The bytes are MessagePack behind a seal (see `seal`): whatever is not exactly what was stored is refused. What was
+learned with other settings, or with another model of the plant, is refused as well, and the difference is named.
 """
 
 from hashlib import blake2b
@@ -15,14 +13,14 @@ import msgspec
 from monitor_node.alignment import AlignmentState
 from monitor_node.config import MonitorConfig
 from monitor_node.sample_run import SampleRun
+from monitor_node.seal import DIGEST_BYTES, Seal
 from monitor_node.stored_state import StoredState
 from monitor_node.watch_state import WatchState
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 
-MAGIC, VERSION = b"reactorwatch monitor", 2
-_DIGEST_BYTES = 16
-_HEAD_BYTES = len(MAGIC) + 2
+MAGIC = b"reactorwatch monitor"
+SEAL = Seal(MAGIC, 2, "state of a monitor")
 
 NOT_LEARNED_BY = frozenset({"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s"})
 """Settings that what is learned does not depend on; the model is known by its equations, not by its file."""
@@ -94,13 +92,12 @@ def fingerprint(model: ProcessModel | None) -> str:
     words = (model.name, *model.state_names, *model.input_names, *model.output_names, *model.parameter_names)
     said = (*words, *model.breakpoints, *model.at_rest, *model.resets, model.function().serialize())
     values = model.values().tobytes()
-    return blake2b("\0".join((*said, function.serialize())).encode() + values, digest_size=_DIGEST_BYTES).hexdigest()
+    return blake2b("\0".join((*said, function.serialize())).encode() + values, digest_size=DIGEST_BYTES).hexdigest()
 
 
 def sealed(state: MonitorState) -> bytes:
     """The bytes of a state."""
-    body = state.to_bytes()
-    return MAGIC + VERSION.to_bytes(2, "big") + _digest(body) + body
+    return SEAL.close(state.to_bytes())
 
 
 def opened(data: bytes, settings: dict[str, Any]) -> MonitorState:
@@ -111,17 +108,11 @@ def opened(data: bytes, settings: dict[str, Any]) -> MonitorState:
         settings: see `settings_of`.
 
     Raises:
-        InputError: they are not that, or not all of it, or of another version.
-        OtherSettingsError: they are, but were learned with other settings.
+        ForeignFileError: the bytes were never a state.
+        InputError: they are a damaged one, or of another version.
+        OtherSettingsError: they are a state, but learned with other settings.
     """
-    head, digest, body = data[:_HEAD_BYTES], data[_HEAD_BYTES : _HEAD_BYTES + _DIGEST_BYTES], data[_HEAD_BYTES:]
-    if not head.startswith(MAGIC) or len(head) < _HEAD_BYTES:
-        raise InputError(f"is no state of a monitor: {len(data)} bytes that do not begin like one")
-    version, body = int.from_bytes(head[len(MAGIC) :], "big"), body[_DIGEST_BYTES:]
-    if version != VERSION:
-        raise InputError(f"is the state of a monitor in version {version}, this software reads {VERSION}")
-    if digest != _digest(body):
-        raise InputError("is a damaged state of a monitor: its digest is another")
+    body = SEAL.open(data)
     try:
         state = MonitorState.from_bytes(body)
     except ValueError as error:
@@ -129,10 +120,6 @@ def opened(data: bytes, settings: dict[str, Any]) -> MonitorState:
     if state.settings != settings:
         raise OtherSettingsError(f"was learned with other settings: {_difference(state.settings, settings)}")
     return state
-
-
-def _digest(body: bytes) -> bytes:
-    return blake2b(body, digest_size=_DIGEST_BYTES).digest()
 
 
 def _difference(before: dict[str, Any], now: dict[str, Any]) -> str:

@@ -1,20 +1,19 @@
 """The file that all a monitor remembers is kept in, so that it goes on where it was after a restart.
 
 It is written beside its place and renamed into it, so a kill at any moment leaves the one before or this one, whole. A
-file that cannot be gone on from is kept aside: it may be worth a look, or what was learned over months may be wanted
-back with the settings that it was learned with.
+state that cannot be used is kept aside, and used again when it fits (see `kept_aside`). A file that is no state is
+refused and left alone.
 """
 
 import os
 from pathlib import Path
 
 from monitor_node.core import Monitor
+from monitor_node.kept_aside import DAMAGED, OTHER_SETTINGS, keep_aside, kept_aside, put_back, read_regular
 from monitor_node.monitor_state import OtherSettingsError
+from monitor_node.seal import ForeignFileError
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import is_full, replacing
-
-DAMAGED, OTHER_SETTINGS = ".damaged", ".other-settings"
-"""What is added to the name of a file that is kept aside; one of each is kept."""
 
 
 class StateFile:
@@ -24,34 +23,34 @@ class StateFile:
         path: the file.
         monitor: its memory.
         every_s: how often it is stored.
+
+    Attributes:
+        was_aside: whether the monitor was restored from a file that had been kept aside.
     """
 
     def __init__(self, path: Path, monitor: Monitor, every_s: float) -> None:
+        self.was_aside = False
         self._path, self._monitor, self._every_ns = path, monitor, int(every_s * 1e9)
         self._alarms_stored: int | None = None
         self._heard_stored: int | None = None
         self._due_ns: int | None = None
 
     def load(self) -> str:
-        """Let the monitor go on from the file, if there is one; returns what people are to be told.
+        """Restore the monitor from the file, or from one kept aside that fits; returns a line for the log.
 
         Raises:
-            InputError: the file cannot be read, or will never be written: its folder is not there, for instance. That
-                the disk is full just now ends nothing.
+            InputError: the file cannot be read, is no state, or will never be written: its folder is not there, for
+                instance. That the disk is full just now ends nothing.
         """
         try:
-            data = self._path.read_bytes() if self._path.exists() else None
+            line = self._restore(read_regular(self._path))
+        except ForeignFileError as error:
+            raise InputError(f"state_file {self._path}: {error}; it is left as it is: name another file") from error
+        except InputError as error:
+            raise InputError(f"state_file {self._path}: {error}") from error
         except OSError as error:
-            raise InputError(f"state_file {self._path}: cannot be read: {error.strerror}") from error
-        told = f"state_file {self._path}: there is none yet; the monitor learns anew"
-        if data is not None:
-            try:
-                self._monitor.from_bytes(data)
-                told = f"state_file {self._path}: the monitor goes on from it"
-            except OtherSettingsError as error:
-                told = self._keep_aside(OTHER_SETTINGS, error)
-            except InputError as error:
-                told = self._keep_aside(DAMAGED, error)
+            raise InputError(f"state_file {self._path}: cannot be read or renamed: {error.strerror}") from error
+        told = f"state_file {self._path}: {line}"
         try:
             self._write()
         except InputError as error:
@@ -96,10 +95,21 @@ class StateFile:
             self._monitor.not_stored += 1
             raise InputError(f"state_file {self._path}: cannot be written: {error.strerror}") from error
 
-    def _keep_aside(self, ending: str, why: InputError) -> str:
-        aside = self._path.with_name(self._path.name + ending)
-        try:
-            self._path.replace(aside)
-        except OSError as error:
-            raise InputError(f"state_file {self._path}: cannot be renamed: {error.strerror}") from error
-        return f"state_file {self._path}: {why}; it is kept as {aside.name}, and the monitor learns anew"
+    def _restore(self, data: bytes | None) -> str:
+        found = "there is none yet"
+        if data is not None:
+            try:
+                self._monitor.from_bytes(data)
+            except ForeignFileError:
+                raise
+            except InputError as error:
+                ending = OTHER_SETTINGS if isinstance(error, OtherSettingsError) else DAMAGED
+                found = f"{error}; it is kept as {keep_aside(self._path, ending).name}"
+            else:
+                return "the monitor goes on from it"
+        asides = kept_aside(self._path.parent).get(self._path.name, [])
+        fitting = put_back(self._path, asides, self._monitor.from_bytes)
+        self.was_aside = fitting is not None
+        if fitting is not None:
+            return f"{found}; {fitting.name} fits and is in use again"
+        return f"{found}{';' if data is None else ', and'} the monitor learns anew"

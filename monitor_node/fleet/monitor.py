@@ -56,6 +56,8 @@ class FleetMonitor:
             past will be told by `on_past`. If not, the plant is watched at once.
         store: told the state of a plant that is another's from now on.
         unusable: told a plant with a state that it cannot go on from, and why; returns what became of the state.
+        put_back: given a plant without a state that can be used, and its new monitor; returns whether the monitor was
+            restored from a state that had been kept aside.
         in_charge: told when we begin to watch a plant (True), and when it is another's (False).
 
     Raises:
@@ -73,10 +75,12 @@ class FleetMonitor:
         ask_past: Callable[[str, bool], bool] = lambda _plant, _taken_over: False,
         store: Callable[[str, State], None] = lambda _plant, _state: None,
         unusable: Callable[[str, InputError], str] = lambda _plant, _why: "",
+        put_back: Callable[[str, Monitor], bool] = lambda _plant, _monitor: False,
         in_charge: Callable[[str, bool], None] = lambda _plant, _ours: None,
     ) -> None:
         self._crew, self._in_charge = crew, in_charge
         self._ask_past, self._store, self._unusable = ask_past, store, unusable
+        self._put_back = put_back
         self._here = WatchedPlants(config, start_ns, model, points=points)
         self._arrivals = Arrivals()
         self._patience_ns: int | None = start_ns + PATIENCE_NS
@@ -134,15 +138,20 @@ class FleetMonitor:
             now_ns: now.
         """
         monitor = self._here.unwatched(plant, now_ns)
+        unusable = kept = ""
         if state is not None:
             try:
                 monitor.from_bytes(state)
             except InputError as error:
                 kept = self._unusable(plant, error)
-                monitor.notes.append(f"the state that was stored {error}; the plant is learned anew{kept}")
-                state = None
-        if state is None:
+                unusable, state = f"the state that was stored {error}", None
+        if state is None and not self._put_back(plant, monitor):
             monitor.go_on_from_alarms(alarm for alarm in self._before.of(plant) if alarm.alarm != SILENCE)
+            if unusable:
+                monitor.notes.append(f"{unusable}; the plant is learned anew{kept}")
+                self._store(plant, monitor.to_bytes())  # or the folder would not name a plant that is watched
+        elif unusable:
+            monitor.notes.append(f"{unusable}{kept}")
         self._here.add(plant, monitor)
         self._met[plant] = None
         self._in_charge(plant, True)

@@ -9,6 +9,7 @@ import structlog
 from monitor_node.alarm_commands import COMMANDS
 from monitor_node.alarm_kpis import are_of_nothing
 from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
 from monitor_node.fleet import shards
 from monitor_node.fleet.absence import Absence
 from monitor_node.fleet.config import FleetConfig
@@ -18,8 +19,9 @@ from monitor_node.fleet.shards import Crew
 from monitor_node.fleet.states import FleetStates
 from monitor_node.fleet.watched import WatchedPlants
 from monitor_node.health import NODE
+from monitor_node.kept_aside import DAMAGED, OTHER_SETTINGS
 from monitor_node.monitor_state import OtherSettingsError
-from monitor_node.state_file import DAMAGED, OTHER_SETTINGS
+from monitor_node.seal import ForeignFileError
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, CommandReply
@@ -107,9 +109,10 @@ class FleetNode(FleetMonitor):
             ask_past=self._find_past,
             store=self._keep,
             unusable=self._keep_aside,
+            put_back=self._put_back,
             in_charge=self._show,
         )
-        for plant in self._states.plants if self._states is not None else []:
+        for plant in sorted({*states.plants, *states.plants_aside}) if states is not None else []:
             if matches(self.expression, f"{keys.ROOT}/{plant}"):
                 self.meet(plant, start_ns, vouched=True)
 
@@ -161,6 +164,7 @@ class FleetNode(FleetMonitor):
             self._store_due(now_ns)
             for past in self._pasts.found():
                 publications += self._noted(self.on_past(past, now_ns))
+                self._report_ns = now_ns  # a state that cannot be used is reported at once
         publications += self._noted(super().on_tick(now_ns))
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + REPORT_EVERY_NS
@@ -225,8 +229,20 @@ class FleetNode(FleetMonitor):
     def _keep_aside(self, plant: str, why: InputError) -> str:
         if self._states is None:
             return ""
+        if isinstance(why, ForeignFileError):
+            name = self._states.leave_alone(plant)
+            return f", and {name} is left as it is; nothing is stored of the plant until it is moved away"
         ending = OTHER_SETTINGS if isinstance(why, OtherSettingsError) else DAMAGED
         return f", and the state kept as {self._states.keep_aside(plant, ending)}"
+
+    def _put_back(self, plant: str, monitor: Monitor) -> bool:
+        """Restore a plant's monitor from a state that was kept aside and fits now; returns whether there is one."""
+        if self._states is None:
+            return False
+        name = self._states.put_back(plant, monitor.from_bytes)
+        if name is not None:
+            log.warning(f"{name} fits and is in use again", plant=plant)
+        return name is not None
 
     def _store_due(self, now_ns: int) -> None:
         """Store plants of which an alarm changed, which has been told by now, and some of which something came."""

@@ -5,16 +5,20 @@ the fleet may share the folder: who takes a plant over goes on from what the one
 
 Two may take themselves for in charge of a plant for a moment: one of them was cut off, or frozen. So nobody writes over
 a file that is not the one that he has read or written last, by its time and size; he is told that another has (`lost`).
+
+A state that cannot be used is kept aside, and used again when it fits (see `kept_aside`). A file that is no state is
+left alone, and nothing is stored of its plant.
 """
 
 import contextlib
 import os
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeAlias
 
+from monitor_node.kept_aside import keep_aside, kept_aside, put_back, read_regular
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import is_full, replacing
 
@@ -51,6 +55,7 @@ class FleetStates:
         self._failed: list[tuple[str, str]] = []
         self._marks: dict[str, _Mark] = {}  # of the file of each plant that was read or written last
         self._lost: list[str] = []
+        self._left_alone: set[str] = set()  # plants whose name has a file that is no state, or cannot be read
         self._changed = threading.Condition()
         self._closed = False
         try:
@@ -63,6 +68,7 @@ class FleetStates:
             if not is_full(error):
                 raise InputError(f"state folder {folder}: {error}") from error
         self._clear_up()
+        self._aside = kept_aside(folder)
         # A daemon: who does not `close` has nothing to write.
         self._thread = threading.Thread(target=self._write_what_waits, name="states", daemon=True)
         self._thread.start()
@@ -71,6 +77,13 @@ class FleetStates:
     def plants(self) -> list[str]:
         """Those of which there is a state."""
         return sorted(path.name.removesuffix(ENDING) for path in self._folder.glob(f"[!.]*{ENDING}"))
+
+    @property
+    def plants_aside(self) -> list[str]:
+        """Those of which a state is kept aside."""
+        return sorted(
+            name.removesuffix(ENDING) for name, paths in self._aside.items() if paths and name.endswith(ENDING)
+        )
 
     def read(self, plant: str) -> bytes | None:
         """The state of a plant; None if there is none.
@@ -85,19 +98,52 @@ class FleetStates:
         path = self._path(plant)
         try:
             self._note(plant)
-            return path.read_bytes() if path.exists() else None
-        except OSError as error:
-            raise InputError(f"state {path}: cannot be read: {error.strerror}") from error
+            return read_regular(path)
+        except (InputError, OSError) as error:
+            self._left_alone.add(plant)
+            why = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else str(error)
+            raise InputError(f"state {path}: {why}; nothing is stored of the plant") from error
 
     def keep_aside(self, plant: str, ending: str) -> str:
-        """Rename the state of a plant that cannot be gone on from; returns the name that it has then."""
+        """Rename the state of a plant that cannot be used; returns the name that it has then."""
         path = self._path(plant)
-        aside = path.with_name(path.name + ending)
         try:
-            path.replace(aside)
+            aside = keep_aside(path, ending)
         except OSError as error:
+            self._left_alone.add(plant)
             return f"{path.name}, as it cannot be renamed: {error.strerror}"
+        self._aside[path.name] = [aside, *self._aside.get(path.name, [])]
         return aside.name
+
+    def leave_alone(self, plant: str) -> str:
+        """Store nothing of a plant while the file that is there now stays; returns the name of the file."""
+        self._left_alone.add(plant)
+        return self._path(plant).name
+
+    def put_back(self, plant: str, use: Callable[[bytes], None]) -> str | None:
+        """Use a state of a plant that was kept aside and fits now.
+
+        Args:
+            plant: its name; of its state nothing is in use.
+            use: as for `kept_aside.put_back`.
+
+        Returns:
+            The name that the state was kept under; None: none fits.
+        """
+        path = self._path(plant)
+        asides = self._aside.get(path.name, [])
+        if not asides or path.exists():
+            return None
+        try:
+            fitting = put_back(path, asides, use)
+        except OSError as error:
+            self._failed.append((plant, f"state {path}: what is kept aside cannot be used: {error.strerror}"))
+            return None
+        if fitting is None:
+            return None
+        asides.remove(fitting)
+        self._note(plant)
+        return fitting.name
 
     @property
     def has_room(self) -> bool:
@@ -173,6 +219,10 @@ class FleetStates:
     def _written(self, plant: str, state: bytes) -> str | None:
         """Write a state; returns why that was not possible."""
         path = self._path(plant)
+        if plant in self._left_alone:
+            if path.exists():
+                return f"state {path}: cannot be used and is not overwritten; move it away"
+            self._left_alone.discard(plant)
         try:
             with replacing(path) as temporary:
                 with temporary.open("wb") as file:

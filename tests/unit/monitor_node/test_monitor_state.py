@@ -9,7 +9,7 @@ import pytest
 
 from monitor_node.config import ChartName, MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.monitor_state import MAGIC, VERSION, OtherSettingsError
+from monitor_node.monitor_state import MAGIC, SEAL, OtherSettingsError
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, Health, ShelveAlarm
@@ -115,7 +115,7 @@ def wrong(stored: bytes) -> list[tuple[str, bytes, str]]:
     """What is no state of ours, and what is said of it."""
     damaged = bytearray(stored)
     damaged[len(stored) // 2] ^= 1
-    newer = MAGIC + (VERSION + 1).to_bytes(2, "big") + stored[len(MAGIC) + 2 :]
+    newer = MAGIC + (SEAL.version + 1).to_bytes(2, "big") + stored[len(MAGIC) + 2 :]
     return [
         ("empty", b"", "is no state of a monitor: 0 bytes"),
         ("foreign", b"\x89PNG and so on", "is no state of a monitor: 14 bytes"),
@@ -125,7 +125,7 @@ def wrong(stored: bytes) -> list[tuple[str, bytes, str]]:
         (
             "of another version",
             newer,
-            f"is the state of a monitor in version {VERSION + 1}, this software reads {VERSION}",
+            f"is the state of a monitor in version {SEAL.version + 1}, this software reads {SEAL.version}",
         ),
     ]
 

@@ -75,7 +75,7 @@ def test_at_its_end_it_is_stored(config: MonitorConfig, leak: list[Encoded]) -> 
     assert MonitorNode(config, 0).rows == 10
 
 
-@pytest.mark.parametrize("data", [b"", b"foreign", b"reactorwatch monitor\x00\x01 and then no state"])
+@pytest.mark.parametrize("data", [b"", b"reactorw", b"reactorwatch monitor\x00\x01 and then no state"])
 def test_a_damaged_file_is_kept_aside_and_told_in_one_line(
     data: bytes, config: MonitorConfig, capsys: pytest.CaptureFixture[str]
 ) -> None:

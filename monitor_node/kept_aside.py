@@ -1,0 +1,84 @@
+"""Files that cannot be used now are kept under other names, and never overwritten.
+
+What was learned over months may be wanted back, with the settings that it was learned with; a damaged file may be worth
+a look.
+"""
+
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from reactorwatch.errors import InputError
+
+DAMAGED, OTHER_SETTINGS = ".damaged", ".other-settings"
+
+_NAME = re.compile(rf"(.+?)(?:{re.escape(DAMAGED)}|{re.escape(OTHER_SETTINGS)})(?:\.\d+)?")
+
+
+def keep_aside(path: Path, ending: str) -> Path:
+    """Rename a file to its name with the ending, and a number if there is such a file; returns the new path.
+
+    Raises:
+        OSError: the file cannot be renamed.
+    """
+    aside, number = path.with_name(path.name + ending), 1
+    while True:
+        try:
+            aside.touch(exist_ok=False)  # takes the name, also where two processes keep files aside at once
+        except FileExistsError:
+            number += 1
+            aside = path.with_name(f"{path.name}{ending}.{number}")
+        else:
+            try:
+                return path.replace(aside)
+            except OSError:
+                aside.unlink()
+                raise
+
+
+def kept_aside(folder: Path) -> dict[str, list[Path]]:
+    """Files of a folder that were kept aside, the newest first, by the name that they had."""
+    found: dict[str, list[Path]] = {}
+    for path in folder.iterdir() if folder.is_dir() else []:
+        match = _NAME.fullmatch(path.name)
+        if match is not None and path.is_file():
+            found.setdefault(match[1], []).append(path)
+    return {name: sorted(paths, key=lambda path: -path.stat().st_mtime_ns) for name, paths in found.items()}
+
+
+def put_back(path: Path, asides: Iterable[Path], use: Callable[[bytes], None]) -> Path | None:
+    """Use the first of the files kept aside that can be used now, and give it its name back.
+
+    Args:
+        path: the name, which no file has now.
+        asides: the files.
+        use: takes the bytes of a file; raises InputError if they cannot be used.
+
+    Returns:
+        The name that the file was kept under; None: none of them can be used.
+
+    Raises:
+        OSError: a file cannot be read or renamed.
+    """
+    for aside in asides:
+        try:
+            use(aside.read_bytes())
+        except InputError:
+            continue  # it stays aside: that is what it is kept aside for
+        aside.replace(path)
+        return aside
+    return None
+
+
+def read_regular(path: Path) -> bytes | None:
+    """The bytes of a file; None: there is none.
+
+    Raises:
+        InputError: the path is a device, a pipe or a folder, which can hold no state.
+        OSError: the file cannot be read.
+    """
+    if not path.exists():
+        return None
+    if not path.is_file():
+        raise InputError("is not a regular file; name one")
+    return path.read_bytes()

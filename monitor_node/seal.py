@@ -1,0 +1,61 @@
+"""A word, a version and a digest in front of stored bytes.
+
+A wrong bit in a covariance, or in the name of an alarm, would otherwise be believed for months. The word tells a state
+from a file of the user's.
+"""
+
+from hashlib import blake2b
+from typing import NamedTuple
+
+from reactorwatch.errors import InputError
+
+DIGEST_BYTES = 16
+_VERSION_BYTES = 2
+
+
+class ForeignFileError(InputError):
+    """Bytes that are not a stored state, damaged or not: nothing that the software may rename or overwrite."""
+
+
+class Seal(NamedTuple):
+    """The head of one kind of stored state.
+
+    Attributes:
+        word: the first bytes.
+        version: of the form that is written and read.
+        name: of what is stored, for messages.
+    """
+
+    word: bytes
+    version: int
+    name: str
+
+    def close(self, body: bytes) -> bytes:
+        """The bytes to store: word, version, digest and body."""
+        return self.word + self.version.to_bytes(_VERSION_BYTES, "big") + _digest(body) + body
+
+    def open(self, data: bytes) -> bytes:
+        """The body of stored bytes.
+
+        Raises:
+            ForeignFileError: the bytes are not a state of this kind.
+            InputError: they are one that is cut, damaged or of another version.
+        """
+        head_bytes = len(self.word) + _VERSION_BYTES
+        head, body = data[:head_bytes], data[head_bytes + DIGEST_BYTES :]
+        is_intact = data[head_bytes : head_bytes + DIGEST_BYTES] == _digest(body)
+        if not head.startswith(self.word) or len(head) < head_bytes:
+            text = f"is no {self.name}: {len(data)} bytes that do not begin like one"
+            # A head that is cut or damaged before an intact rest, or what a power failure leaves: nothing or zeros.
+            is_ours = self.word.startswith(head[: len(self.word)]) or is_intact or not data.strip(b"\0")
+            raise InputError(text) if is_ours else ForeignFileError(text)
+        version = int.from_bytes(head[len(self.word) :], "big")
+        if version != self.version:
+            raise InputError(f"is the {self.name} in version {version}, this software reads {self.version}")
+        if not is_intact:
+            raise InputError(f"is a damaged {self.name}: its digest is another")
+        return body
+
+
+def _digest(body: bytes) -> bytes:
+    return blake2b(body, digest_size=DIGEST_BYTES).digest()
