@@ -1,5 +1,6 @@
 """The charts of a plant, made from its training: what a standard deviation is, and where limits lie."""
 
+from itertools import compress
 from math import sqrt
 from typing import TypeAlias
 
@@ -12,12 +13,19 @@ from monitor_node.charts.cusum import Cusum
 from monitor_node.charts.ewma import Ewma
 from monitor_node.charts.mewma import Mewma
 from monitor_node.charts.pca import PcaModel, PcaSpe, PcaT2
+from monitor_node.charts.run_length.mewma import LARGEST_DIMENSION_WITHOUT_SHIFT as LARGEST_DIMENSION
 from monitor_node.charts.shewhart import Shewhart
 from monitor_node.charts.t2 import T2
 from monitor_node.config import MonitorConfig
 from monitor_node.prewhitening import Prewhitening
 
 Array = NDArray[np.float64]
+
+ROWS_AN_OUTPUT = 2
+"""Rows of the training that a chart of all outputs needs for each: with fewer their correlations are hardly known."""
+
+LEAST_VARIANCE = 1e-8
+"""Of a combination of the outputs, of those of one that varies alone; with less it varies by rounding only."""
 
 VectorChart: TypeAlias = T2 | Mewma | PcaT2 | PcaSpe
 
@@ -44,8 +52,7 @@ class ChartDesign:
         self._p = budget.point_probability(arl0, config.raise_count, config.window)
         self._memory = _long_memory(e, config.ewma_weight)
         self._together = np.flatnonzero(judged)
-        e = e[:, self._together]
-        self._e = e[np.all(np.isfinite(e), axis=1)]
+        self._e = _complete(e, judged)
         self._covariance = _correlation(self._e)
         self.widths = [budget.shewhart_width(self._p, item) for item in learned]
 
@@ -68,11 +75,47 @@ class ChartDesign:
         if name == Mewma.name:
             memory = np.array(self._memory)[self._together]
             covariance = self._covariance * np.outer(memory, memory)
-            return Mewma(mean, covariance, weight, budget.joint_limit(self._arl0, count, weight, learned))
+            return Mewma(mean, covariance, weight, budget.joint_limit(self._arl0, weight, learned, len(self._e)))
         if name == T2.name:
-            return T2(mean, self._covariance, budget.joint_limit(1.0 / self._p, count, 1.0, learned))
+            return T2(mean, self._covariance, budget.joint_limit(1.0 / self._p, 1.0, learned, len(self._e)))
         model = PcaModel.fit(self._e, count - 1, self._p)
         return PcaT2(model) if name == PcaT2.name else PcaSpe(model)
+
+
+def joint_obstacle(name: str, outputs: tuple[str, ...], e: Array, judged: list[bool]) -> str:
+    """The reason why there can be no chart of all outputs together; empty if there can.
+
+    Args:
+        name: of the chart.
+        outputs: names of the outputs.
+        e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
+        judged: which outputs are judged.
+    """
+    names, rows = list(compress(outputs, judged)), _complete(e, judged)
+    count = len(names)
+    if count < 2:
+        return "it needs two outputs or more"
+    if count > LARGEST_DIMENSION:
+        return f"it takes at most {LARGEST_DIMENSION} outputs, got {count}"
+    if len(rows) < ROWS_AN_OUTPUT * count:
+        return (
+            f"the training has {len(rows)} rows in which all {count} outputs could be learned from, "
+            f"{ROWS_AN_OUTPUT * count} are needed"
+        )
+    sizes, directions = np.linalg.eigh(_correlation(rows))
+    if sizes[0] < LEAST_VARIANCE:
+        alike = [names[place] for place in np.flatnonzero(np.abs(directions[:, 0]) > 0.1)]
+        return f"one of the outputs {', '.join(alike)} follows from the others"
+    if name in (PcaT2.name, PcaSpe.name) and not np.all(np.ptp(rows, axis=0) > 0.0):
+        still = names[int(np.argmin(np.ptp(rows, axis=0)))]
+        return f"the residual of {still} does not vary in the training"
+    return ""
+
+
+def _complete(e: Array, judged: list[bool]) -> Array:
+    """The rows in which no judged output is missing, shape (rows, judged outputs)."""
+    e = e[:, np.flatnonzero(judged)]
+    return e[np.all(np.isfinite(e), axis=1)]
 
 
 def _correlation(e: Array) -> Array:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import ChartAlarm, Explanation
-from monitor_node.chart_design import ChartDesign, VectorChart
+from monitor_node.chart_design import ChartDesign, VectorChart, joint_obstacle
 from monitor_node.charts.base import Bank, Judgement, SignalChart, SignalState
 from monitor_node.charts.cusum import Cusum
 from monitor_node.charts.ewma import Ewma
@@ -215,7 +215,7 @@ class ChartWatch:
         }
         self._watched: dict[str, _Watched] = {}
         self._judged: list[bool] = []
-        self._chosen: list[ChartName] = []
+        self._chosen: list[str] = []
         self._passed: list[float] = []
         self.widths: list[float] = []
         """Of the Shewhart limits, one an output, in standard deviations; they are shown about the predictions."""
@@ -226,18 +226,26 @@ class ChartWatch:
         ranks: tuple[PriorityName, ...] = ("low", "medium", "high", "critical")
         return max((self._config.priorities.get(name, "medium") for name in self._config.outputs), key=ranks.index)
 
-    def choose(self, judged: list[bool]) -> int:
-        """Choose the charts that can be made; returns how many alarms of theirs chance can raise.
+    def choose(self, judged: list[bool], e: Array) -> dict[str, str]:
+        """Choose the charts that can be made; returns the others, by alarm, each with the reason.
 
         Args:
             judged: which outputs are judged.
+            e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
         """
-        self._judged = judged
-        count = sum(judged)
-        self._chosen = [
-            name for name in dict.fromkeys(pair[0] for pair in self._alarms) if name in OF_EACH or count > 1
-        ]
-        return sum(count if name in OF_EACH else 1 for name in self._chosen)
+        names = list[str](dict.fromkeys(chart for chart, _ in self._alarms))
+        obstacles = {
+            name: why
+            for name in names
+            if name in OF_ALL and (why := joint_obstacle(name, self._config.outputs, e, judged))
+        }
+        self._judged, self._chosen = judged, [name for name in names if name not in obstacles]
+        return {self._alarms[name, ALL].name: why for name, why in obstacles.items()}
+
+    @property
+    def chance_alarms(self) -> int:
+        """How many of their alarms chance can raise."""
+        return sum(sum(self._judged) if name in OF_EACH else 1 for name in self._chosen)
 
     def start(self, learned: list[Prewhitening], e: Array, arl0: float) -> None:
         """Make the charts, after `choose`.
@@ -264,17 +272,23 @@ class ChartWatch:
         charts = {name: watched.charts.to_bytes() for name, watched in self._watched.items()}
         return ChartsState(charts, list(self.widths), list(self._passed))
 
-    def restore(self, state: ChartsState) -> None:
-        """Go on, bit for bit, where charts of the same settings were when `state` was taken; after board and `choose`.
+    def restore(self, state: ChartsState, judged: list[bool]) -> None:
+        """Go on, bit for bit, where charts of the same settings were when `state` was taken; after the board.
+
+        Args:
+            state: of the other charts.
+            judged: which outputs are judged.
 
         Raises:
             ValueError: the state is damaged.
         """
         signals = self._config.outputs
         self.widths, self._passed = list(state.widths), list(state.passed)
-        names = set(self._chosen)
-        if set(state.charts) != names or not len(self.widths) == len(self._passed) == len(signals):
-            raise ValueError(f"there must be the charts {', '.join(sorted(names))}, got {', '.join(state.charts)}")
+        names = list[str](dict.fromkeys(chart for chart, _ in self._alarms))
+        self._judged, self._chosen = judged, [name for name in names if name in state.charts]
+        each = {name for name in names if name in OF_EACH}
+        if not each <= set(state.charts) <= set(names) or not len(self.widths) == len(self._passed) == len(signals):
+            raise ValueError(f"there must be the charts {', '.join(names)}, got {', '.join(state.charts)}")
 
         def made(name: str) -> _OfEach | _OfAll:
             data = state.charts[name]

@@ -15,18 +15,19 @@ the degrees of freedom nu that belong to the variance 1 / (2 nu) of its relative
     sqrt(1 + (2 - lambda) / (lambda n)) t_nu^-1(Phi(L)),
 
 the one that a new average crosses as rarely as L is crossed when all is known. That is Student's prediction interval
-(Hahn 1970, Additional factors for calculating prediction intervals, J. Amer. Statist. Assoc. 65), and for several
-signals Hotelling's F. It holds on average over trainings: one plant may have been lucky with its training, another
+(Hahn 1970, Additional factors for calculating prediction intervals, J. Amer. Statist. Assoc. 65); several signals:
+`estimated_t2`. It holds on average over trainings: one plant may have been lucky with its training, another
 not.
 """
 
-from math import comb, exp, isfinite, log, sqrt
+from math import comb, exp, log, sqrt
 
 import numpy as np
 from scipy import special
 
 from monitor_node.charts.base import Array
 from monitor_node.charts.run_length.design import LONGEST_DESIGN, SHORTEST, cusum_limit, ewma_limit, mewma_limit
+from monitor_node.estimated_t2 import estimated_t2_quantile
 from monitor_node.persistence import false_alarm_rate
 from monitor_node.prewhitening import Prewhitening
 from reactorwatch.errors import InputError
@@ -125,23 +126,20 @@ def cusum_height(arl0: float, k: float, learned: Prewhitening) -> float:
     return float(optimize.brentq(off, known, beyond, xtol=1e-6 * known))
 
 
-def joint_limit(arl0: float, dimension: int, weight: float, learned: list[Prewhitening]) -> float:
+def joint_limit(arl0: float, weight: float, learned: list[Prewhitening], rows: float) -> float:
     """The limit of a MEWMA's, or with the weight 1 of a T2's, statistic.
 
     Args:
         arl0: its run length without a fault.
-        dimension: number of signals.
         weight: lambda.
         learned: the training of each signal.
+        rows: from which the correlations of the signals were estimated.
     """
+    dimension = len(learned)
     known = mewma_limit(arl0, dimension, weight)
-    rows = min(item.rows for item in learned)
-    freedom = min(_freedom(item, weight) for item in learned)
-    within = float(special.chdtr(dimension, known))
-    wider = dimension * freedom / (freedom - dimension + 1.0)
-    limit = wider * float(special.fdtri(dimension, freedom - dimension + 1.0, within))
-    mean = 1.0 + (2.0 - weight) / (weight * rows)
-    return mean * limit if isfinite(limit) else mean * known * wider
+    freedoms = np.array([_freedom(item, weight) for item in learned])
+    limit = estimated_t2_quantile(float(special.chdtrc(dimension, known)), freedoms, rows)
+    return limit * (1.0 + (2.0 - weight) / (weight * min(item.rows for item in learned)))
 
 
 def _cusum_rate(shift: Array, k: Array, h: Array) -> Array:

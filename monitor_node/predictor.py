@@ -309,6 +309,17 @@ class ArxPredictor:
         )
 
 
+def fewest_rows(order: int, delay: int) -> int:
+    """Rows, one after the other, that a reference is made from at least.
+
+    Args:
+        order: of the models.
+        delay: of the input, in samples.
+    """
+    structure = Structure.of_order(order, delay)
+    return structure.history + ROWS_A_PARAMETER * structure.parameters
+
+
 def _following(rows: Rows, time_min: Array, history: int) -> Rows:
     """Those rows that follow each other, with all their history, by one period, as is asked of the rows that come."""
     steps = np.diff(time_min)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.config import MonitorConfig
-from monitor_node.predictor import ArxPredictor
+from monitor_node.predictor import ArxPredictor, fewest_rows
 from monitor_node.prewhitening import Prewhitening, learn
 from monitor_node.references import ArxReference, ProcessReference, Reference, tuned
 from monitor_node.sampling import TOLERANCE
@@ -105,6 +105,8 @@ class Training:
         self._predictors = predictors
         self._rows: deque[tuple[int, float, list[float]]] = deque(maxlen=MOST_ROWS)
         self._known = [0] * len(config.outputs)
+        of_identified = max(fewest_rows(config.order, config.delay), FEWEST_ROWS)
+        self._fewest_rows = FEWEST_ROWS if model is not None else of_identified
 
     @property
     def state(self) -> TrainingState:
@@ -147,7 +149,7 @@ class Training:
             silent: one an output.
         """
         counts = [known for known, is_silent in zip(self._known, silent, strict=True) if not is_silent]
-        return min(counts, default=0) >= FEWEST_ROWS
+        return min(counts, default=0) >= self._fewest_rows
 
     def finish(self, *, last_chance: bool) -> Trained:
         """Learn; the rows are then forgotten.

@@ -72,7 +72,6 @@ class PlantWatch:
         self._charts = ChartWatch(config, board)
         self.signals = SignalWatch(config, board)
         self._drift = DriftWatch(config, board, told=points)
-        self._chance_alarms = 0
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
         self._refusals = 0
@@ -146,7 +145,7 @@ class PlantWatch:
         self._leave_out(watched.left_out)
         self._judge_by(self._reference_of(watched.reference), learned, watched.arl0)
         self._whiteners = [Prewhitener.from_state(item) for item in watched.whiteners]
-        self._charts.restore(watched.charts)
+        self._charts.restore(watched.charts, self._judged)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
         if self._suspicion is not None and watched.suspicion is not None:
@@ -256,14 +255,19 @@ class PlantWatch:
         """Watch all signals but these."""
         self.left_out = dict(left_out)
         self._judged = [name not in left_out for name in self._config.outputs]
-        self._chance_alarms = (
-            self._charts.choose(self._judged)
-            + SignalWatch.CHANCE_ALARMS * sum(self._judged)
-            + self._drift.chance_alarms(self._judged)
-        )
+
+    @property
+    def _chance_alarms(self) -> int:
+        """How many alarms chance can raise."""
+        of_signals = SignalWatch.CHANCE_ALARMS * sum(self._judged)
+        return self._charts.chance_alarms + of_signals + self._drift.chance_alarms(self._judged)
 
     def _start(self, trained: Trained) -> None:
         self._leave_out(trained.left_out)
+        unmade = self._charts.choose(self._judged, trained.e)
+        trained.checks.extend(
+            Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
+        )
         arl0 = false_alarm_budget.share_arl0(
             self._config.false_alarms_per_30_days, self._chance_alarms, self._sampling.period_ns / MINUTE_NS
         )

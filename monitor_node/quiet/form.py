@@ -116,6 +116,7 @@ class QuietForm:
         self.keeps = config.isolation_rows if self._looks else remembered
         self.columns = len(self._signals) if self._looks else 0
         kinds = [chart for chart, _ in names]
+        self._charts_made = set(kinds) & set(CHARTS)
         self.places = np.array([kinds.index(kind) if kind in kinds else -1 for kind in CHARTS], dtype=np.int32)
         self.rules = np.array(
             [(1, 1) if kind != Shewhart.name else (config.raise_count, (1 << config.window) - 1) for kind in kinds],
@@ -161,7 +162,9 @@ class QuietForm:
         state = monitor.state
         watched, alignment = state.watch.watched, state.alignment
         board = msgspec.msgpack.decode(state.board, type=BoardState)
-        if watched is None or watched.left_out or not isinstance(watched.reference, ProcessReferenceState):
+        if watched is None or not isinstance(watched.reference, ProcessReferenceState):
+            return None
+        if watched.left_out or set(watched.charts.charts) != self._charts_made:
             return None
         if not _is_at_rest(board, self._alarms) or not is_in_order(alignment) or not run_on(state.runs, alignment):
             return None

@@ -18,10 +18,10 @@ from scipy import special
 from monitor_node.charts.run_length.cusum import LARGEST_LIMIT, cusum
 from monitor_node.charts.run_length.ewma import ewma
 from monitor_node.charts.run_length.limits import within
-from monitor_node.charts.run_length.mewma import LARGEST_LIMIT as LARGEST_MEWMA_LIMIT
-from monitor_node.charts.run_length.mewma import SMALLEST_WEIGHT, mewma
+from monitor_node.charts.run_length.mewma import LARGEST_DIMENSION, SMALLEST_WEIGHT, mewma
+from monitor_node.charts.run_length.mewma import LARGEST_LIMIT_WITHOUT_SHIFT as LARGEST_MEWMA_LIMIT
 from monitor_node.charts.run_length.shewhart import shewhart
-from monitor_node.charts.run_length.t2 import LARGEST_DIMENSION, t2
+from monitor_node.charts.run_length.t2 import t2
 from monitor_node.charts.shewhart import checked_rules
 from reactorwatch.errors import InputError
 
@@ -130,7 +130,9 @@ def ewma_limit(arl0: float, weight: float) -> float:
 @cache
 def mewma_limit(arl0: float, dimension: int, weight: float) -> float:
     """The limit H of the MEWMA of weight lambda for an in-control run length."""
-    return _root(lambda limit: mewma(0.0, dimension, weight, limit), arl0, 2.0, LARGEST_MEWMA_LIMIT)
+    return _root(
+        lambda limit: mewma(0.0, dimension, weight, limit), arl0, max(2.0, 0.5 * dimension), LARGEST_MEWMA_LIMIT
+    )
 
 
 def t2_limit(arl0: float, dimension: int) -> float:

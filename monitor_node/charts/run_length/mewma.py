@@ -26,12 +26,13 @@ from monitor_node.charts.base import Array, positive
 from monitor_node.charts.run_length.chain import run_lengths, settled
 from monitor_node.charts.run_length.ewma import ewma
 from monitor_node.charts.run_length.limits import checked_shift, told, within
-from monitor_node.charts.run_length.t2 import LARGEST_DIMENSION, t2
+from monitor_node.charts.run_length.t2 import t2
 
 SMALLEST_WEIGHT = 0.01
 SMALLEST_WEIGHT_WITHOUT_SHIFT = 1e-4
 """One dimension has so few nodes that a far longer memory can be computed."""
-LARGEST_LIMIT = 200.0
+LARGEST_DIMENSION, LARGEST_DIMENSION_WITHOUT_SHIFT = 50, 100
+LARGEST_LIMIT, LARGEST_LIMIT_WITHOUT_SHIFT = 200.0, 500.0
 
 
 def mewma(shift: float, dimension: int, weight: float, limit: float, *, steady_state: bool = False) -> float:
@@ -42,18 +43,18 @@ def mewma(shift: float, dimension: int, weight: float, limit: float, *, steady_s
 
     Args:
         shift: of the mean: its distance measured by the covariance (Mahalanobis).
-        dimension: number of signals, p, at most 50.
+        dimension: number of signals, p, at most 50; without a shift at most 100.
         weight: lambda, in [0.01, 1]; without a shift in [0.0001, 1].
-        limit: H, of the statistic, at most 200.
+        limit: H, of the statistic, at most 200; without a shift at most 500.
         steady_state: whether the chart has long run when the shift comes.
 
     Raises:
         InputError: an argument out of its range.
     """
-    within("dimension", dimension, 1, LARGEST_DIMENSION)
     size = checked_shift(shift)
+    within("dimension", dimension, 1, LARGEST_DIMENSION if size > 0.0 else LARGEST_DIMENSION_WITHOUT_SHIFT)
     within("weight (lambda)", weight, SMALLEST_WEIGHT if size > 0.0 else SMALLEST_WEIGHT_WITHOUT_SHIFT, 1.0)
-    within("limit", positive("limit", limit), 1e-6, LARGEST_LIMIT)
+    within("limit", positive("limit", limit), 1e-6, LARGEST_LIMIT if size > 0.0 else LARGEST_LIMIT_WITHOUT_SHIFT)
     if weight == 1.0:
         return t2(size, dimension, limit)
     # The radius in units of lambda, in which each step has unit variance.

@@ -8,7 +8,7 @@ from scipy import special
 from monitor_node.charts.base import positive
 from monitor_node.charts.run_length.limits import checked_shift, told, within
 
-LARGEST_DIMENSION = 50
+LARGEST_DIMENSION = 100
 
 
 def t2(shift: float, dimension: int, limit: float) -> float:
@@ -19,7 +19,7 @@ def t2(shift: float, dimension: int, limit: float) -> float:
 
     Args:
         shift: of the mean: its distance measured by the covariance (Mahalanobis).
-        dimension: number of signals, p, at most 50.
+        dimension: number of signals, p, at most 100.
         limit: of T2.
 
     Raises:

@@ -228,7 +228,7 @@ def test_far_shifts_are_seen_at_once() -> None:
         (lambda: run_length.cusum(0.0, -0.5), "k must be a number of at least 0, got -0.5"),
         (lambda: run_length.ewma(0.0, 0.0), r"weight \(lambda\) must be in \(0, 1\], got 0.0"),
         (lambda: run_length.ewma(float("nan")), r"shift must be in \[-100, 100\] sigma, got nan"),
-        (lambda: run_length.mewma(0.0, 0, 0.1, 8.0), r"dimension must be in \[1, 50\], got 0"),
+        (lambda: run_length.mewma(0.0, 0, 0.1, 8.0), r"dimension must be in \[1, 100\], got 0"),
         (lambda: run_length.mewma(1.0, 2, 1e-3, 8.0), r"weight \(lambda\) must be in \[0.01, 1\], got 0.001"),
         (lambda: run_length.mewma(0.0, 2, 1e-5, 8.0), r"weight \(lambda\) must be in \[0.0001, 1\], got 1e-05"),
         (lambda: run_length.shewhart(0.0, 30.0), r"the run length must be below 1e\+12 samples"),

@@ -80,7 +80,9 @@ def test_the_chart_of_all_outputs_alarms_as_often_as_its_share_allows() -> None:
     alarms = rows = 0
     for z in residuals(0.3, seed=2, signals=2)[:50]:
         pairs = [prewhitened(column) for column in z]
-        chart = Mewma([0.0, 0.0], np.eye(2), 0.05, budget.joint_limit(ARL0, 2, 0.05, [item for item, _ in pairs]))
+        chart = Mewma(
+            [0.0, 0.0], np.eye(2), 0.05, budget.joint_limit(ARL0, 0.05, [item for item, _ in pairs], TRAINING)
+        )
         for values in np.column_stack([e for _, e in pairs]).tolist():
             rows += 1
             if chart.update(values).out:
@@ -89,9 +91,42 @@ def test_the_chart_of_all_outputs_alarms_as_often_as_its_share_allows() -> None:
     assert 1 / 1.5 < alarms / rows * ARL0 < 1.5
 
 
+@pytest.mark.parametrize("weight", [0.02, 1.0])
+@pytest.mark.parametrize(("outputs", "training", "plants"), [(2, 60, 60), (6, 80, 30), (14, 100, 12), (52, 110, 5)])
+def test_a_chart_of_any_number_of_outputs_keeps_its_share(
+    outputs: int, training: int, plants: int, weight: float
+) -> None:
+    """Also where an output's scale has fewer degrees of freedom than there are outputs.
+
+    Alarms come in clusters, by training; 50 and more are expected.
+    """
+    arl0, rows, alarms = 200.0, 2000, 0
+    least_freedom, generator = np.inf, np.random.default_rng(outputs)
+    mixed = np.linalg.cholesky(0.5 * np.eye(outputs) + 0.5)
+    for _ in range(plants):
+        noise = generator.normal(size=(outputs, 50 + training + rows))
+        z = mixed @ lfilter([1.0], [1.0, -0.3], noise, axis=-1)[:, 50:]
+        learned = [learn(column[:training], 1e-9) for column in z]
+        e = np.empty(z.shape)
+        for row, (item, column) in enumerate(zip(learned, z, strict=True)):
+            e[row] = (lfilter([1.0, *(-a for a in item.coefficients)], [1.0], column) - item.constant) / item.sd
+        known = e[:, 6:training]
+        white = np.linalg.inv(np.linalg.cholesky(np.corrcoef(known))) @ e[:, training:]
+        limit = budget.joint_limit(arl0, weight, learned, known.shape[1])
+        least_freedom = min(least_freedom, *(0.5 / (item.sd_variance + item.passed_variance) for item in learned))
+        first = 0
+        while first < rows:
+            average = lfilter([weight], [1.0, weight - 1.0], white[:, first:], axis=-1)
+            out = np.flatnonzero(np.sum(average**2, axis=0) * (2.0 - weight) / weight > limit)
+            first += int(out[0]) + 1 if out.size else rows
+            alarms += out.size > 0
+    assert outputs < 14 or least_freedom < outputs
+    assert 0.1 < alarms / (plants * rows) * arl0 < 1.5
+
+
 def test_when_all_is_known_limits_are_those_of_the_run_lengths() -> None:
     assert budget.ewma_width(5000.0, 0.1, KNOWN) == pytest.approx(ewma_limit(5000.0, 0.1), rel=1e-6)
-    assert budget.joint_limit(5000.0, 2, 0.1, [KNOWN, KNOWN]) == pytest.approx(mewma_limit(5000.0, 2, 0.1), rel=1e-4)
+    assert budget.joint_limit(5000.0, 0.1, [KNOWN, KNOWN], 1e12) == pytest.approx(mewma_limit(5000.0, 2, 0.1), rel=1e-4)
     assert budget.shewhart_width(0.0026997960632602, KNOWN) == pytest.approx(3.0, abs=1e-6)
 
 

@@ -1,0 +1,104 @@
+"""Plants with any number of outputs: the default charts watch them, and a chart that cannot be made is named."""
+
+import numpy as np
+import pytest
+
+from monitor_node.config import ChartName, MonitorConfig
+from monitor_node.core import Monitor
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Alarm, ChartPoint, Quality, Sample
+
+from .samples import Rows
+
+ROW_NS = 6 * 10**9
+
+
+def plant(outputs: int, rows: int, seed: int = 1) -> Rows:
+    """A moving input, and so many lags of it with noise; shape (1 + outputs, rows)."""
+    generator = np.random.default_rng(seed)
+    u = np.repeat(generator.normal(size=rows // 10 + 1), 10)[:rows]
+    values = np.empty((1 + outputs, rows))
+    values[0] = u
+    gain, state = generator.normal(size=outputs), np.zeros(outputs)
+    for row in range(rows):
+        values[1:, row] = state + 0.3 * generator.normal(size=outputs)
+        state = 0.8 * state + 0.2 * gain * u[row]
+    return values
+
+
+def config_of(
+    outputs: int, training_rows: int, charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
+) -> MonitorConfig:
+    return MonitorConfig(
+        input="u",
+        outputs=tuple(f"y{number}" for number in range(outputs)),
+        training_min=training_rows * 0.1,
+        charts=charts,
+        isolation=False,
+        priorities={},
+        smallest_sd={},
+    )
+
+
+def watch(monitor: Monitor, values: Rows, first: int = 0) -> list[Publication]:
+    """Let a monitor watch rows; what it says."""
+    said: list[Publication] = []
+    names = (monitor.config.input, *monitor.config.outputs)
+    for row in range(first, values.shape[1]):
+        for name, value in zip(names, values[:, row].tolist(), strict=True):
+            message = Sample(time_ns=row * ROW_NS, sequence=row, value=value, quality=Quality.QUALITY_GOOD)
+            said += monitor.on_sample(name, message, 0)
+    return said
+
+
+def raised(said: list[Publication]) -> list[str]:
+    return [item.message.alarm for item in said if isinstance(item.message, Alarm) and item.message.event == "raised"]
+
+
+@pytest.mark.parametrize(
+    ("outputs", "training_rows"), [(1, 60), (2, 60), (5, 200), (6, 80), (8, 100), (14, 150), (30, 150), (52, 150)]
+)
+def test_the_default_charts_watch_any_number_of_outputs(outputs: int, training_rows: int) -> None:
+    """A fault in the last output is seen, and by the chart of all outputs too where there is one."""
+    monitor = Monitor(config_of(outputs, training_rows), 0, points=False)
+    values = plant(outputs, training_rows + 120)
+    values[-1, training_rows + 60 :] += 6.0
+    said = watch(monitor, values)
+    assert monitor.phase == "watching"
+    assert monitor.watching_since_ns == max(training_rows, 73) * ROW_NS  # ten rows for each of seven parameters
+    assert f"ewma/y{outputs - 1}" in raised(said)
+    assert not any(name.endswith("/y0") for name in raised(said) if outputs > 1)
+    assert monitor.notes == []
+    assert ("mewma/all" in raised(said)) == (outputs > 1)
+
+
+@pytest.mark.parametrize("charts", [("shewhart", "mewma"), ("ewma", "t2"), ("cusum", "pca_t2", "pca_spe")])
+def test_a_chart_of_all_outputs_is_left_out_aloud_after_a_training_with_too_few_rows(
+    charts: tuple[ChartName, ...],
+) -> None:
+    """45 outputs in 80 rows; the budget goes to the other charts, and a stored state knows which these are."""
+    config = config_of(45, 80, charts)
+    monitor, again = Monitor(config, 0), Monitor(config, 0)
+    values = plant(45, 130)
+    said = watch(monitor, values[:, :110])
+    for name in charts[1:]:
+        (note,) = (note for note in monitor.notes if f"{name}/all is left out" in note)
+        assert note.endswith("rows in which all 45 outputs could be learned from, 90 are needed")
+    points = [item.key for item in said if isinstance(item.message, ChartPoint)]
+    assert any(f"/{charts[0]}/" in key for key in points)
+    assert not any(key.endswith("/all") for key in points)
+    again.from_bytes(monitor.to_bytes())
+    assert again.expected_false_alarms == monitor.expected_false_alarms > 0.0
+    assert watch(again, values, 110) == watch(monitor, values, 110)
+
+
+def test_outputs_of_which_one_follows_from_the_others_have_no_chart_of_all() -> None:
+    """The same sensor under two names: the charts of each output go on."""
+    values = plant(3, 300)
+    values[3] = values[2]
+    monitor = Monitor(config_of(3, 200), 0, points=False)
+    watch(monitor, values)
+    assert monitor.phase == "watching"
+    assert monitor.notes == [
+        "training: mewma/all is left out: one of the outputs y1, y2 follows from the others",
+    ]
