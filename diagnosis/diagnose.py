@@ -24,17 +24,19 @@ from diagnosis.result import (
     NOMINAL,
     UNKNOWN,
     Alternative,
+    Curves,
     Diagnosis,
     Gain,
     HeldOut,
 )
 from diagnosis.run import Run
 from diagnosis.search import Explained, Found, Search
+from diagnosis.sensor_noise import sensor_noise
 from diagnosis.uncertain import with_uncertain
 from diagnosis.unknown import MARGIN, Located, bic_of, located
 from reactorwatch.process import effects_of
 from reactorwatch.process.effects.base import TIMING, Effect
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.records.record import Record
 
 LEAST_GAIN = 10.0
@@ -116,14 +118,15 @@ def diagnose(
     best.hypothesis.sized.noise, found.nominal.hypothesis.sized.noise = found.noise, found.own_noise
     best, covariances = with_rough_numbers(search, best)
     before, after = gained(run, found.nominal, best)
-    unexplained = verdict == UNKNOWN and left_matters(before, found, model, bands)
+    curves = curves_of(whole, run, model, found.nominal, best, covariances)
+    noise_sd = _noise_sd(found, run, model, curves, verdict)
+    unexplained = verdict == UNKNOWN and left_matters(before, noise_sd, model, bands)
     if verdict == UNKNOWN and not unexplained and looks_like_integration(plant, run, found.nominal.fit.found):
         location = TIMING
         remarks.append(
             "what is left is small and goes with the error of an integrator's steps: it looks like integration "
             "of the record's own making, or timing of its input"
         )
-    curves = curves_of(whole, run, model, found.nominal, best, covariances)
     curves = replace(curves, held_out=dict(zip(model.output_names, after.values.T, strict=True)))
     if verdict == UNKNOWN and strange is not None and strange.effect.location == location:
         curves = replace(curves, unknown=strange.course)
@@ -144,8 +147,8 @@ def diagnose(
         location=location,
         significant=verdict != NOMINAL,
         practical=unexplained or matters(curves, bands),
-        differences=differences_of(model, found, curves),
-        gain=_gain(model, found, best, before, after),
+        differences=differences_of(model, noise_sd, curves),
+        gain=_gain(model, found.nominal.bic - best.bic, noise_sd, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
         experiment=experiment,
         extended_model=extended_model(adjusted, effects, causes, record.zero_ns),
@@ -216,8 +219,19 @@ def _rivals(found: Found, best: Explained) -> list[Explained]:
     return listed
 
 
-def _gain(model: ProcessModel, found: Found, best: Explained, before: Errors, after: Errors) -> Gain:
-    noise_sd = found.noise.sensor_sd(model.output_names)
+def _noise_sd(found: Found, run: Run, model: ProcessModel, curves: Curves, verdict: str) -> Array:
+    """Standard deviation of each sensor's noise, shape (n_y,).
+
+    Where nothing explains the run, a filter takes part of what the model errs for noise.
+    """
+    if verdict != UNKNOWN:
+        return found.noise.sensor_sd(model.output_names)
+    simulated = np.column_stack([curves.free_before[name] for name in model.output_names])
+    period_min = float(np.median(np.diff(run.time_min)))
+    return sensor_noise(found.noise, model.output_names, run.measured - simulated, run.measured, period_min)
+
+
+def _gain(model: ProcessModel, delta_bic: float, noise_sd: Array, before: Errors, after: Errors) -> Gain:
     held_out = {
         output.name: HeldOut(
             float(before.free[place]),
@@ -229,7 +243,7 @@ def _gain(model: ProcessModel, found: Found, best: Explained, before: Errors, af
         )
         for place, output in enumerate(model.outputs)
     }
-    return Gain(found.nominal.bic - best.bic, held_out)
+    return Gain(delta_bic, held_out)
 
 
 def _left_out(whole: Run, run: Run) -> list[str]:

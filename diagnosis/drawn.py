@@ -8,7 +8,7 @@ from diagnosis.difference import Difference, difference
 from diagnosis.held_out import free_run
 from diagnosis.result import Curves
 from diagnosis.run import Run
-from diagnosis.search import Explained, Found
+from diagnosis.search import Explained
 from reactorwatch.process.model import Array, ProcessModel
 
 
@@ -50,12 +50,11 @@ def curves_of(
     )
 
 
-def differences_of(model: ProcessModel, found: Found, curves: Curves) -> dict[str, Difference]:
-    """Of each output: where, when and at which operating points the simulation errs."""
+def differences_of(model: ProcessModel, noise_sd: Array, curves: Curves) -> dict[str, Difference]:
+    """Of each output: where, when and at which operating points the simulation errs; of the sensors the noise."""
     columns = curves.inputs | curves.free_before
     units = {item.name: item.unit for item in model.inputs} | {item.name: item.unit for item in model.outputs}
     signals = {name: (columns[name], unit) for name, unit in units.items()}
-    noise_sd = found.noise.sensor_sd(model.output_names)
     return {
         output.name: difference(
             curves.measured[output.name] - curves.free_before[output.name],

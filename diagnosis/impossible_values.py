@@ -4,19 +4,33 @@ A filter would take such a value for the plant. An input beyond its bounds canno
 exceed those of its state by a scale, for noise and offsets of its sensor.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import Array, ProcessModel, Variable
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 
 MARGIN = 1.0
 """In scales of a state: its sensor may show values so far beyond its bounds."""
 
 
-def typical_value(values: Array) -> float:
-    """Median of the different values of a signal, so that a value which stands for "not measured" counts once."""
-    return float(np.median(np.unique(values[np.isfinite(values)])))
+class Bounds(NamedTuple):
+    """Lowest and highest value that a signal can have, in its unit."""
+
+    lower: float
+    upper: float
+    unit: str
+
+
+def bounds_of(model: ProcessModel) -> dict[str, Bounds]:
+    """Bounds of the inputs, and of those outputs that show a state, by name."""
+    margins = {state.name: (state, MARGIN * state.scale) for state in model.states if state.name in model.output_names}
+    margins |= {item.name: (item, 0.0) for item in model.inputs}
+    return {
+        name: Bounds(item.lower - margin, item.upper + margin, item.unit) for name, (item, margin) in margins.items()
+    }
 
 
 def check_values(record: Record, model: ProcessModel) -> None:
@@ -25,16 +39,13 @@ def check_values(record: Record, model: ProcessModel) -> None:
     Raises:
         InputError: the first such value, by file, row and column.
     """
-    states = {state.name: (state, MARGIN * state.scale) for state in model.states}
-    bounds = {item.name: (item, 0.0) for item in model.inputs}
-    bounds |= {name: states[name] for name in model.output_names if name in states}
-    for name, (item, margin) in bounds.items():
+    for name, bounds in bounds_of(model).items():
         if name in record.columns:
-            _check_column(record, name, item, margin)
+            _check_column(record, name, bounds)
 
 
-def _check_column(record: Record, name: str, item: Variable, margin: float) -> None:
-    values, lower, upper = record.columns[name], item.lower - margin, item.upper + margin
+def _check_column(record: Record, name: str, bounds: Bounds) -> None:
+    values, (lower, upper, unit) = record.columns[name], bounds
     rows = np.flatnonzero(np.isfinite(values) & ~((values >= lower) & (values <= upper)))
     if not rows.size:
         return
@@ -42,7 +53,7 @@ def _check_column(record: Record, name: str, item: Variable, margin: float) -> N
     others = np.count_nonzero(values[rows] == values[row]) - 1
     also = f" (and {others} more of it)" if others else ""
     raise InputError(
-        f"{_place(record, row)}, column {name!r}: must be in [{lower:g}, {upper:g}] {item.unit}, "
+        f"{_place(record, row)}, column {name!r}: must be in [{lower:g}, {upper:g}] {unit}, "
         f"got {values[row]:g}{also}; empty the cells that mean 'not measured'"
     )
 

@@ -113,10 +113,10 @@ def _noise_sd(column: Array) -> float:
     known = column[np.isfinite(column)]
     if known.size < 2 * SIDE_ROWS:
         return inf
-    return max(rough_sensor_sd(known), _step_of(known))
+    return max(rough_sensor_sd(known), resolution(known))
 
 
-def _step_of(values: Array) -> float:
+def resolution(values: Array) -> float:
     """The least difference of two values; of those that do not come in steps it is next to nothing."""
-    steps = np.diff(np.unique(np.round(values, 9)))
+    steps = np.diff(np.unique(np.round(values[np.isfinite(values)], 9)))
     return float(steps.min()) if steps.size else 0.0

@@ -7,9 +7,8 @@ import numpy as np
 from diagnosis.held_out import Errors
 from diagnosis.result import Curves
 from diagnosis.run import Run
-from diagnosis.search import Found
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import Array, ProcessModel
 
 PRACTICAL_SHARE = 0.02
 """Of an output's range in the record: a difference in it that matters, where the user does not say."""
@@ -58,8 +57,14 @@ def matters(curves: Curves, bands: Mapping[str, float]) -> bool:
     return False
 
 
-def left_matters(before: Errors, found: Found, model: ProcessModel, bands: Mapping[str, float]) -> bool:
-    """Whether the nominal free run errs by more than noise and tolerance in an output."""
-    noise = found.own_noise.sensor_sd(model.output_names)
-    left = np.sqrt(np.maximum(before.free**2 - noise**2, 0.0))
+def left_matters(before: Errors, noise_sd: Array, model: ProcessModel, bands: Mapping[str, float]) -> bool:
+    """Whether the nominal free run errs by more than noise and tolerance in an output.
+
+    Args:
+        before: errors of the nominal model.
+        noise_sd: of the sensors, shape (n_y,); without what a filter takes for their noise, see `sensor_noise`.
+        model: of the plant.
+        bands: tolerances, by output.
+    """
+    left = np.sqrt(np.maximum(before.free**2 - noise_sd**2, 0.0))
     return any(not value <= bands[name] for name, value in zip(model.output_names, left.tolist(), strict=True))

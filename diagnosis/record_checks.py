@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnosis.impossible_values import check_values, typical_value
+from diagnosis.impossible_values import check_values
 from diagnosis.run import Run
-from diagnosis.units import check_units
+from diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.records.record import Record
@@ -42,7 +42,6 @@ def run_of(record: Record, model: ProcessModel) -> Run:
             f"{', '.join(missing)} is not there"
         )
     outputs = []
-    states = {state.name: state for state in model.states}
     for output in model.outputs:
         values = record.columns[output.name]
         known = values[np.isfinite(values)]
@@ -56,8 +55,6 @@ def run_of(record: Record, model: ProcessModel) -> Run:
                 f"{name}: {output.name} must vary, it is {known[0]:g} {output.unit} in every row; "
                 "the sensor is stuck, or the column is not what it seems"
             )
-        if output.name in states:
-            _check_bounds(name, output.name, output.unit, known, states[output.name].lower, states[output.name].upper)
         outputs.append(values)
     inputs = []
     for item in model.inputs:
@@ -66,27 +63,21 @@ def run_of(record: Record, model: ProcessModel) -> Run:
             raise InputError(
                 f"{name}: {item.name} must be there in the first row; leave out the rows before its first value"
             )
-        _check_bounds(name, item.name, item.unit, values, item.lower, item.upper)
         inputs.append(values)
+    wrong = find_wrong_unit(model, record.columns, record.time_min)
+    if wrong is not None and not wrong.of_times:
+        raise InputError(f"{name}: {wrong.text}")
     check_values(record, model)
     if all(np.ptp(values) <= LEAST_MOVE * item.scale for values, item in zip(inputs, model.inputs, strict=True)):
         raise InputError(
             f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} all the time; "
             "nothing can be told apart without excitation: record a stretch with steps in it"
         )
+    if wrong is not None:
+        raise InputError(f"{name}: {wrong.text}")
     there: NDArray[np.bool_] = np.column_stack([np.isfinite(record.columns[item.name]) for item in model.inputs])
     u = np.column_stack(inputs)
-    run = Run(record.time_min, u, np.column_stack(outputs), *_breaks(record.time_min, u, there))
-    check_units(name, run, model)
-    return run
-
-
-def _check_bounds(name: str, signal: str, unit: str, values: Array, lower: float, upper: float) -> None:
-    typical = typical_value(values)
-    if not lower <= typical <= upper:
-        hint = "; is it in degrees C? then add 273.15" if unit == "K" and lower <= typical + 273.15 <= upper else ""
-        rule = f"{signal} must be in [{lower:g}, {upper:g}] {unit}"
-        raise InputError(f"{name}: {rule}, its median is {typical:g}{hint or '; check its unit'}")
+    return Run(record.time_min, u, np.column_stack(outputs), *_breaks(record.time_min, u, there))
 
 
 def _breaks(

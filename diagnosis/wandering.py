@@ -147,14 +147,26 @@ def _rate_sd(sd: float, time_min: float, period_min: float) -> float:
     return sd * sqrt((1.0 - exp(-2.0 * period_min / time_min)) / period_min)
 
 
-def _power_ratio(residual: Array) -> float:
-    """Power of a residual at the lower frequencies over that at the higher ones; 1 if it is too short to tell."""
+def power_spectrum(residual: Array) -> tuple[Array, Array] | None:
+    """Frequencies, in shares of the highest, and the power there: of white noise on average its variance.
+
+    None if the residual is too short. What is missing is left out, and outliers are clipped.
+    """
     differences = np.diff(residual[np.isfinite(residual)])  # so that the highest frequencies do not drown in the lowest
     if differences.size < _FEWEST_ROWS:
-        return 1.0
+        return None
     limit = CUT * float(np.median(np.abs(differences))) / 0.6745
-    power = np.abs(np.fft.rfft(np.clip(differences, -limit, limit))) ** 2
+    power = np.abs(np.fft.rfft(np.clip(differences, -limit, limit))) ** 2 / differences.size
     share = np.linspace(0.0, 1.0, power.size)
     power[1:] /= 2.0 - 2.0 * np.cos(np.pi * share[1:])
+    return share, power
+
+
+def _power_ratio(residual: Array) -> float:
+    """Power of a residual at the lower frequencies over that at the higher ones; 1 if it is too short to tell."""
+    spectrum = power_spectrum(residual)
+    if spectrum is None:
+        return 1.0
+    share, power = spectrum
     low, high = (float(np.mean(power[(share >= begin) & (share < end)])) for begin, end in (LOW, HIGH))
     return low / high if high > 0.0 else 1.0

@@ -13,7 +13,10 @@ from reactorwatch.cli.batch import Answer, Kind, Row, as_table
 from reactorwatch.cli.options import existing_recording
 from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.sources import messages, plant_of, zero_of
+from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.errors import InputError
+from reactorwatch.process.cstr import cstr
+from reactorwatch.runtime.model_file import model_on_the_bus
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,8 @@ def answer(job: Job) -> Answer:
     """
     plant = plant_of(existing_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
-    result = run(messages(job.at, plant, job.columns), settings)
+    first = FirstSamples(plant)
+    result = run(first.passing(messages(job.at, plant, job.columns)), settings)
     if set(settings.outputs) <= result.left_out.keys():
         reasons = "; ".join(f"{name}: {result.left_out[name]}" for name in settings.outputs)
         raise InputError(f"{job.at}: there is no output to watch ({reasons})")
@@ -84,7 +88,7 @@ def answer(job: Job) -> Answer:
         said = msgspec.json.encode({"file": str(job.file), **found} if job.among else found).decode()
     else:
         said = backtest_text(result, zero_ns, job.file)
-    return Answer(said, _row(job.file, found))
+    return Answer(said, _row(job.file, found), first.unit_remark(model_on_the_bus(settings.model) or cstr()))
 
 
 _COLUMNS = ("samples", "span_min", "trained_until_min", "expected_false_alarms")

@@ -38,10 +38,12 @@ class Answer:
     Attributes:
         said: to be printed.
         row: of the summary.
+        remark: about the file, for people, on standard error; empty: none.
     """
 
     said: str
     row: Row
+    remark: str = ""
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,7 @@ def say(
         with task(f"{kind.doing} {files[0].name}"):
             answer = kind.work(jobs[0])
         typer.echo(answer.said)
+        write_remark(files[0], answer.remark)
         return
     rows: list[Row] = []
     for file, outcome in zip(files, results(kind.work, jobs, kind.doing, processes, scheduler), strict=True):
@@ -122,6 +125,7 @@ def say(
             rows.append(kind.failed(file, reason))
         else:
             typer.echo(outcome.said)
+            write_remark(file, outcome.remark)
             rows.append(outcome.row)
     failed = sum(bool(row["error"]) for row in rows)
     if len(rows) > 1 and not as_json:
@@ -157,6 +161,12 @@ def results(
                 yield done
 
         yield from in_order(counted())
+
+
+def write_remark(file: Path, remark: str) -> None:
+    """Write a remark about a file to standard error, where it disturbs no machine that reads the answer."""
+    if remark:
+        sys.stderr.write(f"reactorwatch: {file}: remark: {remark}\n")
 
 
 def _without_name(reason: str, file: Path) -> str:

@@ -37,10 +37,14 @@ def identify(
 ) -> None:
     """Fit a linear model to one half, judge it by the other."""
     from reactorwatch.cli import identification
+    from reactorwatch.cli.batch import write_remark
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.sources import record
+    from reactorwatch.cli.unit_remarks import unit_remark
+    from reactorwatch.process.cstr import cstr
 
     measured = record(existing_recording(file), plant, columns(column))
+    remark = unit_remark(cstr(), measured.columns, measured.time_min)
     with task(f"identifying {file.name}"):
         if compare:
             said = identification.compare(measured, output, order, delay, neural=neural, as_json=as_json)
@@ -49,6 +53,7 @@ def identify(
                 measured, output, model, order, delay, recursive=recursive, report_rows=report_rows, as_json=as_json
             )
     typer.echo(said)
+    write_remark(file, remark)
 
 
 def linearise(

@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 
 from diagnosis.impossible_values import check_values
+from diagnosis.units import find_wrong_unit
 from plant_node.initial_state import carried_over
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
@@ -28,6 +29,9 @@ def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record
     """
     for text in faults:
         model = parse_fault(text, effects_of(model)).extend(model, end_min=float(measured.time_min[-1]))
+    wrong = find_wrong_unit(model, measured.columns, measured.time_min)
+    if wrong is not None and not wrong.of_times:  # it may be short, and its rows far apart
+        raise InputError(f"{measured.name}: {wrong.text}")
     check_values(measured, model)
     inputs = np.column_stack([measured.columns[name] for name in model.input_names])
     first = {name: float(measured.columns[name][0]) for name in model.output_names}

@@ -39,6 +39,9 @@ from reactorwatch.process.model import Array, ProcessModel
 SHARES = (0.3, 0.03, 0.003)
 """Process noise to begin with, in scales of the state per square root of a minute; the noisiest finds its way best."""
 
+LEAST_RELATIVE_SD = 1e-9
+"""Of a sensor, relative to the largest value that it shows: the logarithm of no noise at all cannot be taken."""
+
 LEAST_SHARE, AS_GOOD_AS_NONE = 1e-5, 3e-4
 """Less is none; and so little that it is as good as none, though steps lead out of it."""
 
@@ -99,7 +102,8 @@ def tune(
         time_min: shape (rows,), increasing.
         inputs: shape (rows,) or (rows, n_u).
         measured: shape (rows, n_y); NaN where missing or not to be learned from.
-        smallest_sd: of the sensors, one an output, in its unit, above 0: theirs are at least so large.
+        smallest_sd: of the sensors, one an output, in its unit: theirs are at least so large, and at least
+            `LEAST_RELATIVE_SD` of what they show.
     """
     return tune_with(model, time_min, inputs, measured, smallest_sd, (), {})[0]
 
@@ -161,6 +165,8 @@ class _Tuning:
         names = [model.states[place].name for place in self._states]
         self._apart = np.array([first_sd.get(name, 0.0) for name in names])
         self._learned = [model.parameter(name) for name in learned]
+        largest = np.max(np.abs(np.nan_to_num(measured)), axis=0)
+        smallest_sd = np.maximum(smallest_sd, LEAST_RELATIVE_SD * np.where(largest > 0.0, largest, 1.0))
         limits = np.log([[item.lower, item.upper] for item in self._learned]).reshape(-1, 2).T
         self._lowest = np.concatenate([np.log(smallest_sd), np.log(LEAST_SHARE * self._scales), limits[0]])
         self._highest = np.concatenate([np.full(self._of_states.stop, inf), limits[1]])

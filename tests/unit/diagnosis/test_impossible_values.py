@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from diagnosis.record_checks import run_of
@@ -40,6 +40,7 @@ def spoiled(record: Record, signal: str, rows: list[int], value: float) -> Recor
     return replace(record, columns=record.columns | {signal: values})
 
 
+@settings(max_examples=40)
 @given(
     signal=st.sampled_from(sorted(MODELS)),
     value=st.one_of(st.sampled_from(SENTINELS), st.floats(allow_nan=False, allow_infinity=False)),

@@ -92,3 +92,22 @@ def test_an_output_that_is_never_measured_has_the_smallest_level() -> None:
 def test_it_is_the_same_every_time() -> None:
     record = record_of(seed=9, process_noise_sd={"T": 0.2})
     assert tuned(*record) == tuned(*record)
+
+
+@pytest.mark.parametrize("smallest", [(0.0, 0.0), (0.0, 0.05), (1e-300, 1e-300)])
+@pytest.mark.parametrize("noise_sd", [NoiseSd(C=0.0, T=0.0), NoiseSd(C=0.0, T=0.3), NoiseSd(C=0.002, T=0.0)])
+def test_a_sensor_without_noise_needs_no_smallest_level(smallest: tuple[float, float], noise_sd: NoiseSd) -> None:
+    found = tune(cstr(), *record_of(rows=400, seed=5, noise_sd=noise_sd), smallest)
+    for sd, least, true in zip(found.measurement_sd, smallest, (noise_sd.C, noise_sd.T), strict=True):
+        if true > 0.0:
+            assert sd == pytest.approx(true, rel=4 / np.sqrt(2 * 400))
+        else:
+            assert max(0.99 * least, 1e-10) <= sd <= max(1.01 * least, 1e-6)
+    assert found.process_sd == (0.0, 0.0)
+
+
+def test_an_output_that_is_always_zero_has_a_level_too() -> None:
+    time_min, inputs, measured = record_of(rows=400, seed=5)
+    measured[:, 0] = 0.0
+    found = tune(cstr(), time_min, inputs, measured, (0.0, 0.0))
+    assert np.all(np.isfinite([*found.measurement_sd, *found.process_sd]))

@@ -1,0 +1,62 @@
+"""Remarks about units, where a command can answer without the plant's equations but they could not judge the record."""
+
+from collections.abc import Iterable, Iterator, Mapping
+
+import numpy as np
+
+from diagnosis.units import find_wrong_unit
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, Encoded, decode
+from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.records.record import to_minutes
+
+MOST_SAMPLES = 3000
+"""Of each signal: so many tell its unit."""
+
+
+def unit_remark(model: ProcessModel, columns: Mapping[str, Array], time_min: Array) -> str:
+    """The first unit that is not the model's, and what follows from it; empty if there is none.
+
+    Args:
+        model: of the plant.
+        columns: values by signal, NaN where not measured.
+        time_min: shape (rows,).
+    """
+    wrong = find_wrong_unit(model, columns, time_min)
+    return "" if wrong is None else f"{wrong.text}. The plant's equations cannot judge it so; a learned model can"
+
+
+class FirstSamples:
+    """The first samples of a plant among messages that go by.
+
+    Args:
+        plant: its name.
+    """
+
+    def __init__(self, plant: str) -> None:
+        self._prefix = keys.key(plant, keys.SAMPLE, "")
+        self._series: dict[str, list[tuple[int, float]]] = {}
+
+    def passing(self, messages: Iterable[Encoded]) -> Iterator[Encoded]:
+        """The messages as they are, each sample noted on its way."""
+        for message in messages:
+            if message.key.startswith(self._prefix):
+                series = self._series.setdefault(message.key.removeprefix(self._prefix), [])
+                if len(series) < MOST_SAMPLES:
+                    self._note(message, series)
+            yield message
+
+    def _note(self, message: Encoded, series: list[tuple[int, float]]) -> None:
+        try:
+            sample = decode(message.payload, message.encoding)
+        except DecodeError:
+            return  # the monitor counts it as refused
+        if isinstance(sample, Sample):
+            series.append((sample.time_ns, sample.value))
+
+    def unit_remark(self, model: ProcessModel) -> str:
+        """See `unit_remark`."""
+        columns = {name: np.array([value for _, value in series]) for name, series in self._series.items()}
+        times = next(iter(self._series.values()), [])
+        return unit_remark(model, columns, np.array([to_minutes(time_ns) for time_ns, _ in times]))
