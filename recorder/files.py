@@ -69,7 +69,6 @@ class RecordingFiles:
         self._open_part = open_part
         self._writer: RecordingWriter | None = None
         self._black_boxes = BlackBoxFiles(series)
-        self._ages = Ages(series.folder / f".{series.stem}.ages", read_clock)
         self._chores = Chores()
         self._begun = 0
         self._before = ""
@@ -77,11 +76,12 @@ class RecordingFiles:
         self._abandoned: list[Path] = []
         first = series.first(datetime.now(UTC))
         self._left = [] if not series.folder.is_dir() else remains_of(series)
-        self._ages.see((path.name, path.stat().st_mtime_ns) for path in self._kept_for_a_time())
         for copy in self._black_boxes.half_made():
             copy.unlink(missing_ok=True)
         if not self._left:
             check_free(first)
+        self._ages = Ages(series.folder / f".{series.stem}.ages", read_clock)
+        self._ages.see((path.name, path.stat().st_mtime_ns) for path in self._kept_for_a_time())
 
     @property
     def path(self) -> Path | None:
