@@ -194,7 +194,7 @@ class Recorder:
     def stop_recording(self, why: str, now_ns: int) -> list[Publication]:
         """The file cannot be written: raise the alarm."""
         self._stopped = True
-        text = f"recording stopped: {why}; it goes on when there is room"
+        text = f"recording stopped: {why}; it goes on when a file can be written"
         return [self._alarms.raise_alarm(DISK_ALARM, text, now_ns), self.health(now_ns)]
 
     def resume_recording(self, now_ns: int) -> list[Publication]:

@@ -4,6 +4,7 @@ What is written, and when a file is flushed or a new one begun, is decided elsew
 `retention`); here it is done.
 """
 
+import contextlib
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -69,7 +70,6 @@ class RecordingFiles:
         self._open_part = open_part
         self._writer: RecordingWriter | None = None
         self._black_boxes = BlackBoxFiles(series)
-        self._ages = Ages(series.folder / f".{series.stem}.ages", read_clock)
         self._chores = Chores()
         self._begun = 0
         self._before = ""
@@ -77,11 +77,12 @@ class RecordingFiles:
         self._abandoned: list[Path] = []
         first = series.first(datetime.now(UTC))
         self._left = [] if not series.folder.is_dir() else remains_of(series)
-        self._ages.see((path.name, path.stat().st_mtime_ns) for path in self._kept_for_a_time())
         for copy in self._black_boxes.half_made():
             copy.unlink(missing_ok=True)
         if not self._left:
             check_free(first)
+        self._ages = Ages(series.folder / f".{series.stem}.ages", read_clock)
+        self._ages.see((path.name, path.stat().st_mtime_ns) for path in self._kept_for_a_time())
 
     @property
     def path(self) -> Path | None:
@@ -110,7 +111,14 @@ class RecordingFiles:
             InputError: a file cannot be written; see `abandon`.
         """
         self.complete()
-        path = self._series.next(now_ns, {path.name.removesuffix(PART) for path in self._series.folder.iterdir()})
+        folder = self._series.folder
+        try:
+            if self._begun:
+                folder.mkdir(parents=True, exist_ok=True)  # it may have been deleted since
+            there = {path.name.removesuffix(PART) for path in folder.iterdir()}
+        except OSError as error:
+            raise InputError(f"folder {folder}: cannot be written to: {error.strerror}") from error
+        path = self._series.next(now_ns, there)
         started = datetime.fromtimestamp(now_ns / 1e9, UTC).isoformat(timespec="milliseconds")
         about = {**self._metadata, "started": started, NUMBER: str(self._begun + 1)}
         if self._before:
@@ -201,9 +209,10 @@ class RecordingFiles:
             self._writer.flush()
             self._writer.sync()
         self._writer.close()
-        if self._last_ns:
-            os.utime(self._writer.path, ns=(self._last_ns, self._last_ns))
-        self._ages.note(self._writer.path.name, self._writer.path.stat().st_mtime_ns)
+        with contextlib.suppress(FileNotFoundError):  # it was deleted at once
+            if self._last_ns:
+                os.utime(self._writer.path, ns=(self._last_ns, self._last_ns))
+            self._ages.note(self._writer.path.name, self._writer.path.stat().st_mtime_ns)
         log.info("recorded", file=str(self._writer.path))
         self._writer = None
 
@@ -218,8 +227,10 @@ class RecordingFiles:
         self._writer = None
 
     def free_bytes(self) -> int:
-        """The room that is left on the disk."""
-        return shutil.disk_usage(self._series.folder).free
+        """The room that is left on the disk; of a folder that was deleted, where it would be made again."""
+        folder = self._series.folder.absolute()
+        there = next(path for path in (folder, *folder.parents) if path.is_dir())
+        return shutil.disk_usage(there).free
 
     def keep_for_good(self, stretch: Stretch) -> None:
         """Have a stretch of time copied into a file of its own; flush before."""

@@ -5,6 +5,7 @@ each and, in order of receipt, sorts them all. That is left to it only where a f
 the order of receipt, or it has no chunks or no index, as other programs may write it.
 """
 
+import heapq
 import io
 import itertools
 import struct
@@ -18,9 +19,9 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.records import Channel, Chunk, ChunkIndex, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.reader import SeekingReader
+from mcap.records import Channel, Chunk, ChunkIndex, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.well_known import MessageEncoding
 from mcap.writer import MCAP0_MAGIC
@@ -28,6 +29,7 @@ from mcap.writer import MCAP0_MAGIC
 from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
 from reactorwatch.records.reading import reading
+from recorder.chunk_data import chunk_data
 from recorder.entry import Entry
 
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the summary offsets, CRC
@@ -140,13 +142,45 @@ def sorted_entries(path: Path, summary: Summary) -> Iterator[Entry]:
     """
     with path.open("rb") as stream:
         try:
-            kind = SeekingReader if _is_indexed(summary) else NonSeekingReader
-            reader = kind(stream, validate_crcs=True, record_size_limit=path.stat().st_size)
-            for schema, channel, message in reader.iter_messages(log_time_order=True):
-                key, encoding, repeated = channel_of(channel, {schema.id: schema} if schema else {})
-                yield Entry(key, message.data, encoding, message.log_time, message.publish_time, repeated)
+            if _is_indexed(summary):
+                yield from _sorted_chunks(stream, summary, path.stat().st_size)
+            else:
+                yield from sorted(_walk(stream, path.stat().st_size), key=attrgetter("log_time_ns"))
         except DAMAGE as error:
             raise damaged(path, "cannot be read", error) from error
+
+
+def _sorted_chunks(stream: IO[bytes], summary: Summary, size: int) -> Iterator[Entry]:
+    """The messages of chunks that overlap, each chunk read when the first of its messages is due."""
+    channels = {number: channel_of(channel, summary.schemas) for number, channel in summary.channels.items()}
+    waiting: list[tuple[int, int, int, Entry]] = []  # log time, chunk and number in it; so no two entries are compared
+    for index in sorted(summary.chunk_indexes, key=attrgetter("message_start_time", "chunk_start_offset")):
+        while waiting and waiting[0][0] < index.message_start_time:
+            yield heapq.heappop(waiting)[-1]
+        found = _messages_of(_uncompressed(stream, index, size), channels, dict(summary.schemas))
+        for number, entry in enumerate(found):
+            heapq.heappush(waiting, (entry.log_time_ns, index.chunk_start_offset, number, entry))
+    while waiting:
+        yield heapq.heappop(waiting)[-1]
+
+
+def _walk(stream: IO[bytes], size: int) -> Iterator[Entry]:
+    """The messages of a file without an index, from its front to its end."""
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, KeyedChannel] = {}
+    reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size)
+    for record in reader.records:
+        match record:
+            case Chunk():
+                yield from _messages_of(chunk_data(record), channels, schemas)
+            case Schema():
+                schemas[record.id] = record
+            case Channel():
+                channels[record.id] = channel_of(record, schemas)
+            case Message():
+                channel = channels[record.channel_id]
+                times = record.log_time, record.publish_time
+                yield Entry(channel.key, record.data, channel.encoding, *times, channel.repeated)
 
 
 def metadata_records(path: Path) -> list[Metadata]:
@@ -200,13 +234,22 @@ def _uncompressed(stream: IO[bytes], index: ChunkIndex, size: int) -> bytes:
         raise ValueError("it reaches beyond the end of the file")
     stream.seek(index.chunk_start_offset + RECORD.size)
     record = stream.read(index.chunk_length - RECORD.size)  # no more, whatever lengths the chunk claims
-    chunk = Chunk.read(ReadDataStream(io.BytesIO(record)))
-    data, length = get_chunk_data_stream(chunk, validate_crc=True)
-    return data.read(length)
+    return chunk_data(Chunk.read(ReadDataStream(io.BytesIO(record))), index.uncompressed_size)
 
 
-def _messages_of(data: bytes, channels: Mapping[int, KeyedChannel]) -> Iterator[Entry]:
-    """The messages in an uncompressed chunk: records of opcode, length and content, one after the other."""
+def _messages_of(
+    data: bytes, channels: dict[int, KeyedChannel], schemas: dict[int, Schema] | None = None
+) -> Iterator[Entry]:
+    """The messages in an uncompressed chunk: records of opcode, length and content, one after the other.
+
+    Args:
+        data: the chunk.
+        channels: channels by number; messages of others are passed over.
+        schemas: schemas by number; with them, what the chunk describes is learned. None: all is known.
+
+    Raises:
+        ValueError: a record is of no kind that the format knows, or belongs to a channel that was not described.
+    """
     record, message = RECORD.unpack_from, MESSAGE.unpack_from
     at, end = 0, len(data)
     while at < end:
@@ -218,6 +261,16 @@ def _messages_of(data: bytes, channels: Mapping[int, KeyedChannel]) -> Iterator[
             if channel is not None:
                 payload = data[at + MESSAGE.size : at + length]
                 yield Entry(channel.key, payload, channel.encoding, log_time, publish_time, channel.repeated)
+            elif schemas is not None:
+                raise ValueError(f"channel {number} is described nowhere")
+        elif not opcode:
+            raise ValueError("the chunk holds a record of kind 0, which the format does not know")
+        elif schemas is not None and opcode == Opcode.SCHEMA:
+            schema = Schema.read(ReadDataStream(io.BytesIO(data[at : at + length])))
+            schemas[schema.id] = schema
+        elif schemas is not None and opcode == Opcode.CHANNEL:
+            described = Channel.read(ReadDataStream(io.BytesIO(data[at : at + length])))
+            channels[described.id] = channel_of(described, schemas)
         at += length
 
 

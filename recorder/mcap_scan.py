@@ -17,11 +17,11 @@ from typing import NamedTuple, TypeVar
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Metadata, Schema
-from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.reading import reading
+from recorder.chunk_data import chunk_data
 from recorder.entry import Entry
 from recorder.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, channel_of, read_summary
 
@@ -102,6 +102,7 @@ class Scan:
         self._ended = False
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
+        self._indexed_bytes: dict[int, int] = {}  # the size of each chunk's content, by where the chunk begins
         self._sure: set[tuple[type, int]] = set()  # channels and schemas that a checksum vouches for
         with reading(path), path.open("rb") as stream:
             self._size = os.fstat(stream.fileno()).st_size
@@ -150,6 +151,7 @@ class Scan:
             summary = read_summary(self._path)
         except InputError:
             return
+        self._indexed_bytes = {chunk.chunk_start_offset: chunk.uncompressed_size for chunk in summary.chunk_indexes}
         self._channels.update(summary.channels)
         self._schemas.update(summary.schemas)
         self._sure.update((Channel, number) for number in summary.channels)
@@ -182,7 +184,7 @@ class Scan:
             case Opcode.CHUNK:
                 first_ns, last_ns = _CHUNK_TIMES.unpack_from(self._bytes, start)
                 if last_ns >= self._from_ns and first_ns <= self._to_ns and self._may_be_wanted(end):
-                    yield from self._in_chunk(self._bytes[start:end])
+                    yield from self._in_chunk(start, end)
             case Opcode.MESSAGE:
                 yield from self._in_records(self._bytes[start - RECORD.size : end], sure=False)
             case Opcode.CHANNEL | Opcode.SCHEMA:
@@ -211,10 +213,10 @@ class Scan:
             known, at = True, end
         return not known
 
-    def _in_chunk(self, record: bytes) -> list[Stored]:
-        chunk = Chunk.read(_stream(record))
-        data, length = get_chunk_data_stream(chunk, validate_crc=True)
-        return list(self._in_records(data.read(length), sure=chunk.uncompressed_crc != 0))
+    def _in_chunk(self, start: int, end: int) -> list[Stored]:
+        chunk = Chunk.read(_stream(self._bytes[start:end]))
+        data = chunk_data(chunk, self._indexed_bytes.get(start - RECORD.size))
+        return list(self._in_records(data, sure=chunk.uncompressed_crc != 0))
 
     def _in_records(self, data: bytes, *, sure: bool) -> Iterator[Stored]:
         at, channels, schemas = 0, self._channels, self._schemas
@@ -231,6 +233,8 @@ class Scan:
                     yield Stored(
                         channel, schema, sequence, log_time, publish_time, data[at + MESSAGE.size : at + length]
                     )
+            elif not opcode:
+                raise ValueError("the chunk holds a record of kind 0, which the format does not know")
             elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
                 self._learn(opcode, data[at : at + length], sure=sure)
             at += length

@@ -6,6 +6,7 @@ machine. The lock is the operating system's and ends with the process, so a file
 """
 
 import contextlib
+import errno
 import fcntl
 import os
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from reactorwatch.errors import InputError
 
 PART = ".part"
 """The ending that a name has until the recording is whole."""
+DELETED = "its file was deleted"
 LARGEST_PENDING = 1 << 18  # bytes gathered before they are handed over anyway
 
 
@@ -55,12 +57,15 @@ class PartFile:
         """Hand all that was written to the operating system.
 
         Raises:
-            OSError: it does not take it, for lack of room perhaps; part of it may be in the file.
+            OSError: it does not take it, for lack of room perhaps; part of it may be in the file. Or the file was
+                deleted, with its folder perhaps: the system would take what is written, and keep nothing of it.
         """
         while self._pending:
             taken = self._append(self._pending)
             self._handed_over += taken
             del self._pending[:taken]
+        if self._is_deleted:
+            raise OSError(errno.ENOENT, DELETED)
 
     def sync(self) -> None:
         """Wait until all that was written is on the disk.
@@ -92,6 +97,14 @@ class PartFile:
     def closed(self) -> bool:
         """Whether it was finished or abandoned."""
         return self._raw.closed
+
+    @property
+    def _is_deleted(self) -> bool:
+        """Whether the file has lost its name, or another file has it."""
+        try:
+            return not os.path.samestat(os.fstat(self._raw.fileno()), self.path.stat())
+        except (FileNotFoundError, NotADirectoryError):
+            return True
 
     def _append(self, data: bytearray) -> int:
         return self._raw.write(data)

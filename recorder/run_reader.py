@@ -39,6 +39,8 @@ STRETCH = 100_000
 
 SUSPECTED = "suspected"
 """The event of alarms whose suspects are new."""
+LISTED = "listed"
+"""The event of alarms that were in their state when a list of alarms was asked for; since when is not known."""
 
 
 def read_run(recording: Iterable[Entry | Encoded]) -> Run:
@@ -137,6 +139,11 @@ class RunReader:
             self._models.setdefault((into.topic.name, message.reference), []).append(_snapshot(message))
         elif self._newest_ns:  # health of before the first sample has no place in the run
             self._health.setdefault(message.node, []).append(_report(message, self._newest_ns))
+
+    @property
+    def has_samples(self) -> bool:
+        """Whether there has been a sample, before the last cut or since."""
+        return bool(self._newest_ns)
 
     def cut(self) -> Run:
         """What has come since the last cut."""

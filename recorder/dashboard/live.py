@@ -21,18 +21,21 @@ from typing import NamedTuple
 import rerun as rr
 
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import CommandReply
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encoding_of
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_port
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.dashboard.drawing import Drawing
+from recorder.dashboard.late_joiner import Past, ask_for_past
 from recorder.dashboard.stream import APPLICATION
 from recorder.dashboard.viewer import viewer
 from recorder.panels import PANELS
 from recorder.run_reader import STRETCH, RunReader
+
+_ALARM = encoding_of(Alarm)
 
 NODE = "view"
 SCREENS = ("WAYLAND_DISPLAY", "WAYLAND_SOCKET", "DISPLAY")  # whichever of them winit asks
@@ -86,7 +89,8 @@ def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], N
                 return
             try:
                 recording = stream_to(data, shown.bind, f"{plant}-{time.time_ns()}")
-                dashboard = LiveDashboard(recording, lambda: process.poll() is not None, time.time_ns())
+                past = ask_for_past(bus, plant)
+                dashboard = LiveDashboard(recording, lambda: process.poll() is not None, time.time_ns(), past)
                 serve(dashboard, bus, stop, subscriptions=(f"{keys.ROOT}/{plant}/**",), history_s=bus_config.history_s)
                 recording.disconnect()
             finally:
@@ -100,18 +104,31 @@ class LiveDashboard:
         recording: the stream, connected to a viewer.
         is_closed: whether the viewer is.
         now_ns: the clock.
+        past: what was before it began to listen.
     """
 
-    def __init__(self, recording: rr.RecordingStream, is_closed: Callable[[], bool], now_ns: int) -> None:
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        is_closed: Callable[[], bool],
+        now_ns: int,
+        past: Past = Past(),  # noqa: B008 (it is frozen)
+    ) -> None:
         self._recording = recording
         self._is_closed = is_closed
         self._drawing = Drawing(recording)
-        self._reader = RunReader()
-        self._taken = 0
+        self._reader = RunReader(past.zero_ns)
+        self._has_zero = past.zero_ns is not None
+        self._known = {_change(message) for message in past.alarms}
+        self._taken = len(past.alarms)
+        for message in past.alarms:
+            self._reader.take(message)
         self._next_ns = now_ns + DRAW_EVERY_NS
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Keep it until there is something to be drawn."""
+        if self._known and _change(message) in self._known:
+            return []  # publishers remember it, and it was listed
         self._reader.take(message)
         self._taken += 1
         if self._taken >= STRETCH or now_ns >= self._next_ns:
@@ -145,13 +162,27 @@ class LiveDashboard:
         self._next_ns = now_ns + DRAW_EVERY_NS
         if not self._taken:
             return
+        if not (self._has_zero or self._reader.has_samples) and self._taken < STRETCH:
+            return  # the time of the run begins with its first sample
         self._taken = 0
         run = self._reader.cut()
-        if run.earlier.first_ns is None and not run.measured:
-            return  # the time of the run begins with its first sample
+        if not (self._has_zero or self._reader.has_samples):
+            return
         self._drawing.draw(run, PANELS)
         if self._drawing.layout.changed:
             self._recording.send_blueprint(self._drawing.layout.blueprint(live=True))
+
+
+def _change(message: Encoded) -> tuple[str, int, str] | None:
+    """The key, the time and the event of a change of an alarm; None if it is none."""
+    if message.encoding != _ALARM:
+        return None
+    try:
+        alarm = decode(message.payload, message.encoding)
+    except DecodeError:
+        return None
+    assert isinstance(alarm, Alarm), "the encoding says so"
+    return message.key, alarm.time_ns, alarm.event
 
 
 def stream_to(port: int, address: str, name: str) -> rr.RecordingStream:

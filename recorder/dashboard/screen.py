@@ -37,7 +37,8 @@ class Viewer:
         """The tabs: by title, what the layout calls each."""
         layout = self._layout()
         _, root = _tabbed(layout)
-        paths = root.get("contents", [])
+        contents = root.get("contents", [])
+        paths = [contents] if isinstance(contents, str) else contents  # the viewer gives a list of one as its item
         return {layout[f"/{path}"]["ContainerBlueprint"]["display_name"]: path for path in paths}
 
     def open_tab(self, tab: str) -> None:

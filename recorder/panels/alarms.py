@@ -20,7 +20,7 @@ from recorder.panels.base import (
     View,
 )
 from recorder.run import AlarmChange, FaultChange, Run
-from recorder.run_reader import SUSPECTED
+from recorder.run_reader import LISTED, SUSPECTED
 
 _WORDS: dict[int, str] = {
     messages.ALARM_STATE_NORMAL: "normal",
@@ -48,7 +48,8 @@ def draw(run: Run) -> tuple[View, ...]:
     looks = {  # alarms of one look agree
         change.time_ns: change for change in run.alarms if change.event == SUSPECTED and change.time_ns != known_ns
     }
-    events = [_of_alarm(change, run.zero_ns) for change in run.alarms if change.event != SUSPECTED]
+    logged = (change for change in run.alarms if change.event not in (SUSPECTED, LISTED))
+    events = [_of_alarm(change, run.zero_ns) for change in logged]
     events += [_of_suspects(change, run.zero_ns) for change in looks.values()]
     events += [_of_fault(change, run.zero_ns) for change in run.faults]
     log = EventLog("Alarms and faults", tuple(sorted(events, key=lambda event: event.time_ns)))
@@ -61,8 +62,9 @@ def _line(run: Run, alarm: str) -> StateLine:
     changes = {change.time_ns: change for change in run.alarms if change.alarm == alarm}  # the last of a moment counts
     first = next(iter(changes.values()))
     times, states = list(changes), [_word(change.state) for change in changes.values()]
-    if alarm not in run.earlier.states and first.event == "raised" and run.first_ns < first.time_ns:
-        times, states = [run.first_ns, *times], ["normal", *states]
+    begun_ns = max(run.first_ns, run.zero_ns)  # of a run that is joined late, the first sample heard is not its first
+    if alarm not in run.earlier.states and first.event == "raised" and begun_ns < first.time_ns:
+        times, states = [begun_ns, *times], ["normal", *states]
     return StateLine(alarm, tuple(times), tuple(states))
 
 

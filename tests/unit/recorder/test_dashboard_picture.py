@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from reactorwatch.errors import InputError
-from recorder.dashboard.file import write_rrd
+from recorder.dashboard.file import write_rrd, write_views
 from recorder.dashboard.picture import count_coloured, render_png, render_tabs
-from recorder.panels.base import ALARM, INPUT, MEASURED, PREDICTED, RESIDUAL, UNSTABLE, Colour
+from recorder.panels.base import ALARM, INPUT, MEASURED, PREDICTED, RESIDUAL, UNSTABLE, Colour, Series, TimePlot
 from recorder.run_reader import read_run
 from tests.unit.recorder import golden
 
@@ -91,6 +91,23 @@ def test_every_tab_gets_a_picture_of_its_own(rrd: Path, tmp_path: Path) -> None:
         assert like(shown[tab], colour).sum() > least, tab
     for tab, colour in (("residuals-and-charts", MEASURED), ("alarms", MEASURED), ("health", ALARM)):
         assert like(shown[tab], colour).sum() < 50, tab
+
+
+@pytest.mark.parametrize("views", [(1,), (3,)], ids=str)
+def test_a_single_tab_of_any_number_of_views_gets_a_picture(tmp_path: Path, views: tuple[int, ...]) -> None:
+    """A single tab, with a single view in it, too; of several see above."""
+    time_ns = np.arange(100) * 60_000_000_000
+    lines = [Series("x", time_ns, np.sin(time_ns / 1e12), colour, width=4.0) for colour in (MEASURED, ALARM, INPUT)]
+    tabs = {
+        f"Tab {number}": [TimePlot(f"{number}.{view}", "K", (lines[number],)) for view in range(count)]
+        for number, count in enumerate(views)
+    }
+    write_views(tabs, tmp_path / "run.rrd", 0)
+    with skipping_without_graphics():
+        pictures = render_tabs(tmp_path / "run.rrd", tmp_path / "tabs", 800, 500)
+    assert [path.name for path in pictures] == [f"tab-{number}.png" for number in range(len(views))]
+    for path, line in zip(pictures, lines, strict=False):
+        assert like(pixels_of(path), line.colour).sum() > 150, path.name
 
 
 def test_only_coloured_pixels_count() -> None:

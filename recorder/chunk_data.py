@@ -1,0 +1,100 @@
+"""The content of a chunk of an MCAP file, never more of it than the file claims and the setting allows.
+
+A chunk of a few kilobytes may hold gigabytes when it is decompressed. So its claimed size is checked first; then it is
+decompressed in pieces, and refused as soon as a piece shows that it holds no record of the format, or more than it
+claims.
+"""
+
+import os
+import zlib
+from collections.abc import Iterator
+
+import lz4.frame
+import zstandard
+from mcap.opcode import Opcode
+from mcap.records import Chunk
+
+LARGEST_MB = "REACTORWATCH_LARGEST_CHUNK_MB"
+"""The environment variable that sets the largest chunk that is read."""
+DEFAULT_LARGEST_MB = 32.0
+PIECE_BYTES = 4 << 20
+
+_MB = 1_000_000
+_RECORDS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE})
+_FIRST_PRIVATE = 0x80
+"""Opcodes from here on belong to other programs, whose records are passed over."""
+
+
+def largest_chunk_bytes() -> int:
+    """The size of the largest chunk that is read, as it is set in the environment.
+
+    Raises:
+        ValueError: the setting is no positive number.
+    """
+    text = os.environ.get(LARGEST_MB, str(DEFAULT_LARGEST_MB))
+    try:
+        largest_mb = float(text)
+    except ValueError:
+        largest_mb = -1.0
+    if not 0.0 < largest_mb < float("inf"):
+        raise ValueError(f"{LARGEST_MB} must be a positive number, got {text!r}")
+    return round(largest_mb * _MB)
+
+
+def chunk_data(chunk: Chunk, indexed_bytes: int | None = None) -> bytes:
+    """The records in a chunk.
+
+    Args:
+        chunk: the chunk as it stands in the file.
+        indexed_bytes: the size of its content as the file's index claims it; None: no index is known.
+
+    Raises:
+        ValueError: it is larger than the setting allows, not of the size that is claimed, or damaged. What the
+            decompressor raises is passed on.
+    """
+    claimed, largest = chunk.uncompressed_size, largest_chunk_bytes()
+    if claimed > largest:
+        raise ValueError(
+            f"the chunk claims to hold {claimed / _MB:.1f} MB, and at most {largest / _MB:g} MB are read; "
+            f"{LARGEST_MB} sets another limit"
+        )
+    if indexed_bytes is not None and indexed_bytes != claimed:
+        raise ValueError(f"the chunk claims to hold {claimed} bytes, and the index {indexed_bytes}")
+    data = bytearray()
+    for piece in _pieces(chunk, claimed + 1):
+        if not data and piece[0] not in _RECORDS and piece[0] < _FIRST_PRIVATE:
+            raise ValueError(f"the chunk begins with a record of kind {piece[0]}, which no chunk may hold")
+        data += piece
+        if len(data) > claimed:
+            raise ValueError(f"the chunk holds more than the {claimed} bytes that it claims")
+    if len(data) < claimed:
+        raise ValueError(f"the chunk holds {len(data)} bytes, and claims {claimed}")
+    crc = chunk.uncompressed_crc
+    if crc and zlib.crc32(data) != crc:
+        raise ValueError("the checksum of the chunk differs")
+    return bytes(data)
+
+
+def _pieces(chunk: Chunk, most_bytes: int) -> Iterator[bytes]:
+    """The content piece by piece, none of them empty; together no more than so many bytes."""
+    match chunk.compression:
+        case "zstd":
+            with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+                while most_bytes > 0 and (piece := reader.read(min(PIECE_BYTES, most_bytes))):
+                    yield piece
+                    most_bytes -= len(piece)
+        case "lz4":
+            decompressor = lz4.frame.LZ4FrameDecompressor()
+            source = chunk.data
+            while most_bytes > 0 and not decompressor.eof:
+                piece = decompressor.decompress(source, min(PIECE_BYTES, most_bytes))
+                if not piece:
+                    return
+                yield piece
+                source = b""
+                most_bytes -= len(piece)
+        case "":
+            if chunk.data:
+                yield chunk.data[:most_bytes]
+        case other:
+            raise ValueError(f"compression must be zstd, lz4 or none, got {other!r}")

@@ -1,0 +1,140 @@
+"""A live view that is opened late shows every active alarm, with its suspects, at the minute at which it was raised."""
+
+from pathlib import Path
+
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+
+from reactorwatch.contract import keys
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
+from recorder.dashboard import late_joiner
+from recorder.dashboard.late_joiner import Past, ask_for_past, changes
+from recorder.dashboard.live import DRAW_EVERY_NS, LiveDashboard
+from recorder.dashboard.stream import RUN_TIME
+
+MINUTE = 60_000_000_000
+ZERO_NS = 1_700_000_000 * 10**9
+NOW_NS = ZERO_NS + 500 * MINUTE
+UNACKNOWLEDGED, ACKNOWLEDGED = messages.ALARM_STATE_UNACKNOWLEDGED, messages.ALARM_STATE_ACKNOWLEDGED
+RETURNED, SHELVED = messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED, messages.ALARM_STATE_SHELVED
+SUSPECT = messages.Suspect(cause="coolant_flow", probability=0.93, profile="step", size=-0.15, unit="1")
+RAISED_MIN = {"ewma/T": 312.5, "cusum/T": 313.0, "mewma/all": 313.0, "shewhart/C": 315.5, "drift/C": 402.0}
+STATES = dict(zip(RAISED_MIN, (UNACKNOWLEDGED, ACKNOWLEDGED, RETURNED, SHELVED, UNACKNOWLEDGED), strict=True))
+
+
+def alarm(name: str) -> messages.Alarm:
+    raised_ns = ZERO_NS + round(RAISED_MIN[name] * MINUTE)
+    return messages.Alarm(
+        time_ns=NOW_NS,
+        alarm=name,
+        state=STATES[name],
+        raised_ns=raised_ns,
+        cleared_ns=raised_ns + 10 * MINUTE if STATES[name] == RETURNED else 0,
+        incident=2 if name == "drift/C" else 1,
+        suspects=[] if name == "drift/C" else [SUSPECT],
+        text=f"text of {name}",
+    )
+
+
+LISTED = [*map(alarm, RAISED_MIN), messages.Alarm(alarm="stuck/T", state=messages.ALARM_STATE_NORMAL)]
+HEALTH = messages.Health(node="monitor", heard_from_ns={"T": ZERO_NS + 1, "C": ZERO_NS})
+
+
+class Remembering(MemoryBus):
+    """A bus whose publishers remember the monitor's report."""
+
+    def recall(self, key_expression: str) -> list[Encoded]:
+        assert key_expression == "reactor/cstr/health/**"
+        return [encode(Publication("reactor/cstr/health/monitor", HEALTH))]
+
+
+@pytest.fixture
+def past(monkeypatch: pytest.MonkeyPatch) -> Past:
+    monkeypatch.setattr(late_joiner, "ANSWER_WITHIN_S", 60.0)
+    exchange = Exchange()
+
+    def answer(request: Request) -> None:
+        request.reply(messages.CommandReply(accepted=True, alarms=LISTED))
+
+    MemoryBus(exchange).answer(keys.key("cstr", keys.COMMAND, "list_alarms"), answer)
+    return ask_for_past(Remembering(exchange), "cstr")
+
+
+def logged(path: Path) -> list[tuple[float, str]]:
+    """(minute on the run's time, text) of the lines in the log of alarms."""
+    reader = RrdReader(path)
+    found: list[tuple[float, str]] = []
+    for chunk in reader.stream(store=reader.recordings()[0]).to_chunks():
+        batch = chunk.to_record_batch()
+        if "TextLog:text" in batch.schema.names:
+            minutes = [time / MINUTE for time in batch.column(RUN_TIME).cast("int64").to_pylist()]
+            found += zip(minutes, batch.column("TextLog:text").flatten().to_pylist(), strict=True)
+    return sorted(found)
+
+
+def shown(tmp_path: Path, past: Past, received: list[Encoded]) -> list[tuple[float, str]]:
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "sent.rrd")
+    dashboard = LiveDashboard(recording, lambda: False, 0, past)
+    for number, message in enumerate(received):
+        dashboard.on_message(message, number)
+    dashboard.on_tick(DRAW_EVERY_NS)
+    recording.flush()
+    recording.disconnect()
+    return logged(tmp_path / "sent.rrd")
+
+
+def sample(time_ns: int) -> Encoded:
+    body = messages.Sample(time_ns=time_ns, value=440.0, unit="K", quality=messages.QUALITY_GOOD)
+    return encode(Publication("reactor/cstr/sample/T", body))
+
+
+@pytest.mark.parametrize("is_silent", [False, True])
+def test_all_active_alarms_are_shown_with_their_suspects_at_their_minutes(
+    tmp_path: Path, past: Past, *, is_silent: bool
+) -> None:
+    """Also of a plant that sends no sample any more."""
+    assert past.zero_ns == ZERO_NS
+    lines = shown(tmp_path, past, [] if is_silent else [sample(NOW_NS)])
+    for name, minute in RAISED_MIN.items():
+        assert (minute, f"{minute:.1f} min  {name}: text of {name}") in lines
+    assert sum("text of mewma/all" in text for _, text in lines) == 2  # raised and cleared
+    assert [at for at, text in lines if "coolant_flow (93 %" in text] == [315.5]
+    assert len(lines) == len(RAISED_MIN) + 2
+    assert not any("stuck/T" in text for _, text in lines)
+
+
+def test_a_change_that_publishers_remember_is_shown_once(tmp_path: Path, past: Past) -> None:
+    again = alarm("drift/C")
+    again.time_ns, again.event = again.raised_ns, "raised"
+    remembered = encode(Publication("reactor/cstr/alarm/drift/C", again))
+    lines = shown(tmp_path, past, [sample(NOW_NS), remembered])
+    assert sum("drift/C" in text for _, text in lines) == 1
+
+
+def test_the_present_state_of_each_is_the_last_that_is_known(past: Past) -> None:
+    last = {change.alarm: change.state for change in changes(LISTED) if change.event != "suspected"}
+    assert last == STATES
+
+
+def test_alarms_that_come_before_the_first_sample_are_not_lost(tmp_path: Path) -> None:
+    """Of a plant without a monitor that could be asked."""
+    raised = alarm("ewma/T")
+    raised.time_ns, raised.event = raised.raised_ns, "raised"
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "sent.rrd")
+    dashboard = LiveDashboard(recording, lambda: False, 0)
+    dashboard.on_message(encode(Publication("reactor/cstr/alarm/ewma/T", raised)), 0)
+    dashboard.on_tick(DRAW_EVERY_NS)
+    dashboard.on_message(sample(ZERO_NS), DRAW_EVERY_NS)
+    dashboard.on_tick(2 * DRAW_EVERY_NS)
+    recording.flush()
+    recording.disconnect()
+    assert [text for _, text in logged(tmp_path / "sent.rrd")] == ["312.5 min  ewma/T: text of ewma/T"]
+
+
+def test_without_a_monitor_nothing_is_waited_for_and_nothing_is_known() -> None:
+    assert ask_for_past(MemoryBus(Exchange()), "cstr") == Past()
