@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from monitor_node.charts.base import Judgement
 from monitor_node.charts.parameters import ParameterState, ParameterT2
 from monitor_node.drift import learn
+from monitor_node.identification.linear_model import standard_deviations
 from monitor_node.identification.recursion import RlsState
 from monitor_node.identification.regressor import BufferState, RegressorBuffer, Rows, rows_of
 from monitor_node.identification.rls import RecursiveLeastSquares
@@ -290,10 +291,8 @@ class ArxPredictor:
     ) -> ModelSnapshot:
         assert self._scaling is not None
         matrix, shift = self._scaling.undoing(self._structure)
-        covariance = matrix @ scaled_covariance @ matrix.T
         values = matrix @ scaled + shift
-        with np.errstate(invalid="ignore"):
-            deviations = np.sqrt(np.diag(covariance))
+        deviations = standard_deviations(scaled_covariance, matrix)
         return ModelSnapshot(
             structure="arx",
             order=self._structure.output_lags,

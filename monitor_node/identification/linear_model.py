@@ -16,6 +16,32 @@ from reactorwatch.compiled import compiled
 _AWAY = 1e100  # a free run beyond this has left for good
 
 
+def standard_deviations(
+    covariance: NDArray[np.float64], matrix: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Standard deviations of linear combinations of parameters; never NaN.
+
+    Args:
+        covariance: of the parameters, shape (n, n); inf and NaN where the data tell nothing.
+        matrix: of the combinations, shape (m, n); None: the parameters themselves.
+
+    Returns:
+        Shape (m,); inf where a combination depends on what the data do not tell. Where rounding has left a negative
+        variance, the size of that rounding.
+
+    >>> standard_deviations(np.array([[4.0, np.nan], [np.nan, np.inf]]), np.array([[0.5, 0.0], [1.0, 1.0]])).tolist()
+    [1.0, inf]
+    """
+    deviations = np.full(len(covariance) if matrix is None else len(matrix), np.inf)
+    for i in range(len(deviations)):
+        row = np.eye(1, len(covariance), i)[0] if matrix is None else matrix[i]
+        used = np.flatnonzero(row)  # zero times infinity is not zero
+        part = covariance[np.ix_(used, used)]
+        if np.all(np.isfinite(part)):
+            deviations[i] = np.sqrt(abs(row[used] @ part @ row[used]))
+    return deviations
+
+
 @dataclass(frozen=True)
 class LinearModel:
     """A fitted linear model, in the signals' own units.
@@ -46,7 +72,7 @@ class LinearModel:
     @property
     def standard_deviations(self) -> NDArray[np.float64]:
         """Of the parameters, shape (outputs, parameters)."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2)))
+        return np.array([standard_deviations(covariance) for covariance in self.covariance])
 
     @property
     def poles(self) -> NDArray[np.complex128]:

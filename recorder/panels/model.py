@@ -38,6 +38,7 @@ def _parameters(run: Run, signal: str, kind: str, names: list[str]) -> TimePlot:
 def _parameter(name: str, items: list[Snapshot], colour: Colour, *, reference: bool) -> Iterator[Series]:
     time_ns = np.array([item.time_ns for item in items], np.int64)
     value, sd = np.array([item.parameters[name] for item in items]).T
+    sd = np.where(np.isfinite(sd), sd, np.nan)  # infinite where the data tell nothing: there is no interval to draw
     if reference:
         yield Series(f"{name} judged by", time_ns, value, colour, width=0.8, legend=name)
         return

@@ -14,6 +14,7 @@ import zenoh
 import zenoh.ext
 from google.protobuf.message import Message
 
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.runtime.access import MEMORY, NOBODY
 from reactorwatch.runtime.bus import MOST_GATHERED, Request
@@ -36,6 +37,10 @@ log = structlog.get_logger()
 
 FLUSH_WITHIN_S = 10.0
 HEARTBEAT_S = 0.5
+EVERY_ROW = frozenset({keys.SAMPLE, keys.ESTIMATE, keys.RECONSTRUCTION, keys.CHART})
+"""Kinds that are published with every row. What is published less often would fill `cache_messages` for days."""
+MOST_KEPT_OF_OTHERS = 600
+"""Messages kept on each key of another kind: of what is published each plant minute, `history_s` at `--speed 600`."""
 LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that who missed it can ask for it
 MOST_NEW_KEYS, NEW_KEYS_A_S = 1000, 100
 """Of what is told again and again: keys that are declared at once, and in each second after that."""
@@ -323,12 +328,14 @@ class ZenohBus:
         self._numbers.setdefault(stream, 0)
         # Of the same priority as all else: of a lower one, the word that this was all would overtake the replies.
         again = zenoh.ext.RepliesConfig(congestion_control=zenoh.CongestionControl.BLOCK)
-        drop = self._config.congestion == "drop"
+        drop, most = self._config.congestion == "drop", self._config.cache_messages
+        if key.split("/", STREAM_PARTS)[STREAM_PARTS - 1] not in EVERY_ROW:
+            most = min(most, MOST_KEPT_OF_OTHERS)
         publisher = zenoh.ext.declare_advanced_publisher(
             self._voice,
             key,
             congestion_control=zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,
-            cache=zenoh.ext.CacheConfig(self._config.cache_messages, replies_config=again),
+            cache=zenoh.ext.CacheConfig(most, replies_config=again),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
             publisher_detection=True,
         )
