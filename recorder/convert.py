@@ -9,6 +9,7 @@ from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.csv_file import read_csv, write_csv
+from reactorwatch.records.output import refuse_source
 from reactorwatch.records.record import Record, to_time_ns
 from recorder.entry import Entry
 from recorder.mcap_file import ZERO_NS, RecordingWriter, read_record
@@ -35,6 +36,7 @@ def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | N
         keys.checked_plant(plant)
     except ValueError as error:
         raise InputError(str(error)) from error
+    refuse_source(mcap, (csv,))
     record = read_csv(csv, columns)
     _check_times(csv, record, zero_ns)
     metadata = {"plant": plant, "source": record.name, ZERO_NS: str(zero_ns)}
@@ -60,6 +62,7 @@ def export_csv(mcap: Path, csv: Path, plant: str | None = None) -> int:
     Raises:
         InputError: the recording cannot be read, or it is not said of which plant.
     """
+    refuse_source(csv, (mcap,))
     record = read_record(mcap, plant)
     write_csv(csv, record)
     return record.rows

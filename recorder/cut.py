@@ -15,6 +15,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.output import refuse_source
 from recorder.entry import Entry
 from recorder.gaps import GAP, from_metadata
 from recorder.head import Head
@@ -90,7 +91,7 @@ def cut(
         InputError: nothing was received then, a source is damaged, or the new file cannot be written.
     """
     found = _sources(sources, tolerant=tolerant)
-    _check_new(out, sources)
+    refuse_source(out, sources)
     count = 0
     with replacing(out) as temporary, RecordingWriter(temporary, metadata) as writer:
         for stored in _in_order(found, window.received_ns, tolerant=tolerant):
@@ -122,7 +123,7 @@ def merge(sources: Sequence[Path], out: Path, metadata: Mapping[str, str]) -> in
         InputError: a source is damaged, or the new file cannot be written.
     """
     found = _sources(sources)
-    _check_new(out, sources)
+    refuse_source(out, sources)
     count = 0
     with replacing(out) as temporary, RecordingWriter(temporary, metadata) as writer:
         for stored in _in_order(found):
@@ -217,8 +218,3 @@ def _copy_gaps(
             gap = from_metadata(record.metadata) if record.name == GAP else None
             if gap is not None and received_ns[0] <= gap.noticed_ns <= received_ns[1]:
                 writer.add_metadata(GAP, record.metadata)
-
-
-def _check_new(out: Path, sources: Sequence[Path]) -> None:
-    if out.exists() and any(out.samefile(source) for source in sources):
-        raise InputError(f"{out}: is one of the recordings that are read; name another file")

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.output import refuse_source
 from recorder.mcap_scan import Damage, Scan
 from recorder.mcap_writer import METADATA, RecordingWriter, own_metadata
 
@@ -67,8 +68,7 @@ def recover(path: Path, out: Path) -> Saved:
     Raises:
         InputError: there is nothing to save, or the new file cannot be written, or is the damaged one.
     """
-    if out.exists() and out.samefile(path):
-        raise InputError(f"{out}: is the damaged file itself, which is kept as it is; name another")
+    refuse_source(out, (path,))
     scan = Scan(path)
     topics: Counter[str] = Counter()
     first_ns, last_ns = 2**64, 0

@@ -23,7 +23,7 @@ from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.jobs import Failed, in_order, workers
 
-SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
+SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

@@ -32,6 +32,9 @@ PLANT = "cstr"
 EXPERIMENT = "experiment.csv"
 """The proposed input, if there is one: it can drive a plant."""
 
+REPORT = (PAGE, OBJECT, MODEL, DRAWING, EXPERIMENT)
+"""The files that a report writes or deletes in its folder."""
+
 Limits: TypeAlias = dict[str, tuple[float, float]]
 
 

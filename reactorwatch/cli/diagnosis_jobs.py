@@ -15,11 +15,11 @@ from diagnosis.report.machine import as_object
 from diagnosis.report.plain import as_text
 from diagnosis.result import Cause, Diagnosis
 from diagnosis.uncertain import stated
-from reactorwatch.cli.batch import Answer, Kind, Row, as_table
-from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, Asked, Case, case_of, diagnosed
-from reactorwatch.errors import InputError
+from reactorwatch.cli.batch import SUMMARY, Answer, Kind, Row, as_table
+from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, REPORT, Asked, Case, case_of, diagnosed
 from reactorwatch.process import effects_of
 from reactorwatch.process.cstr import cstr
+from reactorwatch.records.output import checked_folder
 from reactorwatch.runtime.model_file import read_extended_model
 
 
@@ -53,10 +53,8 @@ def jobs_of(files: Sequence[Path], out: Path | None, asked: Asked, *, as_json: b
         elsewhere: whether the jobs are done by who sees the same files, but from another folder.
 
     Raises:
-        InputError: the folder cannot be one, or what is asked cannot be meant, of whatever file.
+        InputError: what is asked cannot be meant, of whatever file.
     """
-    if out is not None and out.exists() and not out.is_dir():
-        raise InputError(f"--out {out}: is a file, the name of a folder was expected")
     if len(files) > 1 or elsewhere:
         _check(asked)
     places = list(files)
@@ -65,6 +63,27 @@ def jobs_of(files: Sequence[Path], out: Path | None, asked: Asked, *, as_json: b
         asked = replace(asked, model=asked.model and asked.model.absolute())
     folders = _folders(files, out)
     return [Job(*item, asked, as_json) for item in zip(files, places, folders, strict=True)]
+
+
+def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, force: bool) -> None:
+    """Check that the reports may be written.
+
+    Args:
+        files: that are diagnosed.
+        out: as for `jobs_of`.
+        model: file of an extended model, or None.
+        force: as for `checked_output`.
+
+    Raises:
+        InputError: as `checked_folder`.
+    """
+    if out is None:
+        return
+    sources = (*files, model)
+    checked_folder(out, SUMMARY if len(files) > 1 else (), sources, force=force)
+    for folder in _folders(files, out):
+        assert folder is not None
+        checked_folder(folder, REPORT, sources, force=force)
 
 
 def answer(job: Job) -> Answer:

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Plant, columns, existing, existing_recording, new_file, new_of_kind
+from reactorwatch.cli.options import Columns, Force, Plant, columns, existing, existing_recording, output_file
 from reactorwatch.errors import InputError
+from reactorwatch.records.output import checked_folder
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
 
@@ -31,21 +32,22 @@ def dashboard(
     png: Annotated[
         Path | None, typer.Option(help="A folder for a picture of each tab, without a screen.", show_default=False)
     ] = None,
+    force: Force = False,
 ) -> None:
     """Draw a recording into a Rerun file, without a screen."""
     from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.sources import counted_from_ns, messages
     from recorder.dashboard.file import write_rrd
-    from recorder.dashboard.picture import render_tabs
+    from recorder.dashboard.picture import picture_names, render_tabs
     from recorder.run_reader import stretches
 
-    out = new_of_kind(out, ".rrd")
     drawn = diagnosis / DRAWING if diagnosis is not None else None
+    out = output_file(out, ".rrd", (file, drawn), force=force)
     if drawn is not None and not drawn.is_file():
         raise InputError(f"--diagnosis {diagnosis}: holds no {DRAWING}; it must be the folder that diagnose -o wrote")
-    if png is not None and png.exists() and not png.is_dir():
-        raise InputError(f"--png {png}: is a file, the name of a folder was expected")
+    if png is not None:
+        checked_folder(png, picture_names(), (file,), option="--png", force=force)
     with task(f"drawing {file.name}"):
         run = stretches(messages(existing_recording(file), plant), counted_from_ns=counted_from_ns(file))
         write_rrd(run, out, diagnosis=drawn)
@@ -62,13 +64,15 @@ def import_csv(
     out: Out,
     plant: Plant = None,
     column: Columns = None,
+    force: Force = False,
 ) -> None:
     """Turn a record (.csv) into a recording (.mcap)."""
     from reactorwatch.cli.progress import task
     from recorder.convert import import_csv as convert
 
+    out = output_file(out, ".mcap", (file,), force=force)
     with task(f"importing {file.name}"):
-        rows = convert(existing(file), new_file(out), plant or "cstr", columns(column))
+        rows = convert(existing(file), out, plant or "cstr", columns(column))
     typer.echo(f"wrote {out}: {rows} rows")
 
 
@@ -76,11 +80,13 @@ def export_csv(
     file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
     out: Out,
     plant: Plant = None,
+    force: Force = False,
 ) -> None:
     """Turn a recording (.mcap) into a record (.csv)."""
     from reactorwatch.cli.progress import task
     from recorder.convert import export_csv as convert
 
+    out = output_file(out, ".csv", (file,), force=force)
     with task(f"exporting {file.name}"):
-        rows = convert(existing_recording(file), new_file(out), plant)
+        rows = convert(existing_recording(file), out, plant)
     typer.echo(f"wrote {out}: {rows} rows")

@@ -64,7 +64,7 @@ def main() -> None:
     # the live monitor said, on whatever machine. Who sets it otherwise has to do so for both; nodes inherit it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     try:
-        code = app(standalone_mode=False)
+        code = app(prog_name="reactorwatch", standalone_mode=False)
     except UsageProblem as error:
         _complain(error.format_message())
         code = 2

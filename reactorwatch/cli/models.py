@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Json, Plant, Processes, Scheduler, columns, existing_recording
+from reactorwatch.cli.options import Columns, Force, Json, Plant, Processes, Scheduler, columns, existing_recording
 
 
 def add_to(app: typer.Typer) -> None:
@@ -81,10 +81,13 @@ def reproduce(
     column: Columns = None,
     jobs: Processes = None,
     scheduler: Scheduler = None,
+    force: Force = False,
 ) -> None:
     """Make every figure of the original report anew (reactorwatch[pictures])."""
     from reactorwatch.cli.sources import record
+    from reactorwatch.cli.study.reproduce import check_out
     from reactorwatch.cli.study.reproduce import reproduce as reproduce_figures
 
+    check_out(out, only, (file,), force=force)
     measured = record(existing_recording(file), plant, columns(column)) if file else None
     typer.echo(reproduce_figures(out, seed, only, measured, processes=jobs, scheduler=scheduler))

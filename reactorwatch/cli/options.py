@@ -1,6 +1,7 @@
 """Options that several commands share, and how their values are read."""
 
 import re
+from collections.abc import Iterable
 from math import inf
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +9,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.errors import InputError
+from reactorwatch.records.output import checked_output
 
 Settings = Annotated[
     Path | None, typer.Option("--config", help="Settings file (TOML), a table for each node.", show_default=False)
@@ -23,6 +25,10 @@ Columns = Annotated[
 Model = Annotated[
     Path | None,
     typer.Option("--model", help="An extended model, as diagnose -o writes it [the nominal].", show_default=False),
+]
+
+Force = Annotated[
+    bool, typer.Option("--force", help="Replace a file that is there and is of another kind than its name says.")
 ]
 
 Diagnose = Annotated[
@@ -157,25 +163,19 @@ def existing(path: Path) -> Path:
     return path
 
 
-def new_file(path: Path) -> Path:
-    """The path of a file that is to be written; one that is there is replaced.
+def output_file(path: Path, suffix: str, sources: Iterable[Path | None], *, force: bool) -> Path:
+    """The path of a file that is to be written.
+
+    Args:
+        path: the file.
+        suffix: that its name must have, by which it is opened.
+        sources: as for `checked_output`.
+        force: as for `checked_output`.
 
     Raises:
-        InputError: its folder does not exist, or it is a folder itself.
+        InputError: as `checked_output`; or its name has another suffix.
     """
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
-    if path.is_dir():
-        raise InputError(f"{path}: is a folder, a file name was expected")
-    return path
-
-
-def new_of_kind(path: Path, ending: str) -> Path:
-    """The path of a file of a kind that is to be written.
-
-    Raises:
-        InputError: as `new_file`; or it has another ending, by which nothing would open it.
-    """
-    if new_file(path).suffix != ending:
-        raise InputError(f"{path}: the name must end in {ending}, got {path.suffix or 'no ending'}")
+    checked_output(path, sources, force=force)
+    if path.suffix.lower() != suffix:
+        raise InputError(f"{path}: the name must end in {suffix}, got {path.suffix or 'no ending'}")
     return path

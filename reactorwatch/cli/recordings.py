@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Json, existing, existing_recording, new_of_kind, span_ns
+from reactorwatch.cli.options import Force, Json, existing, existing_recording, output_file, span_ns
 from reactorwatch.errors import InputError
 
 
@@ -23,6 +23,7 @@ def recover(
         Path | None,
         typer.Option("--out", "-o", help="The file to write [beside it, X-recovered.mcap].", show_default=False),
     ] = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Save what is whole in a damaged recording."""
@@ -35,7 +36,7 @@ def recover(
 
     if is_held(existing(file)):
         raise InputError(f"{file}: is still being written; stop its recorder first")
-    out = new_of_kind(out, ".mcap") if out is not None else _beside(file)
+    out = output_file(out, ".mcap", (file,), force=force) if out is not None else _beside(file)
     with task(f"recovering {file.name}"):
         saved = save(file, out)
     typer.echo(msgspec.json.encode(saved_object(saved, out)).decode() if as_json else saved_text(saved, file, out))
@@ -66,6 +67,7 @@ def cut(
     end: Annotated[
         str | None, typer.Option("--to", help="Since the start, such as 20min [the end].", show_default=False)
     ] = None,
+    force: Force = False,
 ) -> None:
     """Copy a stretch of plant time out of a recording."""
     from reactorwatch.cli.progress import task
@@ -78,7 +80,7 @@ def cut(
     to_ns = span_ns(end, "--to") if end is not None else 2**63
     if from_ns >= to_ns:
         raise InputError(f"--from must be before --to, got {begin} and {end}")
-    out = new_of_kind(out, ".mcap")
+    out = output_file(out, ".mcap", (file,), force=force)
     with task(f"cutting {file.name}"):
         sources = recordings_in(existing_recording(file))
         zero_ns = zero_ns_of(file)
@@ -91,13 +93,14 @@ def cut(
 def merge(
     files: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders of them.", show_default=False)],
     out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.mcap).", show_default=False)],
+    force: Force = False,
 ) -> None:
     """Put several recordings into one, in order of receipt."""
     from reactorwatch.cli.progress import task
     from recorder.cut import merge as join
     from recorder.mcap_file import read_metadata, recordings_in
 
-    out = new_of_kind(out, ".mcap")
+    out = output_file(out, ".mcap", files, force=force)
     with task(f"merging into {out.name}"):
         sources = [source for file in files for source in recordings_in(existing_recording(file))]
         for number, source in enumerate(sources):

@@ -8,6 +8,7 @@ import typer
 from reactorwatch.cli.options import (
     Columns,
     Files,
+    Force,
     Json,
     Model,
     Plant,
@@ -18,7 +19,7 @@ from reactorwatch.cli.options import (
     existing,
     existing_recording,
     limits,
-    new_file,
+    output_file,
     tolerances,
 )
 
@@ -39,6 +40,7 @@ def simulate(
     ] = None,
     model: Model = None,
     column: Columns = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Run the plant's equations along a record.
@@ -50,9 +52,9 @@ def simulate(
     from reactorwatch.cli.sources import process_model, record, signals_of
     from reactorwatch.records.csv_file import write_csv
 
+    out = output_file(out, ".csv", (file, model), force=force)
     measured = record(existing_recording(file), plant, columns(column), signals_of(model))
     process = process_model(model, measured)
-    out = new_file(out)
     with task(f"simulating {file.name}"):
         simulated = free_run(measured, process, fault or [])
         write_csv(out, simulated)
@@ -73,16 +75,20 @@ def backtest(
     ] = None,
     jobs: Processes = None,
     scheduler: Scheduler = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Run the monitor over recordings at full speed."""
     from monitor_node.config import MonitorConfig
     from reactorwatch.cli.backtest_jobs import WATCHING, jobs_of
-    from reactorwatch.cli.batch import files_named, say
+    from reactorwatch.cli.batch import SUMMARY, files_named, say
     from reactorwatch.cli.sources import DEFAULT_PLANT
+    from reactorwatch.records.output import checked_folder
     from reactorwatch.runtime.config import read_settings, section
 
     named = files_named(files)
+    if out is not None:
+        checked_folder(out, SUMMARY, (*named, config, model), force=force)
     flags = {
         "plant": plant or DEFAULT_PLANT,
         "training_min": training,
@@ -126,14 +132,16 @@ def diagnose(
     column: Columns = None,
     jobs: Processes = None,
     scheduler: Scheduler = None,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Say what the simulation gets wrong, and why."""
     from reactorwatch.cli.batch import files_named, say
     from reactorwatch.cli.diagnosis import Asked
-    from reactorwatch.cli.diagnosis_jobs import DIAGNOSING, jobs_of
+    from reactorwatch.cli.diagnosis_jobs import DIAGNOSING, check_out, jobs_of
 
     named = files_named(files)
+    check_out(named, out, model, force=force)
     asked = Asked(plant, columns(column), model, uncertain, tolerances(tolerance), limits(limit))
     todo = jobs_of(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
     say(DIAGNOSING, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)

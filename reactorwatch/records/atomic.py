@@ -7,30 +7,32 @@ from errno import EDQUOT, ENOSPC
 from pathlib import Path
 
 from reactorwatch.errors import InputError
+from reactorwatch.records.output import is_replaceable
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A name beside `path` to write to; what is there when the block ends takes the place of `path`.
 
-    When the block raises, `path` is as it was and nothing is left beside it.
+    When the block raises, `path` is as it was and nothing is left beside it. A link stays: the file that it leads to
+    is replaced.
 
     Raises:
-        InputError: the folder does not exist or cannot be written to, or `path` is itself a folder.
+        InputError: the folder does not exist or cannot be written to, or `path` is no regular file.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    is_replaceable(path)
+    place = Path(os.path.realpath(path)) if path.is_symlink() else path
+    temporary = place.with_name(f".{place.name}.{os.getpid()}.tmp")
     try:
-        if path.is_dir():
-            raise InputError(f"cannot write {path}: it is a folder")
-        if not path.parent.is_dir():
-            raise InputError(f"cannot write {path}: the folder {path.parent} does not exist")
+        if not place.parent.is_dir():
+            raise InputError(f"cannot write {path}: the folder {place.parent} does not exist")
         temporary.touch()
         temporary.unlink()  # some writers refuse a file that is there
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from error
     try:
         yield temporary
-        temporary.replace(path)
+        temporary.replace(place)
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise

@@ -22,7 +22,9 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.loopback import free_port
+from recorder.dashboard.file import DIAGNOSIS
 from recorder.dashboard.viewer import viewer
+from recorder.panels import PANELS
 
 if TYPE_CHECKING:
     from recorder.dashboard.screen import Viewer
@@ -85,6 +87,11 @@ def render_tabs(
                 temporary.write_bytes(picture)
             found.append(path)
     return found
+
+
+def picture_names() -> list[str]:
+    """The names of the pictures that `render_tabs` may write."""
+    return [f"{named_after(title)}.png" for title in (*(panel.title for panel in PANELS), DIAGNOSIS)]
 
 
 def named_after(title: str) -> str:

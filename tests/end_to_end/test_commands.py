@@ -69,7 +69,7 @@ def record_csv(tmp_path: Path) -> Path:
         (["backtest", "EMPTY"], "holds no record (.csv) and no recording (.mcap)"),
         (["backtest", "RECORD", "--jobs", "0"], "Invalid value for '--jobs'"),
         (["backtest", "RECORD", "--scheduler", "here"], "--scheduler"),
-        (["import", ".", "-o", "OUT"], "is a folder"),
+        (["import", ".", "-o", "a.mcap"], "is a folder"),
         (["recover", "BAD.mcap"], "BAD.mcap: expected an MCAP recording, got another kind of file"),
         (["recover", "BAD.mcap", "-o", "no/such/a.mcap"], "folder"),
         (["info", "BAD.mcap"], "expected an MCAP recording, got another kind of file"),

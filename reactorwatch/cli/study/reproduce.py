@@ -1,6 +1,6 @@
 """`reproduce`: draws the figures that are asked for and writes the page."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from reactorwatch.cli.study.page import FOLDER, page
 from reactorwatch.cli.study.study import Study
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.output import checked_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.jobs import Failed
 
@@ -77,6 +78,17 @@ def reproduce(
     return _report(out, found)
 
 
+def check_out(out: Path, only: str | None, sources: Iterable[Path | None], *, force: bool) -> None:
+    """Check that the page and its pictures may be written; the arguments are those of `reproduce` and `checked_output`.
+
+    Raises:
+        InputError: as `checked_folder`, or figures that there are not.
+    """
+    pictures = [f"{FOLDER}/{figure.file_name}" for figure in _chosen(only)]
+    checked_folder(out, (PAGE, *pictures), sources, force=force)
+    checked_folder(out / FOLDER)
+
+
 def draw(job: Job) -> Finding:
     """Draw a figure."""
     (figure,) = (item for item in FIGURES if item.number == job.number)
@@ -100,9 +112,6 @@ def _chosen(only: str | None) -> Sequence[Figure]:
 def _folder(out: Path) -> Path:
     """The folder of the pictures, made with that of the page."""
     pictures = out / FOLDER
-    for folder in (out, pictures):
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder}: is a file, a folder was expected")
     try:
         pictures.mkdir(parents=True, exist_ok=True)
     except OSError as error:

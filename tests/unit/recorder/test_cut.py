@@ -101,9 +101,9 @@ def test_where_nothing_was_received_no_file_is_written(tmp_path: Path) -> None:
 
 def test_no_source_is_written_over(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES[:50])
-    with pytest.raises(InputError, match="is one of the recordings that are read"):
+    with pytest.raises(InputError, match="is one of the files that are read"):
         cut([source], source, received_between(0, 2**63), {})
-    with pytest.raises(InputError, match="is one of the recordings that are read"):
+    with pytest.raises(InputError, match="is one of the files that are read"):
         merge([source], source, {})
 
 

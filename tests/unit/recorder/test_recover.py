@@ -185,7 +185,7 @@ def test_where_nothing_can_be_saved_one_line_says_so_and_nothing_is_written(
 def test_the_damaged_file_is_never_written_over(tmp_path: Path, whole: bytes) -> None:
     path = tmp_path / "run.mcap"
     path.write_bytes(whole[:-1])
-    with pytest.raises(InputError, match="is the damaged file itself"):
+    with pytest.raises(InputError, match="is one of the files that are read"):
         recover(path, path)
 
 

@@ -56,3 +56,27 @@ def test_a_folder_without_permission_is_an_input_error(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
     with pytest.raises(InputError, match="Permission denied"), replacing(tmp_path / "run.csv"):
         pytest.fail("the block must not run")
+
+
+def test_a_link_stays_and_the_file_that_it_leads_to_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "folder").mkdir()
+    file, link, dangling = tmp_path / "folder" / "run.csv", tmp_path / "link.csv", tmp_path / "new.csv"
+    file.write_text("old")
+    link.symlink_to(file)
+    dangling.symlink_to(tmp_path / "folder" / "later.csv")
+    for path in (link, dangling):
+        with replacing(path) as temporary:
+            temporary.write_text("new")
+        assert path.is_symlink()
+        assert path.read_text() == "new"
+    assert sorted(path.name for path in (tmp_path / "folder").iterdir()) == ["later.csv", "run.csv"]
+
+
+def test_what_is_no_regular_file_is_never_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    (tmp_path / "round").symlink_to(tmp_path / "round")
+    for name, said in (("pipe", "no regular file"), ("link", "no regular file"), ("round", "symbolic links")):
+        with pytest.raises(InputError, match=said), replacing(tmp_path / name):
+            pytest.fail("the block must not run")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "pipe", "round"]
