@@ -3,12 +3,10 @@
 from math import isfinite
 
 from reactorwatch.contract.messages_pb2 import Quality, Sample
+from reactorwatch.records.record import LARGEST_VALUE as LARGEST_VALUE
 
 LARGEST_SAMPLE = 1000
 """Bytes. A sample takes some thirty and its unit; what is larger is not even read."""
-
-LARGEST_VALUE = 1e15
-"""What is larger measures nothing, and its square would soon be more than a number can hold."""
 
 LARGEST_NUMBER = 2**62
 """Of a sample, and of its time, 146 years from 1970: sums of them must still fit a message."""

@@ -58,6 +58,7 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         keys.checked_plant(self.plant)
+        keys.checked_expression(self.key_expression)
         for name in ("health_period_s", "flush_period_s", "linger_s"):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:

@@ -78,6 +78,12 @@ def _opened(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterato
     plants = plants_in(path)
     if not plants:
         raise InputError(f"{path}: holds no samples")
+    if not config.plant:
+        for plant in plants:
+            try:
+                keys.checked_plant(plant)
+            except ValueError as error:
+                raise InputError(f"{path}: {error}; choose the name by --plant") from error
     if config.plant and len(plants) > 1:
         raise InputError(f"{path}: holds samples of {', '.join(plants)}; they cannot all be played as {config.plant!r}")
     kinds = EVERYTHING if config.everything else SAMPLES

@@ -20,7 +20,7 @@ from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.sources import stands_for
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
-from reactorwatch.records.folder import make_folder
+from reactorwatch.records.folder import filling
 from reactorwatch.runtime.jobs import Failed, in_order, workers
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
@@ -183,7 +183,6 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> None:
     Raises:
         InputError: the folder cannot be made or written to.
     """
-    make_folder(folder, "--out")
     said = {"files": len(rows), "failed": sum(bool(row["error"]) for row in rows), "results": list(rows)}
     table = io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
@@ -191,9 +190,10 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> None:
     writer.writerows(rows)
     content = {SUMMARY_OBJECT: msgspec.json.format(msgspec.json.encode(said), indent=2) + b"\n"}
     content[SUMMARY_TABLE] = table.getvalue().encode()
-    for name, text in content.items():
-        with replacing(folder / name) as temporary:
-            temporary.write_bytes(text)
+    with filling(folder, "--out") as temporary:
+        for name, text in content.items():
+            with replacing(temporary / name) as file:
+                file.write_bytes(text)
 
 
 def as_table(rows: Sequence[dict[str, str]]) -> str:

@@ -19,7 +19,7 @@ from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.csv_file import write_csv
-from reactorwatch.records.folder import make_folder
+from reactorwatch.records.folder import filling
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 
@@ -116,7 +116,7 @@ def diagnosed(
 
 
 def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
-    """Write the files of a report; each appears whole or not at all.
+    """Write the files of a report; they appear together, or none does.
 
     Raises:
         InputError: the folder cannot be made or written to.
@@ -126,23 +126,24 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     from reactorwatch.cli.diagnosis_drawing import write_drawing
 
     assert case.folder is not None
-    folder = make_folder(case.folder, "--out")
+    folder = case.folder
     catalogue, on_the_bus = effects_of(case.model), case.model.name == PLANT
     files = (str(case.file), str(folder / MODEL), str(folder / EXPERIMENT))
     page = as_page(diagnosis, case.model, catalogue, *files, on_the_bus=on_the_bus)
     plain = msgspec.json.format(msgspec.json.encode(with_differences(diagnosis, str(case.file), seconds)), indent=2)
-    write_extended_model(folder / MODEL, diagnosis.extended_model)
-    _write_experiment(diagnosis.experiment, folder / EXPERIMENT)
-    write_drawing(diagnosis, case.model, case.measured, folder / DRAWING)
-    for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):
-        with replacing(folder / name) as temporary:
-            temporary.write_bytes(content)
+    with filling(folder, "--out") as temporary:
+        write_extended_model(temporary / MODEL, diagnosis.extended_model)
+        if diagnosis.experiment is not None:
+            _write_experiment(diagnosis.experiment, temporary / EXPERIMENT)
+        write_drawing(diagnosis, case.model, case.measured, temporary / DRAWING)
+        for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):
+            with replacing(temporary / name) as file:
+                file.write_bytes(content)
+    if diagnosis.experiment is None:
+        (folder / EXPERIMENT).unlink(missing_ok=True)  # of an earlier report
 
 
-def _write_experiment(experiment: Experiment | None, path: Path) -> None:
-    """The level from each change on, and at the end; one of an earlier report goes."""
-    if experiment is None:
-        path.unlink(missing_ok=True)
-        return
+def _write_experiment(experiment: Experiment, path: Path) -> None:
+    """Write the level from each change on, and at the end."""
     time_min, level = np.array([*experiment.input, (experiment.span_min, experiment.input[-1][1])]).T
     write_csv(path, Record(time_min, {experiment.signal: level}, path.name))

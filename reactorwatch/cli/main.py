@@ -1,8 +1,12 @@
 """The command's entry: gathers the subcommands, and turns a person's mistakes into one line and exit code 2.
 
+What is raised and is no mistake of a person's is a fault of ours: it ends in one line, too, which names a file with the
+traceback, and in exit code 70.
+
 Only what `--help` needs is imported here; each command imports its own when it is called.
 """
 
+import errno
 import gc
 import os
 import sys
@@ -31,6 +35,10 @@ from reactorwatch.errors import InputError
 UsageProblem: type[typer.BadParameter] = next(
     cast(type[typer.BadParameter], kind) for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"
 )
+
+_NAMES = "EACCES EDQUOT EFBIG EIO EISDIR ELOOP EMFILE ENAMETOOLONG ENFILE ENOSPC ENOTDIR EPERM EROFS"
+OF_THE_SYSTEM = frozenset(getattr(errno, name) for name in _NAMES.split(" "))
+"""Errors that say something about a file or a disk, and nothing about this software."""
 
 app = typer.Typer(
     name="reactorwatch",
@@ -63,6 +71,7 @@ def main() -> None:
     # longer than they work; and the last bits of a chart's limit depend on how many they are. So a back-test says what
     # the live monitor said, on whatever machine. Who sets it otherwise has to do so for both; nodes inherit it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("RUST_LOG", "off")  # what Rerun logs of a full disk or a closed viewer, we say ourselves
     try:
         code = app(prog_name="reactorwatch", standalone_mode=False)
     except UsageProblem as error:
@@ -73,6 +82,14 @@ def main() -> None:
         code = 2
     except (typer.Abort, KeyboardInterrupt):
         code = 130
+    except Exception as error:  # noqa: BLE001 (the one place that turns what is left into a report)
+        if isinstance(error, OSError) and error.errno in OF_THE_SYSTEM:
+            _complain(f"{error.filename}: {error.strerror}" if error.filename else f"{error.strerror}")
+            sys.exit(2)
+        from reactorwatch.cli.crash import EXIT_CODE, report_crash
+
+        _complain(report_crash(error))
+        code = EXIT_CODE
     gc.freeze()  # the process ends: to look for garbage among a million objects would take a third of a second
     sys.exit(code if isinstance(code, int) else 0)
 

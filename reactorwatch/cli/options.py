@@ -138,7 +138,12 @@ def span_ns(text: str, option: str) -> int:
     match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|min|h)", text)
     if match is None:
         raise InputError(f"{option} must be a number with s, min or h, such as 10min, got {text!r}")
-    return round(float(match[1]) * _SECONDS[match[2]] * 1e9)
+    from reactorwatch.records.record import LONGEST_MIN
+
+    span_s = float(match[1]) * _SECONDS[match[2]]
+    if span_s > LONGEST_MIN * 60:
+        raise InputError(f"{option} must be at most 146 years ({LONGEST_MIN / 60:,.0f}h), got {text}")
+    return round(span_s * 1e9)
 
 
 def existing_recording(path: Path) -> Path:

@@ -79,7 +79,7 @@ def cut(
     from_ns = span_ns(begin, "--from") if begin is not None else 0
     to_ns = span_ns(end, "--to") if end is not None else 2**63
     if from_ns >= to_ns:
-        raise InputError(f"--from must be before --to, got {begin} and {end}")
+        raise InputError(f"--from must be before --to, got {begin} and {end or 'the end'}")
     out = output_file(out, ".mcap", (file,), force=force)
     with task(f"cutting {file.name}"):
         sources = recordings_in(existing_recording(file))

@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from reactorwatch.contract.codec import Encoded, encode
+from reactorwatch.contract.keys import checked_plant
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import UNITS, Record
@@ -117,13 +118,18 @@ def plant_of(path: Path, plant: str | None) -> str:
     """The plant in a file: the one named, or the only one there.
 
     Raises:
-        InputError: as `one_plant_in`.
+        InputError: as `one_plant_in`; or it has a name that no plant can have.
     """
     if kind(path) == "csv":
         return plant or DEFAULT_PLANT
     from recorder.mcap_file import one_plant_in
 
-    return one_plant_in(path, plant)
+    found = one_plant_in(path, plant)
+    try:
+        return checked_plant(found)
+    except ValueError as error:
+        cure = "export it, and use the record"
+        raise InputError(f"{path}: {error}; {cure}") from error
 
 
 def zero_of(path: Path, first_ns: int) -> int:

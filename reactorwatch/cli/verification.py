@@ -1,6 +1,5 @@
 """`replay --verify`: a recording through the monitor's core, and what it says held against what was recorded."""
 
-import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_minutes
-from reactorwatch.runtime.config import read_settings, section
+from reactorwatch.runtime.config import parse_toml, read_settings, section
 from recorder.look import gaps_in, zero_ns_of
 from recorder.mcap_file import one_plant_in, read_messages, read_metadata
 
@@ -79,9 +78,9 @@ def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: 
         tables = read_settings(config)
     elif SETTINGS in metadata:
         try:
-            tables = tomllib.loads(metadata[SETTINGS])
-        except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{file}: the settings in its metadata are not TOML: {error}") from error
+            tables = parse_toml(metadata[SETTINGS].encode())
+        except InputError as error:
+            raise InputError(f"{file}: its metadata's settings: {error}") from error
     else:
         raise InputError(
             f"{file}: does not say how the monitor was set; name the settings file that it ran with by --config"

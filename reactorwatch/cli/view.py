@@ -35,10 +35,7 @@ def view(
     Ends when the window is closed or with Ctrl-C. What was published in the last minute is shown, too.
     """
     import logging
-    import os
 
-    # before Rerun is imported: that a viewer is gone ends this command, and is no error of its connection's
-    os.environ.setdefault("RUST_LOG", "off")
     from reactorwatch.cli.onlooker import begin_beside_recorder
     from recorder.dashboard.live import Shown, show
 

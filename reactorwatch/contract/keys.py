@@ -4,6 +4,7 @@ A key is `reactor/{plant}/{kind}/{name}`; the name of a chart point or an alarm 
 (`chart/ewma/T`, `alarm/ewma/T`).
 """
 
+import itertools
 import re
 from typing import NamedTuple
 
@@ -34,6 +35,8 @@ FLEET = "@fleet"
 
 _PLANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
+_PART = re.compile(r"\*\*?|(\$\*)?[^/*$#?\0]+(\$\*[^/*$#?\0]+)*(\$\*)?")
+
 
 class Topic(NamedTuple):
     """A key taken apart."""
@@ -55,6 +58,24 @@ def checked_plant(plant: str) -> str:
             f"got {plant!r}"
         )
     return plant
+
+
+def checked_expression(expression: str) -> str:
+    """A key expression, if it is one in canonical form.
+
+    Raises:
+        ValueError: Zenoh would refuse it: a part is empty or holds '#', '?' or '$' (but in '$*'), or '*' is beside a
+            letter, or '**' is followed by '*' or '**'.
+    """
+    parts = expression.split("/")
+    if not all(map(_PART.fullmatch, parts)) or any(
+        before == "**" and after in ("*", "**") for before, after in itertools.pairwise(parts)
+    ):
+        raise ValueError(
+            f"key_expression must be names with '/' between, in which '*' stands for one name, '**' for any number of "
+            f"them and '$*' for any letters, such as '{EVERYTHING}', got {expression!r}"
+        )
+    return expression
 
 
 def key(plant: str, kind: str, name: str) -> str:

@@ -118,7 +118,7 @@ def parse_extended_model(
         written = msgspec.json.decode(text, type=_Written)
     except msgspec.ValidationError as error:
         raise InputError(f"is no model: {error}; it must be like extended.json of reactorwatch diagnose -o") from error
-    except msgspec.DecodeError as error:
+    except (msgspec.DecodeError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}") from error
     if written.format != FORMAT:
         raise InputError(f"format must be {FORMAT!r}, got {written.format!r}")

@@ -1,5 +1,6 @@
 """A file appears whole or not at all: it is written beside its place and then renamed into it."""
 
+import glob
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,11 +32,37 @@ def replacing(path: Path) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from error
     try:
-        yield temporary
-        temporary.replace(place)
+        with cannot_write(path, temporary):
+            yield temporary
+            temporary.replace(place)
     except BaseException:
-        temporary.unlink(missing_ok=True)
+        for left in temporary.parent.glob(f"{glob.escape(temporary.name)}*"):  # a writer may have a name of its own
+            left.unlink()
         raise
+
+
+@contextmanager
+def cannot_write(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """While a file is written: that it cannot be, for lack of room perhaps, is one line about it.
+
+    Args:
+        path: the file, as people know it.
+        temporary: the name that it is written under meanwhile; None: the same.
+
+    Raises:
+        InputError: it cannot be written; its cause is the system's error.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.filename is not None and Path(error.filename).name != (temporary or path).name:
+            raise  # of another file
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from error
+    except InputError as error:
+        cause = error.__cause__
+        if temporary is None or temporary.name not in str(error) or not isinstance(cause, OSError):
+            raise
+        raise InputError(f"cannot write {path}: {cause.strerror or cause}") from cause
 
 
 def is_full(error: BaseException | None) -> bool:

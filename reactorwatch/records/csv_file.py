@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.reading import reading
-from reactorwatch.records.record import UNITS, Record
+from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, UNITS, Record
 
 _MINUTES_PER_UNIT = {"time_min": 1.0, "time_s": 60.0}  # divided by, so that 7 s is the same 7/60 min everywhere
 _MCAP_MAGIC = b"\x89MCAP"
@@ -73,12 +73,17 @@ def write_csv(path: Path, record: Record) -> None:
 
     Raises:
         InputError: the folder does not exist or cannot be written to.
-        ValueError: a value is infinite, which the format has no way to say.
+        ValueError: a time or a value is not one that `read_csv` takes, such as an infinite one.
     """
+    if not _can_be(record.time_min, 1.0).all():
+        raise ValueError(f"times must be within {LONGEST_MIN:.3g} min of their zero to be read again from CSV")
     cells = [record.time_min.tolist()]
     for signal, values in record.columns.items():
-        if np.isinf(values).any():
-            raise ValueError(f"column {signal!r} must be finite or NaN to be written as CSV, got an infinite value")
+        if (np.abs(values) >= LARGEST_VALUE).any():
+            raise ValueError(
+                f"column {signal!r} must be below {LARGEST_VALUE:g} or NaN to be read again from CSV, "
+                f"got {np.nanmax(np.abs(values)):g}"
+            )
         cells.append(["" if math.isnan(value) else value for value in values.tolist()])
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")  # writes a float as its repr, which reads back exactly
@@ -161,7 +166,8 @@ def _parsed_at_once(text: str, layout: _Layout) -> NDArray[np.float64] | None:
         return None
     regular = commas == len(values) * (layout.width - 1)
     times = values[:, 0]
-    if not (regular and np.isfinite(times).all() and (np.diff(times) > 0).all() and not np.isinf(values).any()):
+    possible = np.abs(values[:, 1:]).max(initial=0.0, where=~np.isnan(values[:, 1:])) < LARGEST_VALUE
+    if not (regular and possible and _can_be(times, layout.units_per_minute).all() and (np.diff(times) > 0).all()):
         return None
     return values
 
@@ -178,6 +184,11 @@ def _parsed_by_row(path: Path, text: str, layout: _Layout) -> NDArray[np.float64
             raise InputError(f"{path}, row {row}: expected {layout.width} cells as in the header, got {len(cells)}")
         values = [_number(cells[column.position]) for column in columns]
         for column, value in zip(columns, values, strict=True):
+            if value is not None and column is not layout.time and abs(value) >= LARGEST_VALUE:
+                raise InputError(
+                    f"{path}, row {row}, column {column.name!r}: expected a number below {LARGEST_VALUE:g}, or nothing "
+                    f"where nothing was measured, got {cells[column.position]!r}"
+                )
             if value is None:
                 raise InputError(
                     f"{path}, row {row}, column {column.name!r}: expected a finite number"
@@ -188,11 +199,23 @@ def _parsed_by_row(path: Path, text: str, layout: _Layout) -> NDArray[np.float64
             after = "" if not parsed else f" after {previous!r}, that of the row before"
             found = cells[layout.time.position]
             raise InputError(f"{path}, row {row}, column {layout.time.name!r}: expected a time{after}, got {found!r}")
+        if not _can_be(np.array(time), layout.units_per_minute):
+            most = f"{LONGEST_MIN * layout.units_per_minute:.3g}"
+            raise InputError(
+                f"{path}, row {row}, column {layout.time.name!r}: expected a time within 146 years of its zero "
+                f"({most} at most), got {cells[layout.time.position]!r}; check its unit: seconds are time_s"
+            )
         previous = time
         parsed.append(cast(list[float], values))
     if not parsed:
         raise InputError(f"{path}: expected rows below the header, got none")
     return np.array(parsed)
+
+
+def _can_be(times: NDArray[np.float64], units_per_minute: float) -> NDArray[np.bool_]:
+    """Whether times can be those of a record, each for itself."""
+    with np.errstate(over="ignore"):
+        return np.asarray(np.abs(times) <= LONGEST_MIN * units_per_minute)
 
 
 def _number(cell: str) -> float | None:

@@ -1,8 +1,13 @@
 """A folder that is to be written into."""
 
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from reactorwatch.errors import InputError
+from reactorwatch.records.atomic import cannot_write, replacing
 
 
 def make_folder(folder: Path, option: str = "", *, may_exist: bool = True) -> Path:
@@ -25,3 +30,32 @@ def make_folder(folder: Path, option: str = "", *, may_exist: bool = True) -> Pa
         named = f"{option} {folder}" if option else folder
         raise InputError(f"{named}: the folder cannot be made: {error.strerror}") from error
     return folder
+
+
+@contextmanager
+def filling(folder: Path, option: str = "") -> Iterator[Path]:
+    """A folder beside `folder` to write files to, which are moved there when the block ends.
+
+    When the block raises, `folder` is as it was, or not there if it was not, and nothing is left beside it.
+
+    Args:
+        folder: its path; made if it is not there.
+        option: as for `make_folder`.
+
+    Raises:
+        InputError: the folder cannot be made or written to.
+    """
+    beside = next(path for path in (folder, *folder.absolute().parents) if path.is_dir())
+    temporary = beside / f".{folder.name}.{os.getpid()}.tmp"
+    try:
+        temporary.mkdir()
+    except OSError as error:
+        raise InputError(f"{f'{option} ' if option else ''}{folder}: cannot be written to: {error.strerror}") from error
+    try:
+        yield temporary
+        make_folder(folder, option)
+        for file in sorted(temporary.iterdir()):
+            with replacing(folder / file.name) as place, cannot_write(folder / file.name):
+                file.replace(place)
+    finally:
+        shutil.rmtree(temporary)

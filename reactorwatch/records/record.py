@@ -7,6 +7,12 @@ from numpy.typing import NDArray
 
 MINUTE_NS = 60_000_000_000
 
+LARGEST_VALUE = 1e15
+"""A value of at least this size measures nothing, and its square would soon be more than a number can hold."""
+
+LONGEST_MIN = 2.0**62 / MINUTE_NS
+"""From the zero of a record to any of its rows, 146 years: sums of times must still fit 64 bits of nanoseconds."""
+
 UNITS = {"qc": "l/min", "C": "mol/l", "T": "K"}
 """The signals of the reactor and their units."""
 

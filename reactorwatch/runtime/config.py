@@ -22,6 +22,9 @@ from reactorwatch.errors import InputError
 SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log")
 """The tables that a file may hold."""
 
+LARGEST_FILE = 1_000_000
+"""Bytes of a settings file."""
+
 _LAST_PORT = 65535
 
 IDENTITY = ("ca", "certificate", "key")
@@ -121,20 +124,38 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
     if path is None:
         return {}
     try:
-        tables = tomllib.loads(path.read_text(encoding="utf-8"))
+        tables = parse_toml(path.read_bytes())
     except OSError as error:
         raise InputError(f"settings file {path}: cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"settings file {path}: is not TOML: {error}") from error
-    for name, table in tables.items():
+    except InputError as error:
+        raise InputError(f"settings file {path}: {error}") from error
+    for name in tables:
         if name not in SECTIONS:
             raise InputError(f"settings file {path}: {_unknown(name, SECTIONS, 'table')}")
-        if not isinstance(table, dict):
-            raise InputError(f"settings file {path}: '{name}' must be a table, like [{name}]")
     bus = tables.get("bus", {})
     for name in IDENTITY:
         if isinstance(bus.get(name), str):  # so that a folder with settings and certificates can be moved as it is
             bus[name] = str(path.parent / bus[name])
+    return tables
+
+
+def parse_toml(content: bytes) -> dict[str, dict[str, Any]]:
+    """The tables of a TOML document, with or without a byte order mark.
+
+    Raises:
+        InputError: it is not TOML, too large or too deep to be settings, or holds a value outside of its tables.
+    """
+    if len(content) > LARGEST_FILE:
+        raise InputError(f"must be at most {LARGEST_FILE} bytes to be settings, got {len(content)}")
+    try:
+        tables = tomllib.loads(content.decode("utf-8-sig"))
+    except RecursionError as error:
+        raise InputError("is nested too deeply; settings are tables of values and lists") from error
+    except ValueError as error:  # not TOML, not UTF-8, or a number of thousands of digits
+        raise InputError(f"is not TOML: {error}") from error
+    for name, table in tables.items():
+        if not isinstance(table, dict):
+            raise InputError(f"'{name}' must be a table, like [{name}]")
     return tables
 
 

@@ -1,10 +1,13 @@
 """Dashboards as files (.rrd), with their layout in them."""
 
+import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import rerun as rr
 
+from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from recorder.dashboard.drawing import Drawing
 from recorder.dashboard.reading import read_time_plots
@@ -12,6 +15,8 @@ from recorder.dashboard.stream import APPLICATION
 from recorder.panels import PANELS
 from recorder.panels.base import Panel, View
 from recorder.run import Run
+
+_FOOTER, _FOOTER_WITHIN = b"RRF2FOOT", 64
 
 DIAGNOSIS = "Diagnosis"
 """Title of the tab of a diagnosis."""
@@ -71,5 +76,15 @@ def _write(path: Path, onto: Callable[[Drawing], None]) -> None:
             onto(drawing)
             recording.send_blueprint(drawing.layout.blueprint())
         finally:
-            recording.flush()
+            with suppress(RuntimeError):  # its thread has ended, and so has the file: see below
+                recording.flush()
             recording.disconnect()
+        if not _is_complete(temporary):
+            raise InputError(f"cannot write {path}: it could not be completed, for lack of room on the disk perhaps")
+
+
+def _is_complete(path: Path) -> bool:
+    """Whether a file of Rerun's ends as one does; Rerun writes in a thread, and only logs that it could not."""
+    with path.open("rb") as file:
+        file.seek(-min(path.stat().st_size, _FOOTER_WITHIN), os.SEEK_END)
+        return _FOOTER in file.read()

@@ -86,7 +86,6 @@ def check_out(out: Path, only: str | None, sources: Iterable[Path | None], *, fo
     """
     pictures = [f"{FOLDER}/{figure.file_name}" for figure in _chosen(only)]
     checked_folder(out, (PAGE, *pictures), sources, force=force)
-    checked_folder(out / FOLDER)
 
 
 def draw(job: Job) -> Finding:
@@ -111,7 +110,7 @@ def _chosen(only: str | None) -> Sequence[Figure]:
 
 def _folder(out: Path) -> Path:
     """The folder of the pictures, made with that of the page."""
-    pictures = out / FOLDER
+    pictures = checked_folder(checked_folder(out) / FOLDER)
     try:
         pictures.mkdir(parents=True, exist_ok=True)
     except OSError as error:

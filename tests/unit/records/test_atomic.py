@@ -1,12 +1,13 @@
 """A file that is written beside its place."""
 
+import errno
 import os
 from pathlib import Path
 
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import is_full, replacing
 
 
 def test_the_new_file_takes_the_place_of_the_old_when_the_block_ends(tmp_path: Path) -> None:
@@ -19,18 +20,30 @@ def test_the_new_file_takes_the_place_of_the_old_when_the_block_ends(tmp_path: P
     assert list(tmp_path.iterdir()) == [path]
 
 
-@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
-def test_an_exception_leaves_the_old_file_and_nothing_beside_it(tmp_path: Path, error: BaseException) -> None:
+@pytest.mark.parametrize(
+    ("error", "raised", "said"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), InputError, "cannot write .*run.csv: No space left"),
+        (OSError(errno.EIO, "Input/output error", "other.csv"), OSError, "other.csv"),
+        (ValueError("text"), ValueError, "text"),
+        (KeyboardInterrupt(), KeyboardInterrupt, "^$"),
+    ],
+)
+def test_an_exception_leaves_the_old_file_and_nothing_beside_it(
+    tmp_path: Path, error: BaseException, raised: type[BaseException], said: str
+) -> None:
     path = tmp_path / "run.csv"
     path.write_text("old")
 
     def fail() -> None:
         with replacing(path) as temporary:
             temporary.write_text("half")
+            temporary.with_name(f"{temporary.name}.part").write_text("of a writer with a name of its own")
             raise error
 
-    with pytest.raises(type(error)):
+    with pytest.raises(raised, match=said) as caught:
         fail()
+    assert is_full(caught.value) == is_full(error)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 

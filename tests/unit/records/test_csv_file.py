@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.csv_file import read_csv, write_csv
-from reactorwatch.records.record import Record
+from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, Record
 
 PLAIN = "time_min,qc,C,T\n0.1,100,0.1,438\n0.2,101,0.2,439\n0.5,102,0.3,440\n"
 
@@ -164,19 +164,23 @@ def test_writing_replaces_what_was_there_and_names_the_columns(tmp_path: Path) -
     assert path.read_text() == "time_min,qc,T\n0.1,100.0,1e-05\n0.2,,438.54\n"
 
 
-def test_an_infinite_value_is_not_written(tmp_path: Path) -> None:
-    record = Record(np.array([0.1]), {"qc": np.array([np.inf])}, "x")
-    with pytest.raises(ValueError, match="column 'qc' must be finite or NaN"):
+@pytest.mark.parametrize("value", [np.inf, -np.inf, 1e15, -1e308])
+def test_what_could_not_be_read_again_is_not_written(tmp_path: Path, value: float) -> None:
+    record = Record(np.array([0.1]), {"qc": np.array([value])}, "x")
+    with pytest.raises(ValueError, match=r"column 'qc' must be below 1e\+15 or NaN"):
         write_csv(tmp_path / "run.csv", record)
+    with pytest.raises(ValueError, match="times must be within"):
+        write_csv(tmp_path / "run.csv", Record(np.array([value]), {"qc": np.array([1.0])}, "x"))
     assert not list(tmp_path.iterdir())
 
 
-finite = st.floats(allow_nan=False, allow_infinity=False)
+A_TIME = st.floats(-LONGEST_MIN, LONGEST_MIN)
+A_VALUE = st.floats(-LARGEST_VALUE, LARGEST_VALUE, exclude_min=True, exclude_max=True) | st.just(np.nan)
 
 
 @given(
-    times=st.lists(finite, min_size=1, max_size=20, unique=True).map(sorted),
-    values=arrays(np.float64, (3, 20), elements=st.floats(allow_infinity=False)),
+    times=st.lists(A_TIME, min_size=1, max_size=20, unique=True).map(sorted),
+    values=arrays(np.float64, (3, 20), elements=A_VALUE),
 )
 def test_what_is_written_reads_back_exactly(
     tmp_path_factory: pytest.TempPathFactory, times: list[float], values: np.ndarray
@@ -186,3 +190,30 @@ def test_what_is_written_reads_back_exactly(
     record = Record(np.array(times), columns, "run.csv")
     write_csv(path, record)
     assert_same(read_csv(path), record)
+
+
+@given(
+    unit=st.sampled_from(["time_min", "time_s"]),
+    row=st.integers(0, 4),
+    column=st.integers(0, 3),
+    value=st.floats(min_value=LARGEST_VALUE) | st.floats(max_value=-LARGEST_VALUE),
+)
+def test_a_time_or_a_value_that_cannot_be_is_named_with_its_row_and_column(
+    tmp_path_factory: pytest.TempPathFactory, unit: str, row: int, column: int, value: float
+) -> None:
+    cells = [[str(time), "100", "0.1", "440"] for time in range(5)]
+    cells[row][column] = repr(value)
+    path = written(
+        tmp_path_factory.mktemp("csv"), "\n".join([f"{unit},qc,C,T", *(",".join(line) for line in cells)]) + "\n"
+    )
+    with pytest.raises(InputError) as refused:
+        read_csv(path)
+    named = (unit, "qc", "C", "T")[column]
+    assert f"row {row + 2}, column {named!r}: expected a" in str(refused.value)
+
+
+def test_seconds_of_a_clock_in_a_column_of_minutes_are_named(tmp_path: Path) -> None:
+    path = written(tmp_path, "time_min,qc,C,T\n1700000000,100,0.1,440\n1700000006,100,0.1,440\n")
+    with pytest.raises(InputError, match=r"row 2, column 'time_min': .* got '1700000000'; check its unit: seconds are"):
+        read_csv(path)
+    assert read_csv(written(tmp_path, path.read_text().replace("time_min", "time_s"))).rows == 2
