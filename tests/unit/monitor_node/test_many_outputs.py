@@ -46,6 +46,8 @@ def watch(monitor: Monitor, values: Rows, first: int = 0) -> list[Publication]:
     names = (monitor.config.input, *monitor.config.outputs)
     for row in range(first, values.shape[1]):
         for name, value in zip(names, values[:, row].tolist(), strict=True):
+            if np.isnan(value):
+                continue
             message = Sample(time_ns=row * ROW_NS, sequence=row, value=value, quality=Quality.QUALITY_GOOD)
             said += monitor.on_sample(name, message, 0)
     return said
