@@ -27,7 +27,8 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             as well as the second, else the second.
         model: file of an extended model (`diagnose -o`) whose equations they are; None: those of the nominal reactor.
         charts: that watch the residuals.
-        false_alarms_per_30_days: how many alarms chance may raise in 30 days of the plant, all alarms together.
+        false_alarms_per_30_days: how many alarms chance may raise in 30 days of the plant, all alarms together; None:
+            1, or the nearest number that the charts can keep for the number of alarms and the period of the rows.
         ewma_weight: of the newest row in the EWMA chart, in (0, 1].
         mewma_weight: of the newest row in the MEWMA chart, in [0.01, 1].
         cusum_allowance: k of the CUSUM chart, in standard deviations.
@@ -62,7 +63,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     reference: Literal["auto", "process", "arx"] = "auto"
     model: str | None = None
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
-    false_alarms_per_30_days: float = 1.0
+    false_alarms_per_30_days: float | None = None
     ewma_weight: float = 0.1
     mewma_weight: float = 0.02
     cusum_allowance: float = 0.25
@@ -91,12 +92,13 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(
                 f"outputs must be at least one signal, each once, without the input {self.input!r}, got {self.outputs}"
             )
+        asked = self.false_alarms_per_30_days
         for what, value, low, high in (
             ("order", self.order, 1, 20),
             ("delay", self.delay, 1, 100),
             ("forgetting", self.forgetting, 0.5, 1.0),
             ("training_min", self.training_min, 1e-3, 1e6),
-            ("false_alarms_per_30_days", self.false_alarms_per_30_days, 1e-3, 1e6),
+            ("false_alarms_per_30_days", 1.0 if asked is None else asked, 1e-3, 1e6),
             ("ewma_weight", self.ewma_weight, 1e-3, 1.0),
             ("mewma_weight", self.mewma_weight, 0.01, 1.0),
             ("cusum_allowance", self.cusum_allowance, 0.05, 5.0),

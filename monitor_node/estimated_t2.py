@@ -81,7 +81,7 @@ def _factor(p: int, rows: float) -> tuple[Array, Array]:
 def _sum_tail(freedoms: Array, reach: float) -> tuple[Array, Array]:
     """A grid up to `reach`, and the logarithm of the probability that the sum of F(1, nu_i) is beyond each point."""
     step = reach / GRID
-    at = step * np.arange(GRID + 2)
+    at: Array = step * np.arange(GRID + 2, dtype=np.float64)
     transform = np.ones(GRID + 1, dtype=np.complex128)
     for freedom, count in zip(*np.unique(np.minimum(freedoms, LARGEST_FREEDOM), return_counts=True), strict=True):
         # The mean excess over each point; its second differences are the masses that keep the mean.

@@ -20,7 +20,8 @@ the one that a new average crosses as rarely as L is crossed when all is known. 
 not.
 """
 
-from math import comb, exp, log, sqrt
+from collections.abc import Callable
+from math import ceil, comb, exp, floor, log, log10, sqrt
 
 import numpy as np
 from scipy import special
@@ -35,26 +36,49 @@ from reactorwatch.errors import InputError
 DAYS = 30
 DAYS_MIN = DAYS * 24 * 60.0
 
+USUAL_PER_30_DAYS = 1.0
+"""False alarms of a plant that are promised where the settings ask for no number."""
+
+
+def promised_per_30_days(asked: float | None, alarms: int, period_min: float) -> float:
+    """The false alarms of a plant in 30 days that are promised.
+
+    Args:
+        asked: by the settings; None: `USUAL_PER_30_DAYS`, or the nearest number that charts can keep.
+        alarms: number of alarms that share them.
+        period_min: of the rows.
+
+    Raises:
+        InputError: charts cannot keep what is asked for.
+    """
+    rows = DAYS_MIN / period_min * alarms
+    fewest, most = rows / LONGEST_DESIGN, rows / (10 * SHORTEST)
+    if asked is None:
+        return min(max(USUAL_PER_30_DAYS, fewest), most)
+    if not fewest <= asked <= most:
+        bounds = f"[{_two_digits(fewest, ceil)}, {_two_digits(most, floor)}]"
+        raise InputError(
+            f"false_alarms_per_30_days must be in {bounds} for {alarms} alarms and rows every {period_min:g} min, got "
+            f"{asked:g}; set it within that range, or leave it out for the nearest number to 1 that can be kept"
+        )
+    return asked
+
+
+def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
+    """A bound in two digits, which is itself within the bounds."""
+    unit = 10.0 ** (floor(log10(value)) - 1)
+    return f"{rounded(value / unit) * unit:.2g}"
+
 
 def share_arl0(per_30_days: float, alarms: int, period_min: float) -> float:
     """The run length that each of a plant's alarms is to have without a fault, in rows.
 
     Args:
-        per_30_days: false alarms of the plant that are promised.
+        per_30_days: false alarms of the plant that are promised, see `promised_per_30_days`.
         alarms: number of alarms that share them.
         period_min: of the rows.
-
-    Raises:
-        InputError: no chart has such a run length.
     """
-    arl0 = DAYS_MIN / period_min * alarms / per_30_days
-    if not 10 * SHORTEST <= arl0 <= LONGEST_DESIGN:
-        fewest, most = (DAYS_MIN / period_min * alarms / bound for bound in (LONGEST_DESIGN, 10 * SHORTEST))
-        raise InputError(
-            f"false_alarms_per_30_days must be in [{fewest:.2g}, {most:.2g}] for {alarms} alarms and rows every "
-            f"{period_min:g} min, got {per_30_days:g}"
-        )
-    return arl0
+    return min(max(DAYS_MIN / period_min * alarms / per_30_days, 10 * SHORTEST), LONGEST_DESIGN)
 
 
 def point_probability(arl0: float, raise_count: int, window: int) -> float:

@@ -12,7 +12,7 @@ watched. Without values of the input the identified models predict each output f
 from collections import deque
 from collections.abc import Callable
 from math import isfinite, log10
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.predictor import ArxPredictor, fewest_rows
 from monitor_node.prewhitening import Prewhitening, learn
 from monitor_node.references import ArxReference, ProcessReference, Reference, tuned
+from monitor_node.resolution import resolution_sd
 from monitor_node.sampling import TOLERANCE
 from monitor_node.stored_state import StoredState, packed, packed_times, unpacked, unpacked_times
 from monitor_node.undisturbed import Undisturbed, undisturbed
@@ -38,6 +39,9 @@ FEWEST_ROWS = 50
 
 MOST_REFUSALS = 2
 
+Residuals: TypeAlias = tuple[Array, list[float]]
+"""Residuals, shape (n, outputs), and for each output the standard deviation that is of no interest, in their unit."""
+
 MINOR = 0.2
 """A stretch is not disturbed if it is off by less than a few times this, in the smallest standard deviation that counts
 of an identified model's residuals, or in standard deviations of the filter's."""
@@ -46,6 +50,9 @@ AS_WELL = 1.5
 """`auto` takes the process model if its residuals, prewhitened, are at most so many times as large as those of the
 identified one. The doubt is in its favour: where the input goes beyond the training, it still holds."""
 
+
+USUAL_SHARE = 0.9
+"""Of the rows that come as they should; with fewer, that is what is wrong."""
 
 NO_VALUE = "no value of it has come"
 """Why a signal that never came is left out."""
@@ -162,19 +169,24 @@ class Training:
         inputs = np.array([row[1] for row in rows])
         measured = np.array([row[2] for row in rows])
         outputs = self._config.outputs
-        left_out = _too_few_values(outputs, measured)
+        steps = [resolution_sd(column) for column in measured.T]
+        smallest = [
+            max(self._config.smallest_sd.get(name, 0.0), sd, 1e-12) for name, sd in zip(outputs, steps, strict=True)
+        ]
+        left_out = _too_few_values(outputs, measured) | self._constant(measured, steps)
         measured[:, [name in left_out for name in outputs]] = np.nan
-        reference, z, found = self._reference(time_min, inputs, measured)
+        reference, z, found = self._reference(time_min, inputs, measured, smallest, steps)
         if isinstance(reference, ArxReference) and (why := _too_few_values((self._config.input,), inputs[:, None])):
             left_out |= why
-        left_out |= _too_few_residuals(outputs, z, left_out)
+        left_out |= _too_few_residuals(outputs, z, time_min, inputs, left_out)
         judged = [name not in left_out for name in outputs]
         refused = _refused(outputs, found, judged) if any(judged) else "; ".join(dict.fromkeys(left_out.values()))
         if refused and last_chance and any(judged):
             refused, found = "", [Undisturbed(np.isfinite(column), [], [], 0) for column in z.T]
         usable = np.column_stack([item.usable for item in found]) & np.array(judged)
         z = np.where(usable, z, np.nan)
-        smallest = _smallest(self._config, reference)
+        if isinstance(reference, ProcessReference):
+            smallest = [sd / typical for sd, typical in zip(smallest, reference.typical_sd, strict=True)]
         learned = [
             learn(column, sd) if is_judged else NOTHING_LEARNED
             for column, sd, is_judged in zip(z.T, smallest, judged, strict=True)
@@ -184,23 +196,34 @@ class Training:
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
         return Trained(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
 
-    def _reference(self, time_min: Array, inputs: Array, measured: Array) -> tuple[Reference, Array, list[Undisturbed]]:
+    def _constant(self, measured: Array, steps: list[float]) -> dict[str, str]:
+        """Outputs that never vary, and of which no setting says how much is of interest, each with the reason."""
+        return {
+            name: f"it reads {np.nanmax(column):.6g} in the whole training; smallest_sd could say what matters of it"
+            for name, column, step in zip(self._config.outputs, measured.T, steps, strict=True)
+            if not step and not self._config.smallest_sd.get(name) and np.isfinite(column).any()
+        }
+
+    def _reference(
+        self, time_min: Array, inputs: Array, measured: Array, smallest: list[float], steps: list[float]
+    ) -> tuple[Reference, Array, list[Undisturbed]]:
         """The reference, its residuals in its own standard deviations, and what can be learned from them."""
-        smallest = [MINOR * sd for sd in _smallest(self._config, None)]
+        minor = [max(MINOR * sd, step) for sd, step in zip(smallest, steps, strict=True)]
         known_input = inputs
         if np.count_nonzero(np.isfinite(inputs)) < FEWEST_ROWS:
             known_input = np.zeros(inputs.size)
             self._predict_without_input(time_min, measured)
-        identified, found = _twice(lambda rows: self._identified(time_min, known_input, rows), measured, smallest)
+        identified, found = _twice(lambda rows: (self._identified(time_min, known_input, rows), minor), measured)
         if self._model is None or not np.isfinite(inputs).any():
             return ArxReference(known_input), identified, found
         process: list[ProcessReference] = []
 
-        def innovations(rows: Array) -> Array:
-            process.append(self._process_reference(time_min, inputs, rows))
-            return process[-1].run(time_min, inputs, measured)[1]
+        def innovations(rows: Array) -> Residuals:
+            process.append(self._process_reference(time_min, inputs, rows, smallest))
+            z = process[-1].run(time_min, inputs, measured)[1]
+            return z, [max(MINOR, step / sd) for step, sd in zip(steps, process[-1].typical_sd, strict=True)]
 
-        z, found_by_process = _twice(innovations, measured, [MINOR] * measured.shape[1])
+        z, found_by_process = _twice(innovations, measured)
         residuals = z * np.array(process[-1].typical_sd)
         if self._config.reference == "process" or _as_well(residuals, identified):
             return process[-1], z, found_by_process
@@ -221,38 +244,28 @@ class Training:
         columns = zip(self._predictors, measured.T, strict=True)
         return np.column_stack([predictor.hold(time_min, inputs, column) for predictor, column in columns])
 
-    def _process_reference(self, time_min: Array, inputs: Array, measured: Array) -> ProcessReference:
-        config = self._config
+    def _process_reference(
+        self, time_min: Array, inputs: Array, measured: Array, smallest: list[float]
+    ) -> ProcessReference:
+        outputs = self._config.outputs
         assert self._model is not None
-        smallest = [config.smallest_sd.get(signal, 0.0) for signal in config.outputs]
-        noise = tuned(self._model, config.outputs, time_min, inputs, measured, smallest)
-        return ProcessReference(self._model, config.outputs, noise)
+        noise = tuned(self._model, outputs, time_min, inputs, measured, smallest)
+        return ProcessReference(self._model, outputs, noise)
 
 
-def _twice(
-    residuals: Callable[[Array], Array], measured: Array, smallest: list[float]
-) -> tuple[Array, list[Undisturbed]]:
+def _twice(residuals: Callable[[Array], Residuals], measured: Array) -> tuple[Array, list[Undisturbed]]:
     """Residuals of a model that was learned without the rows that were disturbed, and which rows these were.
 
     Args:
         residuals: learns from rows and gives residuals of all.
         measured: shape (n, outputs).
-        smallest: standard deviation, one an output, in the residuals' units.
     """
-    z = residuals(measured)
+    z, smallest = residuals(measured)
     found = [undisturbed(column, sd) for column, sd in zip(z.T, smallest, strict=True)]
     if not any(item.stretches or item.outliers for item in found) or any(item.refused for item in found):
         return z, found
     kept = np.column_stack([item.usable for item in found]) | ~np.isfinite(z)
-    return residuals(np.where(kept, measured, np.nan)), found
-
-
-def _smallest(config: MonitorConfig, reference: Reference | None) -> list[float]:
-    """The least standard deviation of the residuals, in the units that they are in: the outputs' or the filter's."""
-    smallest = [max(config.smallest_sd.get(signal, 0.0), 1e-12) for signal in config.outputs]
-    if isinstance(reference, ProcessReference):
-        return [sd / of_filter for sd, of_filter in zip(smallest, reference.typical_sd, strict=True)]
-    return smallest
+    return residuals(np.where(kept, measured, np.nan))[0], found
 
 
 def _whitened(z: Array, learned: Prewhitening) -> Array:
@@ -286,15 +299,30 @@ def _too_few_values(names: tuple[str, ...], columns: Array) -> dict[str, str]:
     }
 
 
-def _too_few_residuals(outputs: tuple[str, ...], z: Array, left_out: dict[str, str]) -> dict[str, str]:
+def _too_few_residuals(
+    outputs: tuple[str, ...], z: Array, time_min: Array, inputs: Array, left_out: dict[str, str]
+) -> dict[str, str]:
     """Outputs that came, but could hardly ever be predicted, each with the reason."""
     counts = np.count_nonzero(np.isfinite(z), axis=0).tolist()
     return {
-        name: f"of too few rows could be told what to expect of {name}, {count} of {len(z)} where {FEWEST_ROWS} are "
-        "needed: do rows come one by one period?"
+        name: f"only {count} of its {len(z)} rows could be predicted, {FEWEST_ROWS} are needed: "
+        f"{_why_unpredicted(time_min, inputs)}"
         for name, count in zip(outputs, counts, strict=True)
         if count < FEWEST_ROWS and name not in left_out
     }
+
+
+def _why_unpredicted(time_min: Array, inputs: Array) -> str:
+    """Why rows could not be predicted."""
+    spacings = np.diff(time_min)
+    period = float(np.median(spacings)) if spacings.size else 0.0
+    regular = np.count_nonzero(np.abs(spacings - period) <= TOLERANCE * period)
+    if regular < USUAL_SHARE * spacings.size:
+        return f"do rows come one by one period? {regular} of {spacings.size} spacings are within a tenth of the usual"
+    known = int(np.count_nonzero(np.isfinite(inputs)))
+    if FEWEST_ROWS <= known < USUAL_SHARE * inputs.size:
+        return f"the input has a value in {known} of them"
+    return "too often a value is missing in the rows before"
 
 
 def _refused(outputs: tuple[str, ...], found: list[Undisturbed], judged: list[bool]) -> str:

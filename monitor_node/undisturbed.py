@@ -3,9 +3,12 @@
 The residual is cut into blocks of some rows each, and each block is compared with the median of all blocks, in its
 mean and in its spread; by how much blocks may differ is told by the median of the differences between neighbours
 (medians, after Hampel 1974, The influence curve and its role in robust estimation, J. Amer. Statist. Assoc. 69; of
-differences, after von Neumann 1941). Neither moves by much while less than half of the blocks are disturbed. Single
-outliers are left out too. When more than a third has to be left out, what remains is no longer surely the normal
-state, and the training is refused.
+differences, after von Neumann 1941). Neither moves by much while less than half of the blocks are disturbed. When more
+than a third has to be left out, what remains is no longer surely the normal state, and the training is refused.
+
+Single outliers are left out too: at most one value in twenty, for what more values do is how the signal is. (The
+residual of a sensor with coarse steps, or of an analyser that holds its value, is nearly 0 in most rows, so its median
+deviation says nothing of the rows in which it moves.)
 """
 
 from itertools import pairwise
@@ -29,7 +32,11 @@ OUTLIER = 6.0
 
 MOST_LEFT_OUT = 1.0 / 3.0
 
+USUAL_SHARE = 0.95
+"""Of the values that are no outliers, at least."""
+
 _TO_SD = 1.4826  # of the median absolute deviation, for normal values
+_USUAL_TO_SD = 1.0 / 1.96  # of the absolute deviation that 95 % of normal values are within
 
 
 class Undisturbed(NamedTuple):
@@ -65,8 +72,7 @@ def undisturbed(z: Array, smallest_sd: float = 0.0) -> Undisturbed:
     known = np.isfinite(z)
     if not known.any():
         return Undisturbed(known, [], [], 0)
-    centre = float(np.median(z[known]))
-    sd = max(_TO_SD * float(np.median(np.abs(z[known] - centre))), smallest_sd)
+    centre, sd = _centre_and_sd(z[known], smallest_sd)
     size = max(SMALLEST_BLOCK, z.size // BLOCKS)
     starts = np.arange(0, z.size - size + 1, size)
     disturbed = np.zeros(z.size, dtype=np.bool_)
@@ -77,11 +83,17 @@ def undisturbed(z: Array, smallest_sd: float = 0.0) -> Undisturbed:
             disturbed[edges[index] : edges[index + 1]] = True
     stretches = _stretches(disturbed)
     rest = known & ~disturbed
-    centre = float(np.median(z[rest]))
-    sd = max(_TO_SD * float(np.median(np.abs(z[rest] - centre))), smallest_sd)
+    centre, sd = _centre_and_sd(z[rest], smallest_sd)
     shifts = [float(np.nanmean(z[first : last + 1]) - centre) / max(sd, 1e-300) for first, last in stretches]
     single = rest & (np.abs(np.where(known, z, centre) - centre) > OUTLIER * sd) & (sd > 0)
     return Undisturbed(rest & ~single, stretches, shifts, int(np.count_nonzero(single)))
+
+
+def _centre_and_sd(z: Array, smallest_sd: float) -> tuple[float, float]:
+    """Median, and robust standard deviation of the values."""
+    centre = float(np.median(z))
+    half, usual = np.quantile(np.abs(z - centre), (0.5, USUAL_SHARE)).tolist()
+    return centre, max(_TO_SD * half, _USUAL_TO_SD * usual, smallest_sd)
 
 
 def _strange(blocks: list[Array], centre: float, sd: float, smallest_sd: float) -> list[int]:

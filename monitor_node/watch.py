@@ -268,9 +268,16 @@ class PlantWatch:
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
-        arl0 = false_alarm_budget.share_arl0(
-            self._config.false_alarms_per_30_days, self._chance_alarms, self._sampling.period_ns / MINUTE_NS
-        )
+        asked, period_min = self._config.false_alarms_per_30_days, self._sampling.period_ns / MINUTE_NS
+        promised = false_alarm_budget.promised_per_30_days(asked, self._chance_alarms, period_min)
+        if asked is None and promised != false_alarm_budget.USUAL_PER_30_DAYS:
+            text = (
+                f"{promised:.3g} false alarms in 30 days are promised instead of "
+                f"{false_alarm_budget.USUAL_PER_30_DAYS:g}: that is the nearest that the charts can keep for "
+                f"{self._chance_alarms} alarms and rows every {period_min:.3g} min"
+            )
+            trained.checks.append(Check(name="promise", result=text))
+        arl0 = false_alarm_budget.share_arl0(promised, self._chance_alarms, period_min)
         self._checks = trained.checks
         self._judge_by(trained.reference, trained.learned, arl0)
         self._whiteners = [Prewhitener(item) for item in trained.learned]

@@ -1,5 +1,6 @@
 """Plants with any number of outputs: the default charts watch them, and a chart that cannot be made is named."""
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -7,6 +8,7 @@ from monitor_node.config import ChartName, MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, ChartPoint, Quality, Sample
+from reactorwatch.errors import InputError
 
 from .samples import Rows
 
@@ -40,13 +42,15 @@ def config_of(
     )
 
 
-def watch(monitor: Monitor, values: Rows, first: int = 0) -> list[Publication]:
+def watch(monitor: Monitor, values: Rows, first: int = 0, row_ns: int = ROW_NS) -> list[Publication]:
     """Let a monitor watch rows; what it says."""
     said: list[Publication] = []
     names = (monitor.config.input, *monitor.config.outputs)
     for row in range(first, values.shape[1]):
         for name, value in zip(names, values[:, row].tolist(), strict=True):
-            message = Sample(time_ns=row * ROW_NS, sequence=row, value=value, quality=Quality.QUALITY_GOOD)
+            if np.isnan(value):
+                continue
+            message = Sample(time_ns=row * row_ns, sequence=row, value=value, quality=Quality.QUALITY_GOOD)
             said += monitor.on_sample(name, message, 0)
     return said
 
@@ -102,3 +106,28 @@ def test_outputs_of_which_one_follows_from_the_others_have_no_chart_of_all() -> 
     assert monitor.notes == [
         "training: mewma/all is left out: one of the outputs y1, y2 follows from the others",
     ]
+
+
+@pytest.mark.parametrize(("outputs", "period_s"), [(10, 1.0), (2, 0.001), (52, 0.1), (1, 86_400.0), (2, 6e5), (2, 6.0)])
+def test_the_default_promise_is_refused_at_no_period_and_what_is_promised_is_said(
+    outputs: int, period_s: float
+) -> None:
+    config = msgspec.structs.replace(config_of(outputs, 10), training_min=min(150 * period_s / 60, 1e6))
+    monitor = Monitor(config, 0, points=False)
+    watch(monitor, plant(outputs, 200), row_ns=round(period_s * 1e9))
+    assert monitor.phase == "watching"
+    alarms = 4 * outputs + (outputs > 1)
+    fewest, most = (30 * 86_400 / period_s * alarms / arl0 for arl0 in (1e8, 50.0))
+    promised = min(max(1.0, fewest), most)
+    assert monitor.watching_since_ns is not None
+    days = 200 * period_s / 86_400 - monitor.watching_since_ns / 86_400e9
+    assert monitor.expected_false_alarms == pytest.approx(promised * days / 30)
+    told = f"training: {promised:.3g} false alarms in 30 days are promised instead of 1: that is the nearest"
+    assert [note.startswith(told) for note in monitor.notes] == ([True] if promised != 1.0 else [])
+
+
+def test_a_promise_that_is_asked_for_and_cannot_be_kept_is_refused_with_the_range_and_the_cure() -> None:
+    config = msgspec.structs.replace(config_of(10, 10), training_min=2.5, false_alarms_per_30_days=1.0)
+    text = r"must be in \[1.1, 2.1e\+06\] for 41 alarms .* got 1; set it within that range, or leave it out"
+    with pytest.raises(InputError, match=text):
+        watch(Monitor(config, 0, points=False), plant(10, 160), row_ns=10**9)
