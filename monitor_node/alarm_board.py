@@ -30,6 +30,9 @@ KPIS = "monitor"
 SUSPECTED = "suspected"
 """The event of an alarm whose suspects are new."""
 
+STOPPED = "; the search for its cause stopped at its budget of filter steps, so none is named"
+"""The end of an alarm's text after such a search."""
+
 
 class BoardState(msgspec.Struct, forbid_unknown_fields=True):
     """Everything that is remembered of a plant's alarms.
@@ -162,12 +165,13 @@ class AlarmBoard:
             publications.append(self._figures(time_ns))
         return publications
 
-    def suspect(self, time_ns: int, suspects: list[SuspectedCause]) -> list[Publication]:
+    def suspect(self, time_ns: int, suspects: list[SuspectedCause], *, stopped: bool = False) -> list[Publication]:
         """Tell what the alarms of the latest incident may come from: those that stand, and those that are yet to come.
 
         Args:
             time_ns: of the row that this was found at.
             suspects: the likeliest first.
+            stopped: whether the search for them stopped at its budget, which the texts of the alarms then say.
         """
         publications: list[Publication] = []
         self._suspects = list(suspects)
@@ -177,6 +181,7 @@ class AlarmBoard:
                 continue
             if memory.rule.standing and memory.incident == self._incidents.state.number and memory.incident:
                 memory.suspects = list(suspects)
+                memory.text = memory.text.removesuffix(STOPPED) + (STOPPED if stopped else "")
                 self.changes += 1
                 publications.append(self._publication(alarm, SUSPECTED, time_ns))
         return publications

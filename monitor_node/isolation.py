@@ -36,13 +36,21 @@ from monitor_node.isolation_ways import linearisable
 from monitor_node.isolation_window import Row, Window, window_of
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
+from reactorwatch.process.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP
+from reactorwatch.process.step_budget import StepBudget, StepsSpentError
 
 UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
 
 SHARE_OF_RAMPS = 0.3
 """How likely a cause is to grow, beforehand, rather than to set in at once."""
+
+LOOK_STEPS, LOOK_STEPS_A_ROW, SLOW_ROWS = 80_000, 200, 4
+"""Filter steps that a look may take: so many, and so many more for each row of the window, 200,000 for 600 rows. The
+largest faults of the catalogue take up to 180,000. A sensor that shows anything at all would take millions: filters
+then lose the plant and begin again row after row, and no cause explains it. Rows that are too far apart for two steps
+of the integrator are filtered one by one; the budget is then that many times as large."""
 
 SUMMED_ROWS = (1, 5, 20)
 """Over which innovations are summed, to see whether something is left in them."""
@@ -82,6 +90,10 @@ class Isolation:
         window_rows: how many of the newest rows are kept.
         effects: the causes; those that bring states of their own are left out.
         excluded: names of causes that do not come into question.
+
+    Attributes:
+        budget: of the filter steps of the last look.
+        stopped: whether the last look stopped at its budget.
     """
 
     def __init__(
@@ -97,6 +109,7 @@ class Isolation:
         self._nominal = Filter(model, noise)
         self._bank = Bank(model, noise, self._effects)
         self._fitter = Fitter(model, noise, self._effects)
+        self.budget, self.stopped = StepBudget(1), False
 
     def add(self, time_min: float, input_value: float, measured: Sequence[float]) -> None:
         """Keep a row; NaN where something is missing."""
@@ -116,16 +129,35 @@ class Isolation:
     def way(self, state: WayState | None) -> None:
         self._fitter.restore(state)
 
+    @property
+    def steps(self) -> int:
+        """Filter steps that a look at the present rows may take."""
+        steps = LOOK_STEPS + LOOK_STEPS_A_ROW * (self._rows.maxlen or len(self._rows))
+        spacing = np.diff([row[0] for row in self._rows])
+        return steps * SLOW_ROWS if spacing.size and np.median(spacing) > LONGEST_ROW_MIN else steps
+
     def suspects(self, not_before_min: float = -inf) -> list[Suspect]:
         """The causes that come into question, likeliest first, and `UNKNOWN` among them.
+
+        A look stops at a budget of filter steps. `UNKNOWN` is then the only suspect, and `stopped` is set.
 
         Args:
             not_before_min: nothing was wrong before.
         """
+        self.budget, self.stopped = StepBudget(self.steps), False
+        try:
+            return self._compared(not_before_min)
+        except StepsSpentError:  # hypotheses of which some were fitted and some were not cannot be compared
+            self.stopped = True
+            return [_unknown(1.0)]
+
+    def _compared(self, not_before_min: float) -> list[Suspect]:
+        self._nominal.budget = self.budget
         window = window_of(tuple(self._rows), self._nominal, not_before_min)
         if window is None:
             return [_unknown(1.0)]
-        fits = [fit for fit in self._fitter.fit(window, *self._bank.scan(window)) if isfinite(fit.gain)]
+        found_by_bank = self._bank.scan(window)
+        fits = [fit for fit in self._fitter.fit(window, *found_by_bank, self.budget) if isfinite(fit.gain)]
         if not fits:  # nothing was measured in which a cause would show, or none can be followed through it
             return [_unknown(1.0)]
         evidence = [self._evidence(fit) for fit in fits]

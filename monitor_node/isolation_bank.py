@@ -55,7 +55,7 @@ class Scan:
         rows: how many rows it rests on.
         onset_min: when a deviation may set in, shape (n,), increasing.
         size: the likeliest, shape (n, profiles, causes).
-        ratio: twice the logarithm of its likelihood ratio, likewise.
+        ratio: twice the logarithm of its likelihood ratio, shape (n, profiles, causes); minus infinity: not known.
         information: 1 / variance of the size, likewise.
     """
 
@@ -85,8 +85,13 @@ class Bank:
         """Compare all causes on the rows up to the first at which one stands out, and on all.
 
         Args:
-            window: the rows, and the filter's run over them.
+            window: the rows, and the filter's run over them. Where it lost the plant signatures may overflow; the ratio
+                is then minus infinity.
         """
+        with np.errstate(over="ignore", invalid="ignore"):
+            return self._scans(window)
+
+    def _scans(self, window: Window) -> tuple[Scan, Scan]:
         ways, rows = self._linearisation.ways(window), window.time_min.size
         early = self._scanned(window, ways, spread_onsets(window.first_onset, rows), no_further=True)[0]
         if early.rows == rows:
@@ -139,7 +144,8 @@ class Bank:
         order = np.argsort(onset_min, kind="stable")
         onset_min, a, b = onset_min[order], a[order], b[order]
         size = np.clip(a / np.maximum(b, 1e-300), self._lower, self._upper)
-        return Scan(rows, onset_min, size, size * (2.0 * a - size * b), b)
+        ratio = size * (2.0 * a - size * b)
+        return Scan(rows, onset_min, size, np.where(np.isfinite(ratio), ratio, -np.inf), b)
 
 
 def spread_onsets(first: int, rows: int) -> NDArray[np.int64]:

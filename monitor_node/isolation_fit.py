@@ -24,6 +24,7 @@ from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.model import Array, ProcessModel
 from reactorwatch.process.profiles import RAMP, STEP
+from reactorwatch.process.step_budget import StepBudget
 
 BEHIND = 15.0
 """In log likelihood: what is worse than the best by more is left behind."""
@@ -178,14 +179,19 @@ class Fitter:
         if fits:
             self._way = _Way(state.stood_out_min, state.onset_min, state.until_min, state.first, fits)
 
-    def fit(self, window: Window, early: Scan, whole: Scan) -> list[Fit]:
+    def fit(self, window: Window, early: Scan, whole: Scan, budget: StepBudget | None = None) -> list[Fit]:
         """The causes that come into question, likeliest first; of a small fault, then those that are not fitted.
 
         Args:
             window: the rows.
             early: what the linearised bank found in the rows up to the first at which a cause stands out.
             whole: what it found in all.
+            budget: of the filter steps that the fit may take; None: as many as it needs.
+
+        Raises:
+            StepsSpentError: the budget does not reach. How far a large fault has been followed is kept.
         """
+        self._nominal.budget = budget
         best, rows = _begun(whole, window), window.time_min.size
         if not best:
             return []
@@ -247,20 +253,21 @@ class Fitter:
 
 
 def _begun(scan: Scan, window: Window) -> list[Fit]:
-    """The hypotheses of a scan, best first."""
+    """The hypotheses of a scan of which anything can be said, best first."""
     ratio = scan.ratio.reshape(scan.onset_min.size, -1)
     size, information = scan.size.reshape(ratio.shape), scan.information.reshape(ratio.shape)
     places = np.argmax(ratio, axis=0)
     widths = np.gradient(scan.onset_min) if scan.onset_min.size > 1 else np.ones(1)
-    likely = np.exp(0.5 * (ratio - np.max(ratio, axis=0))) * widths[:, None]
+    highest = np.max(ratio, axis=0)
+    likely = np.exp(0.5 * (ratio - np.where(np.isfinite(highest), highest, 0.0))) * widths[:, None]
     off = scan.onset_min[:, None] - scan.onset_min[places]
-    onset_sd_min = np.sqrt(np.sum(likely * off**2, axis=0) / np.sum(likely, axis=0))
+    onset_sd_min = np.sqrt(np.sum(likely * off**2, axis=0) / np.maximum(np.sum(likely, axis=0), 1e-300))
     values = _values_since(window, scan.onset_min)
-    log_volume = np.log(np.sum(likely / np.sqrt(1.0 + values)[:, None], axis=0) / window.span_min)
+    volume = np.sum(likely / np.sqrt(1.0 + values)[:, None], axis=0) / window.span_min
+    log_volume = np.log(np.maximum(volume, 1e-300))
     found = []
     for number, place in enumerate(places.tolist()):
-        # A filter that was far off may leave numbers that overflow: of such a hypothesis nothing can be said.
-        if information[place, number] > 0.0 and isfinite(log_volume[number] + ratio[place, number]):
+        if information[place, number] > 0.0 and isfinite(ratio[place, number]):
             onset_min = float(scan.onset_min[place])
             is_ramp = PROFILES[number // (ratio.shape[1] // len(PROFILES))] is RAMP
             span = float(window.time_min[scan.rows - 1]) - onset_min if is_ramp else 1.0

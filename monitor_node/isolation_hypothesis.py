@@ -58,6 +58,7 @@ class Hypothesis:
             end_min = stretch.end_min
             size = min(max(size * (end_min - onset_min), self.effect.lower), self.effect.upper)
         self._filter.change(dict(zip(self._names, (size, onset_min, end_min), strict=True)))
+        self._filter.budget = stretch.budget
         return stretch.loss(self._filter, onset_min)
 
 

@@ -48,10 +48,12 @@ class Stretch:
         earliest_min: when something may set in at the earliest.
         end_min: time of the last row.
         nothing: the loss, over the rows after the first, if nothing is wrong.
+        budget: of the filter steps over these rows, that of the nominal filter.
     """
 
     def __init__(self, window: Window, begin: int, rows: int, nominal: Filter) -> None:
         part = slice(begin + 1, rows)
+        self.budget = nominal.budget
         self.times = window.time_min[begin:rows]
         self.earliest_min, self.end_min = max(window.earliest_min, float(self.times[0])), float(self.times[-1])
         self._record = FilterRecord.of(window.time_min[part], window.inputs[part], window.measured[part])

@@ -12,9 +12,13 @@ from monitor_node.isolation_window import Row
 from monitor_node.stored_state import StoredState
 from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.step_budget import A_ROW_ALONE, StepBudget, StepsSpentError
 
 MARGIN_MIN = 1.0
 """So long before the onset that was found the sensor is left out already."""
+
+START_STEPS, START_STEPS_A_ROW = 25_000, A_ROW_ALONE
+"""Filter steps that the rows from before may take: enough for each row and two searches for steady states."""
 
 
 class ReconstructionState(StoredState, frozen=True):
@@ -42,8 +46,14 @@ class Reconstruction:
         self._place = place
         self._variance = noise.measurement_sd[place] ** 2
         self._input = nan
-        for time_min, input_value, measured in rows:
-            self._step(time_min, input_value, measured, right=time_min < onset_min - MARGIN_MIN)
+        past = list(rows)
+        self._filter.budget = StepBudget(START_STEPS + START_STEPS_A_ROW * len(past))
+        try:
+            for time_min, input_value, measured in past:
+                self._step(time_min, input_value, measured, right=time_min < onset_min - MARGIN_MIN)
+        except StepsSpentError:  # the filter loses the plant again and again: it begins with the next row instead
+            self._filter.restart()
+        self._filter.budget = None
 
     @property
     def state(self) -> ReconstructionState:

@@ -1,16 +1,18 @@
-"""Faults of the signals themselves, told as what they are: a stuck sensor, a spike, silence.
+"""Faults of the signals themselves, reported as such: a stuck sensor, a spike, a value out of range, silence.
 
 None of them needs a model of what a fault looks like in the process, and each is told at once: a stuck sensor after as
 many equal readings as its noise makes impossible, a spike with the value after it, a silence when the next sample
 is overdue.
 """
 
-from math import isfinite
+from collections.abc import Sequence
+from math import isfinite, nan
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import ChartAlarm, Explanation, SuspectedCause
 from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig
+from monitor_node.signal_range import ANY, SignalRange
 from monitor_node.silence import NOTHING, Change, Silence, SilenceState
 from monitor_node.spike import Spike, SpikeState, spike_limit
 from monitor_node.stored_state import StoredState
@@ -21,6 +23,9 @@ PLANT = "plant"
 """What the silence of all signals together is of."""
 
 STUCK_SENSOR = "stuck_sensor"
+
+RANGE, OUT_OF_RANGE = "range", "out_of_range"
+"""The alarm of a signal that shows what the process cannot be, and what its suspect is called."""
 
 READINGS, SENSOR = "readings", "sensor"
 
@@ -47,6 +52,7 @@ class SignalWatch:
     Args:
         config: of the monitor.
         board: the alarms of the plant; those of the signals are declared here.
+        ranges: of the input and of each output; None: no bounds are known.
 
     Attributes:
         stuck: which outputs' sensors are stuck: what they show is no measurement.
@@ -55,8 +61,9 @@ class SignalWatch:
     CHANCE_ALARMS = 2
     """Alarms of one output that chance can raise."""
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard) -> None:
+    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange] | None = None) -> None:
         self._board = board
+        self._ranges = list(ranges or [ANY] * (1 + len(config.outputs)))
         outputs = config.outputs
         self._names = (PLANT, config.input, *outputs)
         self._silences = [Silence(config.silence_periods) for _ in self._names]
@@ -68,6 +75,10 @@ class SignalWatch:
         self._stuck_alarms = [board.declare(Stuck.name, name, at_once=True, tells_cause=True) for name in outputs]
         self._spike_alarms = [
             board.declare(Spike.name, name, at_once=True, priority="low", tells_cause=True) for name in outputs
+        ]
+        self._range_alarms = [
+            board.declare(RANGE, name, at_once=True, dead_band=0.0, tells_cause=True) if item.is_bounded else None
+            for name, item in zip(self._names[1:], self._ranges, strict=True)
         ]
         self._stuck: list[Stuck] = []
         self._spikes: list[Spike | None] = []
@@ -153,6 +164,32 @@ class SignalWatch:
             if change is not NOTHING:
                 publications += self._tell(index, change)
         return publications
+
+    def measured(self, time_ns: int, values: tuple[float, ...], publications: list[Publication]) -> tuple[float, ...]:
+        """The values of a row, with NaN in place of those that the process cannot have.
+
+        Args:
+            time_ns: of the row.
+            values: of the input, then of the outputs; NaN where missing.
+            publications: changes of alarms are added here.
+        """
+        for index, (value, alarm) in enumerate(zip(values, self._range_alarms, strict=True)):
+            if alarm is None or value != value:
+                continue
+            lower, upper, unit = self._ranges[index]
+            if lower <= value <= upper:
+                if not alarm.at_rest:
+                    inside = Judgement(value, 0.5 * (lower + upper), lower, upper, False)
+                    publications += self._judge(alarm, time_ns, inside, unit, "", self._names[1 + index], cause="")
+                continue
+            values = (*values[:index], nan, *values[index + 1 :])
+            name, outside = self._names[1 + index], Judgement(value, 0.5 * (lower + upper), lower, upper, True)
+            text = (
+                f"{name} reads {value:.6g} {unit}, which the process cannot be: a sensor of it shows {lower:g} to "
+                f"{upper:g} {unit}; such values are not used as measurements"
+            )
+            publications += self._judge(alarm, time_ns, outside, unit, text, name, cause=OUT_OF_RANGE)
+        return values
 
     def look(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
         """Look for stuck sensors in a row."""

@@ -147,9 +147,10 @@ class Suspicion:
             self._since, self._incident = 0, board.incident
         self._since += 1
         if self._since in LOOKS:
-            suspects = self._compared().suspects()
+            isolation = self._compared()
+            suspects = isolation.suspects()
             told = [_told(item) for item in suspects if item.probability >= LEAST]
-            publications += board.suspect(time_ns, told)
+            publications += board.suspect(time_ns, told, stopped=isolation.stopped)
             self._follow(suspects[0])
         return publications
 

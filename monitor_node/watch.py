@@ -20,6 +20,7 @@ from monitor_node.predictor import ArxPredictor
 from monitor_node.prewhitening import Prewhitener, Prewhitening
 from monitor_node.references import ArxReference, ArxReferenceState, ProcessReference, ProcessReferenceState, Reference
 from monitor_node.sampling import SamplingPeriod
+from monitor_node.signal_range import ranges_of
 from monitor_node.signal_watch import SignalWatch
 from monitor_node.suspicion import Suspicion
 from monitor_node.training import MOST_REFUSALS, NO_VALUE, Trained, Training
@@ -70,7 +71,7 @@ class PlantWatch:
         self.model = _model(config, model)
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
-        self.signals = SignalWatch(config, board)
+        self.signals = SignalWatch(config, board, ranges_of(self.model, (config.input, *config.outputs)))
         self._drift = DriftWatch(config, board, told=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
@@ -177,9 +178,10 @@ class PlantWatch:
             units: of the outputs.
             publications: what is to be published is added here.
         """
-        time_ns, (input_value, *values) = row.time_ns, row.values
+        time_ns = row.time_ns
         follows = self._sampling.follows(time_ns) and not row.restarted
         publications.extend(self.signals.hear(time_ns, row.values))
+        input_value, *values = self.signals.measured(time_ns, row.values, publications)
         if self._reference is None:
             self._train(time_ns, input_value, values, units, publications, follows=follows)
         else:

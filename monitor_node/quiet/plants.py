@@ -20,6 +20,7 @@ from monitor_node.quiet.slots import NEVER_NS, Slots
 from monitor_node.receipt import STALL_NS, Receipt
 from monitor_node.references import GATE
 from monitor_node.sample_limits import LARGEST_SAMPLE, USABLE
+from monitor_node.signal_range import ranges_of
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
@@ -69,6 +70,7 @@ class QuietPlants:
         self._slots = Slots(form, self._signals)
         self._rows = RowCode(row_function(model))
         self._parameters = model.values()
+        self._ranges = np.array([[item.lower, item.upper] for item in ranges_of(model, self._signals)])
         self._scratch = np.zeros(1, form.record)
         self._shared: dict[Any, Any] = {}  # parts of `Rest`, which are equal for many plants, are kept once
         self._overdue_ns, self._looked_ns = NEVER_NS, 0  # when the first was overdue, and when that was seen
@@ -241,6 +243,7 @@ class QuietPlants:
             rows.values.view(np.int64),
             self._rows.address,
             self._parameters,
+            self._ranges,
             LONGEST_ROW_MIN,
             GATE,
             self._config.silence_periods,

@@ -9,8 +9,8 @@ Whatever is out of the ordinary is not dealt with here. The record is then left 
 said to be *odd*: it is for the plant's own monitor (see `quiet_plants`).
 
 Odd are: a sample out of its order, that does not follow from those before it, of another unit or quality, or with a
-value, number or time that no plant has; a row after a gap;
-one by which the filter begins anew; a silence; equal readings beyond a sensor's limit; a residual that may be a spike;
+value, number or time that no plant has; a row after a gap; one by which the filter begins anew; a value out of the
+signal's range; a silence; equal readings beyond a sensor's limit; a residual that may be a spike;
 and a row that raises an alarm. Points beyond a limit that raise no alarm are ordinary, they are only remembered.
 """
 
@@ -50,6 +50,7 @@ def _predicted(
     row_time_ns: int,
     time_min: float,
     values: Array,
+    ranges: Array,
     filter_address: int,
     longest_row_min: float,
     gate: float,
@@ -65,6 +66,7 @@ def _predicted(
         row_time_ns: time of the row.
         time_min: the same in minutes.
         values: of the row, input first.
+        ranges: of each signal, see `judge`.
         filter_address: of the filter's machine code.
         longest_row_min: so soon after the row before two steps lead to it.
         gate: see `references`.
@@ -80,6 +82,9 @@ def _predicted(
         return False
     if not (step > 0.0 and 2.0 * step <= longest_row_min):
         return False
+    for place in range(values.size):
+        if not ranges[place, 0] <= values[place] <= ranges[place, 1]:
+            return False
     new[0], new[1], new[2], new[3], new[4] = p.input, values[0], time_min, step, step
     for place in range(outputs):
         new[5 + place], new[5 + outputs + place] = values[1 + place], gate
@@ -279,6 +284,7 @@ def judge(
     row_bits: Ints,
     filter_address: int,
     parameters: Array,
+    ranges: Array,
     longest_row_min: float,
     gate: float,
     silence_limit: float,
@@ -304,6 +310,7 @@ def judge(
         row_bits: the same as bits.
         filter_address: of the filter's machine code.
         parameters: of the model.
+        ranges: smallest and largest value of each signal, shape (signals, 2), see `signal_range`.
         longest_row_min: see `_predicted`.
         gate: likewise.
         silence_limit: periods.
@@ -330,6 +337,7 @@ def judge(
             row_time_ns[k],
             row_time_min[k],
             row_values[k],
+            ranges,
             filter_address,
             longest_row_min,
             gate,

@@ -49,6 +49,7 @@ from reactorwatch.process.filter_stretches import Stretch, Stretches, alone
 from reactorwatch.process.innovations import Innovation, Innovations
 from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.step_budget import A_BEGINNING, A_ROW_ALONE, A_RUN, A_SEARCH, StepBudget
 
 LONGEST_GAP_MIN = 30.0
 
@@ -103,6 +104,9 @@ class Filter:
     Raises:
         ValueError: noise of another size than the model, or that is not positive (of a state: negative); a change that
             names no parameter, or is out of its bounds.
+
+    Attributes:
+        budget: of the filter steps that its rows are counted by; None: they are not.
     """
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, changes: Mapping[str, float] | None = None) -> None:
@@ -122,6 +126,7 @@ class Filter:
         self._inputs: tuple[float, ...] = ()
         self._breaks: tuple[float, ...] = ()
         self.noise = noise
+        self.budget: StepBudget | None = None
         self.change(changes or {})
 
     def twin(self) -> "Filter":
@@ -192,8 +197,13 @@ class Filter:
             accept: ... unless this says so for its output; empty: for none.
             doubt: the inputs that may have held before the row already, and the times from which on, in order, each as
                 likely (see `doubt`); None: it is known that those of the row before did.
+
+        Raises:
+            StepsSpentError: the budget does not reach for the row; also raised by `run`, `over` and `stretches`.
         """
         n, before = self._n_y, self._time_min
+        if self.budget is not None:
+            self.budget.spend(A_ROW_ALONE)
         if before is None or not 0.0 < time_min - before <= LONGEST_GAP_MIN:
             return self._begin(time_min, inputs, measured)
         step = 0.5 * (time_min - before)
@@ -251,6 +261,7 @@ class Filter:
             self.restart()
         else:
             self.state = start
+        self._spend(A_RUN)
         rows, near = record.following(self._time_min, self._inputs, self._breaks)
         count, n, n_x = len(rows), self._n_y, self._n_x
         told, memory = np.empty((count, 5 * n + 1)), np.empty((count, self._memory.size))
@@ -260,6 +271,7 @@ class Filter:
             done = 0
             if self._time_min is not None and near[row]:
                 part = slice(row, ends[bisect_left(ends, row)])
+                self._spend(part.stop - row)
                 done = yield Stretch(self.code, self._memory, rows[part], self._constants, memory[part], told[part])
             if done:
                 self._memory[:] = memory[row + done - 1]
@@ -362,10 +374,16 @@ class Filter:
     def _beginning(self) -> Beginning:
         return Beginning(self.model)
 
+    def _spend(self, steps: int) -> None:
+        if self.budget is not None:
+            self.budget.spend(steps)
+
     def _begin(self, time_min: float, inputs: Sequence[float], measured: Sequence[float]) -> Innovation:
         """Begin at what is measured, if anything is."""
         self._time_min = None
+        searches = self._beginning.searches
         found = self._beginning.at(time_min, inputs, measured, self._noise.measurement_sd, self._changes)
+        self._spend(A_BEGINNING + A_SEARCH * (self._beginning.searches - searches))
         if found is not None:
             x, P = found
             if self._lasting and self._learned:

@@ -35,9 +35,13 @@ class Beginning:
 
     Args:
         model: of the plant.
+
+    Attributes:
+        searches: number of searches for steady states so far, which cost as much as ten thousand rows each.
     """
 
     def __init__(self, model: ProcessModel) -> None:
+        self.searches = 0
         own = model.without_memory()
         self._model = own
         self._outputs = ArrayFunction(output_function(own))
@@ -110,6 +114,7 @@ class Beginning:
         """As they are now. Kept until they are asked for elsewhere: one record is often begun many times."""
         where = (time_min, *u, *changes.items())
         if where != self._where:
+            self.searches += 1
             self._where, self._points = where, self._rests.at(u, time_min, changes)
         return self._points
 

@@ -182,8 +182,7 @@ def test_errors_from_different_places_are_each_reported_once() -> None:
 def test_no_hypothesis_that_overflowed_is_followed() -> None:
     """The linearised bank may leave numbers that overflow; then nothing comes into question, and nothing is raised."""
     shape = (3, 2, 13)
-    nothing = np.full(shape, np.nan)
-    scan = Scan(30, np.array([1.0, 2.0, 3.0]), nothing, nothing, np.ones(shape))
+    scan = Scan(30, np.array([1.0, 2.0, 3.0]), np.full(shape, np.nan), np.full(shape, -np.inf), np.ones(shape))
     times = np.arange(30) / 10
     window = Window(times, times[:, None], np.zeros((30, 2)), np.zeros((30, 2)), np.ones((30, 2), bool), [], 20)
     assert _begun(scan, window) == []

@@ -160,13 +160,22 @@ def moved(run: list[Encoded], first: int, by_ns: int) -> list[Encoded]:
     ]
 
 
+def out_of_range(run: list[Encoded], generator: np.random.Generator) -> list[Encoded]:
+    """Values that the process cannot have, of each signal, alone and in runs."""
+    for place, value in enumerate((-999.0, 9999.0, 65535.0, 1e14)):
+        first, rows = int(generator.integers(300 + 60 * place, 340 + 60 * place)), 1 + 7 * place
+        for at in signal(run, place % 3)[first : first + rows]:
+            run[at] = changed(run[at], value=value)
+    return run
+
+
 def sound(run: list[Encoded], generator: np.random.Generator) -> list[Encoded]:
     return run
 
 
 UPSETS = (
     *(sound, spikes, stuck, coarse, losses, gaps, repeats, disorder, bad, set_back, irregular),
-    *(two_of_a_name, damaged, paused, clock_set, hurried),
+    *(two_of_a_name, damaged, paused, clock_set, hurried, out_of_range),
 )
 
 

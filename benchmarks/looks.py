@@ -1,0 +1,157 @@
+"""How long does a look for causes take, and a row without one, whatever a sensor shows?
+
+Runs of bad values, of 1 to 50 rows, within the range of a signal and far out of it, in a sound plant whose monitor
+looks for causes. Beside it, in the same run, the peer: looks at faults of the catalogue, which are what the budget of
+filter steps is made for. Both are given in seconds of this process and as a ratio; steps are the same on every machine.
+
+Goal: a look within 0.25 s and a row within 50 ms, for any value at all.
+
+    python benchmarks/looks.py [runs of bad values]
+"""
+
+import random
+import sys
+import time
+from collections.abc import Iterable
+from statistics import median
+from typing import NamedTuple
+
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from monitor_node.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation, Suspect
+from monitor_node.signal_range import ranges_of
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.contract.codec import encode
+from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.filter import NoiseLevels
+from recorder.player import samples_of
+
+RUNS = 300
+CONFIG = MonitorConfig(training_min=20.0)
+SIGNALS = (CONFIG.input, *CONFIG.outputs)
+TRAINED, ROWS = 240, 350
+FAULTS = ("coolant_flow:step:-0.05", "coolant_flow:step:-0.3", "heat_transfer:step:-0.8", "temperature_bias:step:30")
+LOOK_S, ROW_S = 0.25, 0.05
+
+
+class Look(NamedTuple):
+    """Seconds of the process, filter steps, and whether it stopped at its budget."""
+
+    seconds: float
+    steps: int
+    stopped: bool
+
+
+class TimedIsolation:
+    """Notes every look while it is in use."""
+
+    def __init__(self) -> None:
+        self.looks: list[Look] = []
+        self._suspects = Isolation.suspects
+
+    def __enter__(self) -> "TimedIsolation":
+        def suspects(isolation: Isolation, not_before_min: float = float("-inf")) -> list[Suspect]:
+            began = time.process_time()
+            found = self._suspects(isolation, not_before_min)
+            self.looks.append(Look(time.process_time() - began, isolation.budget.spent, isolation.stopped))
+            return found
+
+        Isolation.suspects = suspects  # type: ignore[method-assign]
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        Isolation.suspects = self._suspects  # type: ignore[method-assign]
+
+
+def look_at_faults() -> None:
+    """Look at faults of the catalogue, 10, 30, 100 and 300 rows after their onset; the first look compiles."""
+    for fault in FAULTS:
+        record = simulate_record(PlantConfig(seed=4, faults=(f"{fault}@60min",)), 901)
+        columns = (record.time_min, record.columns["qc"], record.columns["C"], record.columns["T"])
+        rows = [(t, u, (c, T)) for t, u, c, T in zip(*(column.tolist() for column in columns), strict=True)]
+        for after in (10, 30, 100, 300):
+            isolation = Isolation(cstr(), NoiseLevels((0.002, 0.3), (0.0, 0.0)))
+            for row in rows[: 600 + after]:
+                isolation.add(*row)
+            isolation.suspects()
+
+
+def watch_bad_values(runs: int, looks: list[Look], seed: int = 1) -> list[float]:
+    """Let a monitor watch runs of bad values; returns the seconds of the slowest row without a look, of each run."""
+    draw, record = random.Random(seed), simulate_record(PlantConfig(seed=9), ROWS)
+    published = samples_of(record, CONFIG.plant, 0)
+    samples = [(item.key.rsplit("/", 1)[1], Sample.FromString(encode(item).payload)) for item in published]
+    trained = Monitor(CONFIG, 0)
+    _feed(trained, samples[: 3 * TRAINED], looks)
+    state, slowest = trained.to_bytes(), []
+    for _ in range(runs):
+        bad = _bad_values(draw)
+        monitor = Monitor(CONFIG, 0)
+        monitor.from_bytes(state)
+        monitor.caught_up()
+        changed = []
+        for at, (signal, sample) in enumerate(samples[3 * TRAINED :]):
+            other = Sample()
+            other.CopyFrom(sample)
+            other.value = bad.get((signal, at // 3), sample.value)
+            changed.append((signal, other))
+        slowest.append(max(_feed(monitor, changed, looks)))
+        assert monitor.failures.by_stage == {}, monitor.failures.notes
+    return slowest
+
+
+def _bad_values(draw: random.Random) -> dict[tuple[str, int], float]:
+    """Values by signal and row of one or two runs: within the range of the signal, at its edges, or anywhere."""
+    bad: dict[tuple[str, int], float] = {}
+    for _ in range(draw.choice((1, 1, 2))):
+        place = draw.randrange(len(SIGNALS))
+        lower, upper, _ = ranges_of(cstr(), SIGNALS)[place]
+        far = draw.choice((-1.0, 1.0)) * 10.0 ** draw.uniform(-3.0, 14.9)
+        value = draw.choice((draw.uniform(lower, upper), lower, upper, far, -999.0, 9999.0, 65535.0))
+        spread = draw.choice((0.0, 0.0, 1e-3, 0.1)) * (upper - lower)
+        first, rows = draw.randrange(20), draw.randrange(1, 51)
+        bad |= {(SIGNALS[place], row): value + spread * draw.random() for row in range(first, first + rows)}
+    return bad
+
+
+def _feed(monitor: Monitor, samples: Iterable[tuple[str, Sample]], looks: list[Look]) -> list[float]:
+    """Feed samples; returns the seconds of those that brought no look."""
+    seconds = []
+    for signal, sample in samples:
+        before, began = len(looks), time.process_time()
+        monitor.on_sample(signal, sample, 0)
+        if len(looks) == before:
+            seconds.append(time.process_time() - began)
+    return seconds
+
+
+def main(runs: int) -> bool:
+    """Measure and print; returns whether the goals are met."""
+    with TimedIsolation() as timed:
+        look_at_faults()  # compiles
+        timed.looks.clear()
+        look_at_faults()
+        peer = timed.looks.copy()
+        timed.looks.clear()
+        rows = watch_bad_values(runs, timed.looks)
+        looks = timed.looks
+    budget, usual = LOOK_STEPS + LOOK_STEPS_A_ROW * CONFIG.isolation_rows, median(item.seconds for item in peer)
+    for name, found in (("faults of the catalogue (peer)", peer), ("bad values", looks)):
+        worst = max(item.seconds for item in found)
+        print(
+            f"{name:31s} {len(found):4d} looks: median {median(item.seconds for item in found):.3f} s, "
+            f"longest {worst:.3f} s ({worst / usual:.1f} times the peer's median); "
+            f"most steps {max(item.steps for item in found):,} of {budget:,}; "
+            f"{sum(item.stopped for item in found)} stopped at the budget"
+        )
+    longest, row = max(item.seconds for item in looks), max(rows)
+    print(f"longest row without a look      {1e3 * row:.1f} ms ({row / usual:.2f} times the peer's median look)")
+    is_met = longest <= LOOK_S and row <= ROW_S
+    print(f"goal: a look within {LOOK_S} s, a row within {1e3 * ROW_S:.0f} ms: {'met' if is_met else 'NOT met'}")
+    return is_met
+
+
+if __name__ == "__main__":
+    sys.exit(0 if main(int(sys.argv[1]) if len(sys.argv) > 1 else RUNS) else 1)
