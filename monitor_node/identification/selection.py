@@ -11,18 +11,26 @@ an output-error model errors of its run. With nearly noise-free data it always a
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from monitor_node.identification.families import LINEAR_FAMILIES, Family, Model
 from monitor_node.identification.linear_model import fit_percent
 from monitor_node.identification.structure import Structure, as_columns
 from reactorwatch.errors import InputError
 
+Array = NDArray[np.float64]
+
 EQUAL_PERCENT = 0.5
+
+LEAST_PERCENT = 20.0
+"""Of a free run on the held-out half: a model that runs worse is not recommended; the mean alone has 0 %."""
+
+UNSEEN_SHARE, BEYOND_SHARE = 0.05, 0.1
+"""Of the held-out half's inputs: so many beyond the fitted half's range by such a share of it are an unseen range."""
 
 
 class Candidate(msgspec.Struct, frozen=True):
@@ -55,7 +63,7 @@ class Selection:
         candidates: in the order of families, then orders.
         chosen: the candidate that was chosen.
         model: it, fitted to the first half.
-        reason: one sentence.
+        reason: one sentence; where no model fits, why.
     """
 
     candidates: tuple[Candidate, ...]
@@ -63,11 +71,16 @@ class Selection:
     model: Model
     reason: str
 
+    @property
+    def fits(self) -> bool:
+        """Whether the chosen model is fit for use; otherwise it is the best of those that are not."""
+        return self.chosen.free_run_percent >= LEAST_PERCENT
+
     def table(self) -> str:
         """The candidates as text, the chosen one marked."""
         lines = ["  family   order  parameters  one-step %  free run %         BIC"]
         for candidate in self.candidates:
-            mark = ">" if candidate is self.chosen else " "
+            mark = ">" if candidate is self.chosen and self.fits else " "
             head = f"{mark} {candidate.family:<8} {candidate.order:>5}"
             if candidate.refusal:
                 lines.append(f"{head}  {candidate.refusal}")
@@ -133,7 +146,21 @@ def select(
     best = max(judged, key=lambda pair: pair[0].free_run_percent)[0]
     equal = [pair for pair in judged if pair[0].free_run_percent >= best.free_run_percent - EQUAL_PERCENT]
     chosen, model = min(equal, key=lambda pair: (pair[0].parameters, -pair[0].free_run_percent))
-    return Selection(tuple(candidates), chosen, model, _reason(chosen, best, candidates))
+    found = Selection(tuple(candidates), chosen, model, _reason(chosen, best, candidates))
+    if found.fits:
+        return found
+    family = next(family for family in families if family.name == chosen.family)
+    structure = Structure.of_order(chosen.order, delay, u.shape[1])
+    return replace(
+        found,
+        reason=f"no model fits: {name_of(best)} runs best on the held-out half, with "
+        f"{best.free_run_percent:.1f} % where the mean alone has 0 %; {_why_none_fits(family, structure, u, y, t)}",
+    )
+
+
+def name_of(candidate: Candidate) -> str:
+    """What a sentence calls it."""
+    return f"{candidate.family} of order {candidate.order}"
 
 
 def bic(residuals: ArrayLike, parameters: int) -> float:
@@ -151,14 +178,46 @@ def bic(residuals: ArrayLike, parameters: int) -> float:
     return values.size * math.log(squares / values.size) + parameters * math.log(values.size)
 
 
+def _why_none_fits(family: Family, structure: Structure, u: Array, y: Array, t: Array) -> str:
+    """In which way the halves of a record differ, so that a model of the first does not run along the second."""
+    half = len(y) // 2
+    before, after = u[:half][np.isfinite(u[:half]).all(axis=1)], u[half:][np.isfinite(u[half:]).all(axis=1)]
+    margin = BEYOND_SHARE * np.ptp(before, axis=0)
+    lowest, highest = before.min(axis=0) - margin, before.max(axis=0) + margin
+    unseen = float(np.mean(np.any((after < lowest) | (after > highest), axis=1)))
+    if unseen > UNSEEN_SHARE:
+        return (
+            f"{100 * unseen:.0f} % of the second half's inputs are out of the range of the first, which no model has "
+            "seen: record a first half that moves as widely"
+        )
+    mean, later, spread = (float(value) for value in (np.nanmean(y[:half]), np.nanmean(y[half:]), np.nanstd(y[:half])))
+    moved = (
+        f"the output's mean went from {mean:.4g} to {later:.4g}, by {abs(later - mean) / max(spread, 1e-300):.1f} sd"
+    )
+    try:
+        own = family.fit(structure, u[half:], y[half:], t[half:]).free_run(u[half:], y[half:], t[half:])
+        percent = fit_percent(y[half:, 0], own[:, 0])
+    except InputError:
+        percent = -math.inf
+    if percent >= 2.0 * LEAST_PERCENT:
+        return (
+            f"the halves differ: a model of the second half runs along it with {percent:.1f} %, and {moved}. In "
+            "between lies a fault, a drift or another operating point: diagnose tells which; or identify each part"
+        )
+    return (
+        f"a model of the second half alone does not run along it either, and {moved}: a drift, a disturbance that is "
+        "not measured, noise, or a plant that is far from linear"
+    )
+
+
 def _reason(chosen: Candidate, best: Candidate, candidates: Sequence[Candidate]) -> str:
-    name, percent = f"{chosen.family} of order {chosen.order}", chosen.free_run_percent
+    name, percent = name_of(chosen), chosen.free_run_percent
     if chosen is best:
         text = f"{name} runs best on the held-out half, {percent:.1f} %"
     else:
         text = (
             f"{name} is the smallest model whose free run on the held-out half, {percent:.1f} %, is within "
-            f"{EQUAL_PERCENT} of the best, {best.family} of order {best.order} with {best.free_run_percent:.1f} %"
+            f"{EQUAL_PERCENT} of the best, {name_of(best)} with {best.free_run_percent:.1f} %"
         )
     smallest = min(
         (c for c in candidates if c.family == chosen.family and not c.refusal), key=lambda candidate: candidate.bic

@@ -86,7 +86,7 @@ def _selection_json(selection: Selection, output: str) -> str:
     said = {
         "output": output,
         "candidates": selection.candidates,
-        "chosen": {"family": selection.chosen.family, "order": selection.chosen.order},
+        "chosen": {"family": selection.chosen.family, "order": selection.chosen.order} if selection.fits else None,
         "reason": selection.reason,
     }
     return msgspec.json.encode(said).decode()

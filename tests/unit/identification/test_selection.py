@@ -1,5 +1,7 @@
 """The choice among models, and the flow chart."""
 
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,6 +100,46 @@ def test_where_nothing_can_be_chosen_every_reason_is_given() -> None:
         select(np.arange(50.0), np.arange(50.0), orders=(0,))
     with pytest.raises(InputError, match="equally many rows, got 50 and 49"):
         select(np.arange(50.0), np.arange(49.0))
+
+
+def second_order(u: Array, gain: Array) -> Array:
+    """A plant whose gain may change on its way, and which forgets in some ten rows."""
+    y = np.zeros(u.size)
+    for k in range(2, u.size):
+        y[k] = 1.5 * y[k - 1] - 0.56 * y[k - 2] + 0.06 * gain[k] * u[k - 1]
+    return y
+
+
+LATER = np.arange(4000) >= 2000
+DIFFERENT_HALVES: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array], str]] = {
+    "an offset": (lambda u: u, lambda y: y + 9.0 * LATER, "the halves differ: .* by .* sd"),
+    "a sensor with the wrong sign": (lambda u: u, lambda y: np.where(LATER, -y, y), "the halves differ"),
+    "a gain ten times as large": (lambda u: u, lambda y: np.where(LATER, 10.0 * y, y), "the halves differ"),
+    "a drift": (lambda u: u, lambda y: y + 0.02 * np.arange(4000) * LATER, "the output's mean went from"),
+    "an unseen range": (lambda u: u + 50.0 * LATER, lambda y: np.minimum(y, 3.0), "out of the range of the first"),
+    "noise": (lambda u: u, lambda y: 1e-3 * y + np.random.default_rng(2).standard_normal(4000), "noise"),
+}
+
+
+@pytest.mark.parametrize("case", DIFFERENT_HALVES)
+def test_where_no_model_fits_it_recommends_none_and_says_why(case: str) -> None:
+    moved, seen, why = DIFFERENT_HALVES[case]
+    u = moved(np.repeat(np.random.default_rng(1).standard_normal(400), 10))
+    y = seen(second_order(u, np.ones(4000))) + 0.01 * np.random.default_rng(3).standard_normal(4000)
+    selection = select(u, y, families=(Arx(),))
+    assert not selection.fits
+    assert max(candidate.free_run_percent for candidate in selection.candidates) < 20.0
+    assert re.match(
+        rf"no model fits: arx of order \d runs best on the held-out half, with -?\d.*{why}", selection.reason
+    )
+    assert not any(line.startswith(">") for line in selection.table().splitlines())
+
+
+def test_a_model_that_fits_is_still_recommended_where_the_halves_differ_a_little(noisy_plant: NoisyPlant) -> None:
+    y = noisy_plant.measured + 0.3 * (np.arange(noisy_plant.measured.size) > 2000)
+    selection = select(noisy_plant.inputs, y)
+    assert selection.fits
+    assert "no model fits" not in selection.reason
 
 
 def test_bic_is_schwarzs() -> None:
