@@ -27,6 +27,9 @@ class Backtest:
         alarm_messages: every change of an alarm, in order.
         refused: counts by reason.
         notes: what people are to be told of the training.
+        reference: what rows were judged by, `equations` or `arx`; None if none was.
+        noise_levels: standard deviations that the equations judged by: of each sensor in its unit (`sensors`), of each
+            state in its unit per square root of a minute (`states`); None where they did not judge.
     """
 
     rows: int
@@ -37,6 +40,8 @@ class Backtest:
     alarm_messages: list[Alarm]
     refused: dict[str, int]
     notes: list[str]
+    reference: str | None = None
+    noise_levels: dict[str, dict[str, float]] | None = None
 
     @property
     def raised(self) -> list[tuple[Alarm, int | None]]:
@@ -88,4 +93,6 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
         alarm_messages=alarms,
         refused=dict(monitor.refusals.by_reason),
         notes=monitor.notes,
+        reference=monitor.reference or None,
+        noise_levels=monitor.noise_levels,
     )

@@ -22,6 +22,8 @@ def health_of(
     heard_from_ns: Mapping[str, int],
     not_stored: int,
     stalls: int,
+    reference: str,
+    training: float,
 ) -> Health:
     """How a plant's monitor does.
 
@@ -37,6 +39,8 @@ def health_of(
         heard_from_ns: by signal, the time of its first sample.
         not_stored: how often what is remembered could not be stored.
         stalls: how often the clock was looked at more than a second late.
+        reference: what rows are judged by; empty before they are.
+        training: the share of the training that is done.
     """
     return Health(
         time_ns=now_ns,
@@ -58,4 +62,6 @@ def health_of(
         heard_from_ns=heard_from_ns,
         not_stored=not_stored,
         stalls=stalls,
+        reference=reference,
+        training=training,
     )
