@@ -30,6 +30,9 @@ class Backtest:
         refused: counts by reason.
         notes: what people are to be told of the training.
         left_out: signals that are not watched, each with the reason.
+        reference: what rows were judged by, `equations` or `arx`; None if none was.
+        noise_levels: standard deviations that the equations judged by: of each sensor in its unit (`sensors`), of each
+            state in its unit per square root of a minute (`states`); None where they did not judge.
     """
 
     input: str
@@ -43,6 +46,8 @@ class Backtest:
     refused: dict[str, int]
     notes: list[str]
     left_out: dict[str, str]
+    reference: str | None = None
+    noise_levels: dict[str, dict[str, float]] | None = None
 
     @property
     def raised(self) -> list[tuple[Alarm, int | None]]:
@@ -97,4 +102,6 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
         refused=dict(monitor.refusals.by_reason),
         notes=monitor.notes,
         left_out=monitor.left_out,
+        reference=monitor.reference or None,
+        noise_levels=monitor.noise_levels,
     )

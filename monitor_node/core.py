@@ -352,6 +352,16 @@ class Monitor:
         return self._watch.model
 
     @property
+    def reference(self) -> str:
+        """What rows are judged by: `equations` or `arx`; empty before they are."""
+        return self._watch.reference
+
+    @property
+    def noise_levels(self) -> dict[str, dict[str, float]] | None:
+        """The noise levels that the equations judge by, by sensor and by state; None where they do not judge."""
+        return self._watch.noise_levels
+
+    @property
     def rows(self) -> int:
         """Rows that have been lined up so far, incomplete ones too."""
         return self._aligner.state.counts.rows
@@ -474,6 +484,8 @@ class Monitor:
             not_stored=self.not_stored,
             stalls=self._stalls,
             failures=self.failures.by_stage,
+            reference=self._watch.reference,
+            training=self._watch.trained_share(self.last_ns),
         )
         self._lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

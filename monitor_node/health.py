@@ -23,6 +23,8 @@ def health_of(
     not_stored: int,
     stalls: int,
     failures: Mapping[str, int],
+    reference: str,
+    training: float,
 ) -> Health:
     """How a plant's monitor does.
 
@@ -39,6 +41,8 @@ def health_of(
         not_stored: how often what is remembered could not be stored.
         stalls: how often the clock was looked at more than a second late.
         failures: number of contained errors of this software, by stage.
+        reference: what rows are judged by; empty before they are.
+        training: the share of the training that is done.
     """
     return Health(
         time_ns=now_ns,
@@ -61,4 +65,6 @@ def health_of(
         not_stored=not_stored,
         stalls=stalls,
         failures=failures,
+        reference=reference,
+        training=training,
     )

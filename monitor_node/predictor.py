@@ -191,7 +191,6 @@ class ArxPredictor:
             condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else inf
             checks = checks_of(self._structure, time_min, inputs, outputs, residual)
             self._reference_model = self._told(theta, covariance, condition, len(y), 1.0)
-            self._reference_model.reference = True
             self._reference_model.checks.extend(checks)
         return residual
 

@@ -70,7 +70,7 @@ class Reference(Protocol):
     """What rows are expected by.
 
     Attributes:
-        kind: as in the settings.
+        kind: `equations` or `arx`, as it is published.
     """
 
     kind: str
@@ -105,7 +105,7 @@ class ProcessReference:
         InputError: the model lacks an output.
     """
 
-    kind = "process"
+    kind = "equations"
 
     def __init__(self, model: ProcessModel, outputs: tuple[str, ...], noise: NoiseLevels) -> None:
         self.model, self.noise = model, noise
@@ -133,6 +133,14 @@ class ProcessReference:
         reference._last_input, reference._guessed = state.last_input, state.guessed
         reference.typical_sd = list(state.typical_sd)
         return reference
+
+    @property
+    def noise_levels(self) -> dict[str, dict[str, float]]:
+        """Standard deviations by name: of each sensor in its unit, of each state in its unit per square root minute."""
+        return {
+            "sensors": dict(zip(self.model.output_names, self.noise.measurement_sd, strict=True)),
+            "states": dict(zip((item.name for item in self.model.states), self.noise.process_sd, strict=True)),
+        }
 
     @property
     def state(self) -> ProcessReferenceState:

@@ -27,7 +27,7 @@ from monitor_node.training import MOST_REFUSALS, NO_VALUE, Trained, Training
 from monitor_node.watch_state import WatchedState, WatchState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Check, Estimate
+from reactorwatch.contract.messages_pb2 import Check, Estimate, ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.model import ProcessModel
@@ -166,6 +166,24 @@ class PlantWatch:
         return self._reference is not None
 
     @property
+    def reference(self) -> str:
+        """What rows are judged by: `equations` or `arx`; empty before they are."""
+        return "" if self._reference is None else self._reference.kind
+
+    @property
+    def noise_levels(self) -> dict[str, dict[str, float]] | None:
+        """The noise levels that the equations judge by, see `ProcessReference`; None where they do not judge."""
+        return self._reference.noise_levels if isinstance(self._reference, ProcessReference) else None
+
+    def trained_share(self, last_ns: int | None) -> float:
+        """The share of the training that is done, 0 to 1, after a row."""
+        if self.watching:
+            return 1.0
+        if self._began_ns is None or last_ns is None:
+            return 0.0
+        return min(max((last_ns - self._began_ns) / MINUTE_NS / self._config.training_min, 0.0), 1.0)
+
+    @property
     def expected_false_alarms(self) -> float:
         """Alarms that chance alone would have raised by now, on average."""
         return self.rows_watched * self._chance_alarms / self._arl0 if self._arl0 else 0.0
@@ -190,15 +208,23 @@ class PlantWatch:
             self._judge(time_ns, input_value, values, units, publications, follows=follows)
 
     def snapshots(self, time_ns: int) -> list[Publication]:
-        """The identified models as they are now: those that adapt and, once there are, the references."""
+        """The models of each output as they are now: the one that adapts, the one held since the training, the judge.
+
+        Where the equations judge, the held one is compared with the one that adapts, and judges nothing.
+        """
         told: list[Publication] = []
         if not self._points:
             return told
-        for key, predictor in zip(self._model_keys, self._predictors, strict=True):
-            adaptive, reference = predictor.adaptive(), predictor.reference()
-            if reference is not None:
-                reference.checks.extend(self._checks)
-            for snapshot in (adaptive, reference):
+        reference = self._reference
+        for key, output, predictor in zip(self._model_keys, self._config.outputs, self._predictors, strict=True):
+            adaptive, held = predictor.adaptive(), predictor.reference()
+            equations = _judge_of(reference, output) if isinstance(reference, ProcessReference) else None
+            if held is not None:
+                held.held, held.reference = True, isinstance(reference, ArxReference)
+            for snapshot in (held, equations):
+                if snapshot is not None:
+                    snapshot.checks.extend(self._checks)
+            for snapshot in (adaptive, held, equations):
                 if snapshot is not None:
                     snapshot.time_ns = time_ns
                     told.append(Publication(key, snapshot))
@@ -398,6 +424,14 @@ class PlantWatch:
                 estimate.residual_sd = scales[index]
                 estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach
                 yield Publication(self._estimate_keys[index], estimate)
+
+
+def _judge_of(reference: ProcessReference, output: str) -> ModelSnapshot:
+    """The filter of the equations as what judges an output: its noise levels."""
+    levels = reference.noise_levels
+    sensor = Parameter(name="sensor_sd", value=levels["sensors"][output])
+    states = [Parameter(name=f"{name}_sd", value=value) for name, value in levels["states"].items()]
+    return ModelSnapshot(structure=reference.kind, parameters=[sensor, *states], reference=True, held=True)
 
 
 def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:

@@ -21,14 +21,15 @@ class Head:
 
     def __init__(self, most: int = MOST_KEYS // 2) -> None:
         self._most = most
-        self._last: dict[tuple[str, bool], Entry] = {}
+        self._last: dict[tuple[str, tuple[str, bool, bool]], Entry] = {}
 
     def remember(self, entry: Entry, message: Message) -> None:
         """Look at an entry and what it holds."""
         if isinstance(message, messages.ModelSnapshot):
-            name = (entry.key, message.reference)  # two models share a key: the one that judges, the one that adapts
+            # models that share a key: the one that adapts, the one held since the training, the one that judges
+            name = (entry.key, (message.structure, message.reference, message.held))
         elif isinstance(message, messages.Alarm | messages.Fault):
-            name = (entry.key, False)
+            name = (entry.key, ("", False, False))
         else:
             return
         self._last.pop(name, None)

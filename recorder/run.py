@@ -89,8 +89,13 @@ class FaultChange(NamedTuple):
     onset_ns: int
 
 
+ADAPTS, HELD, JUDGES, EQUATIONS = "adapts", "held", "judges", "equations"
+"""What a model is for: it adapts; it is held since the training and compared with that one; rows are judged by it; or
+rows are judged by equations, whose noise levels are its parameters."""
+
+
 class Snapshot(NamedTuple):
-    """An identified model of a signal; parameters by name: (value, standard deviation)."""
+    """A model of a signal; parameters by name: (value, standard deviation)."""
 
     time_ns: int
     parameters: Mapping[str, tuple[float, float]]
@@ -156,7 +161,7 @@ class Run:
         alarms: in order of time.
         faults: in order of time.
         reconstructed: by signal.
-        models: snapshots in order of time, by the signal and whether it is the model that alarms are judged by.
+        models: snapshots in order of time, by the signal and what the model is for, such as `ADAPTS`.
         health: reports in order of time, by node.
         seen: of each signal, up to the end of the stretch.
         earlier: what was before it.
@@ -171,7 +176,7 @@ class Run:
     alarms: tuple[AlarmChange, ...]
     faults: tuple[FaultChange, ...]
     reconstructed: dict[str, Reconstructed] = field(default_factory=dict)
-    models: dict[tuple[str, bool], tuple[Snapshot, ...]] = field(default_factory=dict)
+    models: dict[tuple[str, str], tuple[Snapshot, ...]] = field(default_factory=dict)
     health: dict[str, tuple[Report, ...]] = field(default_factory=dict)
     seen: dict[str, Seen] = field(default_factory=dict)
     earlier: Earlier = Earlier()

@@ -21,6 +21,10 @@ from reactorwatch.records.record import UNITS
 from recorder.entry import Entry
 from recorder.measurement import measured
 from recorder.run import (
+    ADAPTS,
+    EQUATIONS,
+    HELD,
+    JUDGES,
     AlarmChange,
     Charted,
     Earlier,
@@ -95,7 +99,7 @@ class RunReader:
         self._series: dict[str, _Series | None] = {}
         self._alarms: list[AlarmChange] = []
         self._faults: list[FaultChange] = []
-        self._models: dict[tuple[str, bool], list[Snapshot]] = {}
+        self._models: dict[tuple[str, str], list[Snapshot]] = {}
         self._health: dict[str, list[Report]] = {}
         self._newest_ns = 0
         self._seen: dict[str, Seen] = {}
@@ -136,7 +140,7 @@ class RunReader:
         elif kind == keys.FAULT:
             self._faults.append(FaultChange(*(getattr(message, name) for name in FaultChange._fields)))
         elif kind == keys.MODEL:
-            self._models.setdefault((into.topic.name, message.reference), []).append(_snapshot(message))
+            self._models.setdefault((into.topic.name, _use(message)), []).append(_snapshot(message))
         elif self._newest_ns:  # health of before the first sample has no place in the run
             self._health.setdefault(message.node, []).append(_report(message, self._newest_ns))
 
@@ -221,6 +225,15 @@ def _last_of_each_time(items: list[_Dated]) -> tuple[_Dated, ...]:
     """In order of time; of several at one time the last counts."""
     newest = {item.time_ns: item for item in items}
     return tuple(newest[time_ns] for time_ns in sorted(newest))
+
+
+def _use(message: messages.ModelSnapshot) -> str:
+    """What a model is for."""
+    if message.structure == EQUATIONS:
+        return EQUATIONS
+    if message.reference:
+        return JUDGES
+    return HELD if message.held else ADAPTS
 
 
 def _snapshot(message: messages.ModelSnapshot) -> Snapshot:

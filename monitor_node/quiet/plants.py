@@ -18,7 +18,7 @@ from monitor_node.quiet.rows import NEW_MINUTE, judge
 from monitor_node.quiet.samples import silent_from, take_samples
 from monitor_node.quiet.slots import NEVER_NS, Slots
 from monitor_node.receipt import STALL_NS, Receipt
-from monitor_node.references import GATE
+from monitor_node.references import GATE, ProcessReference
 from monitor_node.sample_limits import LARGEST_SAMPLE, USABLE
 from monitor_node.signal_range import ranges_of
 from reactorwatch.contract import keys
@@ -323,6 +323,8 @@ class QuietPlants:
             not_stored=int(p["not_stored"]),
             stalls=int(p["stalls"]),
             failures=rest.failures or {},
+            reference=ProcessReference.kind,
+            training=1.0,
         )
         p["lag_ns"] = 0
         return Publication(keys.key(plant, keys.HEALTH, NODE), health)

@@ -32,6 +32,8 @@ def backtest_object(result: Backtest, zero_ns: int) -> dict[str, Any]:
             "outputs": [name for name in result.outputs if name not in result.left_out],
             "left_out": [{"signal": name, "why": why} for name, why in result.left_out.items()],
         },
+        "reference": result.reference,
+        "noise_levels": result.noise_levels,
         "alarms": [
             {
                 "alarm": alarm.alarm,
@@ -63,6 +65,7 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
             f"trained until {said['trained_until_min']:g} min; "
             f"{said['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
         )
+        lines.append(_judged_by(result))
     for alarm, cleared_ns in result.raised:
         end = f"cleared at {to_minutes(cleared_ns, zero_ns):g} min" if cleared_ns else "still standing at the end"
         raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
@@ -75,6 +78,14 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     if result.refused:
         lines.append("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items())))
     return "\n".join(lines)
+
+
+def _judged_by(result: Backtest) -> str:
+    """What judged the rows, and by which noise."""
+    if result.noise_levels is None:
+        return "judged by identified models (ARX)"
+    levels = (f"{name} {sd:.3g}" for name, sd in result.noise_levels["sensors"].items())
+    return f"judged by the equations, with noise of the sensors (standard deviation) {', '.join(levels)}"
 
 
 def priority_word(alarm: Alarm) -> str:

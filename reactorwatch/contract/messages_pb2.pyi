@@ -83,7 +83,7 @@ class Estimate(_message.Message):
     def __init__(self, time_ns: _Optional[int] = ..., prediction: _Optional[float] = ..., residual: _Optional[float] = ..., residual_sd: _Optional[float] = ..., lower_limit: _Optional[float] = ..., upper_limit: _Optional[float] = ..., unit: _Optional[str] = ...) -> None: ...
 
 class ModelSnapshot(_message.Message):
-    __slots__ = ("time_ns", "structure", "order", "delay", "parameters", "rows", "forgetting", "excitation", "condition", "reference", "checks")
+    __slots__ = ("time_ns", "structure", "order", "delay", "parameters", "rows", "forgetting", "excitation", "condition", "reference", "checks", "held")
     TIME_NS_FIELD_NUMBER: _ClassVar[int]
     STRUCTURE_FIELD_NUMBER: _ClassVar[int]
     ORDER_FIELD_NUMBER: _ClassVar[int]
@@ -95,6 +95,7 @@ class ModelSnapshot(_message.Message):
     CONDITION_FIELD_NUMBER: _ClassVar[int]
     REFERENCE_FIELD_NUMBER: _ClassVar[int]
     CHECKS_FIELD_NUMBER: _ClassVar[int]
+    HELD_FIELD_NUMBER: _ClassVar[int]
     time_ns: int
     structure: str
     order: int
@@ -106,7 +107,8 @@ class ModelSnapshot(_message.Message):
     condition: float
     reference: bool
     checks: _containers.RepeatedCompositeFieldContainer[Check]
-    def __init__(self, time_ns: _Optional[int] = ..., structure: _Optional[str] = ..., order: _Optional[int] = ..., delay: _Optional[int] = ..., parameters: _Optional[_Iterable[_Union[Parameter, _Mapping]]] = ..., rows: _Optional[int] = ..., forgetting: _Optional[float] = ..., excitation: _Optional[float] = ..., condition: _Optional[float] = ..., reference: bool = ..., checks: _Optional[_Iterable[_Union[Check, _Mapping]]] = ...) -> None: ...
+    held: bool
+    def __init__(self, time_ns: _Optional[int] = ..., structure: _Optional[str] = ..., order: _Optional[int] = ..., delay: _Optional[int] = ..., parameters: _Optional[_Iterable[_Union[Parameter, _Mapping]]] = ..., rows: _Optional[int] = ..., forgetting: _Optional[float] = ..., excitation: _Optional[float] = ..., condition: _Optional[float] = ..., reference: bool = ..., checks: _Optional[_Iterable[_Union[Check, _Mapping]]] = ..., held: bool = ...) -> None: ...
 
 class Parameter(_message.Message):
     __slots__ = ("name", "value", "sd")
@@ -267,7 +269,7 @@ class Reconstruction(_message.Message):
     def __init__(self, time_ns: _Optional[int] = ..., value: _Optional[float] = ..., sd: _Optional[float] = ..., unit: _Optional[str] = ..., measured: _Optional[float] = ..., cause: _Optional[str] = ...) -> None: ...
 
 class Health(_message.Message):
-    __slots__ = ("time_ns", "node", "version", "phase", "uptime_s", "received", "lost", "late", "refused", "refused_by_reason", "lag_ms", "duplicated", "out_of_order", "published", "rows", "incomplete_rows", "heard_from_ns", "not_stored", "stalls", "failures")
+    __slots__ = ("time_ns", "node", "version", "phase", "uptime_s", "received", "lost", "late", "refused", "refused_by_reason", "lag_ms", "duplicated", "out_of_order", "published", "rows", "incomplete_rows", "heard_from_ns", "not_stored", "stalls", "reference", "training", "failures")
     class RefusedByReasonEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -308,6 +310,8 @@ class Health(_message.Message):
     HEARD_FROM_NS_FIELD_NUMBER: _ClassVar[int]
     NOT_STORED_FIELD_NUMBER: _ClassVar[int]
     STALLS_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_FIELD_NUMBER: _ClassVar[int]
+    TRAINING_FIELD_NUMBER: _ClassVar[int]
     FAILURES_FIELD_NUMBER: _ClassVar[int]
     time_ns: int
     node: str
@@ -328,8 +332,10 @@ class Health(_message.Message):
     heard_from_ns: _containers.ScalarMap[str, int]
     not_stored: int
     stalls: int
+    reference: str
+    training: float
     failures: _containers.ScalarMap[str, int]
-    def __init__(self, time_ns: _Optional[int] = ..., node: _Optional[str] = ..., version: _Optional[str] = ..., phase: _Optional[str] = ..., uptime_s: _Optional[float] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ..., late: _Optional[int] = ..., refused: _Optional[int] = ..., refused_by_reason: _Optional[_Mapping[str, int]] = ..., lag_ms: _Optional[float] = ..., duplicated: _Optional[int] = ..., out_of_order: _Optional[int] = ..., published: _Optional[int] = ..., rows: _Optional[int] = ..., incomplete_rows: _Optional[int] = ..., heard_from_ns: _Optional[_Mapping[str, int]] = ..., not_stored: _Optional[int] = ..., stalls: _Optional[int] = ..., failures: _Optional[_Mapping[str, int]] = ...) -> None: ...
+    def __init__(self, time_ns: _Optional[int] = ..., node: _Optional[str] = ..., version: _Optional[str] = ..., phase: _Optional[str] = ..., uptime_s: _Optional[float] = ..., received: _Optional[int] = ..., lost: _Optional[int] = ..., late: _Optional[int] = ..., refused: _Optional[int] = ..., refused_by_reason: _Optional[_Mapping[str, int]] = ..., lag_ms: _Optional[float] = ..., duplicated: _Optional[int] = ..., out_of_order: _Optional[int] = ..., published: _Optional[int] = ..., rows: _Optional[int] = ..., incomplete_rows: _Optional[int] = ..., heard_from_ns: _Optional[_Mapping[str, int]] = ..., not_stored: _Optional[int] = ..., stalls: _Optional[int] = ..., reference: _Optional[str] = ..., training: _Optional[float] = ..., failures: _Optional[_Mapping[str, int]] = ...) -> None: ...
 
 class Fault(_message.Message):
     __slots__ = ("time_ns", "cause", "specification", "active", "onset_ns")

@@ -135,9 +135,49 @@ def test_models_are_published_in_the_units_of_the_samples(leak: list[Encoded]) -
 
 
 def reference_of(said: list[Publication]) -> ModelSnapshot:
-    """The reference for T."""
+    """The identified model of T that is held since the training."""
     models = [item.message for item in said if item.key.endswith("model/T")]
-    return next(model for model in models if isinstance(model, ModelSnapshot) and model.reference)
+    return next(model for model in models if isinstance(model, ModelSnapshot) and model.held)
+
+
+@pytest.mark.parametrize(("setting", "judge"), [("auto", "equations"), ("process", "equations"), ("arx", "arx")])
+def test_what_judges_is_published_with_its_noise_levels_and_nothing_else_says_that_it_judges(
+    leak: list[Encoded], setting: Literal["auto", "process", "arx"], judge: str
+) -> None:
+    monitor, said = watch(leak, MonitorConfig(reference=setting, isolation=False))
+    models = [(item.key, item.message) for item in said if isinstance(item.message, ModelSnapshot)]
+    since_ns = monitor.watching_since_ns
+    assert since_ns is not None
+    for key in ("reactor/cstr/model/C", "reactor/cstr/model/T"):
+        judging = [model for where, model in models if where == key and model.reference]
+        assert {model.structure for model in judging} == {judge}
+        assert min(model.time_ns for model in judging) == since_ns
+        assert [model.time_ns for model in judging] == sorted({model.time_ns for model in judging})
+    assert monitor.reference == judge
+    levels = monitor.noise_levels
+    assert (levels is not None) == (judge == "equations")
+    if levels is not None:
+        for signal, sd in levels["sensors"].items():
+            model = next(item for where, item in models if where.endswith(signal) and item.structure == "equations")
+            values = {item.name: item.value for item in model.parameters}
+            assert values == {"sensor_sd": sd} | {f"{name}_sd": value for name, value in levels["states"].items()}
+        assert levels["sensors"]["T"] == pytest.approx(0.3, rel=0.2)  # as the plant was made
+
+
+def test_health_says_how_far_the_training_is_and_what_judges_then(leak: list[Encoded]) -> None:
+    """In a training of 100 min."""
+    monitor = Monitor(MonitorConfig(isolation=False), 0)
+    told: list[tuple[float, str]] = []
+    for number, message in enumerate(leak, start=1):
+        monitor.on_message(message, 0)
+        if number % 300 == 0:
+            now = [item.message for item in monitor.on_tick(number * 10**9) if isinstance(item.message, Health)]
+            told += [(report.training, report.reference) for report in now]
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert shares[4] == pytest.approx(0.49, abs=0.03)
+    assert {reference for share, reference in told if share < 1.0} == {""}
+    assert told[-1] == (1.0, "equations")
 
 
 def test_the_reference_says_that_its_rows_were_fit_to_learn_from(leak: list[Encoded]) -> None:

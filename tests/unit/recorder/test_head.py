@@ -18,6 +18,8 @@ def test_the_last_of_each_model_alarm_and_fault_is_said_again_and_nothing_else()
     head = remembered(
         ("model/T", messages.ModelSnapshot(reference=True, rows=1)),
         ("model/T", messages.ModelSnapshot(reference=False, rows=2)),
+        ("model/T", messages.ModelSnapshot(held=True, rows=2)),
+        ("model/T", messages.ModelSnapshot(structure="equations", reference=True)),
         ("alarm/a", messages.Alarm(alarm="a", event="raised")),
         ("sample/T", messages.Sample(value=1.0)),
         ("health/monitor", messages.Health()),
@@ -26,7 +28,7 @@ def test_the_last_of_each_model_alarm_and_fault_is_said_again_and_nothing_else()
         ("alarm/a", messages.Alarm(alarm="a", event="cleared")),
     )
     entries = head.entries(1000)
-    assert [entry.publish_time_ns - 100 for entry in entries] == [0, 5, 6, 7]
+    assert [entry.publish_time_ns - 100 for entry in entries] == [0, 2, 3, 7, 8, 9]
     assert {(entry.log_time_ns, entry.repeated) for entry in entries} == {(1000, True)}
 
 

@@ -12,7 +12,7 @@ import recorder.panels
 from reactorwatch.contract import messages_pb2 as messages
 from recorder.panels import PANELS, alarms, charts, health, model, overview
 from recorder.panels.base import ALARM, Again, EventLog, Panel, PlanePlot, StateLines, TimePlot, View
-from recorder.run import Charted, Reconstructed, Report, Run, Snapshot
+from recorder.run import ADAPTS, EQUATIONS, HELD, JUDGES, Charted, Reconstructed, Report, Run, Snapshot
 from recorder.run_reader import read_run, stretches
 from tests.unit.recorder import golden
 
@@ -227,10 +227,12 @@ def test_what_is_known_of_an_alarm_from_before_is_not_said_again(run: Run) -> No
     assert lanes.lines[0].states == ("raised",)
 
 
-def test_parameters_of_both_models_are_drawn_with_their_intervals(run: Run) -> None:
+@pytest.mark.parametrize(("use", "name"), [(JUDGES, "judged by"), (HELD, "held since the training")])
+def test_parameters_of_both_models_are_drawn_with_their_intervals(run: Run, use: str, name: str) -> None:
+    """A model that judges nothing is not said to."""
     adapting = tuple(Snapshot(at, {"a1": (0.9 + at, 0.1), "b1": (2.0, 0.5)}, 0.02 * at, 50.0) for at in (1, 2))
     judged = (Snapshot(2, {"a1": (0.8, 0.1), "b1": (1.9, 0.5)}, 0.03, 33.0),)
-    plots = model.draw(replace(run, models={("T", False): adapting, ("T", True): judged}))
+    plots = model.draw(replace(run, models={("T", ADAPTS): adapting, ("T", use): judged}))
     assert [plot.title.split(" of ")[0] for plot in plots] == [
         "Parameters a",
         "Parameters b",
@@ -239,9 +241,19 @@ def test_parameters_of_both_models_are_drawn_with_their_intervals(run: Run) -> N
     lines = {series.name: series.value for series in plots[0].series}
     assert lines["a1"] == pytest.approx([1.9, 2.9])
     assert lines["a1 upper end"] - lines["a1"] == pytest.approx(0.196)
-    assert lines["a1 judged by"] == pytest.approx([0.8])
+    assert lines[f"a1 {name}"] == pytest.approx([0.8])
     excitation = {series.name: series.value.tolist() for series in plots[-1].series}
-    assert excitation == {"of the model judged by": [0.03], "of the model that adapts": [0.02, 0.04]}
+    assert excitation == {f"of the model {name}": [0.03], "of the model that adapts": [0.02, 0.04]}
+
+
+def test_the_noise_levels_of_the_equations_that_judge_are_drawn(run: Run) -> None:
+    judged = tuple(Snapshot(at, {"sensor_sd": (0.3, 0.0), "C_sd": (1e-4, 0.0)}, 0.0, 0.0) for at in (1, 2))
+    (plot,) = model.draw(replace(run, models={("T", EQUATIONS): judged}))
+    assert plot.title == "Noise levels by which the equations judge T"
+    assert {series.name: series.value.tolist() for series in plot.series} == {
+        "sensor_sd": [0.3, 0.3],
+        "C_sd": [1e-4, 1e-4],
+    }
 
 
 def test_health_shows_phases_lag_and_troubles_of_each_node(run: Run) -> None:

@@ -7,7 +7,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.errors import InputError
 from recorder.entry import Entry
-from recorder.run import Earlier, Run
+from recorder.run import ADAPTS, EQUATIONS, HELD, JUDGES, Earlier, Run
 from recorder.run_reader import read_run, stretches
 from tests.unit.recorder import golden
 
@@ -139,12 +139,15 @@ def test_a_node_s_report_stands_at_the_newest_sample_of_its_receipt(run: Run) ->
 def test_models_are_told_apart_by_what_they_are_for() -> None:
     parameter = messages.Parameter(name="a1", value=0.9, sd=0.1)
     published = [
-        messages.ModelSnapshot(time_ns=at, parameters=[parameter], excitation=0.1 * at, reference=reference)
-        for at, reference in ((1, False), (2, False), (2, True))
+        messages.ModelSnapshot(time_ns=at, parameters=[parameter], excitation=0.1 * at, reference=reference, held=held)
+        for at, reference, held in ((1, False, False), (2, False, False), (2, True, False), (3, False, True))
     ]
+    published.append(messages.ModelSnapshot(time_ns=4, structure="equations", reference=True, held=True))
     run = read_run(encode(Publication("reactor/cstr/model/T", item)) for item in published)
-    assert [item.time_ns for item in run.models["T", False]] == [1, 2]
-    (judged,) = run.models["T", True]
+    assert [item.time_ns for item in run.models["T", ADAPTS]] == [1, 2]
+    assert [item.time_ns for item in run.models["T", HELD]] == [3]
+    assert [item.time_ns for item in run.models["T", EQUATIONS]] == [4]
+    (judged,) = run.models["T", JUDGES]
     assert judged.parameters == {"a1": (0.9, 0.1)}
     assert judged.excitation == pytest.approx(0.2)
 
