@@ -39,6 +39,7 @@ class Role:
         name: the second part of the common name.
         nodes: the nodes that run with it, each of which says that it is alive and how it does.
         publishes: below the plant's key, such as `sample/**`.
+        denied: what of that is another role's.
         answers: the commands it listens to, and keeps a record of.
         asks: the commands it may give.
     """
@@ -46,6 +47,7 @@ class Role:
     name: str
     nodes: tuple[str, ...] = ()
     publishes: tuple[str, ...] = ()
+    denied: tuple[str, ...] = ()
     answers: tuple[str, ...] = ()
     asks: tuple[str, ...] = LISTS
 
@@ -54,7 +56,7 @@ PROOF = "@doctor/**"
 """Below a kind: where `doctor` publishes to see whether it is heard; nobody else hears it, for no `**` reaches it."""
 
 ROLES = (
-    Role("plant", ("plant", "replay"), (f"{keys.SAMPLE}/**", f"{keys.FAULT}/**"), PLANT_COMMANDS),
+    Role("plant", ("plant", "replay"), (f"{keys.SAMPLE}/**", f"{keys.FAULT}/**"), answers=PLANT_COMMANDS),
     Role(
         "monitor",
         ("monitor", "diagnosis"),
@@ -62,13 +64,14 @@ ROLES = (
             *(f"{kind}/**" for kind in (keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.RECONSTRUCTION)),
             f"{keys.ALARM_KPIS}/monitor",
         ),
-        (*OF_THE_PLANT, *ALARM_ENGINEERING, "list_alarms"),
+        denied=(f"{keys.ALARM}/{keys.RECORDING}/**",),
+        answers=(*OF_THE_PLANT, *ALARM_ENGINEERING, "list_alarms"),
     ),
     Role(
         "recorder",
         ("recorder",),
         (f"{keys.ALARM}/{keys.RECORDING}/**",),
-        (keys.ACKNOWLEDGE_RECORDER, keys.LIST_RECORDER_ALARMS),
+        answers=(keys.ACKNOWLEDGE_RECORDER, keys.LIST_RECORDER_ALARMS),
     ),
     Role("operator", asks=(*LISTS, *ALARM_COMMANDS)),
     Role("engineer", asks=(*LISTS, *ALARM_COMMANDS, *ALARM_ENGINEERING, *PLANT_COMMANDS)),
@@ -116,7 +119,8 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
     subjects, policies = [], []
     for plant in plants:
         root = f"{keys.ROOT}/{plant}"
-        everything = [f"{root}/**", f"{root}/**/{MEMORY}", f"{root}/*/{PROOF}"]
+        monitors = keys.monitor_token(plant, "*")
+        everything = [f"{root}/**", f"{root}/**/{MEMORY}", f"{root}/*/{PROOF}", monitors]
         reading = [
             _rule(plant, "hear", ("ingress",), HEAR_IN, everything),
             _rule(plant, "be told", ("egress",), HEAR_OUT, everything),
@@ -135,6 +139,7 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
                 proofs = [f"{root}/{kind}/{PROOF}" for kind in kinds_of(role)]
                 answers = [f"{root}/{keys.COMMAND}/{command}" for command in role.answers]
                 alive = [f"{root}/{keys.ALIVE}/{node}" for node in role.nodes]
+                alive += [monitors] if role.name == "monitor" else []
                 own += [
                     _rule(name, "publish", ("ingress",), ("put", "reply"), [*said, *memory, *proofs]),
                     _rule(name, "remember", ("ingress",), ("declare_queryable", "liveliness_token"), memory),
@@ -143,6 +148,11 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
                     _rule(name, "be asked", ("egress",), ("query",), [*everything[1:2], *answers]),
                     _rule(name, "know who listens", ("egress",), ("declare_liveliness_subscriber",), everything),
                 ]
+            if role.denied:
+                denied = [f"{root}/{kind}" for kind in role.denied]
+                denied += [f"{key}/{MEMORY}" for key in denied]
+                refused = ("put", "delete", "reply", "declare_queryable", "liveliness_token")
+                own.append(_rule(name, "not publish", ("ingress",), refused, denied, "deny"))
             rules += own
             subjects.append({"id": name, "cert_common_names": [name]})
             used = [rules[0], *reading, *own]
@@ -157,11 +167,16 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _rule(
-    who: str, what: str, flows: tuple[str, ...], messages: tuple[str, ...], key_expressions: list[str]
+    who: str,
+    what: str,
+    flows: tuple[str, ...],
+    messages: tuple[str, ...],
+    key_expressions: list[str],
+    permission: str = "allow",
 ) -> dict[str, Any]:
     return {
         "id": f"{who}: {what}",
-        "permission": "allow",
+        "permission": permission,
         "flows": list(flows),
         "messages": list(messages),
         "key_exprs": key_expressions,
