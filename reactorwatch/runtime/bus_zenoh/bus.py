@@ -218,6 +218,17 @@ class ZenohBus:
         elif on_told is not None:
             on_told()
 
+    def subscribe_live(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
+        """Subscribe to what is published from now on, each message as it comes.
+
+        `subscribe` also gets what publishers remember, which it asks for as soon as it learns that it missed something.
+        """
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            handler(Reader(sample.encoding).read(sample, time.time_ns())[1])
+
+        self._declared.append(self._session.declare_subscriber(spelled(key_expression), on_sample))
+
     def _delivery(
         self,
         key_expression: str,
