@@ -3,6 +3,7 @@
 python -m monitor_node [settings.toml]
 """
 
+import secrets
 import sys
 import time
 from collections.abc import Callable
@@ -22,6 +23,8 @@ from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
+from reactorwatch.runtime.bus import Bus
+from reactorwatch.runtime.command_rate import CommandRate, sender_of
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.entry import main
 from reactorwatch.runtime.metrics import Metrics, served
@@ -46,11 +49,14 @@ class MonitorNode(Monitor):
 
     Attributes:
         resumed: whether it goes on from a stored state.
+        token: the liveliness token of this monitor, unlike any other's.
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
         super().__init__(config, start_ns, model=model_on_the_bus(config.model))
         self._said: dict[object, str] = {}
+        self._rate = CommandRate()
+        self.token = keys.monitor_token(config.plant, f"{start_ns:020d}-{secrets.token_hex(4)}")
         paths = [Path(name) for name in (config.alarm_state_file, config.state_file) if name is not None]
         if len({path.resolve() for path in paths}) < len(paths):
             raise InputError(f"state_file and alarm_state_file must be two files, got {paths[0]} for both")
@@ -77,10 +83,25 @@ class MonitorNode(Monitor):
         return publications
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """See `Monitor`; alarms are stored, before the answer goes out, and logged."""
+        """See `Monitor`; alarms are stored, before the answer goes out, and logged; too many commands are refused."""
+        refusal = self._rate.refusal(sender_of(question), now_ns)
+        if refusal is not None:
+            self.received += 1
+            self.refusals.add("too_many_commands", refusal)
+            return CommandReply(accepted=False, text=refusal), []
         reply, publications = super().on_command(question, now_ns)
         self._keep(publications, now_ns)
         return reply, publications
+
+    def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
+        """Log that another monitor of the plant came or went: two raise every alarm twice, and both answer commands."""
+        if token != self.token:
+            name = token.rpartition("/")[2]
+            if is_alive:
+                log.warning("another monitor watches this plant; stop one of them", plant=self.config.plant, other=name)
+            else:
+                log.info("the other monitor of this plant has gone", plant=self.config.plant, other=name)
+        return []
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """See `Monitor`; what was refused is logged, at most once a minute; what could not be stored is tried again."""
@@ -136,6 +157,12 @@ class MonitorNode(Monitor):
             self._said.pop(store, None)
 
 
+def announce(node: MonitorNode, bus: Bus) -> None:
+    """Show that the plant has a monitor, and which."""
+    bus.announce(keys.key(node.config.plant, keys.ALIVE, NODE))
+    bus.announce(node.token)
+
+
 def run(
     config: MonitorConfig,
     bus_config: BusConfig,
@@ -167,7 +194,9 @@ def run(
                 history_s=inf if node.resumed else 0.0,
                 on_told=node.caught_up,
                 commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
-                on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
+                tokens=(keys.monitor_token(config.plant, "*"),),
+                on_alive=node.on_alive,
+                on_ready=lambda: announce(node, bus),
                 linger_s=LINGER_S,
                 on_publish=metrics.of(node.alarms.all_alarms) if metrics is not None else None,
             )

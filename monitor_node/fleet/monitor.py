@@ -223,6 +223,14 @@ class FleetMonitor:
             raise InputError(f"plant {plant!r} is not watched here (there are: {', '.join(self.plants)})")
         return monitor
 
+    def is_watched(self, plant: str) -> bool:
+        """Whether a plant is watched here."""
+        return plant in self._here
+
+    def own(self, plant: str) -> Monitor | None:
+        """The monitor of a plant; None if it is quiet, or not watched here."""
+        return self._here.own(plant)
+
     def state_of(self, plant: str) -> State:
         """All that is remembered of a plant that is watched here."""
         return self._here.state_of(plant)

@@ -21,6 +21,7 @@ from monitor_node.fleet.watched import WatchedPlants
 from monitor_node.health import NODE
 from monitor_node.kept_aside import DAMAGED, OTHER_SETTINGS
 from monitor_node.monitor_state import OtherSettingsError
+from monitor_node.refusals import Refusals
 from monitor_node.seal import ForeignFileError
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
@@ -28,6 +29,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus, matches
+from reactorwatch.runtime.command_rate import CommandRate, sender_of
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.metrics import FleetMetrics, served
 from reactorwatch.runtime.model_file import model_on_the_bus
@@ -96,6 +98,7 @@ class FleetNode(FleetMonitor):
         self._shown: set[str] = set()
         self._report_ns = start_ns
         self._forgotten_told = 0
+        self._rate, self._commands_refused = CommandRate(), Refusals()
         # The older of two with the same shard is in charge: names sort by the time of the start.
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
         self.crew = Crew(self.expression, shards.parsed(fleet.shard), name)
@@ -150,7 +153,16 @@ class FleetNode(FleetMonitor):
         return self._attended(now_ns) + self._noted(super().on_alive(token, is_alive, now_ns))
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
-        """See `FleetMonitor`; alarms are logged."""
+        """See `FleetMonitor`; alarms are logged; too many commands, of whatever plants, are refused."""
+        topic = keys.parse(question.key)
+        if topic is None or self.holds or not self.is_watched(topic.plant):
+            return None, []
+        refusal = self._rate.refusal(sender_of(question), now_ns)
+        if refusal is not None:
+            self._commands_refused.add("too_many_commands", refusal)
+            if (own := self.own(topic.plant)) is not None:  # a quiet plant stays one
+                own.refusals.add("too_many_commands", refusal)
+            return CommandReply(accepted=False, text=refusal), []
         reply, publications = super().on_command(question, now_ns)
         return reply, self._noted(publications)
 
@@ -172,6 +184,8 @@ class FleetNode(FleetMonitor):
                 log.warning(line, plant=plant)
             for plant, text in self.tracebacks():
                 log.debug("traceback", plant=plant, traceback=text)
+            if (refused := self._commands_refused.report(now_ns)) is not None:
+                log.warning(refused)
             if self.forgotten > self._forgotten_told:
                 self._forgotten_told = self.forgotten
                 log.warning("plants were forgotten that showed no token and said nothing more", so_far=self.forgotten)

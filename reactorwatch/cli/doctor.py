@@ -168,19 +168,21 @@ def _role(config: BusConfig) -> Role | None:
 class _Listening:
     """Who says that he is alive, and what each says of himself, with how far his clock is ahead of ours in seconds.
 
-    Whatever comes late makes a clock seem behind, and one that was recovered, or crossed a busy network, came late. So
-    of two messages the later clock is the truer, and a clock behind by what a message may be late by is listened to
-    until a message says better, or to the end.
+    What a publisher remembers is a minute old, so only what is published from now on counts. A message that crossed a
+    busy network comes late and makes a clock seem behind. So of two messages the later clock is the truer, and a clock
+    behind by what a message may be late by is listened to until a message says better, or to the end.
     """
 
     def __init__(self, bus: ZenohBus, plant: str, timeout_s: float) -> None:
         self._timeout_s = timeout_s
         self.alive: set[str] = set()
         self.said: dict[str, tuple[Health, float]] = {}
+        self.monitors: set[str] = set()
         self._settled: set[str] = set()
         self._changed = threading.Condition()
         bus.watch_alive(keys.all_of(plant, keys.ALIVE), self._on_token)
-        bus.subscribe(keys.key(plant, keys.HEALTH, "*"), self._on_health)
+        bus.watch_alive(keys.monitor_token(plant, "*"), self._on_monitor)
+        bus.subscribe_live(keys.key(plant, keys.HEALTH, "*"), self._on_health)
 
     def wait(self) -> None:
         """Until all who are expected have spoken, and their clocks are known."""
@@ -193,6 +195,10 @@ class _Listening:
             with self._changed:
                 (self.alive.add if is_alive else self.alive.discard)(topic.name)
                 self._changed.notify_all()
+
+    def _on_monitor(self, token: str, is_alive: bool) -> None:
+        with self._changed:
+            (self.monitors.add if is_alive else self.monitors.discard)(token)
 
     def _on_health(self, message: Encoded) -> None:
         topic = keys.parse(message.key)
@@ -229,6 +235,9 @@ def _nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Finding]:
                 yield Finding(node, f"is alive, and says nothing of itself within {timeout_s:g} s", cure)
         else:
             yield _node(node, *said[node])
+    if len(listening.monitors) > 1:
+        found = f"{len(listening.monitors)} of them watch {plant}: every alarm is raised as often"
+        yield Finding("monitors", found, "stop all but one; for a stand-by, start both with --plants")
 
 
 def _node(node: str, health: Health, offset_s: float) -> Finding:

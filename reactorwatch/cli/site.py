@@ -52,18 +52,18 @@ def router(
         Path, typer.Argument(help="Zenoh's settings, as `certify` writes them: router.json5.", show_default=False)
     ],
 ) -> None:
-    """Run the router of a site, with its certificates and access rules."""
+    """Run the router of a site, with its certificates and access rules; the log says what they refuse."""
     import threading
 
     import structlog
 
     from reactorwatch.cli.options import existing
-    from reactorwatch.runtime.bus_zenoh import router_from_file
+    from reactorwatch.runtime.bus_zenoh import refusals_logged, router_from_file
     from reactorwatch.runtime.logs import configure
     from reactorwatch.runtime.serve import stop_on_signals
 
     configure()
-    with stop_on_signals() as stop:
+    with refusals_logged(), stop_on_signals() as stop:
         bus = router_from_file(existing(file))
         stopped = threading.Event()
         stop.wakes(stopped.set)

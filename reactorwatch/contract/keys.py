@@ -111,6 +111,16 @@ def parse(text: str) -> Topic | None:
     return Topic(*parts[1:])
 
 
+def monitor_token(plant: str, name: str) -> str:
+    """The liveliness token by which monitors of a plant notice each other, beside that of their node.
+
+    Args:
+        plant: its name.
+        name: of the monitor, unlike any other's; `*`: the key expression of all.
+    """
+    return key(plant, ALIVE, f"@monitor/{name}")
+
+
 def fleet_token(fleet: str, of: str, number: str, name: str) -> str:
     """The liveliness token of one of the monitors that share a fleet.
 

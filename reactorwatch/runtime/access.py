@@ -61,7 +61,7 @@ PROOF = "@doctor/**"
 """Below a kind: where `doctor` publishes to see whether it is heard; nobody else hears it, for no `**` reaches it."""
 
 ROLES = (
-    Role("plant", ("plant", "replay"), (f"{keys.SAMPLE}/**", f"{keys.FAULT}/**"), PLANT_COMMANDS),
+    Role("plant", ("plant", "replay"), (f"{keys.SAMPLE}/**", f"{keys.FAULT}/**"), answers=PLANT_COMMANDS),
     Role(
         "monitor",
         ("monitor", "diagnosis"),
@@ -69,13 +69,13 @@ ROLES = (
             *(f"{kind}/**" for kind in (keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.RECONSTRUCTION)),
             f"{keys.ALARM_KPIS}/monitor",
         ),
-        (*OF_THE_PLANT, *ALARM_ENGINEERING, "list_alarms"),
+        answers=(*OF_THE_PLANT, *ALARM_ENGINEERING, "list_alarms"),
     ),
     Role(
         "recorder",
         ("recorder",),
         (f"{keys.ALARM}/{keys.RECORDING}/**",),
-        (keys.ACKNOWLEDGE_RECORDER, keys.LIST_RECORDER_ALARMS),
+        answers=(keys.ACKNOWLEDGE_RECORDER, keys.LIST_RECORDER_ALARMS),
     ),
     Role("operator", asks=(*LISTS, *ALARM_COMMANDS)),
     Role("engineer", asks=(*LISTS, *ALARM_COMMANDS, *ALARM_ENGINEERING, *PLANT_COMMANDS)),
@@ -126,7 +126,8 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
     subjects, policies = [], []
     for plant in plants:
         root = f"{keys.ROOT}/{plant}"
-        everything = [f"{root}/**", f"{root}/**/{MEMORY}", f"{root}/*/{PROOF}"]
+        monitors = keys.monitor_token(plant, "*")
+        everything = [f"{root}/**", f"{root}/**/{MEMORY}", f"{root}/*/{PROOF}", monitors]
         reading = [
             _rule(plant, "hear", ("ingress",), HEAR_IN, everything),
             _rule(plant, "be told", ("egress",), HEAR_OUT, everything),
@@ -143,6 +144,7 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
                 proofs = [f"{root}/{kind}/{PROOF}" for kind in kinds_of(role)]
                 answers = [f"{root}/{keys.COMMAND}/{command}" for command in role.answers]
                 alive = [f"{root}/{keys.ALIVE}/{node}" for node in role.nodes]
+                alive += [monitors] if role.name == "monitor" else []
                 own += [
                     _rule(name, "publish", ("ingress",), ("put", "reply"), [*said, *memory, *proofs]),
                     _rule(name, "remember", ("ingress",), ("declare_queryable", "liveliness_token"), memory),
@@ -158,7 +160,7 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
                             name,
                             "leave to others",
                             ("ingress",),
-                            ("put", "delete", "reply", "declare_queryable"),
+                            ("put", "delete", "reply", "declare_queryable", "liveliness_token"),
                             [*others, *(f"{key}/{MEMORY}" for key in others)],
                             permission="deny",
                         )

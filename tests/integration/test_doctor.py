@@ -40,18 +40,25 @@ def now() -> datetime.datetime:
     return datetime.datetime.now(datetime.UTC)
 
 
+def health(node: str, age_s: float, version: str = __version__) -> Encoded:
+    """What a node says of itself, so old."""
+    time_ns = round((now().timestamp() - age_s) * 1e9)
+    message = Health(time_ns=time_ns, node=node, version=version, phase="watching")
+    return encode(Publication(keys.key("cstr", keys.HEALTH, node), message))
+
+
 @contextmanager
-def nodes(buses: dict[str, ZenohBus], late_s: Sequence[float] = (0.0,), version: str = __version__) -> Iterator[None]:
+def nodes(
+    buses: dict[str, ZenohBus], late_s: Sequence[float] = (0.0,), version: str = __version__, every_s: float = 0.05
+) -> Iterator[None]:
     """Nodes that are alive and say so again and again, so late one message after another."""
     stopped = threading.Event()
 
     def speak(node: str, bus: ZenohBus) -> None:
         bus.announce(keys.key("cstr", keys.ALIVE, node))
         lateness_s = itertools.cycle(late_s)
-        while not stopped.wait(0.05):
-            time_ns = round((now().timestamp() - next(lateness_s)) * 1e9)
-            health = Health(time_ns=time_ns, node=node, version=version, phase="watching")
-            bus.publish(encode(Publication(keys.key("cstr", keys.HEALTH, node), health)))
+        while not stopped.wait(every_s):
+            bus.publish(health(node, next(lateness_s), version))
 
     threads = [threading.Thread(target=speak, args=item) for item in buses.items()]
     for thread in threads:
@@ -191,6 +198,45 @@ def test_a_clock_that_is_off_and_another_version_are_told(site: Site, tmp_path: 
 def test_messages_that_come_late_are_not_taken_for_a_clock_that_is_off(site: Site, tmp_path: Path) -> None:
     with nodes({node: site.join(f"cstr/{node}") for node in NODES}, late_s=[4.0, 3.0, 5.0, 0.0]):
         assert wrong(settings(site.folder, "cstr/viewer"), tmp_path) == {}
+
+
+REMEMBERED_S = range(60, 0, -5)
+
+
+@contextmanager
+def nodes_of_a_minute(buses: dict[str, ZenohBus], late_s: float = 0.0) -> Iterator[None]:
+    """Nodes that have said of themselves what they are, every 5 s for a minute, and say it again each second."""
+    for node, bus in buses.items():
+        for age_s in REMEMBERED_S:
+            bus.publish(health(node, late_s + age_s))
+    with nodes(buses, [late_s], every_s=1.0):
+        yield
+
+
+def test_what_a_node_said_a_minute_ago_is_not_taken_for_its_clock(site: Site, tmp_path: Path) -> None:
+    """Publishers remember it, and subscribers ask for it: whatever the plant's speed, it is as old as it is."""
+    with nodes_of_a_minute({node: site.join(f"cstr/{node}") for node in NODES}):
+        assert wrong(settings(site.folder, "cstr/viewer"), tmp_path, 20.0) == {}
+
+
+def test_a_clock_that_is_off_by_less_than_what_is_remembered_is_told(site: Site, tmp_path: Path) -> None:
+    others = {node: site.join(f"cstr/{node}") for node in ("plant", "recorder")}
+    with nodes(others), nodes_of_a_minute({"monitor": site.join("cstr/monitor")}, late_s=20.0):
+        found = wrong(settings(site.folder, "cstr/viewer"), tmp_path, 15.0)
+    assert set(found) == {"monitor"}
+    assert found["monitor"].found.partition("its clock ")[2].startswith(("-20.", "-21."))
+
+
+def test_two_monitors_of_one_plant_are_told(site: Site, tmp_path: Path) -> None:
+    buses = {node: site.join(f"cstr/{node}") for node in NODES}
+    other = site.join("cstr/monitor")
+    with nodes(buses):
+        buses["monitor"].announce(keys.monitor_token("cstr", "a"))
+        assert wrong(settings(site.folder, "cstr/viewer"), tmp_path) == {}
+        other.announce(keys.monitor_token("cstr", "b"))
+        found = wrong(settings(site.folder, "cstr/viewer"), tmp_path)
+    assert set(found) == {"monitors"}
+    assert found["monitors"].found == "2 of them watch cstr: every alarm is raised as often"
 
 
 def test_a_disk_without_room_is_told(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ import pytest
 import zenoh
 
 from benchmarks.link_cuts import Proxy
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply
 from reactorwatch.runtime.bus import Request
@@ -101,18 +102,6 @@ def test_nobody_but_the_plant_publishes_its_samples(site: Site, who: str) -> Non
     assert [message.payload for message in heard] == [b"measured"]
 
 
-@pytest.mark.parametrize("who", ["cstr/monitor", "cstr/plant", "cstr/viewer"])
-def test_no_role_but_the_recorder_publishes_the_recorder_s_alarms(site: Site, who: str) -> None:
-    """Though the monitor publishes all other alarms."""
-    key = "reactor/cstr/alarm/recording/disk"
-    intruder = site.join(who)
-    intruder.publish(Encoded(key, b"forged", ""))
-    site.leave(intruder)
-    site.join("cstr/recorder").publish(Encoded(key, b"raised", ""))
-    heard = site.heard_until(lambda message: message.payload == b"raised")
-    assert [message.payload for message in heard] == [b"raised"]
-
-
 def test_a_recorder_that_uses_the_monitor_s_numbers_suppresses_none_of_its_alarms(
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,6 +118,51 @@ def test_a_recorder_that_uses_the_monitor_s_numbers_suppresses_none_of_its_alarm
     site.leave(monitor)
     site.close_readers()
     assert [item.payload for item in heard if item.payload != b"forged"] == [b"%d" % number for number in range(6)]
+
+
+@pytest.mark.parametrize("name", ["recording/disk", "recording/zz", "recording/disk/@adv/pub/x/_"])
+def test_the_monitor_does_not_publish_the_recorder_s_alarm(site: Site, name: str) -> None:
+    heard: list[bytes] = []
+    site.router.subscribe("reactor/cstr/alarm/*", lambda message: heard.append(message.payload))
+    site.router.subscribe(f"reactor/cstr/alarm/{name}", lambda message: heard.append(message.payload))
+    monitor = site.join("cstr/monitor")
+    monitor._session.put(f"reactor/cstr/alarm/{name}", b"forged")
+    monitor.publish(Encoded("reactor/cstr/alarm/x", b"raised", ""))
+    site.leave(monitor)
+    recorder = site.join("cstr/recorder")
+    if "@adv" not in name:
+        recorder.publish(Encoded(f"reactor/cstr/alarm/{name}", b"full", ""))
+    site.leave(recorder)
+    assert heard == ([b"raised", b"full"] if "@adv" not in name else [b"raised"])
+
+
+WILD = ("sample/*", "sample/**", "sample/T$*", "sample/$*T")
+
+
+@pytest.mark.parametrize("gathered", [False, True], ids=["one by one", "gathered"])
+def test_a_message_on_many_keys_at_once_is_taken_by_no_subscriber(
+    site: Site, plain_log: None, capsys: pytest.CaptureFixture[str], *, gathered: bool
+) -> None:
+    """A router's rules cannot tell `sample/*` from `sample/T`, so subscribers refuse the message and log it once."""
+    heard, last = list[bytes](), threading.Event()
+
+    def on_messages(messages: list[Encoded]) -> None:
+        heard.extend(message.payload for message in messages)
+        if b"measured" in heard:
+            last.set()
+
+    if gathered:
+        site.router.gather("reactor/cstr/sample/**", on_messages)
+    else:
+        site.router.subscribe("reactor/cstr/sample/**", lambda message: on_messages([message]))
+    plant = site.join("cstr/plant")
+    for key in WILD:
+        plant._session.put(f"reactor/cstr/{key}", b"made up")
+    plant.publish(sample(b"measured"))
+    assert last.wait(WITHIN_S)
+    assert heard == [b"measured"]
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if "must be on one key" in line]
+    assert "reactor/cstr/sample/*" in line
 
 
 @pytest.mark.parametrize("who", ["cstr/engineer", "cstr/monitor", "other/plant"])
@@ -289,6 +323,28 @@ def test_who_is_alive_is_told_to_readers_of_the_plant_and_cannot_be_feigned(site
     site.close_readers()
     assert sorted(alive) == ["reactor/cstr/alive/monitor", "reactor/cstr/alive/plant"]
     assert not foreign
+
+
+def test_two_monitors_of_a_plant_notice_each_other_and_cannot_be_feigned(site: Site) -> None:
+    changed, seen = threading.Condition(), dict[str, set[str]]()
+
+    def watch(who: str, name: str) -> None:
+        def on_token(token: str, is_alive: bool) -> None:
+            with changed:
+                (seen[name].add if is_alive else seen[name].discard)(token.rpartition("/")[2])
+                changed.notify_all()
+
+        seen[name] = set()
+        bus = site.join(who)
+        bus.watch_alive(keys.monitor_token("cstr", "*"), on_token)
+        bus.announce(keys.monitor_token("cstr", name))
+
+    watch("cstr/recorder", "feigned")
+    watch("cstr/monitor", "a")
+    watch("cstr/monitor", "b")
+    with changed:
+        assert changed.wait_for(lambda: all(names >= {"a", "b"} for names in seen.values()), WITHIN_S)
+    assert seen["a"] | seen["b"] == {"a", "b"}
 
 
 def test_an_answer_says_what_was_done(site: Site) -> None:

@@ -24,6 +24,7 @@ from reactorwatch.runtime.bus_zenoh.messages import (
     Reader,
     first_line,
     is_of_whole_streams,
+    is_wild,
     numbered,
     payload_of,
     spelled,
@@ -45,6 +46,7 @@ LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that w
 MOST_NEW_KEYS, NEW_KEYS_A_S = 1000, 100
 """Of what is told again and again: keys that are declared at once, and in each second after that."""
 GATHER_AGAIN_S = 0.005
+LOG_AGAIN_S = 60.0
 LARGEST_CHANNEL = 5 * MOST_GATHERED
 MOST_GATHERED_BYTES = 1 << 20
 
@@ -115,6 +117,8 @@ class ZenohBus:
         self._declared: list[Any] = []  # Zenoh undeclares what nobody holds
         self._tokens: dict[str, Any] = {}
         self._deliveries: list[Delivery] = []
+        self._wild = 0  # messages on many keys at once
+        self._wild_logged_at: float | None = None
 
     def publish(self, message: Encoded) -> None:
         """See `Bus`."""
@@ -165,6 +169,9 @@ class ZenohBus:
         delivery = self._delivery(key_expression, hand_on, on_gap)
 
         def on_sample(sample: zenoh.Sample) -> None:
+            if is_wild(str(sample.key_expr)):
+                self._refuse_wild(str(sample.key_expr))
+                return
             came = numbered(sample, time.time_ns())
             if delivery is None or isinstance(came, Encoded):  # or it is of no publisher of ours
                 handler(came if isinstance(came, Encoded) else came.message)
@@ -205,7 +212,9 @@ class ZenohBus:
                     left, room = MOST_GATHERED, MOST_GATHERED_BYTES
                     while sample is not None:
                         who, message = reader.read(sample, now_ns)
-                        if who is None or delivery is None:
+                        if is_wild(message.key):
+                            self._refuse_wild(message.key)
+                        elif who is None or delivery is None:
                             others.append(message)
                         else:
                             came.append((*who, message))
@@ -222,6 +231,17 @@ class ZenohBus:
             self._begin(delivery, key_expression, history_s, on_told)
         elif on_told is not None:
             on_told()
+
+    def subscribe_live(self, key_expression: str, handler: Callable[[Encoded], None]) -> None:
+        """Subscribe to what is published from now on, each message as it comes.
+
+        `subscribe` also gets what publishers remember, which it asks for as soon as it learns that it missed something.
+        """
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            handler(Reader(sample.encoding).read(sample, time.time_ns())[1])
+
+        self._declared.append(self._session.declare_subscriber(spelled(key_expression), on_sample))
 
     def _delivery(
         self,
@@ -319,9 +339,17 @@ class ZenohBus:
                 complete = False
                 continue
             came = numbered(reply.ok, time.time_ns())
-            if isinstance(came, Numbered):
+            if isinstance(came, Numbered) and not is_wild(came.message.key):
                 messages.append(came)
         return _Answers(messages, complete)
+
+    def _refuse_wild(self, key: str) -> None:
+        """Count a message on many keys at once, which none of our publishers sends, and log it once a minute."""
+        self._wild += 1
+        now_s = time.monotonic()
+        if self._wild_logged_at is None or now_s - self._wild_logged_at >= LOG_AGAIN_S:
+            self._wild_logged_at = now_s
+            log.warning("refused: a message must be on one key", key=key[:LONGEST_ENCODING], so_far=self._wild)
 
     def _declare(self, key: str) -> _Key:
         stream = stream_of(key)

@@ -50,6 +50,14 @@ class Reader:
         return NUMBERED.unpack(name) if len(name) == NUMBERED.size else None, message
 
 
+def is_wild(key: str) -> bool:
+    """Whether a message came on a key expression of many keys.
+
+    Zenoh hands it to the subscribers of all of them, and a router's rules cannot tell it from one on a key of its own.
+    """
+    return "*" in key
+
+
 def encoding_text(encoding: zenoh.Encoding) -> str:
     """What an encoding says; none of ours is as long as a stranger's may be."""
     return str(encoding)[:LONGEST_ENCODING]

@@ -23,6 +23,7 @@ from reactorwatch.contract.messages_pb2 import (
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
+from reactorwatch.runtime.command_rate import ONE_NAME
 
 from .samples import PLANT, leaking_run, samples
 
@@ -157,6 +158,37 @@ def test_what_cannot_be_done_is_refused_in_one_line_and_changes_nothing(
     (health,) = room.node.on_tick(1)
     assert isinstance(health.message, Health)
     assert health.message.refused == 1
+
+
+def test_a_flood_of_commands_is_refused_counted_and_written_nowhere(
+    tmp_path: Path, leak: list[Encoded], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three thousand at once: as many writes to the disk as commands that are obeyed, and the next second is served."""
+    room = Room(MonitorConfig(alarm_state_file=str(tmp_path / "alarms.state")), leak)
+    stored: list[int] = []
+    monkeypatch.setattr("os.fsync", stored.append)
+    replies = [room.ask("comment", by_anna(comment=f"number {number}")) for number in range(3000)]
+    obeyed = [reply for reply in replies if reply.accepted]
+    assert len(stored) == len(obeyed) == ONE_NAME.at_once
+    assert {reply.text for reply in replies if not reply.accepted} == {
+        "too many commands by 'Anna': 30 at once and 5 a second are taken; try again in a second"
+    }
+    assert room.node.refusals.by_reason == {"too_many_commands": 3000 - len(obeyed)}
+    assert room.ask("comment", AlarmCommand(alarm="shewhart/T", by="Ben", comment="mine")).accepted
+    question = Encoded(f"reactor/{PLANT}/command/comment", *encode_message(by_anna(comment="a second later")))
+    reply, _ = room.node.on_command(question, 1_000_000_000)
+    assert reply.accepted
+
+
+def test_another_monitor_of_the_plant_is_reported(room: Room, capsys: pytest.CaptureFixture[str]) -> None:
+    """And its own token, which it sees as well, is not."""
+    room.node.on_alive(room.node.token, True, 0)
+    assert capsys.readouterr().out == ""
+    other = MonitorNode(MonitorConfig(), 7).token
+    assert room.node.on_alive(other, True, 0) == []
+    assert "another monitor watches this plant; stop one of them" in capsys.readouterr().out
+    room.node.on_alive(other, False, 0)
+    assert "the other monitor of this plant has gone" in capsys.readouterr().out
 
 
 def test_before_the_first_sample_nothing_can_be_acknowledged() -> None:

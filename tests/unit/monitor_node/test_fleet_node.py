@@ -14,9 +14,10 @@ from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import LOOK_EVERY_NS, FleetNode
 from monitor_node.fleet.shards import Crew, Shard, home
 from monitor_node.fleet.states import FleetStates
-from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
+from reactorwatch.contract.codec import Encoded, Publication, encode_message
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
 from reactorwatch.runtime.bus import Exchange, MemoryBus
+from reactorwatch.runtime.command_rate import ONE_NAME
 from reactorwatch.runtime.metrics import FleetMetrics
 from tests.running import WITHIN_S
 
@@ -146,6 +147,22 @@ def test_commands_are_left_to_the_others_while_they_may_have_the_plant(bench: Be
     bench.tick()
     bench.tick()
     assert bench.node.on_command(run_of("a", 1, span_min=1.0)[0], bench.now_ns) == (None, [])
+
+
+def test_a_flood_of_commands_is_refused_and_leaves_quiet_plants_quiet(
+    bench: Bench, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A plant that a command reaches has a monitor of its own for a while, which is ten times slower."""
+    command = AlarmCommand(alarm="shewhart/T", by="Anna", comment="x")
+    question = Encoded("reactor/a/command/comment", *encode_message(command))
+    replies = [bench.node.on_command(question, bench.now_ns)[0] for _ in range(3000)]
+    refused = [reply for reply in replies if reply is not None and "too many commands" in reply.text]
+    assert len(refused) == 3000 - ONE_NAME.at_once
+    assert bench.node.monitor("a").refusals.by_reason["too_many_commands"] == len(refused)
+    for _ in range(101):
+        bench.tick()
+    assert f"too_many_commands ({len(refused)} so far)" in capsys.readouterr().out
+    assert bench.node.on_command(question._replace(key="reactor/b/command/comment"), bench.now_ns) == (None, [])
 
 
 def test_the_counts_and_alarms_of_each_plant_are_on_the_page_as_long_as_it_is_watched(bench: Bench) -> None:

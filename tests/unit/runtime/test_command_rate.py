@@ -1,0 +1,61 @@
+"""A flood of commands is refused beyond a rate, by name and in all, and people who come by are still served."""
+
+import pytest
+
+from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.contract.messages_pb2 import AlarmCommand, ListAlarms
+from reactorwatch.runtime.command_rate import ALL, MOST_NAMES, ONE_NAME, CommandRate, sender_of
+
+SECOND = 1_000_000_000
+
+
+def taken(rate: CommandRate, names: list[str], now_ns: int = 0) -> int:
+    """How many of the commands are obeyed."""
+    return sum(rate.refusal(name, now_ns) is None for name in names)
+
+
+@pytest.mark.parametrize(
+    ("names", "at_once"),
+    [(["Anna"] * 3000, ONE_NAME.at_once), ([str(n) for n in range(3000)], ALL.at_once), ([""] * 3000, ALL.at_once)],
+    ids=["one name", "made-up names", "questions"],
+)
+def test_of_a_flood_as_many_are_taken_as_may_come_at_once(names: list[str], at_once: float) -> None:
+    assert taken(CommandRate(), names) == at_once
+
+
+def test_over_a_minute_the_rate_is_taken() -> None:
+    rate = CommandRate()
+    obeyed = sum(taken(rate, ["Anna"] * 50, second * SECOND) for second in range(60))
+    assert obeyed == ONE_NAME.at_once + 59 * ONE_NAME.per_s
+
+
+def test_one_person_s_flood_does_not_refuse_another_s_command() -> None:
+    rate = CommandRate()
+    assert taken(rate, ["Anna"] * 3000) == ONE_NAME.at_once
+    assert taken(rate, ["Ben"]) == 1
+
+
+def test_questions_do_not_refuse_commands() -> None:
+    rate = CommandRate()
+    taken(rate, [""] * 3000)
+    assert taken(rate, ["Ben"]) == 1
+
+
+def test_a_clock_that_is_set_back_fills_no_bucket_and_locks_nobody_out() -> None:
+    rate = CommandRate()
+    taken(rate, ["Anna"] * 3000, 1000 * SECOND)
+    assert taken(rate, ["Anna"], 0) == 0
+    assert taken(rate, ["Anna"], SECOND) == 1
+
+
+def test_made_up_names_take_no_memory() -> None:
+    rate = CommandRate()
+    for number in range(3 * MOST_NAMES):
+        rate.refusal(str(number), number * SECOND)
+    assert len(rate._names) == MOST_NAMES
+
+
+def test_the_sender_is_the_name_in_the_command() -> None:
+    assert sender_of(Encoded("k", *encode_message(AlarmCommand(alarm="x", by=" Anna ")))) == "Anna"
+    assert sender_of(Encoded("k", *encode_message(ListAlarms()))) == ""
+    assert sender_of(Encoded("k", b"?", "text/plain")) == ""
