@@ -26,7 +26,7 @@ _OFF_GRID, _REGULAR = 0.05, 0.95
 def run_of(record: Record, model: ProcessModel) -> Run:
     """What of the record the model speaks of.
 
-    Missing inputs are taken to be as they were.
+    Missing inputs are taken to be as they were. Of a record of several runs, the times are `continuous_min`.
 
     Raises:
         InputError: too few rows, a signal that is missing, constant or outside its bounds.
@@ -60,10 +60,11 @@ def run_of(record: Record, model: ProcessModel) -> Run:
         outputs.append(values)
     inputs = []
     for item in model.inputs:
-        values = _held(record.columns[item.name])
+        values = np.concatenate([_held(part.columns[item.name]) for part in record.each_run()])
         if not np.all(np.isfinite(values)):
+            of_run = "the first row" if record.runs is None else "the first row of each run"
             raise InputError(
-                f"{name}: {item.name} must be there in the first row; leave out the rows before its first value"
+                f"{name}: {item.name} must be there in {of_run}; leave out the rows before its first value"
             )
         _check_bounds(name, item.name, item.unit, values, item.lower, item.upper)
         inputs.append(values)
@@ -74,7 +75,9 @@ def run_of(record: Record, model: ProcessModel) -> Run:
         )
     there: NDArray[np.bool_] = np.column_stack([np.isfinite(record.columns[item.name]) for item in model.inputs])
     u = np.column_stack(inputs)
-    run = Run(record.time_min, u, np.column_stack(outputs), *_breaks(record.time_min, u, there))
+    time_min, starts = record.continuous_min, record.run_starts[1:]
+    breaks, few = _breaks(time_min, u, there)
+    run = Run(time_min, u, np.column_stack(outputs), tuple(sorted({*breaks, *starts})), few, starts)
     check_units(name, run, model)
     return run
 

@@ -31,7 +31,7 @@ def one(
         InputError: the record or the options cannot give one.
     """
     found = identify_model(
-        measured.time_min,
+        measured.continuous_min,
         measured.columns[INPUT],
         _column(measured, output),
         model=model,
@@ -42,7 +42,7 @@ def one(
         choice=REPORT_ROWS if report_rows else ALL_ROWS,
         missing="leave out",
     )
-    return msgspec.json.encode(found).decode() if as_json else _text(found)
+    return msgspec.json.encode(found).decode() if as_json else f"{_text(found)}{_remarks_text(measured)}"
 
 
 def compare(measured: Record, output: str, order: int, delay: int, *, neural: bool, as_json: bool) -> str:
@@ -61,12 +61,18 @@ def compare(measured: Record, output: str, order: int, delay: int, *, neural: bo
     selection = select(
         measured.columns[INPUT],
         _column(measured, output),
-        measured.time_min,
+        measured.continuous_min,
         families=families,
         orders=range(1, order + 1),
         delay=delay,
     )
-    return _selection_json(selection, output) if as_json else f"{selection.table()}\n\n{selection.reason}"
+    if as_json:
+        return _selection_json(selection, output)
+    return f"{selection.table()}\n\n{selection.reason}{_remarks_text(measured)}"
+
+
+def _remarks_text(measured: Record) -> str:
+    return "".join(f"\nnote: {remark}" for remark in measured.remarks)
 
 
 def _column(measured: Record, output: str) -> Array:

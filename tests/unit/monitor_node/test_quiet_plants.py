@@ -160,13 +160,18 @@ def moved(run: list[Encoded], first: int, by_ns: int) -> list[Encoded]:
     ]
 
 
+def before_zero(run: list[Encoded], generator: np.random.Generator) -> list[Encoded]:
+    """Time 0 is a row after the training."""
+    return moved(run, 0, -700 * ROW_NS)
+
+
 def sound(run: list[Encoded], generator: np.random.Generator) -> list[Encoded]:
     return run
 
 
 UPSETS = (
     *(sound, spikes, stuck, coarse, losses, gaps, repeats, disorder, bad, set_back, irregular),
-    *(two_of_a_name, damaged, paused, clock_set, hurried),
+    *(two_of_a_name, damaged, paused, clock_set, hurried, before_zero),
 )
 
 
