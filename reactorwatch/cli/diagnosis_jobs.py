@@ -17,9 +17,9 @@ from diagnosis.result import Cause, Diagnosis
 from diagnosis.uncertain import stated
 from reactorwatch.cli.batch import Answer, Kind, Row, as_table
 from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, Asked, Case, case_of, diagnosed
-from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.cstr import cstr
+from reactorwatch.records.folder import check_folder_name
 from reactorwatch.runtime.model_file import read_extended_model
 
 
@@ -55,8 +55,8 @@ def jobs_of(files: Sequence[Path], out: Path | None, asked: Asked, *, as_json: b
     Raises:
         InputError: the folder cannot be one, or what is asked cannot be meant, of whatever file.
     """
-    if out is not None and out.exists() and not out.is_dir():
-        raise InputError(f"--out {out}: is a file, the name of a folder was expected")
+    if out is not None:
+        check_folder_name(out, "--out")
     if len(files) > 1 or elsewhere:
         _check(asked)
     places = list(files)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Plant, columns, existing, existing_recording, new_file, new_of_kind
+from reactorwatch.cli.options import Columns, Plant, columns, existing, existing_recording, new_of_kind
 from reactorwatch.errors import InputError
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def import_csv(
     from recorder.convert import import_csv as convert
 
     with task(f"importing {file.name}"):
-        record = convert(existing(file), new_file(out), plant or "cstr", columns(column))
+        record = convert(existing(file), new_of_kind(out, ".mcap"), plant or "cstr", columns(column))
     typer.echo(_written(out, record))
 
 
@@ -85,7 +85,7 @@ def export_csv(
     from recorder.convert import export_csv as convert
 
     with task(f"exporting {file.name}"):
-        record = convert(existing_recording(file), new_file(out), plant)
+        record = convert(existing_recording(file), new_of_kind(out, ".csv"), plant)
     typer.echo(_written(out, record))
 
 

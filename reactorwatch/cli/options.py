@@ -176,6 +176,6 @@ def new_of_kind(path: Path, ending: str) -> Path:
     Raises:
         InputError: as `new_file`; or it has another ending, by which nothing would open it.
     """
-    if new_file(path).suffix != ending:
+    if new_file(path).suffix.lower() != ending:
         raise InputError(f"{path}: the name must end in {ending}, got {path.suffix or 'no ending'}")
     return path

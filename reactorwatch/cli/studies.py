@@ -18,7 +18,7 @@ from reactorwatch.cli.options import (
     existing,
     existing_recording,
     limits,
-    new_file,
+    new_of_kind,
     tolerances,
 )
 
@@ -52,7 +52,7 @@ def simulate(
 
     measured = record(existing_recording(file), plant, columns(column), signals_of(model))
     process = process_model(model, measured)
-    out = new_file(out)
+    out = new_of_kind(out, ".csv")
     with task(f"simulating {file.name}"):
         simulated = free_run(measured, process, fault or [])
         write_csv(out, simulated)
@@ -80,8 +80,11 @@ def backtest(
     from reactorwatch.cli.backtest_jobs import WATCHING, jobs_of
     from reactorwatch.cli.batch import files_named, say
     from reactorwatch.cli.sources import DEFAULT_PLANT
+    from reactorwatch.records.folder import check_folder_name
     from reactorwatch.runtime.config import read_settings, section
 
+    if out is not None:
+        check_folder_name(out, "--out")
     named = files_named(files)
     flags = {
         "plant": plant or DEFAULT_PLANT,

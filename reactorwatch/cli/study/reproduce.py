@@ -12,6 +12,7 @@ from reactorwatch.cli.study.page import FOLDER, page
 from reactorwatch.cli.study.study import Study
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.folder import check_folder_name, make_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.jobs import Failed
 
@@ -99,15 +100,9 @@ def _chosen(only: str | None) -> Sequence[Figure]:
 
 def _folder(out: Path) -> Path:
     """The folder of the pictures, made with that of the page."""
-    pictures = out / FOLDER
-    for folder in (out, pictures):
-        if folder.exists() and not folder.is_dir():
-            raise InputError(f"{folder}: is a file, a folder was expected")
-    try:
-        pictures.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make the folder {pictures}: {error.strerror}") from error
-    return pictures
+    for folder in (out, out / FOLDER):
+        check_folder_name(folder, "--out")
+    return make_folder(out / FOLDER, "--out")
 
 
 def _report(out: Path, found: Sequence[tuple[Figure, Finding]]) -> str:

@@ -181,7 +181,7 @@ def test_an_output_folder_that_is_a_file_is_refused(tmp_path: Path, name: str) -
     file = tmp_path / name
     file.parent.mkdir(exist_ok=True)
     file.write_text("not a folder")
-    with pytest.raises(InputError, match="is a file, a folder was expected"):
+    with pytest.raises(InputError, match="is a file, the name of a folder was expected"):
         reproduce(tmp_path / "out", 1, "12")
 
 

@@ -228,3 +228,20 @@ def test_a_record_is_of_one_plant(tmp_path: Path) -> None:
         read_record(recorded(tmp_path / "empty.mcap", []))
     with pytest.raises(InputError, match="holds no samples of qc, C, T of plant 'cstr'"):
         read_record(recorded(tmp_path / "level.mcap", [sample(1, signal="level")]))
+
+
+def test_the_file_s_sequence_numbers_are_those_of_the_samples(tmp_path: Path) -> None:
+    """Read by the bare MCAP library; what is no sample has none, and neither has what cannot be read."""
+    late = messages.Sample(time_ns=1, sequence=2**32 + 7, quality=messages.QUALITY_GOOD)
+    encoded = encode(Publication("reactor/cstr/sample/T", late))
+    entries = [*golden.entries(), Entry(*encoded[:3], 2**62, 1)]
+    path = recorded(tmp_path / "run.mcap", entries)
+    with path.open("rb") as stream:
+        found = [(channel.topic, message.sequence) for _, channel, message in make_reader(stream).iter_messages()]
+    expected = [
+        (entry.key, body.sequence % 2**32 if isinstance(body, messages.Sample) else 0)
+        for entry in entries
+        for body in [decode(entry.payload, entry.encoding)]
+    ]
+    assert found == expected
+    assert len({number for topic, number in found if topic.endswith("sample/T")}) > golden.ROWS - 1
