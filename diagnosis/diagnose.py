@@ -7,7 +7,7 @@ import numpy as np
 
 from diagnosis.adequacy import DOUBTFUL, WHITE, minus_log10_p
 from diagnosis.drawn import curves_of, differences_of
-from diagnosis.estimates import adjusted_parameters, causes_of, with_rough_numbers
+from diagnosis.estimates import adjusted_parameters, causes_of, in_minutes_of_runs, with_rough_numbers
 from diagnosis.experiment import proposed
 from diagnosis.extended import extended_model
 from diagnosis.held_out import Errors, gained
@@ -37,7 +37,7 @@ from diagnosis.unknown import MARGIN, Located, bic_of, located
 from reactorwatch.process import effects_of
 from reactorwatch.process.effects.base import TIMING, Effect
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.records.record import Record
+from reactorwatch.records.record import MOST_SPANS, Record
 
 LEAST_GAIN = 10.0
 """In BIC: less does not refute the nominal model (Kass & Raftery 1995, J. American Statistical Association 90)."""
@@ -102,7 +102,7 @@ def diagnose(
     best = found.best if found.nominal.bic - found.best.bic >= LEAST_GAIN else found.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     verdict, location = _verdict(found, best), best.hypothesis.sized.effects[0].location if best.key else ""
-    remarks = _left_out(whole, run)
+    remarks = [*_said_of(record), *_left_out(whole, run)]
     strange: Located | None = None
     if np.any(adequacy >= DOUBTFUL) or (best.key and _seems_noisy(found, model)):
         off = found.nominal.hypothesis.offsets(found.nominal.fit)
@@ -130,7 +130,7 @@ def diagnose(
     curves = replace(curves, held_out=dict(zip(model.output_names, after.values.T, strict=True)))
     if verdict == UNKNOWN and strange is not None and strange.effect.location == location:
         curves = replace(curves, unknown=strange.course)
-    causes = tuple(causes_of(best, covariances))
+    causes = in_minutes_of_runs(causes_of(best, covariances), record)
     parameters = adjusted_parameters(run, model, uncertain or {}, best)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
     rivals = _rivals(found, best)
@@ -140,13 +140,13 @@ def diagnose(
         experiment = None
     return Diagnosis(
         samples=run.time_min.size,
-        span_min=run.span_min,
+        span_min=record.span_min,
         verdict=verdict,
         causes=causes,
         alternatives=tuple(Alternative(item.key, item.bic - best.bic) for item in rivals),
         location=location,
         significant=verdict != NOMINAL,
-        practical=unexplained or matters(curves, bands),
+        practical=unexplained or matters(curves, bands, run.starts),
         differences=differences_of(model, noise_sd, curves),
         gain=_gain(model, found.nominal.bic - best.bic, noise_sd, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
@@ -155,6 +155,7 @@ def diagnose(
         remarks=tuple(remarks),
         parameters=parameters,
         curves=curves,
+        runs=len(record.run_starts),
     )
 
 
@@ -244,6 +245,15 @@ def _gain(model: ProcessModel, delta_bic: float, noise_sd: Array, before: Errors
         for place, output in enumerate(model.outputs)
     }
     return Gain(delta_bic, held_out)
+
+
+def _said_of(record: Record) -> list[str]:
+    """What is to be said of its rows."""
+    if record.runs is None:
+        return record.remarks
+    shifts = ", ".join(f"{shift:+.4g}" for shift in record.run_shifts_min[1 : MOST_SPANS + 1])
+    later = f"pictures and differences show those after the first {shifts} min later"
+    return [f"{record.remarks[0]}; the state starts again in each, and {later}", *record.remarks[1:]]
 
 
 def _left_out(whole: Run, run: Run) -> list[str]:

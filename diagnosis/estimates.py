@@ -1,7 +1,8 @@
 """The numbers of an explanation, with their intervals."""
 
 from collections.abc import Mapping, Sequence
-from math import sqrt
+from dataclasses import replace
+from math import inf, sqrt
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from diagnosis.rough_numbers import settled
 from diagnosis.run import Run
 from diagnosis.search import Explained, Search
 from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.records.record import Record
 
 
 def covariances_of(run: Run, best: Explained) -> list[Array]:
@@ -50,6 +52,31 @@ def adjusted_parameters(
         item = model.parameter(name)
         found[name] = Adjusted(item.value, stated_sd, Estimate(item.value + off[name], sds[name], item.unit))
     return found
+
+
+def in_minutes_of_runs(causes: Sequence[Cause], record: Record) -> tuple[Cause, ...]:
+    """Causes with their times in the minutes of the run in which they set in.
+
+    Args:
+        causes: with times that increase over all runs (`Record.continuous_min`).
+        record: that they explain.
+    """
+    if record.runs is None:
+        return tuple(causes)
+    starts_min = record.continuous_min[list(record.run_starts)]
+    found = []
+    for cause in causes:
+        times = {name for name in cause.parameters if name in ("onset", "end") or name.startswith("time_")}
+        times.discard("time_constant")
+        first_min = min((cause.parameters[name].value for name in times), default=-inf)
+        run = max(int(np.searchsorted(starts_min, first_min, side="right")), 1)
+        shift_min = record.run_shifts_min[run - 1]
+        parameters = {
+            name: replace(item, value=item.value - shift_min) if name in times else item
+            for name, item in cause.parameters.items()
+        }
+        found.append(replace(cause, parameters=parameters, run=run, run_shift_min=shift_min))
+    return tuple(found)
 
 
 def causes_of(best: Explained, covariances: Sequence[Array]) -> list[Cause]:

@@ -8,6 +8,7 @@ a deviation that sets in late would otherwise never be both learned and tested.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +59,8 @@ def held_out_rows(run: Run, onsets_min: Sequence[float] = ()) -> Array:
     block_min = min(BLOCK_MIN, run.span_min / FEWEST_BLOCKS)
     block = np.floor((run.time_min - run.time_min[0]) / block_min)
     found = block % EVERY == EVERY - 1
-    found[:OBSERVED_ROWS] = False
+    for row in (0, *run.starts):
+        found[row : row + OBSERVED_ROWS] = False
     told = found & ~np.isin(block, [np.floor((onset - run.time_min[0]) / block_min) for onset in onsets_min])
     found = told if np.count_nonzero(told) >= FEWEST_ROWS else found
     calm = found.copy()
@@ -95,7 +97,9 @@ def _onsets(explained: Explained) -> list[float]:
 
 
 def free_run(run: Run, sized: Sized, signals: Sequence[Signal], known: Mapping[str, float]) -> Array:
-    """The outputs of a free run, shape (rows, n_y); the first rows are the filter's. NaN if it came to an end.
+    """The outputs of a free run, shape (rows, n_y); NaN if it came to an end.
+
+    The first rows, and those after the plant started again, are the filter's.
 
     Args:
         run: the record.
@@ -108,17 +112,21 @@ def free_run(run: Run, sized: Sized, signals: Sequence[Signal], known: Mapping[s
 
 def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovations, known: Mapping[str, float]) -> Array:
     outputs = np.array(found.prediction)
-    first = min(OBSERVED_ROWS, run.time_min.size - 2)
-    while first < run.time_min.size - 2 and not np.all(np.isfinite(found.x[first])):
-        first += 1
-    try:
-        whole = sized.whole
-        inputs = whole.inputs(run.time_min, run.inputs, signals)[first:]
+    whole = sized.whole
+    inputs = whole.inputs(run.time_min, run.inputs, signals)
+    run_freely = Simulator(whole.model).run
+    for begin, end in pairwise((0, *run.starts, run.time_min.size)):
+        first = max(begin, min(begin + OBSERVED_ROWS, end - 2))
+        while first < end - 2 and not np.all(np.isfinite(found.x[first])):
+            first += 1
         start = found.x[first][: sized.own_states]  # memory is short: it begins at rest
-        run_freely = Simulator(whole.model).run
-        outputs[first:] = run_freely(run.time_min[first:], inputs, start, beginning_with(known)).outputs
-    except SimulationError:
-        outputs[first:] = np.nan
+        if not np.all(np.isfinite(start)) and begin:
+            continue  # of a run this short nothing is known but what the filter predicts
+        try:
+            time_min = run.time_min[first:end]
+            outputs[first:end] = run_freely(time_min, inputs[first:end], start, beginning_with(known)).outputs
+        except SimulationError:
+            outputs[first:end] = np.nan
     return outputs
 
 

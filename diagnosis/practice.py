@@ -46,11 +46,17 @@ def bands_of(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> d
     }
 
 
-def matters(curves: Curves, bands: Mapping[str, float]) -> bool:
-    """Whether the free runs of both models differ by more than the tolerance in an output."""
+def matters(curves: Curves, bands: Mapping[str, float], starts: tuple[int, ...] = ()) -> bool:
+    """Whether the free runs of both models differ by more than the tolerance in an output.
+
+    Args:
+        curves: of both models.
+        bands: the tolerances, by output.
+        starts: rows at which the plant started again, see `Run`.
+    """
     for output, band in bands.items():
-        # The filter says nothing of the first row.
-        difference = (curves.free_after[output] - curves.free_before[output])[1:]
+        # The filter says nothing of the first row of a run.
+        difference = np.delete(curves.free_after[output] - curves.free_before[output], [0, *starts])
         known = difference[np.isfinite(difference)]
         if known.size < difference.size or float(np.sqrt(np.mean(known**2))) > band:
             return True

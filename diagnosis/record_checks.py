@@ -27,7 +27,7 @@ _OFF_GRID, _REGULAR = 0.05, 0.95
 def run_of(record: Record, model: ProcessModel) -> Run:
     """What of the record the model speaks of.
 
-    Missing inputs are taken to be as they were.
+    Missing inputs are taken to be as they were. Of a record of several runs, the times are `continuous_min`.
 
     Raises:
         InputError: too few rows; a signal that is missing, constant or in another unit; a value that it cannot have.
@@ -58,10 +58,11 @@ def run_of(record: Record, model: ProcessModel) -> Run:
         outputs.append(values)
     inputs = []
     for item in model.inputs:
-        values = _held(record.columns[item.name])
+        values = np.concatenate([_held(part.columns[item.name]) for part in record.each_run()])
         if not np.all(np.isfinite(values)):
+            of_run = "the first row" if record.runs is None else "the first row of each run"
             raise InputError(
-                f"{name}: {item.name} must be there in the first row; leave out the rows before its first value"
+                f"{name}: {item.name} must be there in {of_run}; leave out the rows before its first value"
             )
         inputs.append(values)
     wrong = find_wrong_unit(model, record.columns, record.time_min)
@@ -77,7 +78,9 @@ def run_of(record: Record, model: ProcessModel) -> Run:
         raise InputError(f"{name}: {wrong.text}")
     there: NDArray[np.bool_] = np.column_stack([np.isfinite(record.columns[item.name]) for item in model.inputs])
     u = np.column_stack(inputs)
-    return Run(record.time_min, u, np.column_stack(outputs), *_breaks(record.time_min, u, there))
+    time_min, starts = record.continuous_min, record.run_starts[1:]
+    breaks, few = _breaks(time_min, u, there)
+    return Run(time_min, u, np.column_stack(outputs), tuple(sorted({*breaks, *starts})), few, starts)
 
 
 def _breaks(

@@ -36,7 +36,9 @@ class Cause:
         profile: how it goes in time.
         label: what a person calls it.
         location: where it acts.
-        parameters: `size` first, then those of the profile.
+        parameters: `size` first, then those of the profile; times in minutes of the run in which it sets in.
+        run: of the record, in which it sets in, counted from 1.
+        run_shift_min: what `Record.continuous_min` adds to the minutes of that run.
     """
 
     cause: str
@@ -44,6 +46,8 @@ class Cause:
     label: str
     location: str
     parameters: dict[str, Estimate]
+    run: int = 1
+    run_shift_min: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -158,7 +162,8 @@ class Experiment:
         limits: that it keeps under every explanation, by signal.
         apart: of every pair of explanations.
         predicted: the lowest and highest value of each output without noise, by explanation and output.
-        curves: for pictures.
+        curves: for pictures; of several runs, over `Record.continuous_min`.
+        runs: of the record.
     """
 
     why: str
@@ -226,7 +231,7 @@ class Diagnosis:
 
     Attributes:
         samples: rows of the record.
-        span_min: from its first row to its last.
+        span_min: from its first row to its last, summed over its runs.
         verdict: `nominal`, `named`, `ambiguous` or `unknown`.
         causes: that explain the record together; empty if nominal or unknown.
         alternatives: every other explanation within 10 BIC, the best first.
@@ -240,7 +245,8 @@ class Diagnosis:
         extended_model: as in its file (`diagnosis.extended_model`).
         remarks: what else people should know, in sentences.
         parameters: that were stated to be uncertain, by name.
-        curves: for pictures.
+        curves: for pictures; of several runs, over `Record.continuous_min`.
+        runs: of the record.
     """
 
     samples: int
@@ -259,3 +265,4 @@ class Diagnosis:
     remarks: tuple[str, ...] = ()
     parameters: dict[str, Adjusted] = field(default_factory=dict)
     curves: Curves | None = field(default=None, repr=False, compare=False)
+    runs: int = 1

@@ -20,6 +20,7 @@ class Run:
         breaks: rows before which nobody knows what the inputs did for long: a filter begins anew there.
         missing: how many rows are missing before a row with which they are others, so that nobody knows when they
             changed, but may guess it, shape (rows,), else 0; None: nowhere.
+        starts: rows at which the plant started again, so that nothing before them tells its state; each is a break.
     """
 
     time_min: Array
@@ -27,6 +28,7 @@ class Run:
     measured: Array
     breaks: tuple[int, ...] = ()
     missing: NDArray[np.intp] | None = None
+    starts: tuple[int, ...] = ()
 
     @property
     def known_inputs(self) -> Array:

@@ -53,7 +53,7 @@ class Sequence:
 
     Attributes:
         expected: the number after the highest that has come; None before the first.
-        newest_ns: the latest time that has come.
+        newest_ns: the latest time that has come; of no meaning before the first.
     """
 
     expected: int | None = None
@@ -227,9 +227,10 @@ class Aligner:
 
     def _count_sequence(self, position: Sequence, time_ns: int, sequence: int) -> None:
         counts = self.state.counts
-        if position.expected is None or sequence >= position.expected:
-            jump = 0 if position.expected is None else sequence - position.expected
-            counts.lost = min(counts.lost + jump, MOST_LOST)
+        if position.expected is None:
+            position.expected, position.newest_ns = sequence + 1, time_ns
+        elif sequence >= position.expected:
+            counts.lost = min(counts.lost + sequence - position.expected, MOST_LOST)
             position.expected = sequence + 1
         elif time_ns < position.newest_ns:
             counts.out_of_order += 1

@@ -11,7 +11,7 @@ from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.runtime.model_file import model_on_the_bus
 
-RAISED = Event.RAISED.value
+RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
 
 @dataclass
@@ -22,8 +22,10 @@ class Backtest:
         input: name of the input.
         outputs: names of the outputs.
         rows: of samples.
-        first_ns: time of the first sample; 0 without rows.
-        last_ns: time of the last sample.
+        first_ns: time of the first row; 0 without rows.
+        last_ns: time of the last row.
+        span_ns: that the rows span, summed over the runs of the plant.
+        runs: of the plant: one more than it was restarted, or its clock set back.
         watching_since_ns: time of the first row that was judged; None if the record is shorter than the training.
         expected_false_alarms: see `Monitor.expected_false_alarms`.
         alarm_messages: every change of an alarm, in order.
@@ -40,6 +42,8 @@ class Backtest:
     rows: int
     first_ns: int
     last_ns: int
+    span_ns: int
+    runs: int
     watching_since_ns: int | None
     expected_false_alarms: float
     alarm_messages: list[Alarm]
@@ -65,23 +69,27 @@ class Backtest:
                 if message.raised_ns == alarm.raised_ns and message.suspects:
                     del alarm.suspects[:]
                     alarm.suspects.extend(message.suspects)
-                found[last[message.alarm]] = (alarm, cleared_ns or message.cleared_ns or None)
+                if cleared_ns is None and (message.cleared_ns or message.event == CLEARED):
+                    cleared_ns = message.cleared_ns
+                found[last[message.alarm]] = (alarm, cleared_ns)
         return found
 
 
-def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
+def run(messages: Iterable[Encoded], config: MonitorConfig, zero_ns: int = 0) -> Backtest:
     """Run the monitor over messages in the order they were received; those that are no samples are passed over.
 
     Args:
         messages: of any plant; only samples of `config.plant` are looked at.
         config: of the monitor.
+        zero_ns: the time that the minutes of the model count from, where its file does not say.
 
     Raises:
         InputError: settings that do not fit together, or a model's file that cannot be used.
     """
     prefix = keys.key(config.plant, keys.SAMPLE, "")
-    monitor = Monitor(config, start_ns=0, points=False, model=model_on_the_bus(config.model))
+    monitor = Monitor(config, start_ns=0, points=False, model=model_on_the_bus(config.model, zero_ns))
     alarms: list[Alarm] = []
+    first_ns: int | None = None
 
     def keep(publications: list[Publication]) -> None:
         alarms.extend(item.message for item in publications if isinstance(item.message, Alarm))
@@ -89,13 +97,17 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
     for message in messages:
         if message.key.startswith(prefix) and (publications := monitor.on_message(message, message.received_ns)):
             keep(publications)
+        if first_ns is None:
+            first_ns = monitor.first_ns
     keep(monitor.finish())
     return Backtest(
         input=config.input,
         outputs=config.outputs,
         rows=monitor.rows,
-        first_ns=monitor.first_ns or 0,
+        first_ns=(monitor.first_ns or 0) if first_ns is None else first_ns,
         last_ns=monitor.last_ns or 0,
+        span_ns=monitor.span_ns,
+        runs=1 + monitor.restarts,
         watching_since_ns=monitor.watching_since_ns,
         expected_false_alarms=monitor.expected_false_alarms,
         alarm_messages=alarms,

@@ -51,6 +51,7 @@ class Monitor:
         alarms: of the plant.
         first_ns: time of the first row; None before it.
         last_ns: time of the last row; None before the first.
+        span_ns: that the rows span, summed over the runs of the plant, since this monitor was made.
         received: messages so far.
         not_stored: how often what is remembered could not be stored; who stores it counts.
     """
@@ -76,6 +77,7 @@ class Monitor:
         self._output_units = [""] * len(config.outputs)
         self.first_ns: int | None = None
         self.last_ns: int | None = None
+        self.span_ns = 0
         self._watching_since_ns: int | None = None
         self.received = 0
         self.not_stored = 0
@@ -367,6 +369,11 @@ class Monitor:
         return self._aligner.state.counts.rows
 
     @property
+    def restarts(self) -> int:
+        """How often the plant was restarted, or its clock set back, so far."""
+        return self._aligner.state.counts.restarts
+
+    @property
     def watching_since_ns(self) -> int | None:
         """Time of the first row that was judged; None while there is none."""
         return self._watching_since_ns
@@ -425,6 +432,8 @@ class Monitor:
         time_ns, due_ns = row.time_ns, self._snapshot_due_ns
         if self.first_ns is None or time_ns < self.first_ns:
             self.first_ns = time_ns
+        if self.last_ns is not None and not row.restarted:
+            self.span_ns += time_ns - self.last_ns
         self.last_ns = time_ns
         try:
             self._watch.update(row, self._output_units, publications)

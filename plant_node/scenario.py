@@ -188,6 +188,10 @@ class HeldRecord:
         """
         if SIGNAL not in record.columns or not record.rows:
             raise InputError(f"{record.name}: must have a column {SIGNAL!r} with at least one row to drive the plant")
+        if record.runs is not None:
+            raise InputError(
+                f"{record.name}: must be one run to drive the plant, {record.describe_runs()}; cut one run out of it"
+            )
         levels = record.columns[SIGNAL]
         bad = ~(np.isfinite(levels) & (levels >= 0))
         if bad.any():

@@ -10,24 +10,29 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.output import refuse_source
-from reactorwatch.records.record import Record, to_time_ns
+from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, to_time_ns
 from recorder.entry import Entry
-from recorder.mcap_file import ZERO_NS, RecordingWriter, read_record
+from recorder.mcap_file import CLOCK, NO_CLOCK, ZERO_NS, RecordingWriter, read_record
 from recorder.player import samples_of
+from recorder.run_splitter import ContinuousTime
 
 
-def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | None = None, zero_ns: int = 0) -> int:
+def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | None = None, zero_ns: int = 0) -> Record:
     """Turn a record into a recording, as if it had been received when it was measured.
+
+    A recording holds no times before 1970. Where a record without clock time has some, all its times are shifted, and
+    the recording's `zero_ns` says by how much. A run that starts before the one before it has ended is received after
+    it.
 
     Args:
         csv: the record.
         mcap: the recording; an older file of that name is replaced.
         plant: the name of the plant.
         columns: the file's own names for its columns, as in `read_csv`.
-        zero_ns: the time that the record's minutes count from.
+        zero_ns: the time that the record's minutes count from; 0: not known.
 
     Returns:
-        The number of rows.
+        The record.
 
     Raises:
         InputError: the record is malformed, or has times that a recording cannot hold; or the name cannot be a plant's.
@@ -38,17 +43,25 @@ def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | N
         raise InputError(str(error)) from error
     refuse_source(mcap, (csv,))
     record = read_csv(csv, columns)
+    metadata = {"plant": plant, "source": record.name}
+    if not zero_ns:
+        metadata[CLOCK] = NO_CLOCK
+        zero_ns = record.stored_zero_ns
     _check_times(csv, record, zero_ns)
-    metadata = {"plant": plant, "source": record.name, ZERO_NS: str(zero_ns)}
-    with replacing(mcap) as temporary, RecordingWriter(temporary, metadata) as writer:
+    received = ContinuousTime()
+    with (
+        replacing(mcap) as temporary,
+        RecordingWriter(temporary, {**metadata, ZERO_NS: str(zero_ns)}) as writer,
+    ):
         for publication in samples_of(record, plant, zero_ns):
             encoded = encode(publication)
+            received_ns = received.of(*publication)
             time_ns = publication.message.time_ns
-            writer.write(Entry(encoded.key, encoded.payload, encoded.encoding, time_ns, time_ns))
-    return record.rows
+            writer.write(Entry(encoded.key, encoded.payload, encoded.encoding, received_ns, time_ns))
+    return record
 
 
-def export_csv(mcap: Path, csv: Path, plant: str | None = None) -> int:
+def export_csv(mcap: Path, csv: Path, plant: str | None = None) -> Record:
     """Turn the samples of a recording into a record.
 
     Args:
@@ -57,7 +70,7 @@ def export_csv(mcap: Path, csv: Path, plant: str | None = None) -> int:
         plant: whose samples; may be left out if there is but one plant in it.
 
     Returns:
-        The number of rows.
+        The record.
 
     Raises:
         InputError: the recording cannot be read, or it is not said of which plant.
@@ -65,15 +78,16 @@ def export_csv(mcap: Path, csv: Path, plant: str | None = None) -> int:
     refuse_source(csv, (mcap,))
     record = read_record(mcap, plant)
     write_csv(csv, record)
-    return record.rows
+    return record
 
 
 def _check_times(csv: Path, record: Record, zero_ns: int) -> None:
-    times_ns = [to_time_ns(minutes, zero_ns) for minutes in record.time_min.tolist()]
-    for time_ns in (times_ns[0], times_ns[-1]):
-        if not 0 <= time_ns < 2**63:
-            raise InputError(f"{csv}: times must lie between 1970 and 2262 to be recorded, got {time_ns} ns")
-    for row, (before, after) in enumerate(itertools.pairwise(times_ns)):
-        if before >= after:
-            got = f"{record.time_min[row]} and {record.time_min[row + 1]} min"
-            raise InputError(f"{csv}: rows must be at least 1 microsecond apart to be recorded, got {got}")
+    for minutes in (float(record.time_min.min()), float(record.continuous_min.max())):
+        if not 0 <= minutes + zero_ns / MINUTE_NS < LONGEST_MIN:
+            raise InputError(f"{csv}: times must lie between 1970 and 2262 to be recorded, got {minutes:g} min")
+    for run in record.each_run():
+        times_ns = [to_time_ns(minutes, zero_ns) for minutes in run.time_min.tolist()]
+        for row, (before, after) in enumerate(itertools.pairwise(times_ns)):
+            if before >= after:
+                got = f"{run.time_min[row]} and {run.time_min[row + 1]} min"
+                raise InputError(f"{csv}: rows must be at least 1 microsecond apart to be recorded, got {got}")

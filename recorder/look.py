@@ -14,10 +14,11 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
 from recorder.gaps import GAP, from_metadata
 from recorder.mcap_chunks import metadata_records
-from recorder.mcap_file import ZERO_NS, read_messages, read_metadata, recordings_in
+from recorder.mcap_file import read_messages, read_metadata, recordings_in, zero_from
 from recorder.mcap_scan import Scan
 from recorder.mcap_writer import own_metadata
 from recorder.overview import Overview, overview
+from recorder.run_splitter import RunSplitter
 
 
 @dataclass(frozen=True)
@@ -47,14 +48,14 @@ def look_over(path: Path) -> Look:
     """
     if path.is_dir():
         found, metadata = overview(read_messages(path)), read_metadata(path)
-        return Look(found, metadata, _zero_ns(metadata, found.first_sample_ns), (), gaps_in(path))
+        return Look(found, metadata, zero_from(metadata, found.starts_ns or 0), (), gaps_in(path))
     scan = Scan(path)
     found = overview(stored.entry for stored in scan)
     metadata = own_metadata(scan.metadata)
     damages = [str(damage) for damage in scan.damages]
     if scan.orphans:
         damages.append(f"{scan.orphans} messages of channels that are described nowhere")
-    zero_ns = _zero_ns(metadata, found.first_sample_ns)
+    zero_ns = zero_from(metadata, found.starts_ns or 0)
     return Look(found, metadata, zero_ns, tuple(damages), _gaps(scan.metadata))
 
 
@@ -68,31 +69,26 @@ def gaps_in(path: Path) -> tuple[Gap, ...]:
 
 
 def zero_ns_of(path: Path) -> int:
-    """The time that the minutes of a recording count from: what it says itself, else its first sample.
+    """The time that the minutes of a recording count from: what it says itself, else the first sample of its first run.
 
     Raises:
         InputError: it holds no sample, or it is damaged.
     """
-    first_ns: int | None = None
+    splitters: dict[str, RunSplitter] = {}
     for entry in read_messages(path, {keys.SAMPLE}):
         try:
             sample: Any = decode(entry.payload, entry.encoding)
         except DecodeError:
             continue
-        if isinstance(sample, Sample) and (first_ns is None or sample.time_ns < first_ns):
-            first_ns = sample.time_ns
-    if first_ns is None:
+        topic = keys.parse(entry.key)
+        if isinstance(sample, Sample) and topic is not None:
+            splitter = splitters.setdefault(topic.plant, RunSplitter())
+            splitter.update(topic.name, sample.sequence, sample.time_ns)
+    if not splitters:
         raise InputError(f"{path}: holds no sample")
-    return _zero_ns(read_metadata(path), first_ns)
+    return zero_from(read_metadata(path), min(splitter.runs[0].first_ns for splitter in splitters.values()))
 
 
 def _gaps(records: Iterable[Metadata]) -> tuple[Gap, ...]:
     found = (from_metadata(record.metadata) for record in records if record.name == GAP)
     return tuple(gap for gap in found if gap is not None)
-
-
-def _zero_ns(metadata: dict[str, str], first_sample_ns: int) -> int:
-    try:
-        return int(metadata.get(ZERO_NS, first_sample_ns))
-    except ValueError:
-        return first_sample_ns

@@ -5,7 +5,8 @@ ours carry their protobuf schema, so that any program reads them; a stranger's b
 they claimed and no schema.
 
 Our metadata record, "reactorwatch", says which version wrote the file and what else its writer thought worth knowing;
-`zero_ns` in it is the time that minutes are counted from, where that is not the first sample.
+`zero_ns` in it is the time that minutes are counted from, where that is not the first sample. Where `clock` in it is
+`none`, the times are those of a record without clock time, shifted so that none is before 1970.
 
 A folder is read as one recording: the files in it in the order of their times, and each in turn, or together where
 their times overlap. What a file says again of the one before it is passed over, but in the first.
@@ -14,6 +15,7 @@ their times overlap. What a file says again of the one before it is passed over,
 import heapq
 from array import array
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,16 +26,18 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, decode, encoding_of
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import MINUTE_NS, UNITS, Record
+from reactorwatch.records.record import MINUTE_NS, UNITS, Record, join_runs
 from recorder.entry import Entry
 from recorder.mcap_chunks import entries, is_in_order, metadata_records, read_summary, sorted_entries, span_ns
 from recorder.mcap_writer import RecordingWriter, own_metadata
 from recorder.measurement import measured
+from recorder.run_splitter import RunSplitter
 from recorder.turns import in_turn
 
 __all__ = ["RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
 
 ZERO_NS = "zero_ns"
+CLOCK, NO_CLOCK = "clock", "none"
 
 _SAMPLE = encoding_of(messages.Sample)
 
@@ -124,7 +128,7 @@ def read_metadata(path: Path) -> dict[str, str]:
 
 
 def read_record(path: Path, plant: str | None = None) -> Record:
-    """The samples of one plant as rows of equal sample time.
+    """The samples of one plant as rows of equal sample time; see `RunSplitter` for where a new run starts.
 
     Args:
         path: the recording.
@@ -132,16 +136,20 @@ def read_record(path: Path, plant: str | None = None) -> Record:
 
     Returns:
         The three signals; NaN where one has no sample at a time that another has, or none that is finite and not of
-        bad quality. Where a sample came twice the first counts. The time is counted from `zero_ns` of the file's
-        metadata, else from the first sample.
+        bad quality. Where a sample came twice in a run the first counts, and samples that are out of place are counted
+        as `strays`. The time is counted from `zero_ns` of the
+        file's metadata, else from the first sample of the first run.
 
     Raises:
         InputError: as `read_messages` and `one_plant_in`; or a sample cannot be decoded.
     """
     plant = one_plant_in(path, plant)
-    series = {keys.key(plant, keys.SAMPLE, signal): (array("q"), array("d")) for signal in UNITS}
+    signals = {keys.key(plant, keys.SAMPLE, signal): signal for signal in UNITS}
+    runs: list[dict[str, tuple[array[int], array[float]]]] = []
+    newest: dict[str, tuple[array[int], array[float]]] = {}  # by signal, where its newest sample is
+    splitter = RunSplitter()
     for entry in read_messages(path, {keys.SAMPLE}, plant):
-        if entry.key not in series or entry.encoding != _SAMPLE:
+        if entry.key not in signals or entry.encoding != _SAMPLE:
             continue
         try:
             sample: Any = decode(entry.payload, entry.encoding)
@@ -149,18 +157,45 @@ def read_record(path: Path, plant: str | None = None) -> Record:
             continue  # the recorder has counted it as refused
         value = measured(sample)
         if value is not None:
-            times, values = series[entry.key]
+            signal, strays = signals[entry.key], splitter.strays
+            number = splitter.update(signal, sample.sequence, sample.time_ns)
+            if splitter.strays > strays:
+                for column in newest[signal]:
+                    column.pop()
+            if number > len(runs):
+                runs.append({signal: (array("q"), array("d")) for signal in UNITS})
+            newest[signal] = times, values = runs[number - 1][signal]
             times.append(sample.time_ns)
             values.append(value)
-    all_times = np.unique(np.concatenate([np.asarray(times, np.int64) for times, _ in series.values()]))
-    if not all_times.size:
+    if not runs:
         raise InputError(f"{path}: holds no samples of {', '.join(UNITS)} of plant {plant!r}")
-    columns = {signal: np.full(all_times.size, np.nan) for signal in UNITS}
-    for column, (times, values) in zip(columns.values(), series.values(), strict=True):
+    metadata = read_metadata(path)
+    zero_ns = zero_from(metadata, splitter.runs[0].first_ns)
+    rows = [_rows(series, zero_ns, path.name) for series in runs if any(times for times, _ in series.values())]
+    return replace(join_runs(rows), zero_ns=zero_ns if has_clock(metadata) else 0, strays=splitter.strays)
+
+
+def zero_from(metadata: dict[str, str], first_ns: int) -> int:
+    """The time that the minutes of a recording count from: what its metadata says, else its first sample."""
+    try:
+        return int(metadata.get(ZERO_NS, first_ns))
+    except ValueError:
+        return first_ns
+
+
+def has_clock(metadata: dict[str, str]) -> bool:
+    """Whether the times of a recording are clock times."""
+    return metadata.get(CLOCK) != NO_CLOCK and metadata.get(ZERO_NS) != "0"
+
+
+def _rows(series: dict[str, tuple["array[int]", "array[float]"]], zero_ns: int, name: str) -> Record:
+    """The samples of one run, by signal their times and values, as rows."""
+    all_times = np.unique(np.concatenate([np.asarray(times, np.int64) for times, _ in series.values()]))
+    columns = {signal: np.full(all_times.size, np.nan) for signal in series}
+    for signal, (times, values) in series.items():
         own_times, first = np.unique(np.asarray(times, np.int64), return_index=True)
-        column[np.searchsorted(all_times, own_times)] = np.asarray(values)[first]
-    zero_ns = int(read_metadata(path).get(ZERO_NS, all_times[0]))
-    return Record((all_times - zero_ns) / MINUTE_NS, columns, path.name, zero_ns)
+        columns[signal][np.searchsorted(all_times, own_times)] = np.asarray(values)[first]
+    return Record((all_times - zero_ns) / MINUTE_NS, columns, name)
 
 
 class _File(NamedTuple):

@@ -13,7 +13,8 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from reactorwatch import __version__
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import message_type
+from reactorwatch.contract.codec import encoding_of, message_type
+from reactorwatch.contract.sample_bytes import sample_number
 from reactorwatch.errors import InputError
 from recorder.entry import Entry
 from recorder.mcap_chunks import REPEATED
@@ -23,6 +24,11 @@ from recorder.part_file import PART, PartFile, is_held
 from recorder.room import MOST_CHANNELS
 
 METADATA = "reactorwatch"
+MOST_MESSAGES = 2**32 - 1
+"""The largest sequence number that a file holds; beyond it numbers start again from 0."""
+
+_SAMPLE = encoding_of(messages.Sample)
+
 NUMBER = "file"
 """In it: which file of its run it is, if it was written by a recorder."""
 
@@ -82,7 +88,7 @@ class RecordingWriter:
         return self._stream.tell()
 
     def write(self, entry: Entry, *, readable: bool = True) -> None:
-        """Append a message.
+        """Append a message; a sample's number is its sequence number in the file.
 
         Args:
             entry: the message.
@@ -96,7 +102,8 @@ class RecordingWriter:
             channel = self._channels.get(name)
             if channel is None:
                 channel = self._channels[name] = self._register(entry, readable=readable)
-            self._writer.add_message(channel, entry.log_time_ns, entry.payload, entry.publish_time_ns)
+            number = sample_number(entry.payload) & MOST_MESSAGES if readable and entry.encoding == _SAMPLE else 0
+            self._writer.add_message(channel, entry.log_time_ns, entry.payload, entry.publish_time_ns, number)
         except OSError as error:
             raise self._failed(error) from error
 

@@ -8,7 +8,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, decode
 from recorder.entry import Entry
-from recorder.sequences import SequenceCheck
+from recorder.run_splitter import RunSpan, RunSplitter
 
 MOST_GAPS = 1000
 """Gaps that are named; more are counted only."""
@@ -62,11 +62,11 @@ class Overview:
         topics: by key.
         first_ns: when the first message was received; 0 if there is none.
         last_ns: likewise, the last.
-        first_sample_ns: time of the first sample; 0 if there is none.
-        last_sample_ns: time of the last sample.
+        runs: of each plant, the times of its first and its last sample in each run.
         lost: samples that are missing.
         duplicated: samples that are there again.
         out_of_order: samples after a later one.
+        out_of_place: samples with a number or time that fits neither those before nor those after.
         gaps: which are missing.
         alarms: in the order in which they came up.
     """
@@ -74,11 +74,11 @@ class Overview:
     topics: dict[str, Topic] = field(default_factory=dict)
     first_ns: int = 0
     last_ns: int = 0
-    first_sample_ns: int = 0
-    last_sample_ns: int = 0
+    runs: dict[str, list[RunSpan]] = field(default_factory=dict)
     lost: int = 0
     duplicated: int = 0
     out_of_order: int = 0
+    out_of_place: int = 0
     gaps: list[Gap] = field(default_factory=list)
     alarms: list[Raised] = field(default_factory=list)
 
@@ -86,6 +86,17 @@ class Overview:
     def messages(self) -> int:
         """All of them, without what is said again at the beginning."""
         return sum(topic.count for topic in self.topics.values())
+
+    @property
+    def sample_span_ns(self) -> RunSpan | None:
+        """The times of the first and the last sample; None if there is none."""
+        spans = [span for runs in self.runs.values() for span in runs]
+        return RunSpan(min(span.first_ns for span in spans), max(span.last_ns for span in spans)) if spans else None
+
+    @property
+    def starts_ns(self) -> int | None:
+        """The time of the first sample of the first run; None if there is none."""
+        return min((runs[0].first_ns for runs in self.runs.values()), default=None)
 
     @property
     def span_s(self) -> float:
@@ -101,12 +112,13 @@ def overview(entries: Iterable[Entry]) -> Overview:
     """
     seen = Overview()
     checks: dict[str, _Check | None] = {}
+    splitters: dict[str, RunSplitter] = {}
     standing: dict[str, int] = {}
     for entry in entries:
         if not entry.repeated:
             _count(seen, entry)
         if entry.key not in checks:
-            checks[entry.key] = _Check.of(entry.key)
+            checks[entry.key] = _Check.of(entry.key, splitters)
         check = checks[entry.key]
         if check is None:
             continue
@@ -117,14 +129,14 @@ def overview(entries: Iterable[Entry]) -> Overview:
         if isinstance(message, messages.Alarm):
             _follow(seen, standing, message)
         elif isinstance(message, messages.Sample) and message.quality != messages.QUALITY_UNSPECIFIED:
-            seen.last_sample_ns = max(seen.last_sample_ns, message.time_ns)
-            if not seen.first_sample_ns or message.time_ns < seen.first_sample_ns:
-                seen.first_sample_ns = message.time_ns
             check.update(message)
+    seen.runs = {plant: splitter.runs for plant, splitter in splitters.items() if splitter.runs}
+    for sequence in (item for splitter in splitters.values() for item in splitter.checks.values()):
+        seen.lost += sequence.lost
+        seen.duplicated += sequence.duplicated
+        seen.out_of_order += sequence.out_of_order
+        seen.out_of_place += sequence.out_of_place
     for check in filter(None, checks.values()):
-        seen.lost += check.sequence.lost
-        seen.duplicated += check.sequence.duplicated
-        seen.out_of_order += check.sequence.out_of_order
         seen.gaps += check.gaps
     seen.gaps.sort(key=lambda gap: (gap.after_ns, gap.key))
     del seen.gaps[MOST_GAPS:]
@@ -156,28 +168,37 @@ def _follow(seen: Overview, standing: dict[str, int], alarm: messages.Alarm) -> 
 class _Check:
     """The sequence numbers of one key, and which of them are missing."""
 
-    def __init__(self, key: str) -> None:
-        self._key = key
-        self._newest_ns = 0
-        self.sequence = SequenceCheck()
+    def __init__(self, key: str, signal: str, splitter: RunSplitter) -> None:
+        self._key, self._signal, self._splitter = key, signal, splitter
+        self._skipped = False
         self.gaps: list[Gap] = []
 
     @classmethod
-    def of(cls, key: str) -> "_Check | None":
-        """The check of a key; None if nothing on it has to be looked into."""
+    def of(cls, key: str, splitters: dict[str, RunSplitter]) -> "_Check | None":
+        """The check of a key, with the runs of its plant; None if nothing on it has to be looked into."""
         topic = keys.parse(key)
-        return cls(key) if topic is not None and topic.kind in (keys.SAMPLE, keys.ALARM) else None
+        if topic is None or topic.kind not in (keys.SAMPLE, keys.ALARM):
+            return None
+        return cls(key, topic.name, splitters.setdefault(topic.plant, RunSplitter()))
 
     def update(self, sample: messages.Sample) -> None:
         """Look at one sample."""
-        before, number = self.sequence.lost, sample.sequence
-        self.sequence.update(number, sample.time_ns)
-        missing = self.sequence.lost - before
-        if missing > 0 and len(self.gaps) < MOST_GAPS:
-            self.gaps.append(Gap(self._key, number - missing, number - 1, self._newest_ns))
+        check, number = self._splitter.checks.get(self._signal), sample.sequence
+        before, after_ns = (check.lost, check.newest_ns) if check is not None else (0, 0)
+        strays = check.out_of_place if check is not None else 0
+        self._splitter.update(self._signal, number, sample.time_ns)
+        check = self._splitter.checks[self._signal]
+        if check.out_of_place > strays:  # the gap before it is none
+            if self._skipped:
+                gap = self.gaps.pop()
+                before -= gap.last - gap.first + 1
+            after_ns = 0
+        missing = check.lost - before
+        self._skipped = missing > 0 and len(self.gaps) < MOST_GAPS
+        if self._skipped:
+            self.gaps.append(Gap(self._key, number - missing, number - 1, after_ns))
         elif missing < 0:
             self._fill(number)
-        self._newest_ns = max(self._newest_ns, sample.time_ns)
 
     def _fill(self, number: int) -> None:
         """A sample that was missing has come after all."""

@@ -2,12 +2,13 @@
 
 The pace is that of the sample times, not of the times of receipt: a record from elsewhere has only those, and a
 recording of a plant that ran sixty times faster than the clock is the same plant. Messages go out in the order in
-which they were received; one whose sample is older than what went before goes out at once.
+which they were received; one whose sample is older than what went before goes out at once. Where the plant's clock
+stepped back, the run that follows is played at its pace, one row after the run before it (`ContinuousTime`).
 """
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import cast
+from typing import NamedTuple, cast
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
@@ -17,6 +18,7 @@ from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import UNITS, Record, to_time_ns
 from recorder.entry import Entry
+from recorder.run_splitter import ContinuousTime
 
 BATCH = 256
 """Messages that go out before the loop looks for a stop again."""
@@ -52,12 +54,18 @@ def samples_of(record: Record, plant: str, zero_ns: int = 0) -> Iterator[Publica
 
     Yields:
         The samples; none for what was not measured, but one of bad quality where nothing at all was, so that the row
-        is not lost. Each signal is counted from 0.
+        is not lost. Each signal is counted from 0, and again from 0 where a run starts after the one before it, as a
+        plant counts that was restarted. Where the clock steps back the count goes on, as of a plant whose clock was
+        set.
     """
     sequences = dict.fromkeys(record.columns, 0)
     columns = {signal: values.tolist() for signal, values in record.columns.items()}
     names = {signal: keys.key(plant, keys.SAMPLE, signal) for signal in columns}
-    for row, minutes in enumerate(record.time_min.tolist()):
+    times_min = record.time_min.tolist()
+    restarts = {row for row in record.run_starts[1:] if times_min[row] > times_min[row - 1]}
+    for row, minutes in enumerate(times_min):
+        if row in restarts:
+            sequences = dict.fromkeys(sequences, 0)
         time_ns = to_time_ns(minutes, zero_ns)
         measured = [signal for signal, values in columns.items() if not math.isnan(values[row])]
         for signal in measured or list(columns)[:1]:
@@ -100,6 +108,24 @@ def between(publications: Iterable[Publication], from_ns: int, to_ns: int) -> It
     return (publication for publication in publications if from_ns <= publication.message.time_ns <= to_ns)
 
 
+class _Due(NamedTuple):
+    """A publication, and the time by which it is paced."""
+
+    publication: Publication
+    time_ns: int
+
+
+def _paced(tape: Iterable[Publication]) -> Iterator[_Due]:
+    """The publications with times that increase from run to run of each plant."""
+    clocks: dict[str, ContinuousTime] = {}
+    for publication in tape:
+        plant = publication.key.split("/", 2)[1]
+        clock = clocks.get(plant)
+        if clock is None:
+            clock = clocks[plant] = ContinuousTime()
+        yield _Due(publication, clock.of(*publication))
+
+
 class Player:
     """Hands out publications when they are due; see `reactorwatch.runtime.serve.Node`.
 
@@ -114,7 +140,7 @@ class Player:
 
     def __init__(self, open_tape: Callable[[], Iterator[Publication]], rate: float, *, loop: bool = False) -> None:
         self._open_tape = open_tape
-        self._tape = open_tape()
+        self._tape = _paced(open_tape())
         self._rate = rate
         self._loop = loop
         self._paused = False
@@ -128,7 +154,7 @@ class Player:
     def on_tick(self, now_ns: int) -> list[Publication]:
         """What is due; the first call starts the play."""
         if self._next is not None and self._anchor is None:
-            self._anchor = now_ns, self._next.message.time_ns
+            self._anchor = now_ns, self._next.time_ns
         due: list[Publication] = []
         while self._next is not None and len(due) < BATCH and self.next_tick_ns() <= now_ns:
             due.append(self._take(self._next))
@@ -142,7 +168,7 @@ class Player:
         if self._anchor is None or self._next is None:
             return 0
         clock_ns, plant_ns = self._anchor
-        return clock_ns + round((self._next.message.time_ns - plant_ns) / self._rate)
+        return clock_ns + round((self._next.time_ns - plant_ns) / self._rate)
 
     @property
     def finished(self) -> bool:
@@ -199,7 +225,7 @@ class Player:
         if self._anchor is None or self._next is None:
             return None
         clock_ns, plant_ns = self._anchor
-        next_ns = self._next.message.time_ns
+        next_ns = self._next.time_ns
         if self._paused or math.isinf(self._rate):
             return plant_ns if self._paused else next_ns
         return min(next_ns, plant_ns + round((now_ns - clock_ns) * self._rate))
@@ -207,21 +233,21 @@ class Player:
     def _row(self, now_ns: int) -> list[Publication]:
         """All messages of the next time, which the play has then come to."""
         row: list[Publication] = []
-        while self._next is not None and (not row or self._next.message.time_ns == row[0].message.time_ns):
-            self._anchor = now_ns, self._next.message.time_ns
+        first_ns = self._next.time_ns if self._next is not None else 0
+        while self._next is not None and self._next.time_ns == first_ns:
+            self._anchor = now_ns, first_ns
             row.append(self._take(self._next))
         return row
 
-    def _take(self, publication: Publication) -> Publication:
+    def _take(self, due: _Due) -> Publication:
         """Move on behind a message, at the end to the beginning."""
-        time_ns = publication.message.time_ns
         self._next = next(self._tape, None)
         if self._next is not None:
-            self._spacing_ns = self._next.message.time_ns - time_ns or self._spacing_ns
+            self._spacing_ns = self._next.time_ns - due.time_ns or self._spacing_ns
         elif self._loop:
-            self._tape = self._open_tape()
+            self._tape = _paced(self._open_tape())
             self._next = next(self._tape, None)
             if self._next is not None and self._anchor is not None:
                 clock_ns, plant_ns = self._anchor
-                self._anchor = clock_ns, plant_ns - (time_ns + max(self._spacing_ns, 0) - self._next.message.time_ns)
-        return publication
+                self._anchor = clock_ns, plant_ns - (due.time_ns + max(self._spacing_ns, 0) - self._next.time_ns)
+        return due.publication

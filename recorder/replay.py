@@ -74,7 +74,10 @@ def _opened(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterato
     path = Path(config.file)
     if path.suffix.lower() == ".csv":
         plant, record = config.plant or PLANT, read_csv(path, config.columns)
-        return (plant,), lambda: between(samples_of(record, plant), *_span_ns(config, 0))
+        if record.runs is not None:
+            log.warning("plays several runs one after the other", file=config.file, runs=record.describe_runs())
+        zero_ns = record.stored_zero_ns
+        return (plant,), lambda: between(samples_of(record, plant, zero_ns), *_span_ns(config, zero_ns))
     plants = plants_in(path)
     if not plants:
         raise InputError(f"{path}: holds no samples")

@@ -1,5 +1,7 @@
 """Messages into a run, as columns: all of them, or stretch by stretch. Pure.
 
+Where the plant's clock stepped back, what follows is drawn after what was before (`ContinuousTime`).
+
 The numbers go into growing arrays, so that a stretch of a million samples costs a few bytes a number and not an object
 each; with the stretch that they are cut into they are gone.
 """
@@ -37,6 +39,7 @@ from recorder.run import (
     Seen,
     Snapshot,
 )
+from recorder.run_splitter import ContinuousTime
 
 STRETCH = 100_000
 """Messages; drawn they take some 20 MB for a moment."""
@@ -101,7 +104,8 @@ class RunReader:
         self._faults: list[FaultChange] = []
         self._models: dict[tuple[str, str], list[Snapshot]] = {}
         self._health: dict[str, list[Report]] = {}
-        self._newest_ns = 0
+        self._newest_ns: int | None = None
+        self._clock = ContinuousTime()
         self._seen: dict[str, Seen] = {}
         self._earlier = Earlier()
 
@@ -131,23 +135,29 @@ class RunReader:
                     f"a run is of one plant; name one of {', '.join(sorted((self._plant, into.topic.plant)))}"
                 )
             self._plant = into.topic.plant
+        if kind == keys.HEALTH:  # of before the first sample it has no place in the run
+            if self._newest_ns is not None:
+                self._health.setdefault(message.node, []).append(_report(message, self._newest_ns))
+            return
+        time_ns = self._clock.of(key, message)
         if _KINDS[kind].numbers is not None:
-            into.append(message)
-            if kind == keys.SAMPLE and message.time_ns > self._newest_ns:
-                self._newest_ns = message.time_ns
+            into.append(message, time_ns)
+            if kind == keys.SAMPLE and (self._newest_ns is None or time_ns > self._newest_ns):
+                self._newest_ns = time_ns
         elif kind == keys.ALARM:
-            self._alarms.append(AlarmChange(*(getattr(message, name) for name in AlarmChange._fields)))
+            change = AlarmChange(*(getattr(message, name) for name in AlarmChange._fields))
+            self._alarms.append(change._replace(time_ns=time_ns))
         elif kind == keys.FAULT:
-            self._faults.append(FaultChange(*(getattr(message, name) for name in FaultChange._fields)))
+            fault = FaultChange(*(getattr(message, name) for name in FaultChange._fields))
+            onset_ns = fault.onset_ns + time_ns - fault.time_ns
+            self._faults.append(fault._replace(time_ns=time_ns, onset_ns=onset_ns))
         elif kind == keys.MODEL:
-            self._models.setdefault((into.topic.name, _use(message)), []).append(_snapshot(message))
-        elif self._newest_ns:  # health of before the first sample has no place in the run
-            self._health.setdefault(message.node, []).append(_report(message, self._newest_ns))
+            self._models.setdefault((into.topic.name, _use(message)), []).append(_snapshot(message, time_ns))
 
     @property
     def has_samples(self) -> bool:
         """Whether there has been a sample, before the last cut or since."""
-        return bool(self._newest_ns)
+        return self._newest_ns is not None
 
     def cut(self) -> Run:
         """What has come since the last cut."""
@@ -236,9 +246,9 @@ def _use(message: messages.ModelSnapshot) -> str:
     return HELD if message.held else ADAPTS
 
 
-def _snapshot(message: messages.ModelSnapshot) -> Snapshot:
+def _snapshot(message: messages.ModelSnapshot, time_ns: int) -> Snapshot:
     parameters = {item.name: (item.value, item.sd) for item in message.parameters}
-    return Snapshot(message.time_ns, parameters, message.excitation, message.condition)
+    return Snapshot(time_ns, parameters, message.excitation, message.condition)
 
 
 def _report(message: messages.Health, time_ns: int) -> Report:
@@ -281,14 +291,14 @@ class _Series:
         topic = keys.parse(key)
         return cls(topic) if topic is not None and topic.kind in _KINDS else None
 
-    def append(self, message: Any) -> None:
-        """Add a message's numbers, if it has any."""
+    def append(self, message: Any, time_ns: int) -> None:
+        """Add a message's numbers, if it has any, at a time."""
         numbers = self._of(message)
         if not numbers:
             return
         if not self.unit:
             self.unit = getattr(message, "unit", "")
-        self.times.append(message.time_ns)
+        self.times.append(time_ns)
         self._numbers.extend(numbers)
 
     def in_order(self) -> list[NDArray[Any]]:

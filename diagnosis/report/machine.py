@@ -7,18 +7,21 @@ from diagnosis.difference import Difference
 from diagnosis.result import Diagnosis, Estimate, Experiment, HeldOut
 
 
-def as_object(diagnosis: Diagnosis, file: str, seconds: float) -> dict[str, Any]:
+def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None = None) -> dict[str, Any]:
     """The object that `diagnose --json` prints.
 
     Args:
         diagnosis: of the file.
         file: as it was named.
         seconds: that the diagnosis took.
+        zero: clock time that the minutes count from; None: not known.
     """
     experiment = diagnosis.experiment
     return {
         "file": file,
+        "zero": zero,
         "samples": diagnosis.samples,
+        "runs": diagnosis.runs,
         "span_min": _number(diagnosis.span_min),
         "seconds": _number(round(seconds, 3)),
         "verdict": diagnosis.verdict,
@@ -28,6 +31,7 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float) -> dict[str, Any]
                 "profile": cause.profile,
                 "label": cause.label,
                 "location": cause.location,
+                **({"run": cause.run} if diagnosis.runs > 1 else {}),
                 "parameters": {name: _estimate(item) for name, item in cause.parameters.items()},
             }
             for cause in diagnosis.causes
@@ -61,10 +65,10 @@ def _parameters(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def with_differences(diagnosis: Diagnosis, file: str, seconds: float) -> dict[str, Any]:
+def with_differences(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None = None) -> dict[str, Any]:
     """The same, and where the simulation differs from the record: what report.json holds."""
     differences = {name: _difference(item) for name, item in diagnosis.differences.items()}
-    return as_object(diagnosis, file, seconds) | {"differences": differences}
+    return as_object(diagnosis, file, seconds, zero) | {"differences": differences}
 
 
 def _experiment(experiment: Experiment) -> dict[str, Any]:

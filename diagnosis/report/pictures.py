@@ -216,8 +216,8 @@ def _rows_of_interest(curves: Curves, causes: Sequence[Cause]) -> slice:
 
 def _onsets(causes: Sequence[Cause]) -> list[float]:
     """When causes set in, as far as that was found and not given."""
-    found = [cause.parameters["onset"] for cause in causes if "onset" in cause.parameters]
-    return [item.value for item in found if item.sd > 0.0]
+    found = [(cause.parameters["onset"], cause.run_shift_min) for cause in causes if "onset" in cause.parameters]
+    return [item.value + shift_min for item, shift_min in found if item.sd > 0.0]
 
 
 def _with_zero(course: Array, lower: Array, upper: Array) -> tuple[float, float]:

@@ -80,6 +80,8 @@ def when(cause: Cause, curves: Curves | None = None) -> str:
         largest = "" if curves is None else f", largest at {_largest_min(cause, curves):.4g} min"
         return f"changing over the record{largest}"
     since = f"since {with_interval(cause.parameters['onset'])}"
+    if cause.run > 1:
+        since += f" of run {cause.run}"
     if cause.profile == "ramp":
         return f"growing {since}"
     return f"settling {since}" if cause.profile == "decay" else since

@@ -12,7 +12,7 @@ from monitor_node.config import MonitorConfig
 from reactorwatch.cli.batch import Answer, Kind, Row, as_table
 from reactorwatch.cli.options import existing_recording
 from reactorwatch.cli.reports import backtest_object, backtest_text
-from reactorwatch.cli.sources import messages, plant_of, zero_of
+from reactorwatch.cli.sources import plant_of, tape
 from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
@@ -77,13 +77,13 @@ def answer(job: Job) -> Answer:
     """
     plant = plant_of(existing_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
-    first = FirstSamples(plant)
-    result = run(first.passing(messages(job.at, plant, job.columns)), settings)
+    recording, first = tape(job.at, plant, job.columns), FirstSamples(plant)
+    result = run(first.passing(recording.messages), settings, recording.zero_ns or 0)
     if set(settings.outputs) <= result.left_out.keys():
         reasons = "; ".join(f"{name}: {result.left_out[name]}" for name in settings.outputs)
         raise InputError(f"{job.at}: there is no output to watch ({reasons})")
-    zero_ns = zero_of(job.at, result.first_ns)
-    found = backtest_object(result, zero_ns)
+    zero_ns = result.first_ns if recording.zero_ns is None else recording.zero_ns
+    found = backtest_object(result, zero_ns, recording.zero(result.first_ns))
     if job.as_json:
         said = msgspec.json.encode({"file": str(job.file), **found} if job.among else found).decode()
     else:

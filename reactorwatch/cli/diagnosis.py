@@ -130,7 +130,9 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     catalogue, on_the_bus = effects_of(case.model), case.model.name == PLANT
     files = (str(case.file), str(folder / MODEL), str(folder / EXPERIMENT))
     page = as_page(diagnosis, case.model, catalogue, *files, on_the_bus=on_the_bus)
-    plain = msgspec.json.format(msgspec.json.encode(with_differences(diagnosis, str(case.file), seconds)), indent=2)
+    plain = msgspec.json.format(
+        msgspec.json.encode(with_differences(diagnosis, str(case.file), seconds, case.measured.zero)), indent=2
+    )
     with filling(folder, "--out") as temporary:
         write_extended_model(temporary / MODEL, diagnosis.extended_model)
         if diagnosis.experiment is not None:

@@ -107,7 +107,7 @@ def _check(asked: Asked) -> None:
 
 def _said(case: Case, diagnosis: Diagnosis, seconds: float, *, as_json: bool) -> str:
     if as_json:
-        return msgspec.json.encode(as_object(diagnosis, str(case.file), seconds)).decode()
+        return msgspec.json.encode(as_object(diagnosis, str(case.file), seconds, case.measured.zero)).decode()
     said = as_text(diagnosis, str(case.file), effects_of(case.model))
     if case.folder is None:
         return said

@@ -1,13 +1,16 @@
 """Files into other files: `import`, `export`, `dashboard`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from reactorwatch.cli.options import Columns, Force, Plant, columns, existing, existing_recording, output_file
 from reactorwatch.errors import InputError
 from reactorwatch.records.output import checked_folder
+
+if TYPE_CHECKING:
+    from reactorwatch.records.record import Record
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
 
@@ -37,7 +40,7 @@ def dashboard(
     """Draw a recording into a Rerun file, without a screen."""
     from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.sources import counted_from_ns, messages
+    from reactorwatch.cli.sources import tape
     from recorder.dashboard.file import write_rrd
     from recorder.dashboard.picture import picture_names, render_tabs
     from recorder.run_reader import stretches
@@ -49,8 +52,8 @@ def dashboard(
     if png is not None:
         checked_folder(png, picture_names(), (file,), option="--png", force=force)
     with task(f"drawing {file.name}"):
-        run = stretches(messages(existing_recording(file), plant), counted_from_ns=counted_from_ns(file))
-        write_rrd(run, out, diagnosis=drawn)
+        recording = tape(existing_recording(file), plant)
+        write_rrd(stretches(recording.messages, counted_from_ns=recording.zero_ns), out, diagnosis=drawn)
     typer.echo(f"wrote {out}")
     if png is not None:
         with task("rendering"):
@@ -72,8 +75,8 @@ def import_csv(
 
     out = output_file(out, ".mcap", (file,), force=force)
     with task(f"importing {file.name}"):
-        rows = convert(existing(file), out, plant or "cstr", columns(column))
-    typer.echo(f"wrote {out}: {rows} rows")
+        record = convert(existing(file), out, plant or "cstr", columns(column))
+    typer.echo(_written(out, record))
 
 
 def export_csv(
@@ -88,5 +91,9 @@ def export_csv(
 
     out = output_file(out, ".csv", (file,), force=force)
     with task(f"exporting {file.name}"):
-        rows = convert(existing_recording(file), out, plant)
-    typer.echo(f"wrote {out}: {rows} rows")
+        record = convert(existing_recording(file), out, plant)
+    typer.echo(_written(out, record))
+
+
+def _written(out: Path, record: "Record") -> str:
+    return "\n".join([f"wrote {out}: {record.rows} rows", *(f"note: {remark}" for remark in record.remarks)])

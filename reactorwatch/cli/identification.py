@@ -32,7 +32,7 @@ def one(
         InputError: the record or the options cannot give one.
     """
     found = identify_model(
-        measured.time_min,
+        measured.continuous_min,
         *_columns(measured, output),
         model=model,
         order=order,
@@ -42,7 +42,7 @@ def one(
         choice=REPORT_ROWS if report_rows else ALL_ROWS,
         missing="leave out",
     )
-    return msgspec.json.encode(found).decode() if as_json else _text(found)
+    return msgspec.json.encode(found).decode() if as_json else f"{_text(found)}{_remarks_text(measured)}"
 
 
 def compare(measured: Record, output: str, order: int, delay: int, *, neural: bool, as_json: bool) -> str:
@@ -60,12 +60,18 @@ def compare(measured: Record, output: str, order: int, delay: int, *, neural: bo
         raise InputError(f"order must be at least 1, got {order}")
     selection = select(
         *_columns(measured, output),
-        measured.time_min,
+        measured.continuous_min,
         families=families,
         orders=range(1, order + 1),
         delay=delay,
     )
-    return _selection_json(selection, output) if as_json else f"{selection.table()}\n\n{selection.reason}"
+    if as_json:
+        return _selection_json(selection, output)
+    return f"{selection.table()}\n\n{selection.reason}{_remarks_text(measured)}"
+
+
+def _remarks_text(measured: Record) -> str:
+    return "".join(f"\nnote: {remark}" for remark in measured.remarks)
 
 
 def _columns(measured: Record, output: str) -> tuple[Array, Array]:

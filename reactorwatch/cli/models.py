@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Columns, Force, Json, Plant, Processes, Scheduler, columns, existing_recording
+from reactorwatch.errors import InputError
 
 
 def add_to(app: typer.Typer) -> None:
@@ -90,4 +91,6 @@ def reproduce(
 
     check_out(out, only, (file,), force=force)
     measured = record(existing_recording(file), plant, columns(column)) if file else None
+    if measured is not None and measured.runs is not None:
+        raise InputError(f"--record {file}: must be one run, {measured.describe_runs()}; cut one run out of it")
     typer.echo(reproduce_figures(out, seed, only, measured, processes=jobs, scheduler=scheduler))

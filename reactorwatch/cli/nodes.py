@@ -160,10 +160,13 @@ def record(
     ] = None,
 ) -> None:
     """Record everything on the bus into an MCAP file."""
+    from reactorwatch.records.output import check_folder_name
     from reactorwatch.runtime.config import section
     from recorder.__main__ import run
     from recorder.config import RecorderConfig
 
+    if out is not None and out.suffix != ".mcap":
+        check_folder_name(out, "--out")
     tables, bus = _settings(config, endpoint)
     flags = {"plant": name, "out": str(out) if out is not None else None}
     run(section(RecorderConfig, "recorder", tables, flags), bus, _metrics(tables))

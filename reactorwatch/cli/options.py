@@ -130,12 +130,12 @@ _SECONDS = {"s": 1, "min": 60, "h": 3600}
 
 
 def span_ns(text: str, option: str) -> int:
-    """A span of time, such as `90s`, `10min` or `1.5h`, in nanoseconds.
+    """A span of time, such as `90s`, `10min`, `1.5h` or `-20min`, in nanoseconds.
 
     Raises:
         InputError: no such span.
     """
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|min|h)", text)
+    match = re.fullmatch(r"(-?\d+(?:\.\d+)?)(s|min|h)", text)
     if match is None:
         raise InputError(f"{option} must be a number with s, min or h, such as 10min, got {text!r}")
     from reactorwatch.records.record import LONGEST_MIN

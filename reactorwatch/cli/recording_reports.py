@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from reactorwatch.contract.messages_pb2 import Priority
-from reactorwatch.records.record import to_minutes
+from reactorwatch.records.record import clock_time, to_minutes
 from recorder.look import Look
+from recorder.mcap_file import has_clock
 from recorder.recover import Saved
 
 MOST_LINES = 20
@@ -47,16 +48,23 @@ def info_object(seen: Look, file: Path) -> dict[str, Any]:
     def minutes(time_ns: int | None) -> float | None:
         return None if time_ns is None else to_minutes(time_ns, seen.zero_ns)
 
+    span = found.sample_span_ns
     return {
         "file": str(file),
+        "zero": clock_time(seen.zero_ns) if span is not None and has_clock(seen.metadata) else None,
         "whole": not seen.damages,
         "damages": list(seen.damages),
         "messages": found.messages,
         "first_ns": found.first_ns,
         "last_ns": found.last_ns,
         "span_s": found.span_s,
-        "from_min": minutes(found.first_sample_ns) if found.first_sample_ns else None,
-        "to_min": minutes(found.last_sample_ns) if found.first_sample_ns else None,
+        "from_min": minutes(span.first_ns) if span is not None else None,
+        "to_min": minutes(span.last_ns) if span is not None else None,
+        "runs": [
+            {"plant": plant, "from_min": minutes(run.first_ns), "to_min": minutes(run.last_ns)}
+            for plant, runs in sorted(found.runs.items())
+            for run in runs
+        ],
         "topics": [
             {
                 "topic": topic.key,
@@ -69,6 +77,7 @@ def info_object(seen: Look, file: Path) -> dict[str, Any]:
         "lost": found.lost,
         "duplicated": found.duplicated,
         "out_of_order": found.out_of_order,
+        "out_of_place": found.out_of_place,
         "gaps": [
             {"topic": gap.key, "first": gap.first, "last": gap.last, "after_min": minutes(gap.after_ns)}
             for gap in found.gaps
@@ -106,6 +115,15 @@ def info_text(seen: Look, file: Path) -> str:
         lines[0] += f", received over {said['span_s']:.1f} s ({first} to {last})"
     if said["from_min"] is not None:
         lines.append(f"samples from {said['from_min']:g} to {said['to_min']:g} min")
+    for plant, runs in sorted(seen.overview.runs.items()):
+        if len(runs) > 1:
+            lines.append(f"{len(runs)} runs of {plant}: its clock steps back, or it was restarted:")
+            spans = [(to_minutes(run.first_ns, seen.zero_ns), to_minutes(run.last_ns, seen.zero_ns)) for run in runs]
+            lines += [
+                f"  run {number}: {first:g} to {last:g} min"
+                for number, (first, last) in enumerate(spans[:MOST_LINES], 1)
+            ]
+            lines += [f"  and {len(runs) - MOST_LINES} more (--json names them)"] if len(runs) > MOST_LINES else []
     told = [
         f"{name} {seen.metadata[name]}" for name in ("plant", "version", "seed", "started") if name in seen.metadata
     ]
@@ -128,6 +146,8 @@ def info_text(seen: Look, file: Path) -> str:
     ]
     if len(said["lost_on_the_way"]) > MOST_LINES:
         lines.append(f"  and {len(said['lost_on_the_way']) - MOST_LINES} times more (--json names them)")
+    if said["out_of_place"]:
+        lines.append(f"{said['out_of_place']} samples have a time or number that fits no other")
     if not said["lost"]:
         lines.append("no sample is missing, by their sequence numbers")
     lines += [

@@ -76,7 +76,7 @@ def cut(
     from recorder.look import zero_ns_of
     from recorder.mcap_file import ZERO_NS, read_metadata, recordings_in
 
-    from_ns = span_ns(begin, "--from") if begin is not None else 0
+    from_ns = span_ns(begin, "--from") if begin is not None else -(2**63)
     to_ns = span_ns(end, "--to") if end is not None else 2**63
     if from_ns >= to_ns:
         raise InputError(f"--from must be before --to, got {begin} and {end or 'the end'}")

@@ -11,12 +11,13 @@ from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.records.record import to_minutes
 
 
-def backtest_object(result: Backtest, zero_ns: int) -> dict[str, Any]:
+def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> dict[str, Any]:
     """The object that `backtest --json` prints.
 
     Args:
         result: of the back-test.
         zero_ns: where the file's minutes start.
+        zero: the same as a clock time; None: not known.
     """
 
     def minutes(time_ns: int | None) -> float | None:
@@ -24,7 +25,9 @@ def backtest_object(result: Backtest, zero_ns: int) -> dict[str, Any]:
 
     return {
         "samples": result.rows,
-        "span_min": to_minutes(result.last_ns, result.first_ns),
+        "zero": zero,
+        "span_min": to_minutes(result.span_ns),
+        "runs": result.runs,
         "trained_until_min": minutes(result.watching_since_ns),
         "expected_false_alarms": float(f"{result.expected_false_alarms:.3g}"),
         "signals": {
@@ -58,6 +61,10 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     said = backtest_object(result, zero_ns)
     lines = [f"{file}: {said['samples']} rows over {said['span_min']:g} min"]
     lines += [f"  {name} is not watched: {why}" for name, why in result.left_out.items()]
+    if result.runs > 1:
+        lines.append(
+            f"the plant's clock steps back, or the plant was restarted: {result.runs} runs, watched one by one"
+        )
     if said["trained_until_min"] is None:
         lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
     else:
@@ -67,7 +74,9 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
         )
         lines.append(_judged_by(result))
     for alarm, cleared_ns in result.raised:
-        end = f"cleared at {to_minutes(cleared_ns, zero_ns):g} min" if cleared_ns else "still standing at the end"
+        end = (
+            "still standing at the end" if cleared_ns is None else f"cleared at {to_minutes(cleared_ns, zero_ns):g} min"
+        )
         raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
         lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}")
     told = dict.fromkeys(filter(None, (suspects_text(alarm.suspects, zero_ns) for alarm, _ in result.raised)))

@@ -1,5 +1,6 @@
 """`simulate`: the plant's equations against a record."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -13,11 +14,11 @@ from reactorwatch.process import effects_of
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.records.record import Record
+from reactorwatch.records.record import Record, join_runs
 
 
 def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record:
-    """Run the equations from the record's first row, driven by its input.
+    """Run the equations from the first row of each run of the record, driven by its input.
 
     Args:
         measured: with the model's inputs and outputs as columns.
@@ -27,6 +28,12 @@ def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record
     Raises:
         InputError: the record cannot drive the model.
     """
+    simulated = join_runs([_free_run(run, model, faults) for run in measured.each_run()])
+    return replace(simulated, name=f"simulation of {measured.name}")
+
+
+def _free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record:
+    """The free run along one run of a record."""
     for text in faults:
         model = parse_fault(text, effects_of(model)).extend(model, end_min=float(measured.time_min[-1]))
     wrong = find_wrong_unit(model, measured.columns, measured.time_min)
@@ -53,7 +60,7 @@ def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record
         raise InputError(f"{measured.name}: {error}") from error
     columns = {name: inputs[:, index] for index, name in enumerate(model.input_names)}
     columns |= {name: trajectory.outputs[:, index] for index, name in enumerate(model.output_names)}
-    return Record(measured.time_min, columns, f"simulation of {measured.name}")
+    return replace(measured, columns=columns)
 
 
 def report(measured: Record, simulated: Record, model: ProcessModel, out: Path, *, as_json: bool) -> str:
@@ -66,8 +73,10 @@ def report(measured: Record, simulated: Record, model: ProcessModel, out: Path, 
         said = {
             "file": str(out),
             "rows": measured.rows,
+            "runs": len(measured.run_starts),
             "rmse": {name: {"value": value, "unit": units[name]} for name, value in rmse.items()},
         }
         return msgspec.json.encode(said).decode()
     parts = ", ".join(f"{name} {value:.3g} {units[name]}" for name, value in rmse.items())
-    return f"wrote {out}: {measured.rows} rows; root mean square difference from the record: {parts}"
+    said = f"wrote {out}: {measured.rows} rows; root mean square difference from the record: {parts}"
+    return "\n".join([said, *(f"note: {remark}" for remark in measured.remarks)])

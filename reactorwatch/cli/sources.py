@@ -7,12 +7,13 @@ A folder stands for the recordings in it, as one; where many files may be named,
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import NamedTuple
 
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import checked_plant
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.record import UNITS, Record
+from reactorwatch.records.record import UNITS, Record, clock_time
 
 DEFAULT_PLANT = "cstr"
 
@@ -43,20 +44,54 @@ def record(
     return read_record(path, plant)
 
 
+class Tape(NamedTuple):
+    """The messages of a file.
+
+    Attributes:
+        messages: in the order they were received; those of a .csv are its samples.
+        zero_ns: the time of the messages that the file's minutes count from; None: the first sample.
+        has_clock: whether the times of the messages are clock times.
+    """
+
+    messages: Iterator[Encoded]
+    zero_ns: int | None
+    has_clock: bool
+
+    def zero(self, first_ns: int) -> str | None:
+        """The clock time that the minutes count from, as in ISO 8601; None: not known.
+
+        Args:
+            first_ns: time of the first sample.
+        """
+        return clock_time(first_ns if self.zero_ns is None else self.zero_ns) if self.has_clock else None
+
+
+def tape(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Tape:
+    """The messages of a file, and what its minutes count from.
+
+    Raises:
+        InputError: as `record`.
+    """
+    if kind(path) == "csv":
+        from recorder.player import samples_of
+
+        measured = record(path, plant, columns)
+        publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
+        return Tape((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
+    from recorder.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from
+
+    read = (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
+    metadata = read_metadata(path)
+    return Tape(read, zero_from(metadata, 0) if ZERO_NS in metadata else None, has_clock(metadata))
+
+
 def messages(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Iterator[Encoded]:
     """The messages of a file, in the order they were received; those of a .csv are its samples.
 
     Raises:
         InputError: as `record`.
     """
-    if kind(path) == "csv":
-        from recorder.replay import samples_of
-
-        publications = samples_of(record(path, plant, columns), plant or DEFAULT_PLANT)
-        return (encode(publication) for publication in publications)
-    from recorder.mcap_file import read_messages
-
-    return (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
+    return tape(path, plant, columns).messages
 
 
 def stands_for(folder: Path) -> list[Path]:
@@ -130,25 +165,6 @@ def plant_of(path: Path, plant: str | None) -> str:
     except ValueError as error:
         cure = "export it, and use the record"
         raise InputError(f"{path}: {error}; {cure}") from error
-
-
-def zero_of(path: Path, first_ns: int) -> int:
-    """Where the minutes of a file start: a .csv has times of its own, a recording counts from its first sample."""
-    return 0 if kind(path) == "csv" else first_ns
-
-
-def counted_from_ns(path: Path) -> int | None:
-    """The time that a file's minutes count from, where it says so; None: its first sample.
-
-    Raises:
-        InputError: as `messages`.
-    """
-    if kind(path) == "csv":
-        return 0
-    from recorder.mcap_file import ZERO_NS, read_metadata
-
-    said = read_metadata(path).get(ZERO_NS, "")
-    return int(said) if said.isdecimal() else None
 
 
 def kind(path: Path) -> str:

@@ -15,10 +15,10 @@ from reactorwatch.cli.progress import task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import to_minutes
+from reactorwatch.records.record import clock_time, to_minutes
 from reactorwatch.runtime.config import parse_toml, read_settings, section
 from recorder.look import gaps_in, zero_ns_of
-from recorder.mcap_file import one_plant_in, read_messages, read_metadata
+from recorder.mcap_file import has_clock, one_plant_in, read_messages, read_metadata
 
 SETTINGS = "settings"
 """What our metadata of a recording calls the settings of the nodes that ran."""
@@ -63,7 +63,8 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
         for gap in gaps_in(file)
         if gap.stream in {keys.all_of(monitor.plant, kind).removesuffix("/**") for kind in (keys.SAMPLE, *COMPARED)}
     ]
-    said = _object(found, file, monitor.plant, zero_ns_of(file))
+    zero_ns = zero_ns_of(file)
+    said = _object(found, file, monitor.plant, zero_ns) | {"zero": clock_time(zero_ns) if has_clock(metadata) else None}
     typer.echo(msgspec.json.encode(said).decode() if as_json else _text(said))
     return 0 if found.exact else 1
 

@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 from reactorwatch.compiled import compiled
 
 _TIME, _SEQUENCE, _VALUE, _UNIT, _QUALITY = 0x09, 0x10, 0x19, 0x22, 0x28  # field and wire type of each
+_TIME_TAG, _SEQUENCE_TAG = bytes([_TIME]), bytes([_SEQUENCE])
+LONGEST_VARINT = 10
+"""Bytes of the longest number that protobuf writes."""
+
 _FNV_START, _FNV_FACTOR = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
 
 
@@ -36,6 +40,19 @@ class SampleColumns(NamedTuple):
     value: NDArray[np.float64]
     unit: NDArray[np.uint64]
     quality: NDArray[np.int64]
+
+
+def sample_number(payload: bytes) -> int:
+    """The number of one sample, read without parsing the rest; 0 where the bytes have another form."""
+    at = 9 if payload[:1] == _TIME_TAG else 0  # the time takes eight bytes, and none where it is zero
+    if payload[at : at + 1] != _SEQUENCE_TAG:
+        return 0
+    number = 0
+    for place, byte in enumerate(payload[at + 1 : at + 1 + LONGEST_VARINT]):
+        number |= (byte & 0x7F) << 7 * place
+        if byte < 0x80:
+            return number
+    return 0
 
 
 def sample_columns(payloads: Sequence[bytes]) -> SampleColumns:

@@ -1,7 +1,8 @@
 """Records as CSV: from a plant's historian, a spreadsheet, another program, or `export`.
 
 The header names the columns: `time_min` or `time_s`, then `qc`, `C`, `T` in any order among others, which are
-ignored. Rows are in time order; gaps and irregular times are allowed; an empty cell was not measured.
+ignored. Rows are in time order; gaps and irregular times are allowed; an empty cell was not measured. Where the time
+steps back a new run starts, and where a column `run` counts up from 1 by 1, each of its numbers is a run.
 
 A well-formed file is parsed by NumPy in one go. Whatever that cannot take is read again row by row, which is slow,
 knows the few things more that are fine (quoted numbers, say), and otherwise finds the row and the column to blame.
@@ -22,7 +23,16 @@ from reactorwatch.records.atomic import replacing
 from reactorwatch.records.reading import reading
 from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, UNITS, Record
 
+LONGEST_NUMBER = 18
+"""Digits of a run's number that are read."""
+
 _MINUTES_PER_UNIT = {"time_min": 1.0, "time_s": 60.0}  # divided by, so that 7 s is the same 7/60 min everywhere
+RUN = "run"
+"""The column that counts the runs of a record, where there are several."""
+
+LARGEST_SHARE_BACK = 1 / 3
+"""Of the rows, before which the time steps back: a file with more of them is not in time order."""
+
 _MCAP_MAGIC = b"\x89MCAP"
 
 
@@ -32,13 +42,14 @@ class _Column(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Where in the file what is."""
+    """Where in the file what is; `runs` is the number of each row's run, if a column says so."""
 
     width: int
     header_lines: int
     time: _Column
     units_per_minute: float
     signals: dict[str, _Column]
+    runs: NDArray[np.intp] | None
 
 
 def read_csv(path: Path, columns: Mapping[str, str] | None = None, required: tuple[str, ...] = tuple(UNITS)) -> Record:
@@ -65,7 +76,8 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None, required: tup
     signals = {signal: values[:, number].copy() for number, signal in enumerate(layout.signals, start=1)}
     lines_below_header = text.rstrip("\n").count("\n") + 1 - layout.header_lines
     first_row = layout.header_lines + 1 if lines_below_header == len(values) else None  # None: blank lines between
-    return Record(time_min=time_min, columns=signals, name=path.name, first_row=first_row)
+    runs = _runs(path, layout, values[:, 0])
+    return Record(time_min=time_min, columns=signals, name=path.name, first_row=first_row, runs=runs)
 
 
 def write_csv(path: Path, record: Record) -> None:
@@ -78,6 +90,7 @@ def write_csv(path: Path, record: Record) -> None:
     if not _can_be(record.time_min, 1.0).all():
         raise ValueError(f"times must be within {LONGEST_MIN:.3g} min of their zero to be read again from CSV")
     cells = [record.time_min.tolist()]
+    header = ["time_min", *record.columns]
     for signal, values in record.columns.items():
         if (np.abs(values) >= LARGEST_VALUE).any():
             raise ValueError(
@@ -85,9 +98,12 @@ def write_csv(path: Path, record: Record) -> None:
                 f"got {np.nanmax(np.abs(values)):g}"
             )
         cells.append(["" if math.isnan(value) else value for value in values.tolist()])
+    if record.runs is not None:
+        header.append(RUN)
+        cells.append(record.runs.tolist())
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")  # writes a float as its repr, which reads back exactly
-        writer.writerow(["time_min", *record.columns])
+        writer.writerow(header)
         writer.writerows(zip(*cells, strict=True))
 
 
@@ -146,7 +162,40 @@ def _layout(path: Path, text: str, columns: Mapping[str, str], required: tuple[s
         if in_file not in header:
             raise InputError(f"{path}, row {row}: expected a column {in_file!r} (for {signal}) in the header, {found}")
     time, units_per_minute = times[0]
-    return _Layout(len(header), row, time, units_per_minute, signals)
+    runs = _numbered_runs(path, text, header.index(RUN)) if RUN in header and RUN not in columns.values() else None
+    return _Layout(len(header), row, time, units_per_minute, signals, runs)
+
+
+def _numbered_runs(path: Path, text: str, position: int) -> NDArray[np.intp] | None:
+    """The number of each row's run; None if the column holds anything but runs that are counted from 1."""
+    rows = _rows(path, text)
+    next(rows)  # the header
+    cells = [cells[position].strip() if position < len(cells) else "" for _, cells in rows]
+    if not all(cell.isdecimal() and len(cell) < LONGEST_NUMBER for cell in cells):
+        return None
+    runs = np.array([int(cell) for cell in cells], dtype=np.intp)
+    steps = np.diff(runs, prepend=0)
+    return runs if runs.size and runs[0] == 1 and np.all((steps == 0) | (steps == 1)) else None
+
+
+def _runs(path: Path, layout: _Layout, times: NDArray[np.float64]) -> NDArray[np.intp] | None:
+    """The run of each row, from 1; None if there is one.
+
+    Raises:
+        InputError: the time steps back so often that the rows are in no order.
+    """
+    starts = np.diff(times, prepend=times[0]) < 0
+    if layout.runs is not None:
+        numbered = np.diff(layout.runs, prepend=1) > 0
+        back, starts = starts & ~numbered, starts | numbered
+    else:
+        back = starts
+    if np.count_nonzero(back) > LARGEST_SHARE_BACK * times.size:
+        raise InputError(
+            f"{path}, column {layout.time.name!r}: expected rows in time order, the time steps back before "
+            f"{np.count_nonzero(back)} of {times.size} rows; sort the rows by time"
+        )
+    return 1 + np.cumsum(starts) if starts.any() else None
 
 
 def _parsed_at_once(text: str, layout: _Layout) -> NDArray[np.float64] | None:
@@ -167,7 +216,10 @@ def _parsed_at_once(text: str, layout: _Layout) -> NDArray[np.float64] | None:
     regular = commas == len(values) * (layout.width - 1)
     times = values[:, 0]
     possible = np.abs(values[:, 1:]).max(initial=0.0, where=~np.isnan(values[:, 1:])) < LARGEST_VALUE
-    if not (regular and possible and _can_be(times, layout.units_per_minute).all() and (np.diff(times) > 0).all()):
+    still = np.diff(times) == 0
+    if layout.runs is not None and layout.runs.size == times.size:
+        still &= np.diff(layout.runs) == 0
+    if not (regular and possible and _can_be(times, layout.units_per_minute).all() and not still.any()):
         return None
     return values
 
@@ -178,7 +230,7 @@ def _parsed_by_row(path: Path, text: str, layout: _Layout) -> NDArray[np.float64
     next(rows)  # the header
     parsed: list[list[float]] = []
     columns = (layout.time, *layout.signals.values())
-    previous = -math.inf
+    previous, runs = math.nan, layout.runs
     for row, cells in rows:
         if len(cells) != layout.width:
             raise InputError(f"{path}, row {row}: expected {layout.width} cells as in the header, got {len(cells)}")
@@ -195,7 +247,8 @@ def _parsed_by_row(path: Path, text: str, layout: _Layout) -> NDArray[np.float64
                     f"{'' if column is layout.time else ' or nothing'}, got {cells[column.position]!r}"
                 )
         time = cast(float, values[0])
-        if not time > previous:  # which an empty cell is not either
+        same_run = runs is None or not parsed or runs[len(parsed)] == runs[len(parsed) - 1]
+        if math.isnan(time) or (time == previous and same_run):
             after = "" if not parsed else f" after {previous!r}, that of the row before"
             found = cells[layout.time.position]
             raise InputError(f"{path}, row {row}, column {layout.time.name!r}: expected a time{after}, got {found!r}")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import cannot_write, replacing
+from reactorwatch.records.output import check_folder_name
 
 
 def make_folder(folder: Path, option: str = "", *, may_exist: bool = True) -> Path:
@@ -22,8 +23,10 @@ def make_folder(folder: Path, option: str = "", *, may_exist: bool = True) -> Pa
         The folder.
 
     Raises:
-        InputError: it cannot be made.
+        InputError: it cannot be made, or has the name of a file.
     """
+    if option:
+        check_folder_name(folder, option)
     try:
         folder.mkdir(parents=True, exist_ok=may_exist)
     except OSError as error:

@@ -5,11 +5,15 @@ takes the place of regular files only, and a file that is there and is not of th
 replaced only with `--force`.
 """
 
+import re
 import stat
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from reactorwatch.errors import InputError
+
+_FILE_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,6}")
+"""A new folder has no such suffix: its name would be taken for that of a file of that kind."""
 
 _HEAD_BYTES = 65_536
 _PARTS = 4
@@ -44,6 +48,27 @@ def checked_output(path: Path, sources: Iterable[Path | None] = (), *, force: bo
     return path
 
 
+def check_folder_name(folder: Path, option: str) -> None:
+    """Check that a name is not that of a file.
+
+    Args:
+        folder: its path.
+        option: of the command line that names it.
+
+    Raises:
+        InputError: it is no folder, or does not exist and has the suffix of a file.
+    """
+    if folder.exists():
+        if not folder.is_dir():
+            kind = "a file" if folder.is_file() else "no folder"
+            raise InputError(f"{option} {folder}: is {kind}, the name of a folder was expected")
+    elif _FILE_SUFFIX.fullmatch(folder.suffix):
+        raise InputError(
+            f"{option} {folder}: no {folder.suffix} file is written, the name of a folder was expected; "
+            f"name it {folder.stem}"
+        )
+
+
 def checked_folder(
     folder: Path,
     names: Iterable[str] = (),
@@ -65,13 +90,11 @@ def checked_folder(
         The folder.
 
     Raises:
-        InputError: it is no folder, or as `checked_output` for one of the files.
+        InputError: it is no folder, its name is that of a file, or as `checked_output` for one of the files.
     """
+    check_folder_name(folder, option)
     if not folder.exists():
         return folder
-    if not folder.is_dir():
-        kind = "a file" if folder.is_file() else "no folder"
-        raise InputError(f"{option} {folder}: is {kind}, the name of a folder was expected")
     read = list(sources)
     for name in names:
         if (folder / name).parent.is_dir():

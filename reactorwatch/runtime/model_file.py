@@ -1,6 +1,7 @@
 """Extended models as files: what `diagnose` writes and `--model` takes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +25,20 @@ def read_extended_model(path: Path) -> ExtendedModel:
         raise InputError(f"model file {path}: {error}") from error
 
 
-def model_on_the_bus(path: str | None) -> ProcessModel | None:
+def model_on_the_bus(path: str | None, zero_ns: int = 0) -> ProcessModel | None:
     """The model in a file, its clock that of the samples: minutes since 1970-01-01 UTC. None if there is no file.
+
+    Args:
+        path: of the file.
+        zero_ns: the time that its minutes count from, where it does not say.
 
     Raises:
         InputError: as `read_extended_model`.
     """
-    return None if path is None else read_extended_model(Path(path)).counted_from(0).build()
+    if path is None:
+        return None
+    model = read_extended_model(Path(path))
+    return replace(model, zero_ns=model.zero_ns or zero_ns).counted_from(0).build()
 
 
 def write_extended_model(path: Path, written: dict[str, Any]) -> None:

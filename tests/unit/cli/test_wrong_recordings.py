@@ -85,7 +85,7 @@ def state(folder: Path) -> dict[Path, bytes]:
         ("cut good.mcap -o x", "must end in .mcap"),
         ("cut good.mcap -o good.mcap", "is one of the files that are read (good.mcap); name another file"),
         ("cut good.mcap --from 10 -o x.mcap", "--from must be a number with s, min or h, such as 10min, got '10'"),
-        ("cut good.mcap --from -5min -o x.mcap", "--from must be a number with s, min or h"),
+        ("cut good.mcap --from -5 -o x.mcap", "--from must be a number with s, min or h"),
         ("cut good.mcap --from 20min --to 10min -o x.mcap", "--from must be before --to, got 20min and 10min"),
         ("cut good.mcap --from 99999min -o x.mcap", "holds no sample of that time"),
         ("cut cut_off.mcap -o x.mcap", "`reactorwatch recover cut_off.mcap` saves what is whole in it"),

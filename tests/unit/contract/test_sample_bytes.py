@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
-from reactorwatch.contract.sample_bytes import sample_columns, unit_digest
+from reactorwatch.contract.sample_bytes import sample_columns, sample_number, unit_digest
 
 SAMPLES = st.builds(
     Sample,
@@ -61,3 +61,21 @@ def test_half_a_sample_is_left_to_protobuf() -> None:
 
 def test_another_message_is_no_plain_sample_unless_its_bytes_are_one() -> None:
     assert not sample_columns([Alarm(time_ns=1, alarm="ewma/T", text="x").SerializeToString()]).plain[0]
+
+
+@given(
+    time_ns=st.integers(-(2**63), 2**63 - 1),
+    sequence=st.integers(0, 2**64 - 1),
+    value=st.floats(),
+    quality=st.integers(0, 5),
+)
+def test_the_number_of_one_sample_is_read_from_its_bytes(
+    time_ns: int, sequence: int, value: float, quality: int
+) -> None:
+    sample = Sample(time_ns=time_ns, sequence=sequence, value=value, quality=quality, unit="K")
+    assert sample_number(sample.SerializeToString()) == sequence
+
+
+@given(st.binary(max_size=40))
+def test_any_other_bytes_have_a_number_or_none(data: bytes) -> None:
+    assert sample_number(data) >= 0

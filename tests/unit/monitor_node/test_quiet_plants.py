@@ -169,13 +169,18 @@ def out_of_range(run: list[Encoded], generator: np.random.Generator) -> list[Enc
     return run
 
 
+def before_zero(run: list[Encoded], generator: np.random.Generator) -> list[Encoded]:
+    """Time 0 is a row after the training."""
+    return moved(run, 0, -700 * ROW_NS)
+
+
 def sound(run: list[Encoded], generator: np.random.Generator) -> list[Encoded]:
     return run
 
 
 UPSETS = (
     *(sound, spikes, stuck, coarse, losses, gaps, repeats, disorder, bad, set_back, irregular),
-    *(two_of_a_name, damaged, paused, clock_set, hurried, out_of_range),
+    *(two_of_a_name, damaged, paused, clock_set, hurried, out_of_range, before_zero),
 )
 
 

@@ -8,17 +8,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from reactorwatch.cli.recording_reports import info_object
 from reactorwatch.errors import InputError
 from reactorwatch.records.csv_file import read_csv, write_csv
-from reactorwatch.records.record import Record
+from reactorwatch.records.record import Record, join_runs
 from recorder.convert import export_csv, import_csv
+from recorder.look import look_over
 from recorder.mcap_file import read_messages, read_metadata, read_record
 from tests.unit.records.test_csv_file import A_VALUE, assert_same
 
 
 @given(
     steps=st.lists(st.integers(1, 10**9), min_size=1, max_size=30),
-    start_us=st.integers(0, 10**12),
+    start_us=st.integers(-(10**12), 10**12),
     values=arrays(np.float64, (3, 30), elements=A_VALUE),
     zero_ns=st.sampled_from([0, 1_700_000_000_123_456_789]),
 )
@@ -26,20 +28,48 @@ from tests.unit.records.test_csv_file import A_VALUE, assert_same
 def test_import_and_then_export_give_the_identical_rows(
     tmp_path: Path, steps: list[int], start_us: int, values: np.ndarray, zero_ns: int
 ) -> None:
-    """Times in whole microseconds, as decimal minutes or as seconds over 60."""
-    times = (start_us + np.cumsum(steps)) / 60e6
-    columns = {signal: values[number, : times.size] for number, signal in enumerate(("qc", "C", "T"))}
-    record = Record(times, columns, "run.csv")
+    """Times in whole microseconds, as decimal minutes or as seconds over 60, before and after zero."""
+    columns = {signal: values[number, : len(steps)] for number, signal in enumerate(("qc", "C", "T"))}
+    record = Record((start_us + np.cumsum(steps)) / 60e6, columns, "run.csv")
+    assert_comes_back(tmp_path, record, zero_ns)
+
+
+@given(
+    rows=st.integers(2, 30),
+    period_us=st.integers(1, 10**9),
+    starts_us=st.lists(st.integers(-(10**12), 10**12), min_size=2, max_size=4),
+    values=arrays(np.float64, (3, 30), elements=st.floats(allow_infinity=False, allow_nan=False)),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=15)
+def test_the_runs_of_a_record_come_back_identical(
+    tmp_path: Path, rows: int, period_us: int, starts_us: list[int], values: np.ndarray
+) -> None:
+    """Each run starts anywhere: before the one before it, within it, or later."""
+    columns = {signal: values[number, :rows] for number, signal in enumerate(("qc", "C", "T"))}
+    times_us = period_us * np.arange(rows)
+    record = join_runs([Record((start + times_us) / 60e6, columns, "run.csv") for start in starts_us])
+    assert_comes_back(tmp_path, record, 0)
+
+
+def assert_comes_back(tmp_path: Path, record: Record, zero_ns: int) -> None:
+    """A record is the same after import and export, and the recording between them holds nothing but its rows."""
     write_csv(tmp_path / "run.csv", record)
-    assert import_csv(tmp_path / "run.csv", tmp_path / "run.mcap", "cstr", zero_ns=zero_ns) == record.rows
-    assert export_csv(tmp_path / "run.mcap", tmp_path / "again.csv") == record.rows
+    assert import_csv(tmp_path / "run.csv", tmp_path / "run.mcap", "cstr", zero_ns=zero_ns).rows == record.rows
+    assert export_csv(tmp_path / "run.mcap", tmp_path / "again.csv").rows == record.rows
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "run.csv").read_bytes()
     assert_same(read_record(tmp_path / "run.mcap"), read_csv(tmp_path / "run.csv"))
+    entries = list(read_messages(tmp_path / "run.mcap"))
+    assert all(entry.publish_time_ns >= 0 for entry in entries)
+    assert [entry.log_time_ns for entry in entries] == sorted(entry.log_time_ns for entry in entries)
+    seen = look_over(tmp_path / "run.mcap")
+    assert seen.overview.lost == seen.overview.duplicated == 0
+    assert seen.overview.out_of_place == 0
+    assert len(seen.overview.runs["cstr"]) == len(record.run_starts)
 
 
 def test_the_measured_record_comes_back_identical(tmp_path: Path, daisy_csv: Path) -> None:
-    rows = import_csv(daisy_csv, tmp_path / "daisy.mcap", "cstr")
-    assert rows == export_csv(tmp_path / "daisy.mcap", tmp_path / "daisy.csv", "cstr") == 7500
+    rows = import_csv(daisy_csv, tmp_path / "daisy.mcap", "cstr").rows
+    assert rows == export_csv(tmp_path / "daisy.mcap", tmp_path / "daisy.csv", "cstr").rows == 7500
     assert_same(read_csv(tmp_path / "daisy.csv"), read_csv(daisy_csv))
 
 
@@ -56,14 +86,22 @@ def test_an_imported_record_is_a_recording_received_when_it_was_measured(tmp_pat
     assert (metadata["plant"], metadata["source"], metadata["zero_ns"]) == ("site", "run.csv", "1000")
 
 
+def test_a_recording_of_negative_minutes_holds_shifted_times_and_their_zero_and_no_clock(tmp_path: Path) -> None:
+    csv, mcap = tmp_path / "run.csv", tmp_path / "run.mcap"
+    csv.write_text("time_min,qc,C,T\n-1500,1,2,3\n0,4,5,6\n")
+    import_csv(csv, mcap, "cstr")
+    assert read_metadata(mcap)["zero_ns"] == str(2880 * 60 * 10**9)  # two days
+    record = read_record(mcap)
+    assert (record.time_min.tolist(), record.zero, record.zero_ns) == ([-1500.0, 0.0], None, 0)
+    seen = info_object(look_over(mcap), mcap)
+    assert (seen["from_min"], seen["to_min"], seen["zero"]) == (-1500.0, 0.0, None)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("time_min,qc,C,T\n0,1,2,3\n1,x,2,3\n", "row 3, column 'qc'"),
-        (
-            "time_min,qc,C,T\n-1,1,2,3\n1,1,2,3\n",
-            "times must lie between 1970 and 2262 to be recorded, got -60000000000 ns",
-        ),
+        ("time_min,qc,C,T\n-1e12,1,2,3\n0,1,2,3\n", "expected a time within 146 years of its zero"),
         ("time_min,qc,C,T\n0,1,2,3\n1e12,1,2,3\n", "expected a time within 146 years of its zero"),
         ("time_s,qc,C,T\n0,1,2,3\n1e-9,1,2,3\n", "at least 1 microsecond apart to be recorded, got 0.0 and"),
     ],
@@ -88,5 +126,5 @@ def test_an_older_recording_is_replaced(tmp_path: Path) -> None:
     csv, mcap = tmp_path / "run.csv", tmp_path / "run.mcap"
     csv.write_text("time_min,qc,C,T\n0,1,2,3\n")
     mcap.write_text("old")
-    assert import_csv(csv, mcap, "cstr") == 1
+    assert import_csv(csv, mcap, "cstr").rows == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["run.csv", "run.mcap"]

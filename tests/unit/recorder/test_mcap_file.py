@@ -30,8 +30,12 @@ def recorded(path: Path, entries: list[Entry], every: int = 0) -> Path:
     return path
 
 
+MINUTE = 60_000_000_000
+
+
 def sample(time_ns: int, value: float = 1.0, signal: str = "T", plant: str = "cstr", received_ns: int = 0) -> Entry:
-    message = messages.Sample(time_ns=time_ns, value=value, quality=messages.QUALITY_GOOD)
+    """A sample of a plant that samples once a minute and counts as it should."""
+    message = messages.Sample(time_ns=time_ns, sequence=time_ns // MINUTE, value=value, quality=messages.QUALITY_GOOD)
     encoded = encode(Publication(keys.key(plant, keys.SAMPLE, signal), message))
     return Entry(encoded.key, encoded.payload, encoded.encoding, received_ns or time_ns, time_ns)
 
@@ -192,8 +196,8 @@ def test_a_record_holds_the_samples_by_time(tmp_path: Path) -> None:
 
 
 def test_a_record_has_nan_where_a_signal_was_not_measured(tmp_path: Path) -> None:
-    minute = 60_000_000_000
-    bad = messages.Sample(time_ns=3 * minute, value=7.0, quality=messages.QUALITY_BAD)
+    minute = MINUTE
+    bad = messages.Sample(time_ns=3 * minute, sequence=3, value=7.0, quality=messages.QUALITY_BAD)
     encoded = encode(Publication("reactor/cstr/sample/T", bad))
     entries = [
         sample(2 * minute, 20.0, received_ns=1),
@@ -224,3 +228,20 @@ def test_a_record_is_of_one_plant(tmp_path: Path) -> None:
         read_record(recorded(tmp_path / "empty.mcap", []))
     with pytest.raises(InputError, match="holds no samples of qc, C, T of plant 'cstr'"):
         read_record(recorded(tmp_path / "level.mcap", [sample(1, signal="level")]))
+
+
+def test_the_file_s_sequence_numbers_are_those_of_the_samples(tmp_path: Path) -> None:
+    """Read by the bare MCAP library; what is no sample has none, and neither has what cannot be read."""
+    late = messages.Sample(time_ns=1, sequence=2**32 + 7, quality=messages.QUALITY_GOOD)
+    encoded = encode(Publication("reactor/cstr/sample/T", late))
+    entries = [*golden.entries(), Entry(*encoded[:3], 2**62, 1)]
+    path = recorded(tmp_path / "run.mcap", entries)
+    with path.open("rb") as stream:
+        found = [(channel.topic, message.sequence) for _, channel, message in make_reader(stream).iter_messages()]
+    expected = [
+        (entry.key, body.sequence % 2**32 if isinstance(body, messages.Sample) else 0)
+        for entry in entries
+        for body in [decode(entry.payload, entry.encoding)]
+    ]
+    assert found == expected
+    assert len({number for topic, number in found if topic.endswith("sample/T")}) > golden.ROWS - 1

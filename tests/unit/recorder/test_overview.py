@@ -3,11 +3,12 @@
 from collections import Counter
 from pathlib import Path
 
+from reactorwatch.cli.recording_reports import info_object
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
 from recorder.entry import Entry
-from recorder.look import look_over, zero_ns_of
+from recorder.look import Look, look_over, zero_ns_of
 from recorder.mcap_file import RecordingWriter
 from recorder.overview import Gap, overview
 from tests.unit.recorder import golden
@@ -42,7 +43,7 @@ def test_counts_and_times_are_those_of_the_entries() -> None:
     seen = overview(entries)
     assert {key: topic.count for key, topic in seen.topics.items()} == Counter(entry.key for entry in entries)
     assert (seen.first_ns, seen.last_ns) == (entries[0].log_time_ns, entries[-1].log_time_ns)
-    assert (seen.first_sample_ns, seen.last_sample_ns) == (golden.time_ns(0), golden.time_ns(golden.ROWS - 1))
+    assert seen.sample_span_ns == (golden.time_ns(0), golden.time_ns(golden.ROWS - 1))
     assert (seen.messages, seen.lost, seen.gaps) == (len(entries), 0, [])
 
 
@@ -98,3 +99,15 @@ def test_a_file_that_is_cut_off_is_looked_over_as_far_as_it_goes(tmp_path: Path)
     cut_off = look_over(path)
     assert cut_off.overview.messages == 1000
     assert cut_off.damages == (f"cut off at byte {half}",)
+
+
+def test_a_sample_at_time_0_is_a_sample() -> None:
+    """Alone, or among others before and after it."""
+    at = [messages.Sample(time_ns=time_ns, sequence=n, quality=1) for n, time_ns in enumerate((-SECOND, 0, SECOND))]
+    entries = [entry(KEY, item, 1) for item in at]
+    assert overview(entries[1:2]).sample_span_ns == (0, 0)
+    assert overview(entries).sample_span_ns == (-SECOND, SECOND)
+    assert overview([]).sample_span_ns is None
+    said = info_object(Look(overview(entries[1:2]), {"zero_ns": "0"}, 0, ()), Path("x.mcap"))
+    assert (said["from_min"], said["to_min"], said["zero"]) == (0.0, 0.0, None)
+    assert info_object(Look(overview([]), {}, 0, ()), Path("x.mcap"))["from_min"] is None

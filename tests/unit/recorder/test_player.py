@@ -18,9 +18,10 @@ SECOND = 10**9
 
 
 def at(*seconds: float) -> Callable[[], Iterator[Publication]]:
-    """A tape with a message at each of these times."""
+    """A tape with a message at each of these times, of a plant that counts ten samples a second."""
     return lambda: (
-        Publication("reactor/x/sample/T", messages.Sample(time_ns=round(second * SECOND))) for second in seconds
+        Publication("reactor/x/sample/T", messages.Sample(time_ns=round(second * SECOND), sequence=round(second * 10)))
+        for second in seconds
     )
 
 

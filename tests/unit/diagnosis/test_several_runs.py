@@ -1,0 +1,90 @@
+"""A record of several runs is diagnosed as such: each starts from a state of its own, times are those of its run."""
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from diagnosis.diagnose import diagnose
+from diagnosis.held_out import OBSERVED_ROWS, held_out_rows
+from diagnosis.record_checks import run_of
+from diagnosis.report.machine import as_object
+from diagnosis.report.plain import as_text
+from reactorwatch.errors import InputError
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.extended_model import parse_extended_model
+from reactorwatch.records.record import Record, join_runs
+from tests.unit.diagnosis.runs import record_of
+
+ROWS, FIRST = 1600, 900
+ONSET_MIN = 120.0
+CATALOGUE = [CoolantFlow()]
+
+
+@pytest.fixture(scope="module")
+def sound() -> Record:
+    return record_of(seed=3, rows=ROWS)
+
+
+@pytest.fixture(scope="module")
+def leaking() -> Record:
+    return record_of(f"coolant_flow:step:-0.1@{ONSET_MIN}min", seed=3, rows=ROWS)
+
+
+def set_back(record: Record, by_min: float) -> Record:
+    """The record with its clock set back within it."""
+    times = record.time_min - np.where(np.arange(record.rows) < FIRST, 0.0, by_min)
+    return replace(record, time_min=times, runs=1 + (np.arange(record.rows) >= FIRST))
+
+
+def sessions(*seeds: int, start_min: float = 0.0) -> Record:
+    """A plant that was started several times, each from its rest."""
+    parts = [record_of(seed=seed, rows=700) for seed in seeds]
+    return join_runs([replace(part, time_min=part.time_min + start_min * n) for n, part in enumerate(parts)])
+
+
+@pytest.mark.parametrize("by_min", [0.05, 60.0, 60.05, 2000.0])
+def test_a_sound_plant_whose_clock_was_set_back_is_sound(sound: Record, by_min: float) -> None:
+    found = diagnose(set_back(sound, by_min), cstr(), CATALOGUE)
+    assert (found.verdict, found.practical, found.runs, found.samples) == ("nominal", False, 2, ROWS)
+
+
+@pytest.mark.parametrize("start_min", [-10.0, 40.0, 1000.0])
+def test_a_plant_that_was_started_again_is_sound(start_min: float) -> None:
+    found = diagnose(sessions(1, 2, start_min=start_min), cstr(), CATALOGUE)
+    assert (found.verdict, found.practical) == ("nominal", False)
+    assert found.span_min == pytest.approx(2 * 69.9)
+
+
+@pytest.mark.parametrize("by_min", [60.0, 60.05])
+def test_a_fault_is_found_at_the_minute_that_the_clock_showed(leaking: Record, by_min: float) -> None:
+    record = set_back(leaking, by_min)
+    found = diagnose(record, cstr(), CATALOGUE)
+    said = as_object(found, "run.csv", 1.0)
+    (cause,) = said["causes"]
+    assert (cause["cause"], cause["run"], said["runs"]) == ("coolant_flow", 2, 2)
+    assert cause["parameters"]["onset"]["value"] == pytest.approx(ONSET_MIN - by_min, abs=0.1)
+    extended = parse_extended_model(msgspec.json.encode(found.extended_model))
+    assert extended.effects[0].values["onset"] == cause["parameters"]["onset"]["value"]
+    text = as_text(found, "run.csv", CATALOGUE)
+    assert "of run 2" in text
+    assert "2 runs" in text
+
+
+def test_nothing_is_judged_where_the_free_run_is_still_looking_for_the_state() -> None:
+    record = sessions(1, 2)
+    run = run_of(record, cstr())
+    assert run.starts == (700,)
+    assert 700 in run.breaks
+    held_out = held_out_rows(run)
+    assert not held_out[700 : 700 + OBSERVED_ROWS].any()
+    assert held_out[700:].any()
+
+
+def test_an_input_is_not_carried_over_from_one_run_to_the_next() -> None:
+    record = sessions(1, 2)
+    record.columns["qc"][700] = np.nan
+    with pytest.raises(InputError, match="qc must be there in the first row of each run"):
+        run_of(record, cstr())
