@@ -225,12 +225,20 @@ def test_a_recording_of_a_plant_with_an_impossible_name_is_watched_under_no_name
 
 
 @pytest.mark.parametrize("there", [False, True])
-@pytest.mark.parametrize("fails", ["as_page", "with_differences", "write_extended_model", "write_drawing"])
+@pytest.mark.parametrize(
+    "fails",
+    [
+        "diagnosis.report.page.as_page",
+        "reactorwatch.cli.diagnosis.with_differences",
+        "reactorwatch.cli.diagnosis.write_extended_model",
+        "reactorwatch.cli.diagnosis_drawing.write_drawing",
+    ],
+)
 def test_a_report_that_cannot_be_made_leaves_no_half_of_it(
     folder: Path, fails: str, there: bool, monkeypatch: Patch, capsys: Shown
 ) -> None:
     monkeypatch.setattr(diagnosis, "diagnose", lambda *_: CASES["ambiguous"])
-    monkeypatch.setattr(diagnosis, fails, crashing)
+    monkeypatch.setattr(fails, crashing)
     if there:
         (folder / "report").mkdir()
         (folder / "report" / "report.json").write_text("{}")
