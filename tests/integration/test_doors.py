@@ -7,6 +7,7 @@ sent before has come through: a session that leaves has a question answered by t
 import json
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -163,6 +164,47 @@ def test_a_message_on_many_keys_at_once_is_taken_by_no_subscriber(
     assert heard == [b"measured"]
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "must be on one key" in line]
     assert "reactor/cstr/sample/*" in line
+
+
+def test_a_recorder_that_forges_the_monitor_s_source_suppresses_none_of_its_alarms_for_long(
+    site: Site, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh's subscriber drops them; publishers are asked for the last they have published, past it."""
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.LAST_AGAIN_S", 0.5)
+    key, changed = "reactor/cstr/alarm/ewma/T", threading.Condition()
+    heard: list[bytes] = []
+    sources: list[zenoh.SourceInfo] = []
+
+    def hear(message: Encoded) -> None:
+        with changed:
+            heard.append(message.payload)
+            changed.notify_all()
+
+    def note(sample: zenoh.Sample) -> None:
+        with changed:
+            if sample.source_info is not None:
+                sources.append(sample.source_info)
+            changed.notify_all()
+
+    def wait_for(is_so: Callable[[], bool]) -> None:
+        with changed:
+            assert changed.wait_for(is_so, WITHIN_S), (heard, sources)
+
+    viewer, monitor, recorder = (site.join(f"cstr/{who}") for who in ("viewer", "monitor", "recorder"))
+    viewer.subscribe("reactor/cstr/alarm/**", hear)
+    spy = recorder._session.declare_subscriber("reactor/cstr/alarm/**", note)
+    monitor.publish(Encoded(key, b"0", ""))
+    wait_for(lambda: bool(sources) and bool(heard))
+    source = sources[0]
+    for ahead in range(1, 51):
+        forged = zenoh.SourceInfo(source.source_id, source.source_sn + ahead)
+        recorder._session.put("reactor/cstr/alarm/recording/zz", b"forged", source_info=forged)
+    wait_for(lambda: heard.count(b"forged") == 50)
+    for number in range(1, 6):
+        monitor.publish(Encoded(key, b"%d" % number, ""))
+    wait_for(lambda: len(heard) == 56)
+    spy.undeclare()
+    assert [payload for payload in heard if payload != b"forged"] == [b"%d" % number for number in range(6)]
 
 
 @pytest.mark.parametrize("who", ["cstr/engineer", "cstr/monitor", "other/plant"])

@@ -52,6 +52,13 @@ MOST_GATHERED_BYTES = 1 << 20
 
 HISTORY_WITHIN_S = 10.0
 LONGEST_WAY_S = 5.0  # that a message takes to us; what is missing was published so much before what came instead of it
+LAST_AGAIN_S = 20.0
+"""On a bus with certificates: between two questions for the last number on each key.
+
+Zenoh's subscriber numbers messages by their source, which it reads from the message. A client that forges the source of
+another role's publisher, on keys of its own, makes it drop what that one publishes next, and nothing shows that. What
+publishers remember is told past that subscriber, and says what is missing.
+"""
 MOST_ASKED = 4  # times for what was before; what was published while the answers came may be missing
 
 
@@ -119,6 +126,7 @@ class ZenohBus:
         self._deliveries: list[Delivery] = []
         self._wild = 0  # messages on many keys at once
         self._wild_logged_at: float | None = None
+        self._closed = threading.Event()
 
     def publish(self, message: Encoded) -> None:
         """See `Bus`."""
@@ -254,7 +262,16 @@ class ZenohBus:
             return None
         delivery = Delivery(handler, on_gap or _say_gap, self._asked_again)
         self._deliveries.append(delivery)
+        if self._config.ca is not None:
+            arguments = (delivery, key_expression)
+            threading.Thread(target=self._ask_for_last, args=arguments, name="last numbers", daemon=True).start()
         return delivery
+
+    def _ask_for_last(self, delivery: Delivery, key_expression: str) -> None:
+        """See `LAST_AGAIN_S`; ends with the bus."""
+        while not self._closed.wait(LAST_AGAIN_S):
+            with contextlib.suppress(zenoh.ZError):  # it is being closed
+                delivery.receive(self._remembered(key_expression, "_max=1").messages)
 
     def _listen(self, key_expression: str, handler: Any) -> Any:
         """Subscribe, with a callback or a channel."""
@@ -416,6 +433,7 @@ class ZenohBus:
         second nor under load), but it promises nothing; this does, for one round trip. What was thrown away on a full
         network is told once more by then, and can be asked for as long as this bus is open.
         """
+        self._closed.set()
         if self._published_at is not None:
             time.sleep(max(0.0, self._published_at + LAST_RECOVERY_S - time.monotonic()))
         for _ in self._voice.get(NOBODY, timeout=FLUSH_WITHIN_S):
