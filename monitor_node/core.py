@@ -355,7 +355,7 @@ class Monitor:
 
     @property
     def reference(self) -> str:
-        """What rows are judged by: `equations` or `arx`; empty before they are."""
+        """The kind of reference that judges rows: `equations` or `arx`; empty before there is one."""
         return self._watch.reference
 
     @property

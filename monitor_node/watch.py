@@ -167,7 +167,7 @@ class PlantWatch:
 
     @property
     def reference(self) -> str:
-        """What rows are judged by: `equations` or `arx`; empty before they are."""
+        """The kind of reference that judges rows: `equations` or `arx`; empty before there is one."""
         return "" if self._reference is None else self._reference.kind
 
     @property

@@ -27,8 +27,9 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         rotate_min: age of a file, in minutes, at which a new one is begun; inf: never.
         rotate_mb: its size, likewise.
         keep_mb: size of all files together beyond which the oldest is deleted; inf: never.
-        keep_days: age of a file, since its end, likewise; only days in which the machine ran count.
-        keep_files: how many there may be, likewise.
+        keep_days: age of a file since its end, in days in which the machine ran, beyond which it is deleted; inf:
+            never.
+        keep_files: number of files beyond which the oldest is deleted; inf: never.
         most_keys: keys with messages of the product that a file has room for; a thousand take about 1.5 MB of
             memory. Messages on more keys are not recorded; the alarm `recording/keys` says so.
         black_box_min: minutes before and after each alarm that are kept in a file of their own, which is never

@@ -69,7 +69,7 @@ def fingerprint(key: str, payload: bytes) -> int:
 
 @lru_cache(maxsize=MOST_CHECKS)
 def is_key(key: str) -> bool:
-    """Whether a key is a key of the product."""
+    """True for a key of the product."""
     return keys.parse(key) is not None
 
 
@@ -175,7 +175,7 @@ class Recorder:
         self._refused["too many keys"] += 1
         self._no_room_ns = now_ns
         key = kept.entry.key[:LONGEST_QUOTE]
-        kind = "with messages of ours" if kept.channel.is_of_product else "with other messages"
+        kind = "of this software" if kept.channel.is_of_product else "of other programs"
         if self._logged_ns is None or now_ns - self._logged_ns >= LOG_AGAIN_NS:
             self._logged_ns = now_ns
             log.warning("not recorded: too many keys", example=key, keys=kind, messages=self._refused["too many keys"])

@@ -263,7 +263,7 @@ class RecordingFiles:
         return [path for path in self._series.folder.iterdir() if self._series.owns(path.name) and path.is_file()]
 
     def _kept_for_a_time(self) -> list[Path]:
-        """What the limits are of: recordings, and remains from which not all could be recovered."""
+        """The files that the limits are of: recordings, and remains from which not all could be recovered."""
         return [*self._finished(), *damaged(self._series)]
 
     def _black_box(self, stretch: Stretch) -> None:

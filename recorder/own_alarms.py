@@ -52,7 +52,7 @@ class OwnAlarms:
         return list(self._now.values())
 
     def is_active(self, name: str) -> bool:
-        """Whether an alarm is raised and has not cleared."""
+        """True while an alarm is raised and has not cleared."""
         return self._now[name].state in _ACTIVE
 
     def raise_alarm(self, name: str, text: str, now_ns: int) -> Publication:

@@ -100,7 +100,7 @@ class PartFile:
 
     @property
     def _is_deleted(self) -> bool:
-        """Whether the file has lost its name, or another file has it."""
+        """True if the file has lost its name, or another file has it."""
         try:
             return not os.path.samestat(os.fstat(self._raw.fileno()), self.path.stat())
         except (FileNotFoundError, NotADirectoryError):

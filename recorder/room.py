@@ -81,11 +81,11 @@ class Room:
         return True
 
     def has(self, channel: Channel) -> bool:
-        """Whether messages of a channel have their room in the file."""
+        """True if messages of a channel have room in the file."""
         return channel in self._received_ns or channel in self._others
 
     def needs_new_file(self, channel: Channel, now_ns: int) -> bool:
-        """Whether a message has no room in this file, and would have room in the next one."""
+        """True if a message has no room in this file, and would have room in the next one."""
         if not channel.is_of_product or channel in self._received_ns or not self._is_full:
             return False
         if 0 <= self._look_at_ns - now_ns <= LOOK_AGAIN_NS:

@@ -90,7 +90,7 @@ class FaultChange(NamedTuple):
 
 
 ADAPTS, HELD, JUDGES, EQUATIONS = "adapts", "held", "judges", "equations"
-"""What a model is for: it adapts; it is held since the training and compared with that one; rows are judged by it; or
+"""Purposes of a model: it adapts; it is held since the training and compared with that one; rows are judged by it; or
 rows are judged by equations, whose noise levels are its parameters."""
 
 
@@ -161,7 +161,7 @@ class Run:
         alarms: in order of time.
         faults: in order of time.
         reconstructed: by signal.
-        models: snapshots in order of time, by the signal and what the model is for, such as `ADAPTS`.
+        models: snapshots in order of time, by the signal and the purpose of the model, such as `ADAPTS`.
         health: reports in order of time, by node.
         seen: of each signal, up to the end of the stretch.
         earlier: what was before it.

@@ -156,7 +156,7 @@ class RunReader:
 
     @property
     def has_samples(self) -> bool:
-        """Whether there has been a sample, before the last cut or since."""
+        """True once there was a sample, before the last cut or since."""
         return self._newest_ns is not None
 
     def cut(self) -> Run:
@@ -238,7 +238,7 @@ def _last_of_each_time(items: list[_Dated]) -> tuple[_Dated, ...]:
 
 
 def _use(message: messages.ModelSnapshot) -> str:
-    """What a model is for."""
+    """The purpose of a model."""
     if message.structure == EQUATIONS:
         return EQUATIONS
     if message.reference:

@@ -90,7 +90,7 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
 
 
 def _judged_by(result: Backtest) -> str:
-    """What judged the rows, and by which noise."""
+    """The line that names the reference and its noise levels."""
     if result.noise_levels is None:
         return "judged by identified models (ARX)"
     levels = (f"{name} {sd:.3g}" for name, sd in result.noise_levels["sensors"].items())

@@ -179,7 +179,7 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
 
 
 def key_space_of_others(role: Role) -> tuple[str, ...]:
-    """What other roles alone may publish among the keys that a role's own expressions name.
+    """Key expressions of other roles that lie within a role's own expressions; no other role may publish there.
 
     >>> [key_space_of_others(role) for role in ROLES if role.name == "monitor"]
     [('alarm/recording/**',)]

@@ -21,7 +21,7 @@ COMMANDS = ("list_alarms", keys.LIST_RECORDER_ALARMS)
 
 
 class Past(NamedTuple):
-    """What there was before.
+    """Alarms and zero of a run before a viewer joined it.
 
     Attributes:
         alarms: messages of the changes that led to the alarms' present state.

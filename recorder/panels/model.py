@@ -13,7 +13,7 @@ from recorder.run import ADAPTS, EQUATIONS, HELD, JUDGES, Run, Snapshot
 
 _KINDS = {"a": "of its own past", "b": "of the input", "c": "offset"}
 _HELD = {JUDGES: "judged by", HELD: "held since the training"}
-"""How the lines of a model that does not adapt are named."""
+"""Names of the lines of models that do not adapt."""
 
 
 def draw(run: Run) -> tuple[TimePlot, ...]:

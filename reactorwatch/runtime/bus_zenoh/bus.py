@@ -56,8 +56,8 @@ LAST_AGAIN_S = 20.0
 """On a bus with certificates: between two questions for the last number on each key.
 
 Zenoh's subscriber numbers messages by their source, which it reads from the message. A client that forges the source of
-another role's publisher, on keys of its own, makes it drop what that one publishes next, and nothing shows that. What
-publishers remember is told past that subscriber, and says what is missing.
+another role's publisher, on keys of its own, makes it drop what that publisher sends next, without a sign of it. The
+answers of publishers do not pass that subscriber, and show what is missing.
 """
 MOST_ASKED = 4  # times for what was before; what was published while the answers came may be missing
 

@@ -50,7 +50,7 @@ def test_10_000_stray_keys_take_no_room_from_messages_of_the_product(tmp_path: P
     hear(fed, (sample(f"p{number}") for number in range(100)))
     (raised,) = fed.alarms()
     assert (raised.alarm, raised.event) == (KEYS_ALARM, "raised")
-    assert "with other messages" in raised.text
+    assert "for more keys of other programs" in raised.text
     fed.pass_time(120 * SECOND)
     assert fed.alarms()[-1].event == "cleared"
     fed.stop()
@@ -65,7 +65,7 @@ def test_messages_of_the_product_beyond_the_room_raise_the_alarm_and_those_that_
         fed.pass_time(SECOND)
     (raised,) = fed.alarms()
     hear(fed, [encode(Publication(f"reactor/cstr/alarm/{KEYS_ALARM}", raised))])
-    assert "with messages of ours" in raised.text
+    assert "for more keys of this software" in raised.text
     assert "'reactor/p100/sample/T'" in raised.text
     fed.stop()
     files = recordings_in(tmp_path)
