@@ -34,6 +34,7 @@ from diagnosis.search import Explained, Found, Search
 from diagnosis.sensor_noise import sensor_noise
 from diagnosis.uncertain import with_uncertain
 from diagnosis.unknown import MARGIN, Located, bic_of, located
+from diagnosis.wandering import Noise
 from reactorwatch.process import effects_of
 from reactorwatch.process.effects.base import TIMING, Effect
 from reactorwatch.process.model import Array, ProcessModel
@@ -143,7 +144,7 @@ def diagnose(
         span_min=record.span_min,
         verdict=verdict,
         causes=causes,
-        alternatives=tuple(Alternative(item.key, item.bic - best.bic) for item in rivals),
+        alternatives=tuple(_alternative(search, item, found.noise, best.bic, record) for item in rivals),
         location=location,
         significant=verdict != NOMINAL,
         practical=unexplained or matters(curves, bands, run.starts),
@@ -230,6 +231,12 @@ def _noise_sd(found: Found, run: Run, model: ProcessModel, curves: Curves, verdi
     simulated = np.column_stack([curves.free_before[name] for name in model.output_names])
     period_min = float(np.median(np.diff(run.time_min)))
     return sensor_noise(found.noise, model.output_names, run.measured - simulated, run.measured, period_min)
+
+
+def _alternative(search: Search, item: Explained, noise: Noise, best_bic: float, record: Record) -> Alternative:
+    item.hypothesis.sized.noise = noise
+    explained, covariances = with_rough_numbers(search, item)
+    return Alternative(in_minutes_of_runs(causes_of(explained, covariances), record), item.bic - best_bic)
 
 
 def _gain(model: ProcessModel, delta_bic: float, noise_sd: Array, before: Errors, after: Errors) -> Gain:

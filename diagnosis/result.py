@@ -75,12 +75,17 @@ class Alternative:
     """Another explanation.
 
     Attributes:
-        causes: (cause, profile) of each of its causes.
+        explanation: its causes.
         delta_bic: by how much it is worse than the one that is named.
     """
 
-    causes: tuple[tuple[str, str], ...]
+    explanation: tuple[Cause, ...]
     delta_bic: float
+
+    @property
+    def causes(self) -> tuple[tuple[str, str], ...]:
+        """(cause, profile) of each of its causes."""
+        return tuple((item.cause, item.profile) for item in self.explanation)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from math import isfinite
 from typing import Any
 
 from diagnosis.difference import Difference
-from diagnosis.result import Diagnosis, Estimate, Experiment, HeldOut
+from diagnosis.result import Cause, Diagnosis, Estimate, Experiment, HeldOut
 
 
 def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None = None) -> dict[str, Any]:
@@ -25,20 +25,10 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None 
         "span_min": _number(diagnosis.span_min),
         "seconds": _number(round(seconds, 3)),
         "verdict": diagnosis.verdict,
-        "causes": [
-            {
-                "cause": cause.cause,
-                "profile": cause.profile,
-                "label": cause.label,
-                "location": cause.location,
-                **({"run": cause.run} if diagnosis.runs > 1 else {}),
-                "parameters": {name: _estimate(item) for name, item in cause.parameters.items()},
-            }
-            for cause in diagnosis.causes
-        ],
+        "causes": [_cause(cause, diagnosis.runs) for cause in diagnosis.causes],
         "alternatives": [
             {
-                "causes": [{"cause": cause, "profile": profile} for cause, profile in item.causes],
+                "causes": [_cause(cause, diagnosis.runs) for cause in item.explanation],
                 "delta_bic": _number(item.delta_bic),
             }
             for item in diagnosis.alternatives
@@ -54,6 +44,17 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None 
         "experiment": None if experiment is None else _experiment(experiment),
         "extended_model": diagnosis.extended_model,
         **({"parameters": _parameters(diagnosis)} if diagnosis.parameters else {}),
+    }
+
+
+def _cause(cause: Cause, runs: int) -> dict[str, Any]:
+    return {
+        "cause": cause.cause,
+        "profile": cause.profile,
+        "label": cause.label,
+        "location": cause.location,
+        **({"run": cause.run} if runs > 1 else {}),
+        "parameters": {name: _estimate(item) for name, item in cause.parameters.items()},
     }
 
 

@@ -23,7 +23,7 @@ from diagnosis.report.words import (
     when,
     with_interval,
 )
-from diagnosis.result import NOMINAL, Cause, Diagnosis, Experiment
+from diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES
@@ -48,6 +48,14 @@ class _CauseSaid:
     symbol: str
     course: str
     parameters: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class _RivalSaid:
+    label: str
+    place: str
+    size: str
+    when: str
 
 
 def as_page(
@@ -82,7 +90,10 @@ def as_page(
         file=file,
         verdict=verdict(diagnosis, effects),
         place=place(diagnosis) if diagnosis.verdict != NOMINAL else "",
-        causes=[_said(diagnosis, cause, item.symbol) for cause, item in zip(diagnosis.causes, meant, strict=True)],
+        causes=[
+            _said(diagnosis, effects, cause, item.symbol) for cause, item in zip(diagnosis.causes, meant, strict=True)
+        ],
+        rivals=_rivals(diagnosis, effects) if diagnosis.verdict == AMBIGUOUS else [],
         parameters=[(name, adjusted_said(item)) for name, item in diagnosis.parameters.items()],
         meanings=meant,
         equations=balances(model, found),
@@ -104,19 +115,33 @@ def as_page(
     )
 
 
-def _said(diagnosis: Diagnosis, cause: Cause, symbol: str) -> _CauseSaid:
+def _rivals(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[list[_RivalSaid], str]]:
+    """All explanations that the record does not tell apart, and by how much each is worse than the first."""
+    explanations = [(diagnosis.causes, 0.0), *((item.explanation, item.delta_bic) for item in diagnosis.alternatives)]
+    return [
+        (
+            [_RivalSaid(item.label, place_of(item.location), size_said(item, effects), when(item)) for item in causes],
+            f"{worse:.1f}",
+        )
+        for causes, worse in explanations
+    ]
+
+
+def _said(diagnosis: Diagnosis, effects: Sequence[Effect], cause: Cause, symbol: str) -> _CauseSaid:
     profile = next((item for item in PROFILES if item.name == cause.profile), None)
     return _CauseSaid(
         cause.cause,
         cause.profile,
         cause.label,
         place_of(cause.location),
-        size_said(cause),
+        size_said(cause, effects),
         when(cause, diagnosis.curves),
         symbol,
         cause.profile if profile is None else profile.meaning,
         tuple(
-            (name.replace("_", " "), with_interval(item))
+            (name.replace("_", " "), f"{size_said(cause, effects)}; m = {with_interval(item)}")
+            if name == "size"
+            else (name.replace("_", " "), with_interval(item))
             for name, item in cause.parameters.items()
             if cause.profile != FREE_NAME or name == "size"  # a curve is better seen than read
         ),

@@ -4,14 +4,14 @@ from collections.abc import Sequence
 
 from diagnosis.report.words import (
     adjusted_said,
-    causes_said,
     difference_said,
     error_left,
+    explanation_said,
     size_said,
     verdict,
     when,
 )
-from diagnosis.result import NOMINAL, Diagnosis
+from diagnosis.result import AMBIGUOUS, NOMINAL, Diagnosis
 from reactorwatch.process.effects.base import Effect
 
 INDENT = 14
@@ -29,10 +29,14 @@ def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
         f"{file}: {diagnosis.samples} rows over {diagnosis.span_min:g} min",
         verdict(diagnosis, effects),
     ]
-    for cause in diagnosis.causes:
+    ambiguous = diagnosis.verdict == AMBIGUOUS
+    if ambiguous:
+        lines += [_line("either", f"{explanation_said(diagnosis.causes, effects)}  (95 %)")]
+        lines += _rivals(diagnosis, effects) + _experiment(diagnosis)
+    for cause in () if ambiguous else diagnosis.causes:
         lines += [
             _line("cause", f"{cause.label} ({cause.cause}, {cause.profile})"),
-            _line("size", f"{size_said(cause)}  (95 %)"),
+            _line("size", f"{size_said(cause, effects)}  (95 %)"),
             _line("when", when(cause, diagnosis.curves)),
         ]
     if diagnosis.verdict != NOMINAL:
@@ -42,14 +46,23 @@ def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
         lines.append(_line("parameter", f"{name} {adjusted_said(known)}  (95 %)"))
     for name, item in diagnosis.gain.held_out.items():
         lines.append(_line("held out", error_left(name, item, improved=bool(diagnosis.causes))))
-    for rival in diagnosis.alternatives:
-        lines.append(_line("or", f"{causes_said(rival.causes, effects)}, worse by {rival.delta_bic:.1f} in BIC"))
+    if not ambiguous:
+        lines += _rivals(diagnosis, effects) + _experiment(diagnosis)
     if diagnosis.causes and not diagnosis.alternatives:
         lines.append(_line("or", "nothing else in the catalogue comes near"))
-    if diagnosis.experiment is not None:
-        lines.append(_line("experiment", diagnosis.experiment.why))
     lines += [_line("note", remark) for remark in diagnosis.remarks]
     return "\n".join(lines)
+
+
+def _rivals(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[str]:
+    return [
+        _line("or", f"{explanation_said(item.explanation, effects)}, worse by {item.delta_bic:.1f} in BIC")
+        for item in diagnosis.alternatives
+    ]
+
+
+def _experiment(diagnosis: Diagnosis) -> list[str]:
+    return [] if diagnosis.experiment is None else [_line("experiment", diagnosis.experiment.why)]
 
 
 def _line(what: str, said: str) -> str:

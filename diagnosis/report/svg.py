@@ -13,7 +13,7 @@ import numpy as np
 from reactorwatch.axis import Axis, axis
 from reactorwatch.process.model import Array
 
-WIDTH, HEIGHT = 900, 210
+WIDTH, HEIGHT = 900, 250
 LEFT, RIGHT, TOP, BOTTOM = 64, 10, 8, 30
 COLUMNS = 600
 LABEL_ROOM = 40
@@ -176,7 +176,8 @@ def _frame(across: _Time, up: Axis) -> str:
         label = text if number < len(ticks) else f"{text} min"
         parts.append(f'<path class="frame" d="M{place:.1f} {floor}v4"/>')
         at, anchor = (place, "middle") if place < WIDTH - LABEL_ROOM else (WIDTH - RIGHT, "end")
-        parts.append(f'<text x="{at:.1f}" y="{floor + 17}" text-anchor="{anchor}">{label}</text>')
+        spare = " spare" if (len(ticks) - number) % 2 else ""  # left out where the text is large
+        parts.append(f'<text class="across{spare}" x="{at:.1f}" y="{floor + 17}" text-anchor="{anchor}">{label}</text>')
     for share, label in zip(up.share(up.ticks).tolist(), up.labels, strict=True):
         y = TOP + (1.0 - share) * (floor - TOP)
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')

@@ -1,6 +1,7 @@
 """What a diagnosis says, in words."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import floor, isfinite, log10
 
 import numpy as np
@@ -36,8 +37,8 @@ def verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
     if diagnosis.verdict == NOMINAL:
         return "The simulation is right: what the record shows beyond it is noise."
     if diagnosis.verdict == AMBIGUOUS:
-        rivals = [f"{cause.label} ({when(cause, diagnosis.curves)})" for cause in diagnosis.causes]
-        names = [" with ".join(rivals), *(causes_said(item.causes, effects) for item in diagnosis.alternatives)]
+        explanations = [diagnosis.causes, *(item.explanation for item in diagnosis.alternatives)]
+        names = [" with ".join(f"{item.label} ({when(item)})" for item in causes) for causes in explanations]
         return (
             f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {in_practice(diagnosis)}"
         )
@@ -87,10 +88,39 @@ def when(cause: Cause, curves: Curves | None = None) -> str:
     return f"settling {since}" if cause.profile == "decay" else since
 
 
-def size_said(cause: Cause) -> str:
-    """Its size with its interval, and of what in its course that is the size."""
+def size_said(cause: Cause, effects: Sequence[Effect]) -> str:
+    """Its size in its unit and meaning with its 95 % interval, and of what in its course that is the size.
+
+    Args:
+        cause: of an explanation.
+        effects: the catalogue, where it has its meaning.
+    """
     of_what = {"ramp": " at the end", "decay": " in the end", "sine": " to either side", "free": " at its largest"}
-    return with_interval(cause.parameters["size"]) + of_what.get(cause.profile, "")
+    return _size_meant(cause, effects) + of_what.get(cause.profile, "")
+
+
+def explanation_said(causes: Sequence[Cause], effects: Sequence[Effect]) -> str:
+    """Causes that explain a record together, each with its size and since when."""
+    return " with ".join(
+        f"{item.label} ({item.cause}, {item.profile}): {size_said(item, effects)}, {when(item)}" for item in causes
+    )
+
+
+def _size_meant(cause: Cause, effects: Sequence[Effect]) -> str:
+    size = cause.parameters["size"]
+    effect = next((item for item in effects if item.name == cause.cause), None)
+    if effect is None or not effect.larger:
+        return with_interval(size)
+    share = "{} %" in effect.larger
+    amount = replace(size, value=100.0 * size.value, sd=100.0 * size.sd, unit="%") if share else size
+    if cause.profile == "sine":  # whose sign says nothing
+        return with_interval(amount)
+    text = effect.larger
+    if amount.value < 0.0 and effect.smaller:
+        text, amount = effect.smaller, replace(amount, value=-amount.value)
+    value, half = rounded(amount)
+    unit = "" if amount.unit == "1" else f" {amount.unit}"
+    return text.format(value) + (f" (± {half}{unit})" if half else "")
 
 
 def causes_said(causes: Sequence[tuple[str, str]], effects: Sequence[Effect]) -> str:
@@ -118,13 +148,26 @@ def with_interval(estimate: Estimate) -> str:
     '299.9 min'
     """
     unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    value, half = rounded(estimate)
+    return f"{value} ± {half}{unit}" if half else f"{value}{unit}"
+
+
+def rounded(estimate: Estimate) -> tuple[str, str]:
+    """A number and half the width of its 95 % interval with as many decimals; the latter empty if it is not known.
+
+    The interval has one digit, or two if it begins with a 1.
+
+    >>> rounded(Estimate(14.998, 0.0127, "%"))
+    ('15.00', '0.02')
+    """
     half = SD_95 * estimate.sd
     if not (isfinite(half) and half > 0.0):
-        return f"{estimate.value:.5g}{unit}"
-    decimals = 1 - floor(log10(half))
+        return f"{estimate.value:.5g}", ""
+    first = floor(log10(half))
+    decimals = -first + (half < 2.0 * 10.0**first)
     if decimals < 0:
-        return f"{round(estimate.value, decimals):.0f} ± {round(half, decimals):.0f}{unit}"
-    return f"{estimate.value:.{decimals}f} ± {half:.{decimals}f}{unit}"
+        return f"{round(estimate.value, decimals):.0f}", f"{round(half, decimals):.0f}"
+    return f"{estimate.value:.{decimals}f}", f"{half:.{decimals}f}"
 
 
 def adjusted_said(item: Adjusted) -> str:

@@ -63,6 +63,21 @@ class Browser:
         """What the page shows, as PNG."""
         return base64.b64decode(self._ask("Page.captureScreenshot", on=self._session)["data"])
 
+    def resize(self, width: int, height: int) -> None:
+        """Lay the page out for a window of that size, in pixels."""
+        metrics = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self._ask("Emulation.setDeviceMetricsOverride", on=self._session, **metrics)
+
+    def prefer(self, scheme: str) -> None:
+        """Ask the page for a `light` or a `dark` ground."""
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        self._ask("Emulation.setEmulatedMedia", on=self._session, features=features)
+
+    def evaluate(self, expression: str) -> Any:
+        """The value of a JavaScript expression in the page."""
+        found = self._ask("Runtime.evaluate", on=self._session, expression=expression, returnByValue=True)
+        return found["result"]["value"]
+
     def _ask(self, method: str, on: dict[str, str] | None = None, **parameters: Any) -> Any:
         self._number += 1
         command = {"id": self._number, "method": method, "params": parameters, **(on or {})}

@@ -180,6 +180,9 @@ def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, c
     listed = [item["causes"] for item in found["alternatives"]]
     said = found["experiment"]
     assert len(listed) >= 1
+    for cause in (item for causes in listed for item in causes):
+        assert cause["parameters"].keys() == {"size"} | ({"onset"} if cause["profile"] == "step" else set())
+        assert cause["parameters"]["size"]["sd"] > 0.0
     assert set(said["separates"]) == {item["cause"] for causes in [found["causes"], *listed] for item in causes}
     assert said["limits"]["qc"] == [97.0, 110.0]
     assert all(97.0 <= level <= 110.0 for _, level in said["input"])

@@ -37,7 +37,10 @@ def said(*names: str, verdict: str = "named", others: tuple[str, ...] = (), loca
         span_min=10.0,
         verdict=verdict,
         causes=causes,
-        alternatives=tuple(Alternative(tuple((part, "ramp") for part in item.split("+")), 3.0) for item in others),
+        alternatives=tuple(
+            Alternative(tuple(Cause(part, "ramp", "", location, parameters) for part in item.split("+")), 3.0)
+            for item in others
+        ),
         location=location,
         significant=True,
         practical=True,

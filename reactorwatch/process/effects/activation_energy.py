@@ -10,6 +10,8 @@ class ActivationEnergy(ParameterEffect):
     label = "wrong activation energy"
     location = "reaction"
     unit = "1"
+    larger = "activation energy higher by {} %"
+    smaller = "activation energy lower by {} %"
     lower = -0.5
     upper = 0.5
     typical = 0.002

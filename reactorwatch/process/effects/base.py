@@ -38,6 +38,8 @@ class Effect(ABC):
         label: what a person calls it.
         location: where in the plant it acts; of the reactor's effects one of `LOCATIONS`.
         unit: of its size.
+        larger: meaning of a positive size, with `{}` for its amount: in the size's unit, or in % where it is a share.
+        smaller: meaning of a negative size likewise; empty where there is none.
         lower: smallest size that makes physical sense.
         upper: largest size that makes physical sense.
         neutral: the size at which it does nothing.
@@ -53,6 +55,8 @@ class Effect(ABC):
     label: ClassVar[str]
     location: ClassVar[str]
     unit: ClassVar[str]
+    larger: ClassVar[str] = ""
+    smaller: ClassVar[str] = ""
     lower: ClassVar[float]
     upper: ClassVar[float]
     neutral: ClassVar[float] = 0.0

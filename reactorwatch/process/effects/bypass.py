@@ -19,6 +19,7 @@ class Bypass(Effect):
     label = "short cut of the feed"
     location = "feed"
     unit = "1"
+    larger = "{} % of the feed passes the reaction by"
     lower = 0.0
     upper = 0.9
     typical = 0.02

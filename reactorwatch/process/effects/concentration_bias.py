@@ -14,6 +14,8 @@ class ConcentrationBias(ReadingEffect):
     label = "bias of the analyser"
     location = "concentration_sensor"
     unit = "mol/l"
+    larger = "analyser shows {} mol/l too much"
+    smaller = "analyser shows {} mol/l too little"
     lower = -1.0
     upper = 1.0
     typical = 0.01

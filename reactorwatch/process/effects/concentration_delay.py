@@ -34,6 +34,7 @@ class ConcentrationDelay(SensorEffect):
     label = "delay of the analyser"
     location = "concentration_sensor"
     unit = "min"
+    larger = "analyser shows what was there {} min before"
     lower = 0.0
     upper = 3.0
     typical = 0.2

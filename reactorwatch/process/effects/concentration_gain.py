@@ -14,6 +14,8 @@ class ConcentrationGain(ReadingEffect):
     label = "wrong gain of the analyser"
     location = "concentration_sensor"
     unit = "1"
+    larger = "analyser shows {} % too much"
+    smaller = "analyser shows {} % too little"
     lower = -0.99
     upper = 4.0
     typical = 0.1

@@ -15,6 +15,8 @@ class CoolantFlow(Effect):
     label = "wrong coolant flow"
     location = "coolant"
     unit = "1"
+    larger = "{} % more coolant than commanded"
+    smaller = "{} % of the coolant lost"
     lower = -0.99
     upper = 4.0
     typical = 0.02

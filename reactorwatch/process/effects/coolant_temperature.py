@@ -10,6 +10,8 @@ class CoolantTemperature(ParameterShift):
     label = "wrong coolant temperature"
     location = "coolant"
     unit = "K"
+    larger = "coolant warmer by {} K"
+    smaller = "coolant colder by {} K"
     lower = -50.0
     upper = 50.0
     typical = 2.0

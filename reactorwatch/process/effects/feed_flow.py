@@ -10,6 +10,8 @@ class FeedFlow(ParameterEffect):
     label = "wrong feed flow"
     location = "feed"
     unit = "1"
+    larger = "{} % more feed"
+    smaller = "{} % less feed"
     lower = -0.99
     upper = 4.0
     typical = 0.03

@@ -10,6 +10,8 @@ class FeedTemperature(ParameterShift):
     label = "wrong feed temperature"
     location = "feed"
     unit = "K"
+    larger = "feed warmer by {} K"
+    smaller = "feed colder by {} K"
     lower = -50.0
     upper = 50.0
     typical = 2.0

@@ -15,6 +15,7 @@ class HeatLoss(Effect):
     label = "heat loss to the surroundings"
     location = "energy_balance"
     unit = "1/min"
+    larger = "contents cool towards their surroundings at a rate of {} 1/min"
     lower = 0.0
     upper = 1.0
     typical = 0.01

@@ -12,6 +12,8 @@ class HeatTransfer(ParameterEffect):
     label = "changed heat transfer"
     location = "coolant"
     unit = "1"
+    larger = "{} % more heat transfer to the coolant"
+    smaller = "{} % of the heat transfer to the coolant lost"
     lower = -0.99
     upper = 4.0
     typical = -0.3

@@ -20,6 +20,7 @@ class JacketLag(Effect):
     label = "slow jacket"
     location = "coolant"
     unit = "min"
+    larger = "cooling follows with a time constant of {} min"
     lower = 0.0
     upper = 10.0
     typical = 0.1

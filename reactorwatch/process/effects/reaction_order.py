@@ -19,6 +19,8 @@ class ReactionOrder(Effect):
     label = "wrong order of the reaction"
     location = "reaction"
     unit = "1"
+    larger = "order of the reaction higher by {}"
+    smaller = "order of the reaction lower by {}"
     lower = -0.9
     upper = 2.0
     typical = 0.05

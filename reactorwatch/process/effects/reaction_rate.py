@@ -15,6 +15,8 @@ class ReactionRate(Effect):
     label = "changed reaction rate"
     location = "reaction"
     unit = "1"
+    larger = "reaction faster by {} %"
+    smaller = "reaction slower by {} %"
     lower = -0.99
     upper = 4.0
     typical = 0.05

@@ -36,6 +36,7 @@ class SampleTiming(Effect):
     label = "coolant flow stamped late, or interpolated"
     location = TIMING
     unit = "min"
+    larger = "coolant flow stamped {} min too late"
     lower = 0.0
     upper = 0.5
     typical = 0.05

@@ -29,6 +29,7 @@ class SideReaction(Effect):
     label = "side reaction"
     location = "reaction"
     unit = "1/min"
+    larger = "side reaction of {} 1/min at 438.54 K"
     lower = 0.0
     upper = 20.0
     typical = 0.1

@@ -14,6 +14,8 @@ class TemperatureBias(ReadingEffect):
     label = "bias of the temperature sensor"
     location = "temperature_sensor"
     unit = "K"
+    larger = "thermometer shows {} K too much"
+    smaller = "thermometer shows {} K too little"
     lower = -100.0
     upper = 100.0
     typical = 2.0

@@ -14,6 +14,7 @@ class TemperatureLag(SensorEffect):
     label = "slow thermometer"
     location = "temperature_sensor"
     unit = "min"
+    larger = "thermometer follows with a time constant of {} min"
     lower = 0.0
     upper = 10.0
     typical = 0.1

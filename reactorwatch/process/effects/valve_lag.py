@@ -14,6 +14,7 @@ class ValveLag(Effect):
     label = "slow coolant valve"
     location = "coolant"
     unit = "min"
+    larger = "coolant flow follows its command with a time constant of {} min"
     lower = 0.0
     upper = 10.0
     typical = 0.1

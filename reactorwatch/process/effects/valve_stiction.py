@@ -20,6 +20,7 @@ class ValveStiction(Effect):
     label = "sticking coolant valve"
     location = "coolant"
     unit = "l/min"
+    larger = "valve moves only for changes of more than {} l/min"
     lower = 0.0
     upper = 100.0
     typical = 2.0

@@ -16,6 +16,8 @@ class Volume(Effect):
     label = "wrong volume of the contents"
     location = "mass_balance"
     unit = "1"
+    larger = "{} % more contents than stated"
+    smaller = "{} % less contents than stated"
     lower = -0.9
     upper = 4.0
     typical = 0.03

@@ -24,6 +24,7 @@ class WallHeatCapacity(Effect):
     label = "heat stored in the wall"
     location = "energy_balance"
     unit = "1"
+    larger = "wall stores {} % of the heat that the contents store"
     lower = 0.0
     upper = 10.0
     typical = 0.05

@@ -14,6 +14,8 @@ class LevelBias(ReadingEffect):
     label = "bias of the level sensor"
     location = "level_sensor"
     unit = "V"
+    larger = "level sensor shows {} V too much"
+    smaller = "level sensor shows {} V too little"
     lower = -10.0
     upper = 10.0
     typical = 0.05

@@ -13,6 +13,7 @@ class OutletClogging(Effect):
     label = "clogged outlet of the upper tank"
     location = "upper_tank"
     unit = "1"
+    larger = "{} % of the outlet of the upper tank clogged"
     lower = 0.0
     upper = 0.99
     typical = 0.03

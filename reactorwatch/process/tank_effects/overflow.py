@@ -27,6 +27,7 @@ class Overflow(Effect):
     label = "overflow of the upper tank"
     location = "upper_tank"
     unit = "1/min"
+    larger = "overflow of {} 1/min of the level above the brim"
     lower = 0.0
     upper = 60.0
     typical = 5.0

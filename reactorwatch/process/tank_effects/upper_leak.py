@@ -14,6 +14,7 @@ class UpperLeak(Effect):
     label = "leak of the upper tank"
     location = "upper_tank"
     unit = "V^0.5/min"
+    larger = "upper tank leaks with {} V^0.5/min"
     lower = 0.0
     upper = 30.0
     typical = 0.1

@@ -142,7 +142,18 @@ def diagnosis_of(
     )
 
 
-FEED = Alternative((("feed_temperature", "step"),), 3.21)
+FEED = Alternative(
+    (
+        Cause(
+            "feed_temperature",
+            "step",
+            "wrong feed temperature",
+            "feed",
+            {"size": Estimate(1.234, 0.05, "K"), "onset": Estimate(150.1, 0.4, "min")},
+        ),
+    ),
+    3.21,
+)
 CASES = {
     "nominal": diagnosis_of("nominal"),
     "named": diagnosis_of("named", (LEAK,)),

@@ -71,7 +71,15 @@ def test_what_stands_in_the_page_from_outside_is_escaped(case: str) -> None:
         ("nominal", ["The simulation is right", "How well it simulates", "They stay as they are"]),
         (
             "named",
-            ["coolant leak", "-0.04996 ± 0.00017", "What it gains", "A closer look", "209,025.5", 'class="added"'],
+            [
+                "coolant leak",
+                "4.996 % of the coolant lost (± 0.017 %)",
+                "m = -0.04996 ± 0.00017",
+                "What it gains",
+                "A closer look",
+                "209,025.5",
+                'class="added"',
+            ],
         ),
         ("pair", ["drift of the temperature sensor", "Please note", "<msub><mi>m</mi><mn>2</mn></msub>"]),
         (
@@ -88,6 +96,33 @@ def test_the_page_answers_what_it_is_asked(case: str, parts: list[str]) -> None:
     text = page(case)
     for part in parts:
         assert part in text
+
+
+def test_an_ambiguous_verdict_shows_all_rivals_with_their_sizes_and_the_experiment_at_the_top() -> None:
+    top = page("ambiguous").partition("<h2>")[0]
+    for part in (
+        *("coolant leak", "on the side of the coolant", "4.996 % of the coolant lost (± 0.017 %)", "150.33 ± 0.02 min"),
+        *("wrong feed temperature", "in the feed", "feed warmer by 1.23 K (± 0.10 K)", "150.1 ± 0.8 min", "3.2"),
+        "Wider steps of qc tell both apart.",
+    ):
+        assert part in top
+    assert "<th>cause</th>" not in top
+    assert "<th>cause</th>" in page("named").partition("<h2>")[0]
+    assert "which is not sure" in page("ambiguous")
+    assert "which is not sure" not in page("named")
+
+
+def test_an_ambiguous_verdict_without_an_experiment_says_so() -> None:
+    text = as_page(replace(CASES["ambiguous"], experiment=None), cstr(), EFFECTS, "a.csv", "extended.json")
+    assert "No experiment within the limits would decide." in text.partition("<h2>")[0]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_said_of_colours_holds_on_a_dark_ground_too_and_plots_are_as_wide_as_the_page(case: str) -> None:
+    text = page(case)
+    assert "dark" not in text.partition("</style>")[2]
+    assert "min-width" not in text
+    assert "figure > svg { display: block; width: 100%;" in text
 
 
 def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> None:
@@ -108,7 +143,7 @@ def test_the_page_tells_how_the_extended_model_is_used() -> None:
 
 def test_the_page_tells_what_is_known_now_of_uncertain_parameters() -> None:
     text = as_page(ADJUSTED, cstr(), EFFECTS, "plant.csv", "extended.json")
-    assert "<tr><th>K3</th><td>711.2 ± 2.9 l/min; stated: 700 ± 27 l/min" in text
+    assert "<tr><th>K3</th><td>711 ± 3 l/min; stated: 700 ± 30 l/min" in text
 
 
 def test_a_page_without_curves_is_refused() -> None:

@@ -1,15 +1,18 @@
 """What a diagnosis says to people and to machines."""
 
 import json
+import re
 
 import msgspec
 import pytest
 
 from diagnosis.report.machine import as_object, with_differences
 from diagnosis.report.plain import as_text
-from diagnosis.report.words import verdict, with_interval
-from diagnosis.result import Diagnosis, Estimate
+from diagnosis.report.words import size_said, verdict, with_interval
+from diagnosis.result import Cause, Diagnosis, Estimate
 from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.tank_effects import TANK_EFFECTS
 from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
 
 
@@ -17,11 +20,11 @@ from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
     ("case", "expected"),
     [
         ("nominal", "The simulation is right: what the record shows beyond it is noise."),
-        ("named", "The simulation is wrong: coolant leak, since 150.335 ± 0.024 min. It matters in practice."),
+        ("named", "The simulation is wrong: coolant leak, since 150.33 ± 0.02 min. It matters in practice."),
         (
             "pair",
-            "The simulation is wrong: coolant leak, since 150.335 ± 0.024 min; and drift of the temperature sensor, "
-            "growing since 20.0 ± 5.9 min. It matters in practice.",
+            "The simulation is wrong: coolant leak, since 150.33 ± 0.02 min; and drift of the temperature sensor, "
+            "growing since 20 ± 6 min. It matters in practice.",
         ),
         (
             "curve",
@@ -30,8 +33,8 @@ from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
         ),
         (
             "ambiguous",
-            "The simulation is wrong, and the record cannot tell why: coolant leak (since 150.335 ± 0.024 min) or "
-            "wrong feed temperature (feed_temperature, step). It matters in practice.",
+            "The simulation is wrong, and the record cannot tell why: coolant leak (since 150.33 ± 0.02 min) or "
+            "wrong feed temperature (since 150.1 ± 0.8 min). It matters in practice.",
         ),
         (
             "unknown",
@@ -59,18 +62,51 @@ def test_a_number_has_the_digits_that_its_95_percent_interval_allows(estimate: E
     assert with_interval(estimate) == expected
 
 
-def test_people_read_size_onset_gain_rivals_experiment_and_remarks() -> None:
+@pytest.mark.parametrize("effect", [*EFFECTS, *TANK_EFFECTS], ids=lambda effect: effect.name)
+@pytest.mark.parametrize("profile", ["constant", "ramp", "decay", "sine", "free"])
+def test_the_size_of_every_cause_is_said_in_its_unit_and_meaning(effect: Effect, profile: str) -> None:
+    for sign in (1.0, -1.0) if effect.lower < 0.0 else (1.0,):
+        size = Estimate(sign * abs(effect.typical), 0.01 * abs(effect.typical), effect.unit)
+        cause = Cause(effect.name, profile, effect.label, effect.location, {"size": size})
+        said = size_said(cause, (effect,))
+        unit = "%" if "%" in effect.larger else effect.unit
+        value = abs(size.value) * (100.0 if unit == "%" else 1.0)
+        number = re.search(r"-?\d[\d.]*", said)
+        assert number is not None
+        assert abs(float(number.group())) == pytest.approx(value, rel=0.02)
+        half = re.search(r"± ([\d.]+)", said)
+        assert half is not None
+        assert float(half.group(1)) == pytest.approx(0.0196 * value, rel=0.3)
+        assert unit in said or unit == "1"
+        if profile != "sine":
+            assert "-" not in said  # the words tell the direction
+            words = effect.larger if sign > 0.0 else effect.smaller
+            assert all(part.strip() in said for part in words.split("{}"))
+
+
+def test_more_and_less_are_told_in_different_words() -> None:
+    for effect in (*EFFECTS, *TANK_EFFECTS):
+        assert bool(effect.smaller) == (effect.lower < 0.0), effect.name
+        assert effect.larger.count("{}") == 1
+        assert effect.larger != effect.smaller
+
+
+def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
     text = as_text(CASES["ambiguous"], "run.csv", EFFECTS)
     for part in (
         "run.csv: 2000 rows over 199.9 min",
-        "size        -0.04996 ± 0.00017  (95 %)",
-        "when        since 150.335 ± 0.024 min",
+        "either      coolant leak (coolant_flow, step): 4.996 % of the coolant lost (± 0.017 %), "
+        "since 150.33 ± 0.02 min",
         "C off by 0.00202 mol/l, before 0.0147 mol/l; noise 0.00197 mol/l",
         "T off by 0.292 K, before none, it ran away; noise 0.303 K",
-        "or          wrong feed temperature (feed_temperature, step), worse by 3.2 in BIC",
+        "or          wrong feed temperature (feed_temperature, step): feed warmer by 1.23 K (± 0.10 K), since 150.1 ± "
+        "0.8 min, worse by 3.2 in BIC",
         "experiment  Wider steps of qc tell both apart.",
     ):
         assert part in text
+    order = [text.index(part) for part in ("either", "  or  ", "experiment  ", "evidence  ", "held out  ")]
+    assert order == sorted(order)
+    assert "size        4.996 % of the coolant lost (± 0.017 %)  (95 %)" in as_text(CASES["named"], "run.csv", EFFECTS)
     assert "note        The record runs under <control>." in as_text(CASES["pair"], "run.csv", EFFECTS)
 
 
@@ -84,7 +120,7 @@ def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -
     assert said["seconds"] == 1.235
     for item in said["gain"]["held_out"].values():
         assert list(item) == ["rmse_before", "rmse_after", "noise_sd", "unit"]
-    for cause in said["causes"]:
+    for cause in [*said["causes"], *(cause for item in said["alternatives"] for cause in item["causes"])]:
         assert list(cause) == ["cause", "profile", "label", "location", "parameters"]
         assert next(iter(cause["parameters"])) == "size"
         assert all(list(item) == ["value", "sd", "unit"] for item in cause["parameters"].values())
@@ -93,7 +129,10 @@ def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -
 def test_the_object_holds_what_was_found() -> None:
     said = as_object(CASES["ambiguous"], "run.csv", 1.0)
     assert said["causes"][0]["parameters"]["onset"] == {"value": 150.3349, "sd": 0.0122, "unit": "min"}
-    assert said["alternatives"] == [{"causes": [{"cause": "feed_temperature", "profile": "step"}], "delta_bic": 3.21}]
+    (rival,) = said["alternatives"]
+    assert rival["delta_bic"] == 3.21
+    assert rival["causes"][0]["cause"] == "feed_temperature"
+    assert rival["causes"][0]["parameters"]["size"] == {"value": 1.234, "sd": 0.05, "unit": "K"}
     assert said["experiment"] == {
         "why": "Wider steps of qc tell both apart.",
         "input": [[0.0, 103.4], [10.0, 90.0]],
@@ -117,7 +156,7 @@ def test_what_was_stated_to_be_uncertain_is_told_as_it_is_known_now() -> None:
         "The simulation is right within what was stated of its parameters: K3 is a little off, "
         "and what the record shows beyond that is noise."
     )
-    assert "parameter   K3 711.2 ± 2.9 l/min; stated: 700 ± 27 l/min  (95 %)" in as_text(ADJUSTED, "run.csv", EFFECTS)
+    assert "parameter   K3 711 ± 3 l/min; stated: 700 ± 30 l/min  (95 %)" in as_text(ADJUSTED, "run.csv", EFFECTS)
     said = as_object(ADJUSTED, "run.csv", 1.0)["parameters"]
     assert list(said) == ["K3", "Tf"]
     assert said["K3"] == {"nominal": 700.0, "stated_sd": 14.0, "value": 711.2, "sd": 1.5, "unit": "l/min"}

@@ -1,0 +1,58 @@
+"""The page of a diagnosis in a browser: on a phone, at 1,400 px, on a light and on a dark ground."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from diagnosis.report.page import as_page
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.effects import EFFECTS
+from tests.unit.diagnosis.cases import CASES
+
+from .browser import Browser, browser
+
+SPILLED = "[...document.querySelectorAll({selector!r})].filter(item => item.scrollWidth > item.clientWidth + 1).length"
+BEYOND = """[...document.querySelectorAll('figure > svg')].filter(item => {
+  const ends = item.getBoundingClientRect(); return ends.left < 0 || ends.right > document.documentElement.clientWidth;
+}).length"""
+GROUNDS = """[...document.querySelectorAll('.strips td')].map(item => [
+  parseFloat(item.style.getPropertyValue('--shade')), getComputedStyle(item).backgroundColor])"""
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    with browser(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
+
+
+def show(page: Browser, case: str, folder: Path) -> None:
+    path = folder / "report.html"
+    path.write_text(as_page(CASES[case], cstr(), EFFECTS, "plant.csv", "extended.json"), encoding="utf-8")
+    page.go_to(path.as_uri())
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("width", [390, 800, 1400])
+def test_plots_and_tables_end_within_the_page(page: Browser, case: str, width: int, tmp_path: Path) -> None:
+    page.resize(width, 1000)
+    show(page, case, tmp_path)
+    assert page.evaluate("document.querySelectorAll('figure > svg').length") >= 4
+    assert page.evaluate(BEYOND) == 0
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    tables = ".wide" if width >= 800 else ".wide:has(.strips), .wide:has(.rivals)"
+    assert page.evaluate(SPILLED.format(selector=tables)) == 0
+    assert page.evaluate(SPILLED.format(selector="figure")) == 0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_what_is_worse_has_the_stronger_colour_on_either_ground(page: Browser, scheme: str, tmp_path: Path) -> None:
+    page.prefer(scheme)
+    show(page, "named", tmp_path)
+    shades = page.evaluate(GROUNDS)
+    opacity = [(shade, float(colour.rpartition("/")[2].rstrip(" )"))) for shade, colour in shades if "/" in colour]
+    assert len(opacity) > 10
+    ordered = sorted(opacity)
+    assert all(first[1] <= second[1] + 1e-3 for first, second in pairwise(ordered))
+    assert ordered[-1][1] > ordered[0][1] + 0.2
