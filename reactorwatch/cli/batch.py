@@ -39,11 +39,13 @@ class Answer:
         said: to be printed.
         row: of the summary.
         remark: about the file, for people, on standard error; empty: none.
+        not_written: why the files that belong to the answer could not be written; empty if they were.
     """
 
     said: str
     row: Row
     remark: str = ""
+    not_written: str = ""
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,8 @@ def say(
             answer = kind.work(jobs[0])
         typer.echo(answer.said)
         write_remark(files[0], answer.remark)
+        if answer.not_written:
+            raise InputError(answer.not_written)
         return
     rows: list[Row] = []
     for file, outcome in zip(files, results(kind.work, jobs, kind.doing, processes, scheduler), strict=True):
@@ -126,6 +130,8 @@ def say(
         else:
             typer.echo(outcome.said)
             write_remark(file, outcome.remark)
+            if outcome.not_written:
+                sys.stderr.write(f"reactorwatch: {file}: {outcome.not_written}\n")
             rows.append(outcome.row)
     failed = sum(bool(row["error"]) for row in rows)
     if len(rows) > 1 and not as_json:

@@ -25,6 +25,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample
 from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
 from reactorwatch.runtime.bus_zenoh import ZenohBus
@@ -178,7 +179,7 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folde
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
     """Diagnose the recording, draw it, read from it what happened, and write that down."""
     from diagnosis.report.words import verdict
-    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, Asked, case_of, diagnosed
+    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, Asked, case_of, diagnosed, write_report
     from reactorwatch.process import effects_of
     from recorder.dashboard.file import write_rrd
     from recorder.run_reader import stretches
@@ -189,7 +190,8 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         again = backtest.run(messages(recording, PLANT), monitor)
     with task("diagnosing"):
         case = case_of(recording, folder / DIAGNOSIS_FOLDER, Asked(plant=PLANT))
-        diagnosis, _ = diagnosed(case)
+        diagnosis, seconds = diagnosed(case)
+        write_report(diagnosis, case, seconds)
     with task("drawing"):
         write_rrd(stretches(messages(recording, PLANT)), drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)
     same = [alarm.SerializeToString() for alarm in alarms] == [
@@ -241,8 +243,9 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         "",
     ]
     text = "\n".join(lines)
-    (folder / "summary.md").write_text(text, encoding="utf-8")
     typer.echo(text)
+    with replacing(folder / "summary.md") as temporary:
+        temporary.write_text(text, encoding="utf-8")
     typer.echo(f"All of it is in {folder}")
     return 0 if after and not before and same else 1
 

@@ -102,17 +102,14 @@ def case_of(file: Path, folder: Path | None, asked: Asked, at: Path | None = Non
 def diagnosed(
     case: Case, tolerance: dict[str, float] | None = None, limits: Limits | None = None
 ) -> tuple[Diagnosis, float]:
-    """The diagnosis of a record and the seconds that it took; its report is written if there is a folder for it.
+    """The diagnosis of a record and the seconds that it took.
 
     Raises:
-        InputError: a tolerance or limits that cannot be, or a folder that cannot be written to.
+        InputError: a tolerance or limits that cannot be.
     """
     began = time.monotonic()
     diagnosis = diagnose(case.measured, case.model, None, tolerance, case.uncertain, limits)
-    seconds = time.monotonic() - began
-    if case.folder is not None:
-        write_report(diagnosis, case, seconds)
-    return diagnosis, seconds
+    return diagnosis, time.monotonic() - began
 
 
 def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:

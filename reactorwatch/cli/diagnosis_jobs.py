@@ -16,7 +16,8 @@ from diagnosis.report.plain import as_text
 from diagnosis.result import Cause, Diagnosis
 from diagnosis.uncertain import stated
 from reactorwatch.cli.batch import SUMMARY, Answer, Kind, Row, as_table
-from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, REPORT, Asked, Case, case_of, diagnosed
+from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, REPORT, Asked, Case, case_of, diagnosed, write_report
+from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.cstr import cstr
 from reactorwatch.records.output import checked_folder
@@ -87,14 +88,21 @@ def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, fo
 
 
 def answer(job: Job) -> Answer:
-    """Diagnose a file, and write its report if there is a folder for it.
+    """Diagnose a file, and write its report if there is a folder for it; the answer says where that failed.
 
     Raises:
-        InputError: the file cannot be read or diagnosed, the folder not be written to, or what is asked not be meant.
+        InputError: the file cannot be read or diagnosed, or what is asked cannot be meant.
     """
     case = case_of(job.file, job.folder, job.asked, job.at)
     diagnosis, seconds = diagnosed(case, job.asked.tolerance, job.asked.limits)
-    return Answer(_said(case, diagnosis, seconds, as_json=job.as_json), _row(job.file, diagnosis, seconds))
+    not_written = ""
+    if case.folder is not None:
+        try:
+            write_report(diagnosis, case, seconds)
+        except InputError as error:
+            case, not_written = replace(case, folder=None), str(error)
+    said = _said(case, diagnosis, seconds, as_json=job.as_json)
+    return Answer(said, _row(job.file, diagnosis, seconds) | {"error": not_written or None}, not_written)
 
 
 def _check(asked: Asked) -> None:

@@ -10,6 +10,7 @@ import errno
 import gc
 import os
 import sys
+from contextlib import suppress
 from typing import cast
 
 import typer
@@ -74,6 +75,7 @@ def main() -> None:
     os.environ.setdefault("RUST_LOG", "off")  # what Rerun logs of a full disk or a closed viewer, we say ourselves
     try:
         code = app(prog_name="reactorwatch", standalone_mode=False)
+        sys.stdout.flush()
     except UsageProblem as error:
         _complain(error.format_message())
         code = 2
@@ -84,7 +86,7 @@ def main() -> None:
         code = 130
     except Exception as error:  # noqa: BLE001 (the one place that turns what is left into a report)
         if isinstance(error, OSError) and error.errno in OF_THE_SYSTEM:
-            _complain(f"{error.filename}: {error.strerror}" if error.filename else f"{error.strerror}")
+            _complain(f"{error.filename or 'what is said here cannot be written'}: {error.strerror}")
             sys.exit(2)
         from reactorwatch.cli.crash import EXIT_CODE, report_crash
 
@@ -96,4 +98,6 @@ def main() -> None:
 
 def _complain(text: str) -> None:
     line = " ".join(text.split())
-    sys.stderr.write(f"reactorwatch: {line}\n")
+    with suppress(OSError):  # the exit code says it, too
+        sys.stderr.write(f"reactorwatch: {line}\n")
+        sys.stderr.flush()

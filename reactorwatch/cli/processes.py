@@ -15,6 +15,8 @@ from typing import Any, Self
 import msgspec
 import structlog
 
+from reactorwatch.records.atomic import replacing
+
 log = structlog.get_logger()
 
 MODULES = {
@@ -93,7 +95,8 @@ class Processes:
 
 def write_settings(path: Path, tables: dict[str, msgspec.Struct]) -> None:
     """Write whole settings as TOML, every value spelled out, so that the file says what ran."""
-    path.write_text(settings_text(tables), encoding="utf-8")
+    with replacing(path) as temporary:
+        temporary.write_text(settings_text(tables), encoding="utf-8")
 
 
 def settings_text(tables: dict[str, msgspec.Struct]) -> str:

@@ -63,20 +63,29 @@ def _free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Recor
     return replace(measured, columns=columns)
 
 
-def report(measured: Record, simulated: Record, model: ProcessModel, out: Path, *, as_json: bool) -> str:
-    """How far the simulation is from the record, by signal."""
+def report(measured: Record, simulated: Record, model: ProcessModel, out: Path | None, *, as_json: bool) -> str:
+    """How far the simulation is from the record, by signal.
+
+    Args:
+        measured: the record.
+        simulated: the simulation, in the rows of the record.
+        model: the process.
+        out: the file that the simulation was written to; None: it could not be written.
+        as_json: for machines.
+    """
     rmse, units = {}, {output.name: output.unit for output in model.outputs}
     for name in model.output_names:
         difference = simulated.columns[name] - measured.columns[name]
         rmse[name] = float(np.sqrt(np.nanmean(difference**2)))
     if as_json:
         said = {
-            "file": str(out),
+            "file": None if out is None else str(out),
             "rows": measured.rows,
             "runs": len(measured.run_starts),
             "rmse": {name: {"value": value, "unit": units[name]} for name, value in rmse.items()},
         }
         return msgspec.json.encode(said).decode()
     parts = ", ".join(f"{name} {value:.3g} {units[name]}" for name, value in rmse.items())
-    said = f"wrote {out}: {measured.rows} rows; root mean square difference from the record: {parts}"
-    return "\n".join([said, *(f"note: {remark}" for remark in measured.remarks)])
+    written = "not written" if out is None else f"wrote {out}"
+    line = f"{written}: {measured.rows} rows; root mean square difference from the record: {parts}"
+    return "\n".join([line, *(f"note: {remark}" for remark in measured.remarks)])

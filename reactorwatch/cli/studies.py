@@ -22,6 +22,7 @@ from reactorwatch.cli.options import (
     output_file,
     tolerances,
 )
+from reactorwatch.errors import InputError
 
 
 def add_to(app: typer.Typer) -> None:
@@ -57,7 +58,11 @@ def simulate(
     process = process_model(model, measured)
     with task(f"simulating {file.name}"):
         simulated = free_run(measured, process, fault or [])
-        write_csv(out, simulated)
+        try:
+            write_csv(out, simulated)
+        except InputError:
+            typer.echo(report(measured, simulated, process, None, as_json=as_json))
+            raise
     typer.echo(report(measured, simulated, process, out, as_json=as_json))
 
 

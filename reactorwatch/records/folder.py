@@ -57,8 +57,12 @@ def filling(folder: Path, option: str = "") -> Iterator[Path]:
     try:
         yield temporary
         make_folder(folder, option)
-        for file in sorted(temporary.iterdir()):
-            with replacing(folder / file.name) as place, cannot_write(folder / file.name):
+        for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
+            target = folder / file.relative_to(temporary)
+            make_folder(target.parent)
+            with replacing(target) as place, cannot_write(target):
                 file.replace(place)
+    except InputError as error:
+        raise InputError(str(error).replace(str(temporary), str(folder))) from error.__cause__
     finally:
         shutil.rmtree(temporary)

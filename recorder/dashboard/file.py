@@ -1,13 +1,15 @@
 """Dashboards as files (.rrd), with their layout in them."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+import shutil
+import tempfile
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import rerun as rr
 
-from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from recorder.dashboard.drawing import Drawing
 from recorder.dashboard.reading import read_time_plots
@@ -16,7 +18,7 @@ from recorder.panels import PANELS
 from recorder.panels.base import Panel, View
 from recorder.run import Run
 
-_FOOTER, _FOOTER_WITHIN = b"RRF2FOOT", 64
+_PIPE_BYTES = 65_536
 
 DIAGNOSIS = "Diagnosis"
 """Title of the tab of a diagnosis."""
@@ -69,22 +71,49 @@ def write_views(drawn: Mapping[str, Sequence[View]], path: Path, zero_ns: int) -
 
 def _write(path: Path, onto: Callable[[Drawing], None]) -> None:
     recording = rr.RecordingStream(APPLICATION)
-    with replacing(path) as temporary:
-        recording.save(temporary)
+    with replacing(path) as temporary, _copied_to(temporary) as pipe:
+        recording.save(pipe)
         try:
             drawing = Drawing(recording)
             onto(drawing)
             recording.send_blueprint(drawing.layout.blueprint())
         finally:
-            with suppress(RuntimeError):  # its thread has ended, and so has the file: see below
-                recording.flush()
+            recording.flush()
             recording.disconnect()
-        if not _is_complete(temporary):
-            raise InputError(f"cannot write {path}: it could not be completed, for lack of room on the disk perhaps")
 
 
-def _is_complete(path: Path) -> bool:
-    """Whether a file of Rerun's ends as one does; Rerun writes in a thread, and only logs that it could not."""
-    with path.open("rb") as file:
-        file.seek(-min(path.stat().st_size, _FOOTER_WITHIN), os.SEEK_END)
-        return _FOOTER in file.read()
+@contextmanager
+def _copied_to(path: Path) -> Iterator[Path]:
+    """A pipe whose content goes into a file.
+
+    Rerun writes a file in a thread of its own; where the disk is full it logs that and goes on, or waits for ever. A
+    pipe takes all, and the error is ours.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    failed: list[OSError] = []
+
+    def copy() -> None:
+        with pipe.open("rb", buffering=0) as source:
+            try:
+                with path.open("wb") as file:
+                    shutil.copyfileobj(source, file, _PIPE_BYTES)
+            except OSError as error:
+                failed.append(error)
+                while source.read(_PIPE_BYTES):  # so that the other end never waits
+                    pass
+
+    with tempfile.TemporaryDirectory() as folder:
+        pipe = Path(folder) / path.name
+        os.mkfifo(pipe)
+        thread = threading.Thread(target=copy, name="dashboard")
+        thread.start()
+        try:
+            yield pipe
+        finally:
+            with suppress(OSError):  # nobody reads any more
+                os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
+            thread.join()
+    if failed:
+        raise failed[0]

@@ -12,6 +12,7 @@ from reactorwatch.cli.study.page import FOLDER, page
 from reactorwatch.cli.study.study import Study
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
+from reactorwatch.records.folder import filling, make_folder
 from reactorwatch.records.output import checked_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.jobs import Failed
@@ -65,16 +66,18 @@ def reproduce(
     """
     figures = _chosen(only)
     require_matplotlib()
-    pictures = _folder(out).absolute()
-    jobs = [Job(figure.number, pictures / figure.file_name, seed, measured) for figure in figures]
+    checked_folder(checked_folder(out) / FOLDER)
     found: list[tuple[Figure, Finding]] = []
-    for figure, finding in zip(figures, results(draw, jobs, "reproducing", processes, scheduler), strict=True):
-        if isinstance(finding, Failed):
-            raise (RuntimeError if finding.ours else InputError)(f"figure {figure.number}: {finding.reason}")
-        found.append((figure, finding))
-    text = page(found, seed, measured.name if measured else "")
-    with replacing(out / PAGE) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    with filling(out, "--out") as folder:
+        pictures = make_folder(folder / FOLDER).absolute()
+        jobs = [Job(figure.number, pictures / figure.file_name, seed, measured) for figure in figures]
+        for figure, finding in zip(figures, results(draw, jobs, "reproducing", processes, scheduler), strict=True):
+            if isinstance(finding, Failed):
+                raise (RuntimeError if finding.ours else InputError)(f"figure {figure.number}: {finding.reason}")
+            found.append((figure, finding))
+        text = page(found, seed, measured.name if measured else "")
+        with replacing(folder / PAGE) as temporary:
+            temporary.write_text(text, encoding="utf-8")
     return _report(out, found)
 
 
@@ -106,16 +109,6 @@ def _chosen(only: str | None) -> Sequence[Figure]:
                 f"--only must be numbers of figures from {numbers[0]} to {numbers[-1]}, such as 7,12, got {part!r}"
             )
     return [figure for figure in FIGURES if str(figure.number) in wanted]
-
-
-def _folder(out: Path) -> Path:
-    """The folder of the pictures, made with that of the page."""
-    pictures = checked_folder(checked_folder(out) / FOLDER)
-    try:
-        pictures.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"cannot make the folder {pictures}: {error.strerror}") from error
-    return pictures
 
 
 def _report(out: Path, found: Sequence[tuple[Figure, Finding]]) -> str:
