@@ -49,25 +49,41 @@ def certify(
 
 def router(
     file: Annotated[
-        Path, typer.Argument(help="Zenoh's settings, as `certify` writes them: router.json5.", show_default=False)
-    ],
+        Path | None,
+        typer.Argument(
+            help="Zenoh's settings, as `certify` writes them: router.json5 [a plain router, on this machine alone].",
+            show_default=False,
+        ),
+    ] = None,
+    config: Settings = None,
+    endpoint: Annotated[
+        str | None,
+        typer.Option(help="Where a plain router listens [tcp/127.0.0.1:7447].", show_default=False),
+    ] = None,
 ) -> None:
-    """Run the router of a site, with its certificates and access rules."""
+    """Run a router until stopped: of a site, with its certificates and access rules; or without a file a plain one."""
     import threading
 
     import structlog
 
     from reactorwatch.cli.options import existing
+    from reactorwatch.errors import InputError
+    from reactorwatch.runtime.bus_zenoh import router as plain_router
     from reactorwatch.runtime.bus_zenoh import router_from_file
+    from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
     from reactorwatch.runtime.logs import configure
     from reactorwatch.runtime.serve import stop_on_signals
 
-    configure()
+    if file is not None and (config is not None or endpoint is not None):
+        raise InputError(f"{file}: says where this router listens; leave out --config and --endpoint")
+    tables = read_settings(config)
+    settings = section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
     with stop_on_signals() as stop:
-        bus = router_from_file(existing(file))
+        bus = router_from_file(existing(file)) if file is not None else plain_router(settings)
         stopped = threading.Event()
         stop.wakes(stopped.set)
-        structlog.get_logger().info("router", settings=str(file))
+        structlog.get_logger().info("router", **({"settings": str(file)} if file else {"endpoint": settings.endpoint}))
         try:
             if not stop.is_set:
                 stopped.wait()

@@ -96,6 +96,7 @@ class ZenohBus:
         self._declared: list[Any] = []  # Zenoh undeclares what nobody holds
         self._tokens: dict[str, Any] = {}
         self._deliveries: list[Delivery] = []
+        self._gathering: list[threading.Thread] = []
 
     def publish(self, message: Encoded) -> None:
         """See `Bus`."""
@@ -198,7 +199,8 @@ class ZenohBus:
                         delivery.receive(came)
                     time.sleep(GATHER_AGAIN_S)
 
-        threading.Thread(target=empty, name="gather", daemon=True).start()
+        self._gathering.append(threading.Thread(target=empty, name="gather", daemon=True))
+        self._gathering[-1].start()
         if delivery is not None:
             self._begin(delivery, key_expression, history=history, on_told=on_told)
         elif on_told is not None:
@@ -361,6 +363,10 @@ class ZenohBus:
             self._voice.close()
         for delivery in self._deliveries:
             delivery.close()
+        # A thread that is in Zenoh's code when the interpreter ends aborts the process: "exception not rethrown".
+        for thread in self._gathering:
+            if thread is not threading.current_thread():
+                thread.join(FLUSH_WITHIN_S)
 
 
 def _say_gap(gap: Gap) -> None:
