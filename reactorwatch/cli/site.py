@@ -31,20 +31,40 @@ def certify(
         typer.Option(help="Where the router listens [as before, or where it is called].", show_default=False),
     ] = None,
     days: Annotated[float, typer.Option(help="How long certificates are valid.", min=1, max=3650)] = 365.0,
+    renew: Annotated[
+        float | None,
+        typer.Option(
+            "--renew", help="Make certificates again that end within so many days.", min=0, max=3650, show_default=False
+        ),
+    ] = None,
+    revoke: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--revoke",
+            help="Have the router refuse the certificates so far of this plant and role, such as cstr/monitor, and "
+            "make a new one. Repeatable.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Make the certificates and access rules of a site.
 
     Each who joins its bus gets a folder of its own, to be copied to its machine: certificate, key and settings for
-    --config. What is there already stays: a plant is added by naming it, and a certificate renewed by deleting its
-    folder first. The router's rules are written anew; start it again after that.
+    --config. What is complete stays, what is half made is completed: a plant is added by naming it. The router's rules
+    are written again; start it again after that, unless certificates were only renewed.
     """
     from datetime import UTC, datetime
 
-    from reactorwatch.runtime.site import AUTHORITY, make_site
+    from reactorwatch.runtime.site import AUTHORITY, ROUTER, ROUTER_SETTINGS, make_site
 
-    for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, datetime.now(UTC)):
+    now, revoked = datetime.now(UTC), tuple(revoke or ())
+    for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, now, renew_days=renew, revoke=revoked):
         said = "; signs new certificates, keep it off line" if made.name == AUTHORITY else ""
         typer.echo(f"{made}{said}")
+    for holder in revoke or ():
+        typer.echo(
+            f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; start the router again"
+        )
 
 
 def router(
