@@ -10,6 +10,9 @@ from reactorwatch.contract.keys import checked_plant
 ChartName = Literal["shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe", "parameters"]
 PriorityName = Literal["low", "medium", "high", "critical"]
 
+DEFAULT_PRIORITIES: dict[str, PriorityName] = {"T": "high"}
+"""Priorities where the settings give none; an entry holds where its signal is an output."""
+
 
 class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a plant is watched.
@@ -83,7 +86,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     silence_periods: float = 5.0
     snapshot_min: float = 5.0
     health_period_s: float = 5.0
-    priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: {"T": "high"})
+    priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: DEFAULT_PRIORITIES)
 
     def __post_init__(self) -> None:
         checked_plant(self.plant)
@@ -119,6 +122,9 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for signal, sd in self.smallest_sd.items():
             if not 0 <= sd < 1e6:
                 raise ValueError(f"smallest_sd of {signal} must be in [0, 1e6), got {sd:g}")
+        if self.priorities is DEFAULT_PRIORITIES:
+            held = {signal: priority for signal, priority in DEFAULT_PRIORITIES.items() if signal in self.outputs}
+            msgspec.structs.force_setattr(self, "priorities", held)
         for signal in self.priorities:
             if signal not in self.outputs:
                 raise ValueError(f"priorities are by output, {self.outputs}, got {signal!r}")

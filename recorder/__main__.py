@@ -10,6 +10,7 @@ import msgspec
 import tomli_w
 
 from reactorwatch.contract import keys
+from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
@@ -49,7 +50,8 @@ def run(
         metrics_config: where its counts are shown.
 
     Raises:
-        InputError: the file exists already, or cannot be written; or the endpoint makes no sense.
+        InputError: the folder cannot be made; the file exists already, or cannot be written; or the endpoint makes no
+            sense.
     """
     with stop_on_signals() as stop:
         record(config, bus_config, stop, metrics_config)
@@ -69,7 +71,11 @@ def record(
     Raises:
         InputError: as `run`.
     """
-    files = files_for(config)  # before the waiting for a router
+    # both before the waiting for a router
+    series = series_for(config)
+    if series.dated:
+        make_folder(series.folder, "--out")
+    files = files_for(config)
     with served(metrics_config, Metrics(config.plant, NODE, files.free_bytes), NODE) as metrics:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:

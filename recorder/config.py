@@ -17,7 +17,8 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         plant: the plant that the recorder reports its health under, and that a file is named after.
-        out: the file, with the ending `.mcap`; or the folder for a file named `{plant}-{UTC time}.mcap`.
+        out: the file, with the ending `.mcap`; or the folder for a file named `{plant}-{UTC time}.mcap`. A folder that
+            does not exist is made.
         key_expression: what is recorded.
         health_period_s: between two reports of health.
         flush_period_s: between two moments at which all that was received is handed to the operating system: what a

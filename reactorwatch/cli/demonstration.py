@@ -131,6 +131,7 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
     try:
         tables = {**nodes, "recorder": heard_by(recorder, site)}
         settings = write_node_settings(folder / SETTINGS_FILE, tables, join, NODES)
+        typer.echo(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
         with stop_on_signals() as stop:
             if not _run_nodes(bus, stop, settings, folder, plant):
                 typer.echo(f"stopped; what was recorded until then is in {folder}", err=True)

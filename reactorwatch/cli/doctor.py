@@ -91,7 +91,7 @@ def _certificate(config: BusConfig, plant: str, now: datetime) -> Iterator[Findi
         return
     own, ca = read_certificate(Path(config.certificate)), read_certificate(Path(config.ca))
     name = common_name_of(own)
-    renew = "renew it: delete its folder in the site, and call `reactorwatch certify` again"
+    renew = "renew it: `reactorwatch certify SITE --renew 30`, and copy the new folder"
     for what, certificate in (("certificate", own), ("authority", ca)):
         left = certificate.not_valid_after_utc - now
         until = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC, {left.days} days"

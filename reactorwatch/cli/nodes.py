@@ -108,7 +108,7 @@ def monitor(
         Path | None,
         typer.Option(
             "--state",
-            help="Folder where all that it has learned is kept, so that it goes on after a restart.",
+            help="Folder where all that it has learned is kept, so that it resumes after a restart; made if not there.",
             show_default=False,
         ),
     ] = None,
@@ -129,6 +129,7 @@ def monitor(
     from monitor_node.fleet.config import FleetConfig
     from monitor_node.fleet.node import run as run_fleet
     from reactorwatch.cli.supervise import diagnosing, diagnosis_settings
+    from reactorwatch.records.folder import make_folder
     from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = _settings(config, endpoint)
@@ -139,13 +140,17 @@ def monitor(
         flags |= {"state_file": str(state / "monitor.state"), "alarm_state_file": str(state / "alarms.state")}
     config_of_monitor = section(MonitorConfig, "monitor", tables, flags)
     if fleet.plants is not None:
+        state = Path(fleet.state) if fleet.state is not None else None
         for option, given in (("--plant", name), ("--diagnose", diagnose)):
             if given is not None:
                 raise InputError(f"{option} is for the monitor of one plant; leave it out with --plants")
+    if shard is not None and fleet.plants is None:
+        raise InputError("--shard is a part of the plants that --plants names; give both")
+    if state is not None:
+        make_folder(state, "--state")
+    if fleet.plants is not None:
         run_fleet(config_of_monitor, fleet, bus, _metrics(tables))
         return
-    if shard is not None:
-        raise InputError("--shard is a part of the plants that --plants names; give both")
     diagnosis = diagnosis_settings(tables, config_of_monitor, diagnose)
     with diagnosing(diagnosis, bus, section(LogConfig, "log", tables, {})) if diagnosis.out else nullcontext():
         run(config_of_monitor, bus, _metrics(tables))
@@ -156,7 +161,10 @@ def record(
     endpoint: Endpoint = None,
     name: Plant = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="File or folder to write to [.].", show_default=False)
+        Path | None,
+        typer.Option(
+            "--out", "-o", help="File or folder to write to, made if it does not exist [.].", show_default=False
+        ),
     ] = None,
 ) -> None:
     """Record everything on the bus into an MCAP file."""

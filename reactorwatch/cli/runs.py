@@ -26,7 +26,15 @@ def up(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the recording.")] = Path("runs"),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for the recording, or its file [as in the settings, or runs].",
+            show_default=False,
+        ),
+    ] = None,
     speed: Annotated[
         str | None, typer.Option(help="Plant time over wall time: a number, or 'max' [1].", show_default=False)
     ] = None,

@@ -31,43 +31,82 @@ def certify(
         typer.Option(help="Where the router listens [as before, or where it is called].", show_default=False),
     ] = None,
     days: Annotated[float, typer.Option(help="How long certificates are valid.", min=1, max=3650)] = 365.0,
+    renew: Annotated[
+        float | None,
+        typer.Option(
+            "--renew", help="Make certificates again that end within so many days.", min=0, max=3650, show_default=False
+        ),
+    ] = None,
+    revoke: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--revoke",
+            help="Have the router refuse the certificates so far of this plant and role, such as cstr/monitor, and "
+            "make a new one. Repeatable.",
+            show_default=False,
+        ),
+    ] = None,
 ) -> None:
     """Make the certificates and access rules of a site.
 
     Each who joins its bus gets a folder of its own, to be copied to its machine: certificate, key and settings for
-    --config. What is there already stays: a plant is added by naming it, and a certificate renewed by deleting its
-    folder first. The router's rules are written anew; start it again after that.
+    --config. What is complete stays, what is half made is completed: a plant is added by naming it. The router's rules
+    are written again; start it again after that, unless certificates were only renewed.
     """
     from datetime import UTC, datetime
 
-    from reactorwatch.runtime.site import AUTHORITY, make_site
+    from reactorwatch.runtime.site import AUTHORITY, ROUTER, ROUTER_SETTINGS, make_site
 
-    for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, datetime.now(UTC)):
+    now, revoked = datetime.now(UTC), tuple(revoke or ())
+    for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, now, renew_days=renew, revoke=revoked):
         said = "; signs new certificates, keep it off line" if made.name == AUTHORITY else ""
         typer.echo(f"{made}{said}")
+    for holder in revoke or ():
+        typer.echo(
+            f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; start the router again"
+        )
 
 
 def router(
     file: Annotated[
-        Path, typer.Argument(help="Zenoh's settings, as `certify` writes them: router.json5.", show_default=False)
-    ],
+        Path | None,
+        typer.Argument(
+            help="Zenoh's settings, as `certify` writes them: router.json5 [a plain router, on this machine alone].",
+            show_default=False,
+        ),
+    ] = None,
+    config: Settings = None,
+    endpoint: Annotated[
+        str | None,
+        typer.Option(help="Where a plain router listens [tcp/127.0.0.1:7447].", show_default=False),
+    ] = None,
 ) -> None:
-    """Run the router of a site, with its certificates and access rules; the log says what they refuse."""
+    """Run a router until stopped: of a site, with its certificates and access rules, or without a file a plain one.
+
+    The log says what the rules refuse.
+    """
     import threading
 
     import structlog
 
     from reactorwatch.cli.options import existing
+    from reactorwatch.errors import InputError
+    from reactorwatch.runtime.bus_zenoh import router as plain_router
     from reactorwatch.runtime.bus_zenoh import refusals_logged, router_from_file
+    from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
     from reactorwatch.runtime.logs import configure
     from reactorwatch.runtime.serve import stop_on_signals
 
-    configure()
+    if file is not None and (config is not None or endpoint is not None):
+        raise InputError(f"{file}: says where this router listens; leave out --config and --endpoint")
+    tables = read_settings(config)
+    settings = section(BusConfig, "bus", tables, {"endpoint": endpoint})
+    configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
     with refusals_logged(), stop_on_signals() as stop:
-        bus = router_from_file(existing(file))
+        bus = router_from_file(existing(file)) if file is not None else plain_router(settings)
         stopped = threading.Event()
         stop.wakes(stopped.set)
-        structlog.get_logger().info("router", settings=str(file))
+        structlog.get_logger().info("router", **({"settings": str(file)} if file else {"endpoint": settings.endpoint}))
         try:
             if not stop.is_set:
                 stopped.wait()

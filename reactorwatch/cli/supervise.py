@@ -25,16 +25,19 @@ from reactorwatch.runtime.model_file import read_extended_model
 from reactorwatch.runtime.serve import stop_on_signals
 from recorder.__main__ import file_for
 from recorder.config import RecorderConfig
+from recorder.series import ENDING
 
 log = structlog.get_logger()
 
 LOOK_EVERY_S = 0.5
+DEFAULT_OUT = "runs"
+"""Folder of recordings where neither the command line nor the settings give one."""
 
 
 def run_until_stopped(
     config: Path | None,
     endpoint: str | None,
-    out: Path,
+    out: Path | None,
     flags: dict[str, Any],
     diagnose: Path | None = None,
     site: Path | None = None,
@@ -44,7 +47,8 @@ def run_until_stopped(
     Args:
         config: settings file, or None.
         endpoint: the router's address, or None.
-        out: folder for the recording and the settings that ran; made if it is not there.
+        out: folder for the recording and the settings that ran, or the recording's file; a folder that does not exist
+            is made. None: `out` of the recorder's settings, or the folder `runs`.
         flags: of the plant; None: not said.
         diagnose: folder for diagnoses after alarms; None: that of the settings, or none.
         site: folder of certificates, whose router is run and whose roles the nodes take; None: all is plain.
@@ -62,7 +66,9 @@ def run_until_stopped(
     waiting = {"wait_for": ["monitor", "recorder"]}
     plant = section(PlantConfig, "plant", {"plant": {**waiting, **tables.get("plant", {})}}, flags)
     monitor = section(MonitorConfig, "monitor", tables, {"plant": name or plant.name})
-    recorder = heard_by(section(RecorderConfig, "recorder", tables, {"plant": name or plant.name}), site)
+    of_recorder = {"recorder": {"out": DEFAULT_OUT, **tables.get("recorder", {})}}
+    recorder_flags = {"plant": name or plant.name, "out": str(out) if out is not None else None}
+    recorder = heard_by(section(RecorderConfig, "recorder", of_recorder, recorder_flags), site)
     join = joining(site, plant.name, tables, endpoint)
     diagnosis = diagnosis_settings(tables, monitor, diagnose)
     metrics = section(MetricsConfig, "metrics", tables, {})
@@ -71,13 +77,13 @@ def run_until_stopped(
     try:
         tables_written = {"plant": plant, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
         nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", "plant")
-        settings = _write_down(out, recorder, plant.seed, {**tables_written, "log": log_config}, join, nodes)
+        settings = _write_down(recorder, plant.seed, {**tables_written, "log": log_config}, join, nodes)
         with stop_on_signals() as stop, Processes(settings) as processes:
             woken = threading.Event()
             stop.wakes(woken.set)
             for node in nodes:
                 processes.start(node)
-            log.info("running", plant=plant.name, router=join[VIEWER].endpoint, folder=str(out), stop="Ctrl-C")
+            log.info("running", plant=plant.name, router=join[VIEWER].endpoint, out=recorder.out, stop="Ctrl-C")
             while not woken.wait(LOOK_EVERY_S):
                 ended = processes.ended()
                 if ended:
@@ -122,7 +128,6 @@ def diagnosing(config: DiagnosisConfig, bus_config: BusConfig, log_config: LogCo
 
 
 def _write_down(
-    out: Path,
     recorder: RecorderConfig,
     seed: int,
     others: dict[str, msgspec.Struct],
@@ -130,9 +135,12 @@ def _write_down(
     nodes: Sequence[str],
 ) -> dict[str, Path]:
     """Write the whole settings where the recordings will be, named after the moment as they are; each node's file."""
-    make_folder(out, "--out")
-    recorder = msgspec.structs.replace(recorder, out=str(out))
-    settings = file_for(recorder, datetime.now(UTC)).with_suffix(".toml")
+    out = Path(recorder.out)
+    make_folder(out.parent if out.suffix == ENDING and not out.is_dir() else out, "--out")
+    recording = file_for(recorder, datetime.now(UTC))
+    if recording.exists():
+        raise InputError(f"--out {out}: a recording of that name exists; choose another name, or a folder")
+    settings = recording.with_suffix(".toml")
     about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **others}), **recorder.about}
     recorder = msgspec.structs.replace(recorder, about=about)
     return write_node_settings(settings, {**others, "recorder": recorder}, join, nodes)

@@ -10,7 +10,10 @@ out. What publishers remember is asked for below `@adv`, which no `**` reaches, 
 Source of the words: https://zenoh.io/docs/manual/access-control
 """
 
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 from reactorwatch.contract import keys
@@ -83,6 +86,16 @@ ROLES = (
 )
 """Everyone that a certificate can be made for, but the router."""
 
+REVOKED = "revoked"
+"""The subject of certificates that may do nothing: Zenoh 1.10 reads no revocation lists of certificates."""
+SERIAL_BYTES = 4
+_SERIAL = re.compile(rf"\.[0-9a-f]{{{2 * SERIAL_BYTES}}}$")
+NO_NAMES: Mapping[str, str] = MappingProxyType({})
+EVERY_MESSAGE = (
+    *("put", "delete", "query", "reply", "declare_subscriber", "declare_queryable"),
+    *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
+)
+
 HEAR_IN = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
 HEAR_OUT = ("put", "delete", "reply", "liveliness_token", "declare_queryable", "declare_subscriber")
 
@@ -106,14 +119,18 @@ def role_of(name: str) -> tuple[str, Role] | None:
 
     >>> role_of("line.2.viewer")[0]
     'line.2'
+    >>> role_of("line.2.viewer.0f3a9c21")[0]
+    'line.2'
     >>> role_of("router") is None
     True
     """
-    plant, _, word = name.rpartition(".")
+    plant, _, word = _SERIAL.sub("", name).rpartition(".")
     return next(((plant, role) for role in ROLES if plant and role.name == word), None)
 
 
-def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
+def access_control(
+    plants: tuple[str, ...], names: Mapping[str, str] = NO_NAMES, revoked: Sequence[str] = ()
+) -> dict[str, Any]:
     """A router's settings `access_control`: nothing is allowed but what the roles of these plants may do.
 
     A key is published on by one role alone (see `streams`): where a role's expression also names keys of another, these
@@ -121,6 +138,8 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
 
     Args:
         plants: their names.
+        names: the common name of a holder's certificates, by `plant/role`; those not named have `common_name`.
+        revoked: common names of certificates that may do nothing. The list is in the settings under `subjects`.
     """
     rules: list[dict[str, Any]] = [_rule("everyone", "ask nobody", ("ingress",), ("query",), [NOBODY])]
     subjects, policies = [], []
@@ -166,9 +185,14 @@ def access_control(plants: tuple[str, ...]) -> dict[str, Any]:
                         )
                     )
             rules += own
-            subjects.append({"id": name, "cert_common_names": [name]})
+            subjects.append({"id": name, "cert_common_names": [names.get(f"{plant}/{role.name}", name)]})
             used = [rules[0], *reading, *own]
             policies.append({"rules": [rule["id"] for rule in used], "subjects": [name]})
+    if revoked:
+        nothing = _rule(REVOKED, "nothing", ("ingress", "egress"), EVERY_MESSAGE, ["**", f"**/{MEMORY}"])
+        rules.append({**nothing, "permission": "deny"})
+        subjects.append({"id": REVOKED, "cert_common_names": list(revoked)})
+        policies.append({"rules": [nothing["id"]], "subjects": [REVOKED]})
     return {
         "enabled": True,
         "default_permission": "deny",

@@ -9,15 +9,22 @@ SITE/cstr/viewer/ ...
 
 import datetime
 import json
+import re
+import shutil
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-import msgspec
+import tomli_w
+from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
 
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.access import ROLES, access_control, common_name
-from reactorwatch.runtime.certificates import Identity, authority, issue, read_certificate, read_key
+from reactorwatch.records.atomic import replacing
+from reactorwatch.runtime.access import ROLES, SERIAL_BYTES, access_control, common_name
+from reactorwatch.runtime.certificates import Identity, authority, common_name_of, issue, read_certificate, read_key
+from reactorwatch.runtime.site_register import Register, read_register
 
 AUTHORITY, ROUTER = "authority", "router"
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
@@ -27,6 +34,15 @@ DEFAULT_ENDPOINT = "tls/127.0.0.1:7447"
 AUTHORITY_DAYS = 3650.0
 
 
+LONGEST_DAYS = 3650.0
+LONGEST_NAME = 64
+"""Letters of a certificate's common name (RFC 5280, ub-common-name)."""
+LONGEST_PLANT = LONGEST_NAME - max(len(common_name("", role.name)) for role in ROLES) - 2 * SERIAL_BYTES - 1
+
+Write = Callable[[Path], None]
+"""Writes the files of an identity into a folder."""
+
+
 def make_site(
     folder: Path,
     plants: tuple[str, ...],
@@ -34,27 +50,68 @@ def make_site(
     listen: str | None,
     days: float,
     now: datetime.datetime,
+    *,
+    renew_days: float | None = None,
+    revoke: Sequence[str] = (),
 ) -> list[Path]:
-    """Make what is not there yet of a site: its authority, the router, and every role of every plant.
+    """Make what is missing of a site: its authority, the router, and every role of every plant.
 
-    What is there stays as it is, but for the router's settings, which allow the plants that then are there. So a plant
-    is added by naming it, and removed by deleting its folder; a certificate is renewed by deleting its folder first.
+    What is complete stays as it is, but for the router's settings, which allow the plants that the site then has. A
+    folder with a file missing or damaged is completed. A plant is removed by deleting its folder.
 
     Args:
-        folder: of the site; made if it is not there.
-        plants: those that should be there besides those that are; if there are none then, `cstr`.
+        folder: the site's folder; made if it does not exist.
+        plants: names of plants to add. A new site without any gets `cstr`.
         endpoint: where the nodes call the router, `tls/HOST:PORT`; the router's certificate is for that host. None: as
             before, or this machine's loopback.
-        listen: where the router listens, likewise; None: as before, or where it is called.
+        listen: where the router listens, of the same form. None: as before, or where it is called.
         days: for how long certificates are valid.
-        now: from when on.
+        now: the time from which they are valid.
+        renew_days: certificates that end within so many days are made again. None: none is.
+        revoke: holders, such as `cstr/monitor`, whose certificates so far the router is to refuse; each gets a new one.
 
     Returns:
-        The folders that were made.
+        The folders that were made, completed or given a new certificate.
 
     Raises:
-        InputError: the folder cannot be written, or holds a damaged authority; or an address or a name is none.
+        InputError: the folder cannot be written, its authority is missing or damaged, or an argument cannot be used.
     """
+    _check(plants, days)
+    there = _plants_in(folder)
+    register = _register_of(folder, there, endpoint, listen)
+    plants = tuple(sorted({*there, *plants}))
+    if not plants and not (folder / AUTHORITY).is_dir():
+        plants = ("cstr",)
+    holders = [f"{plant}/{role.name}" for plant in plants for role in ROLES]
+    for holder in revoke:
+        if holder not in holders:
+            raise InputError(
+                f"--revoke {holder}: is no PLANT/ROLE of this site (valid: {', '.join(holders) or 'none'})"
+            )
+    try:
+        ca, made = _authority(folder / AUTHORITY, now, is_old=_is_old(folder, there))
+        for holder in revoke:
+            register.revoke(holder)
+        register.write(folder / AUTHORITY / PLACE)
+        until = now + datetime.timedelta(days=renew_days) if renew_days is not None else now
+        issuer = _Issuer(ca, now, days, until)
+        host = _host(register.endpoint)
+        hosts = tuple(dict.fromkeys((host, "localhost", "127.0.0.1")))
+        if issuer.complete(folder / ROUTER, ROUTER, hosts):
+            made.append(folder / ROUTER)
+        rules = access_control(plants, register.names, register.revoked)
+        with replacing(folder / ROUTER / ROUTER_SETTINGS) as part:
+            part.write_text(_router_settings(rules, register.listen), encoding="utf-8")
+        for holder in holders:
+            settings = _settings(holder.partition("/")[0], register.endpoint)
+            if issuer.complete(folder / holder, register.name_of(holder), settings=settings):
+                made.append(folder / holder)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+    return made
+
+
+def _check(plants: tuple[str, ...], days: float) -> None:
     for plant in plants:
         try:
             keys.checked_plant(plant)
@@ -62,77 +119,138 @@ def make_site(
             raise InputError(f"--plant: {error}") from error
         if plant in (AUTHORITY, ROUTER):
             raise InputError(f"--plant {plant}: is the name of another folder of the site; choose another")
-    before = _read_place(folder / AUTHORITY / PLACE)
-    endpoint = endpoint or before.get("endpoint") or DEFAULT_ENDPOINT
-    listen = listen or before.get("listen") or endpoint
-    _host(listen)
-    there = {path.parent.parent.name for path in folder.glob(f"*/*/{CERTIFICATE}")}
-    plants = tuple(sorted(there.union(plants))) or ("cstr",)
-    try:
-        return _make(folder, plants, (endpoint, _host(endpoint), listen), days, now)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+        if len(plant) > LONGEST_PLANT:
+            raise InputError(
+                f"--plant {plant}: a plant of a site has at most {LONGEST_PLANT} letters, because certificates hold "
+                f"{LONGEST_NAME}, got {len(plant)}"
+            )
+    if not 1.0 <= days <= LONGEST_DAYS:
+        raise InputError(f"--days must be in [1, {LONGEST_DAYS:g}], got {days:g}")
 
 
-def _make(
-    folder: Path, plants: tuple[str, ...], at: tuple[str, str, str], days: float, now: datetime.datetime
-) -> list[Path]:
-    endpoint, host, listen = at
-    made: list[Path] = []
-    ca = _authority(folder / AUTHORITY, now, made)
-    place = json.dumps({"endpoint": endpoint, "listen": listen})
-    (folder / AUTHORITY / PLACE).write_text(place + "\n", encoding="utf-8")
-    router = folder / ROUTER
-    hosts = tuple(dict.fromkeys((host, "localhost", "127.0.0.1")))
-    _identity(router, ca, "router", (now, days), made, hosts)
-    (router / ROUTER_SETTINGS).write_text(_router_settings(plants, listen), encoding="utf-8")
-    for plant in plants:
-        for role in ROLES:
-            holder = folder / plant / role.name
-            if _identity(holder, ca, common_name(plant, role.name), (now, days), made):
-                (holder / SETTINGS).write_text(_settings(plant, endpoint), encoding="utf-8")
-    return made
+def _plants_in(folder: Path) -> list[str]:
+    """Names of the plants that have a folder in a site.
+
+    Raises:
+        InputError: a folder of another name holds a role.
+    """
+    found = []
+    for holder in sorted(folder.glob("*/*")):
+        plant = holder.parent.name
+        if holder.is_dir() and holder.name in {role.name for role in ROLES} and plant not in (AUTHORITY, ROUTER):
+            try:
+                found.append(keys.checked_plant(plant))
+            except ValueError as error:
+                raise InputError(f"{holder.parent}: is no plant's folder; move it out of the site: {error}") from error
+    return list(dict.fromkeys(found))
 
 
-def _authority(folder: Path, now: datetime.datetime, made: list[Path]) -> Identity:
-    if folder.is_dir():
-        return Identity(read_certificate(folder / CA), read_key(folder / KEY))
-    folder.mkdir(parents=True, mode=0o700)
+def _is_old(folder: Path, there: list[str]) -> bool:
+    """Whether a site has certificates, which then are of an authority that exists somewhere."""
+    holders = [folder / ROUTER, *(folder / plant / role.name for plant in there for role in ROLES)]
+    return any((holder / CERTIFICATE).exists() for holder in holders)
+
+
+def _register_of(folder: Path, there: list[str], endpoint: str | None, listen: str | None) -> Register:
+    """The notes of the site with the addresses that are given.
+
+    Raises:
+        InputError: the site's authority or its notes are missing, or an address is none.
+    """
+    home = folder / AUTHORITY
+    is_old = _is_old(folder, there)
+    if is_old and not (home / KEY).exists():
+        raise InputError(
+            f"{home}: the site's authority is not there, and its private key signs all certificates; put that folder "
+            "back, or begin a new site in another folder"
+        )
+    before = read_register(home / PLACE)
+    if before is None and is_old and (endpoint is None or listen is None):
+        raise InputError(f"{home / PLACE}: is missing, and says where the router is; give --endpoint and --listen")
+    if before is None:
+        called = endpoint or DEFAULT_ENDPOINT
+        before = Register(called, listen or called)
+    register = Register(endpoint or before.endpoint, listen or before.listen, before.names, before.revoked)
+    for address in (register.endpoint, register.listen):
+        _host(address)
+    return register
+
+
+def _authority(folder: Path, now: datetime.datetime, *, is_old: bool) -> tuple[Identity, list[Path]]:
+    """The authority of a site, made if the site is new; and the folders made."""
+    if (folder / CA).exists() or is_old:
+        return Identity(read_certificate(folder / CA), read_key(folder / KEY)), []
     ca = authority(f"reactorwatch {now:%Y-%m-%d}", now, AUTHORITY_DAYS)
-    ca.write(folder / CA, folder / KEY)
-    made.append(folder)
-    return ca
+    _place(folder, lambda new: ca.write(new / CA, new / KEY), mode=0o700)
+    return ca, [folder]
 
 
-def _read_place(path: Path) -> dict[str, str]:
-    """Where the router of a site is; empty if it has none yet."""
-    if not path.exists():
-        return {}
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=dict[str, str])
-    except (OSError, msgspec.DecodeError) as error:
-        raise InputError(f"{path}: cannot be read as what `certify` has written there: {error}") from error
+class _Issuer:
+    """Completes folders of identities.
+
+    Args:
+        ca: the authority.
+        now: the time from which new certificates are valid.
+        days: for how long.
+        until: certificates that end before this are made again.
+    """
+
+    def __init__(self, ca: Identity, now: datetime.datetime, days: float, until: datetime.datetime) -> None:
+        self._ca, self._now, self._days, self._until = ca, now, days, until
+        if ca.certificate.not_valid_after_utc <= now:
+            raise InputError(
+                f"the authority's certificate ended on {ca.certificate.not_valid_after_utc:%Y-%m-%d}; make a new site"
+            )
+        self._ca_pem = ca.certificate.public_bytes(serialization.Encoding.PEM)
+
+    def complete(self, folder: Path, name: str, hosts: tuple[str, ...] = (), settings: str = "") -> bool:
+        """Make what is missing or has to be new in a folder; False if nothing was.
+
+        Args:
+            folder: the holder's.
+            name: the common name of its certificate.
+            hosts: of a router.
+            settings: for `settings.toml`, which is not replaced.
+        """
+        is_new = not self._is_valid(folder, name)
+        if not is_new and (folder / CA).is_file() and (not settings or (folder / SETTINGS).is_file()):
+            return False
+
+        def write(new: Path) -> None:
+            if is_new:
+                issue(self._ca, name, self._now, self._days, hosts).write(new / CERTIFICATE, new / KEY)
+            (new / CA).write_bytes(self._ca_pem)
+            if settings and not (folder / SETTINGS).exists():
+                (new / SETTINGS).write_text(settings, encoding="utf-8")
+
+        _place(folder, write)
+        return True
+
+    def _is_valid(self, folder: Path, name: str) -> bool:
+        try:
+            certificate, key = read_certificate(folder / CERTIFICATE), read_key(folder / KEY)
+            certificate.verify_directly_issued_by(self._ca.certificate)
+        except (InputError, ValueError, TypeError, InvalidSignature):
+            return False
+        is_pair = key.public_key() == certificate.public_key()
+        return is_pair and common_name_of(certificate) == name and certificate.not_valid_after_utc > self._until
 
 
-def _identity(
-    folder: Path,
-    ca: Identity,
-    name: str,
-    validity: tuple[datetime.datetime, float],
-    made: list[Path],
-    hosts: tuple[str, ...] = (),
-) -> bool:
-    """Make a folder with a new certificate in it, if there is none."""
-    if folder.is_dir():
-        return False
-    folder.mkdir(parents=True)
-    issue(ca, name, *validity, hosts).write(folder / CERTIFICATE, folder / KEY)
-    (folder / CA).write_bytes(ca.certificate.public_bytes(serialization.Encoding.PEM))
-    made.append(folder)
-    return True
+def _place(folder: Path, write: Write, mode: int = 0o777) -> None:
+    """Have files written into a new folder beside `folder`, then put them into it; a new folder appears complete."""
+    new = folder.with_name(f".{folder.name}.new")
+    shutil.rmtree(new, ignore_errors=True)
+    new.mkdir(parents=True, mode=mode)
+    write(new)
+    if not folder.exists():
+        new.rename(folder)
+        return
+    for file in sorted(new.iterdir()):
+        file.replace(folder / file.name)
+    new.rmdir()
 
 
-def _router_settings(plants: tuple[str, ...], listen: str) -> str:
+def _router_settings(rules: dict[str, Any], listen: str) -> str:
     """For `zenohd --config` and `reactorwatch router`; files are relative to the folder they are in."""
     tls = {
         "root_ca_certificate": CA,
@@ -153,20 +271,26 @@ def _router_settings(plants: tuple[str, ...], listen: str) -> str:
                 "tx": {"queue": {"congestion_control": {"block": {"wait_before_close": 1_000_000}}}},
             }
         },
-        "access_control": access_control(plants),
+        "access_control": rules,
     }
     return json.dumps(settings, indent=2) + "\n"
 
 
 def _settings(plant: str, endpoint: str) -> str:
-    """For `--config`: where the router is, who we are, and which plant it is about."""
-    identity = f'ca = "{CA}"\ncertificate = "{CERTIFICATE}"\nkey = "{KEY}"\n'
-    tables = [f'[bus]\nendpoint = "{endpoint}"\n{identity}']
-    tables.append(f'[plant]\nname = "{plant}"\n')
-    tables += [f'[{table}]\nplant = "{plant}"\n' for table in ("monitor", "replay")]
-    # a subscription to more than may be read would be refused as a whole
-    tables.append(f'[recorder]\nplant = "{plant}"\nkey_expression = "{keys.ROOT}/{plant}/**"\n')
-    return "\n".join(tables)
+    """For `--config`: where the router is, the files of the identity, and the plant."""
+    tables = {
+        "bus": {"endpoint": endpoint, "ca": CA, "certificate": CERTIFICATE, "key": KEY},
+        "plant": {"name": plant},
+        "monitor": {"plant": plant},
+        "replay": {"plant": plant},
+        # a subscription to more than may be read would be refused as a whole
+        "recorder": {"plant": plant, "key_expression": f"{keys.ROOT}/{plant}/**"},
+    }
+    return tomli_w.dumps(tables)
+
+
+_ADDRESS = re.compile(r"tls/(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>\d{1,5})")
+LAST_PORT = 65535
 
 
 def _host(endpoint: str) -> str:
@@ -175,8 +299,10 @@ def _host(endpoint: str) -> str:
     Raises:
         InputError: it is no address for TLS.
     """
-    protocol, _, place = endpoint.partition("/")
-    host, colon, port = place.rpartition(":")
-    if protocol != "tls" or not host or not colon or not port.isdigit():
-        raise InputError(f"address must be like 'tls/127.0.0.1:7447', got {endpoint!r}")
-    return host.strip("[]")
+    match = _ADDRESS.fullmatch(endpoint)
+    if match is None or not 1 <= int(match["port"]) <= LAST_PORT:
+        raise InputError(
+            f"address must be like 'tls/127.0.0.1:7447', of letters, digits, '.' and '-', with a port up to "
+            f"{LAST_PORT}, got {endpoint!r}"
+        )
+    return match["host"].strip("[]")

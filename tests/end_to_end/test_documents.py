@@ -1,60 +1,184 @@
-"""What README, CONTRIBUTING and docs tell people to type does what they say."""
+"""README, CONTRIBUTING and docs are true: every command, Python block and settings block works, in order."""
 
+import contextlib
 import re
-import shlex
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
+import msgspec
 import pytest
+import typer.main
 
+from monitor_node.config import MonitorConfig
+from monitor_node.fleet.config import FleetConfig
 from plant_node.config import PlantConfig
-from plant_node.record import simulate_record
+from reactorwatch.cli.after_alarm import DiagnosisConfig
+from reactorwatch.cli.main import app
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.records.csv_file import write_csv
-from reactorwatch.runtime.config import read_settings, section
-from recorder.config import RecorderConfig
+from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, read_settings, section
+from recorder.config import RecorderConfig, ReplayConfig
 
 from .conftest import Command
+from .given import Files
+from .machine import Machine
+from .pages import PAGES, ROOT, Block, blocks, inline_commands, words
 
-ROOT = Path(__file__).parents[2]
-DOCUMENTS = [
-    ROOT / "README.md",
-    ROOT / "CONTRIBUTING.md",
-    ROOT / "CHANGELOG.md",
-    *sorted((ROOT / "docs").rglob("*.md")),
-]
+DOCUMENTS = [*PAGES, ROOT / "CHANGELOG.md", *sorted((ROOT / "docs" / "decisions").glob("*.md"))]
+KINDS: dict[str, type[msgspec.Struct]] = {
+    "bus": BusConfig,
+    "plant": PlantConfig,
+    "monitor": MonitorConfig,
+    "fleet": FleetConfig,
+    "recorder": RecorderConfig,
+    "replay": ReplayConfig,
+    "diagnosis": DiagnosisConfig,
+    "metrics": MetricsConfig,
+    "log": LogConfig,
+}
+JOINS_THE_BUS = (
+    *("up", "demo", "plant", "monitor", "record", "replay", "router"),
+    *("view", "alive", "doctor", "status", "alarm", "playback"),
+)
+"""Commands that run as processes on the page's machine; others are called within this process, which is faster."""
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
-CONTRIBUTING = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+SCREEN = "needs a screen"
+ROOT_ONLY = "is for root and a running systemd, tests/integration/test_systemd.py checks the units"
+INDEX = "needs a package index"
+OTHERS = "is for several machines, tests/unit/runtime/test_jobs.py has a cluster on loopback"
+NOT_HERE = {
+    "docs/dashboards.md": [("rerun run.rrd", SCREEN)],
+    "docs/deployment.md": [
+        ("cp deploy/systemd/*.service /etc/systemd/system/", ROOT_ONLY),
+        ("systemctl enable --now reactorwatch-router reactorwatch@monitor reactorwatch@record", ROOT_ONLY),
+        ("pip install 'reactorwatch[metrics]'", INDEX),
+    ],
+    "docs/getting-started.md": [(".venv/bin/rerun runs/demo-…/demo.rrd", SCREEN)],
+    "docs/many_files.md": [
+        ("pip install 'reactorwatch[cluster]'       # here and on each machine", OTHERS),
+        ("dask scheduler                            # on one", OTHERS),
+        ("dask worker tcp://10.0.0.5:8786 --nworkers 8 --nthreads 1     # on each", OTHERS),
+        ("reactorwatch diagnose '/data/runs/*.csv' -o /data/reports --scheduler tcp://10.0.0.5:8786", OTHERS),
+    ],
+}
+"""All commands that this test leaves out, by page, and why; a page's mark gives the same reason."""
 
-RUN_BLOCKS = re.findall(r"<!-- run.*?-->\n```console\n(.*?)```", README, re.DOTALL)
-COMMAND_LINES = re.findall(r"^\$ (.*)$", README, re.MULTILINE)
-EXAMPLES = re.findall(r"^## (.*?)$(?:(?!^## ).)*?```python\n(.*?)```", CONTRIBUTING, re.MULTILINE | re.DOTALL)
+
+def name_of(page: Path) -> str:
+    return str(page.relative_to(ROOT))
 
 
-def test_the_readme_s_commands_on_a_record_work_as_they_stand(tmp_path: Path, command: Command) -> None:
-    config = PlantConfig(seed=3, faults=("coolant_flow:step:-0.15@120min",))
-    write_csv(tmp_path / "record.csv", simulate_record(config, 1500))
-    lines = [line.removeprefix("$ ") for block in RUN_BLOCKS for line in block.splitlines()]
-    assert len(lines) == 12
-    said = []
-    for line in lines:
-        name, *arguments = shlex.split(line)
-        assert name == "reactorwatch"
-        done = command(*arguments, cwd=tmp_path)
-        assert done.returncode == 0, f"{line}: {done.stderr}"
-        said.append(done.stdout)
-    assert "shewhart/T" in said[0]
-    first, again = (np.genfromtxt(tmp_path / name, delimiter=",", names=True) for name in ("record.csv", "again.csv"))
-    assert np.array_equal(first, again)
-    assert (tmp_path / "record.rrd").stat().st_size > 0
-    diagnosed = said[[line.split()[1] for line in lines].index("diagnose")]
-    assert "The simulation is wrong: coolant leak, since 1" in diagnosed
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
+    return Files(tmp_path_factory.mktemp("given"))
+
+
+@pytest.fixture
+def machine(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Machine]:
+    found = Machine(tmp_path_factory.mktemp("machine"))
+    yield found
+    found.close()
+
+
+def run_command(command: str, folder: Path, machine: Machine, called: Command) -> subprocess.CompletedProcess[str]:
+    name, *arguments = words(command)
+    if name == "make":  # what it would do: the work itself is in other tests, or takes hours
+        planned = ["make", "--dry-run", "--assume-new=pyproject.toml", *arguments]
+        return subprocess.run(planned, cwd=ROOT, capture_output=True, text=True, check=False)
+    if name == "reactorwatch" and (arguments[0] not in JOINS_THE_BUS or "--verify" in arguments):
+        return called(*arguments, cwd=folder)
+    return machine.run((name, *arguments), folder)
+
+
+def run_commands(block: Block, folder: Path, machine: Machine, called: Command) -> None:
+    if "not here:" in block.clauses:
+        return
+    for command in block.commands:
+        if "until" in block.clauses:
+            machine.start(words(command), folder, block.clauses["until"])
+            continue
+        done = run_command(command, folder, machine, called)
+        assert str(done.returncode) in block.clauses.get("ends with", "0").split(" or "), (
+            f"line {block.line}: {command}\n{done.stdout}{done.stderr}"
+        )
+
+
+def check_settings(block: Block, path: Path) -> None:
+    path.write_text(block.text, encoding="utf-8")
+    tables = read_settings(path)
+    assert tables, f"line {block.line}: settings without a table"
+    for table in tables:
+        section(KINDS[table], table, tables, {})
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_the_page_works_as_it_is_written(
+    page: Path, tmp_path: Path, files: Files, machine: Machine, called: Command
+) -> None:
+    for block in blocks(page.read_text(encoding="utf-8")):
+        for name in filter(None, block.clauses.get("given", "").split(", ")):
+            files.give(name, tmp_path)
+        if "others end" in block.clauses:
+            machine.end_started()
+        written = tmp_path / block.clauses.get("file", f"line-{block.line}.{block.kind}")
+        match block.kind:
+            case "commands":
+                run_commands(block, tmp_path, machine, called)
+            case "toml":
+                check_settings(block, written)
+            case "json":
+                assert parse_extended_model(block.text)
+                written.write_text(block.text, encoding="utf-8")
+            case "python":
+                with contextlib.chdir(tmp_path):
+                    exec(compile(block.text, f"{name_of(page)}:{block.line}", "exec"), {"__name__": "example"})
+    machine.end_started()
+
+
+def test_what_is_not_run_here_is_on_the_list_with_its_reason() -> None:
+    left_out: dict[str, list[tuple[str, str]]] = {}
+    for page in PAGES:
+        for block in blocks(page.read_text(encoding="utf-8")):
+            if "not here:" in block.clauses:
+                found = [(command, block.clauses["not here:"]) for command in block.commands]
+                left_out.setdefault(name_of(page), []).extend(found)
+    assert left_out == NOT_HERE
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_no_command_hides_in_another_kind_of_block(page: Path) -> None:
+    for block in blocks(page.read_text(encoding="utf-8")):
+        if block.kind not in ("commands", "python"):
+            assert not re.search(r"^\$? ?(\S*/)?reactorwatch ", block.text, re.MULTILINE), f"line {block.line}"
+
+
+def test_every_command_within_a_sentence_or_table_has_arguments_that_are_taken() -> None:
+    commands = [command for page in DOCUMENTS for command in inline_commands(page.read_text(encoding="utf-8"))]
+    assert len(commands) > 20
+    for command in commands:
+        name, *arguments = words(command)
+        known, context = typer.main.get_command(app), None
+        while hasattr(known, "resolve_command") and arguments:
+            context = known.make_context(name, arguments[:1], parent=context, resilient_parsing=True)
+            name, known, arguments = known.resolve_command(context, arguments)
+            assert known is not None, command
+        if arguments:  # a bare name is that of the command, and no line to type
+            known.make_context(name, arguments, parent=context)
+
+
+def test_every_table_of_settings_is_read_by_its_own_structure() -> None:
+    assert tuple(KINDS) == SECTIONS
+
+
+def test_there_is_an_example_of_each_addition() -> None:
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    examples = re.findall(r"^## (.*?)$(?:(?!^## ).)*?```python\n", text, re.MULTILINE | re.DOTALL)
+    assert examples == ["Add an effect", "Add a chart", "Add a message", "Add a panel", "Add a process model"]
 
 
 def test_the_readme_s_make_commands_are_targets_that_set_up_by_themselves() -> None:
-    made = [line.split()[1] for line in COMMAND_LINES if line.startswith("make ")]
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    made = [words(line)[1] for block in blocks(text) for line in block.commands if line.startswith("make ")]
     assert made == ["demo", "test"]
     for target in made:
         planned = subprocess.run(
@@ -65,54 +189,7 @@ def test_the_readme_s_make_commands_are_targets_that_set_up_by_themselves() -> N
         assert {"demo": "reactorwatch demo", "test": "pytest"}[target] in planned
 
 
-@pytest.mark.parametrize("line", [line for line in COMMAND_LINES if line.startswith("reactorwatch ")])
-def test_every_command_line_of_the_readme_names_a_command_and_options_that_exist(line: str, called: Command) -> None:
-    name, *arguments = shlex.split(line)[1:]
-    described = called(name, "--help")
-    assert described.returncode == 0
-    for option in (argument for argument in arguments if argument.startswith("-")):
-        assert re.search(rf"(?<![\w-]){re.escape(option)}(?![\w-])", described.stdout), f"{name} has no {option}"
-
-
-def test_there_is_an_example_of_each_addition() -> None:
-    assert [title for title, _ in EXAMPLES] == [
-        "Add an effect",
-        "Add a chart",
-        "Add a message",
-        "Add a panel",
-        "Add a process model",
-    ]
-
-
-@pytest.mark.parametrize(("title", "code"), EXAMPLES, ids=[title for title, _ in EXAMPLES])
-def test_the_example_runs(title: str, code: str) -> None:
-    exec(compile(code, f"CONTRIBUTING.md: {title}", "exec"), {"__name__": "example"})
-
-
-def test_the_example_of_a_diagnosis_runs(capsys: pytest.CaptureFixture[str]) -> None:
-    text = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    exec(compile(code, "docs/diagnosis.md", "exec"), {"__name__": "example"})
-    assert capsys.readouterr().out.startswith("The simulation is wrong: coolant leak, since ")
-
-
-def test_the_extended_model_of_the_docs_is_taken() -> None:
-    text = (ROOT / "docs" / "diagnosis.md").read_text(encoding="utf-8")
-    (written,) = re.findall(r"```json\n(.*?)```", text, re.DOTALL)
-    assert parse_extended_model(written).effects[0].effect.name == "coolant_flow"
-
-
-def test_the_settings_file_of_the_docs_is_taken(tmp_path: Path) -> None:
-    text = (ROOT / "docs" / "getting-started.md").read_text(encoding="utf-8")
-    (settings,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
-    path = tmp_path / "settings.toml"
-    path.write_text(settings, encoding="utf-8")
-    tables = read_settings(path)
-    assert section(PlantConfig, "plant", tables, {}).name == "R-101"
-    assert section(RecorderConfig, "recorder", tables, {}).plant == "R-101"
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=[str(path.relative_to(ROOT)) for path in DOCUMENTS])
+@pytest.mark.parametrize("document", DOCUMENTS, ids=name_of)
 def test_every_link_within_the_repository_leads_somewhere(document: Path) -> None:
     for target in re.findall(r"\]\((?!https?:)([^)#]+)", document.read_text(encoding="utf-8")):
         assert (document.parent / target).exists(), target

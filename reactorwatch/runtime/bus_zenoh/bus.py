@@ -127,6 +127,7 @@ class ZenohBus:
         self._wild = 0  # messages on many keys at once
         self._wild_logged_at: float | None = None
         self._closed = threading.Event()
+        self._gathering: list[threading.Thread] = []
 
     def publish(self, message: Encoded) -> None:
         """See `Bus`."""
@@ -234,7 +235,8 @@ class ZenohBus:
                         delivery.receive(came)
                     time.sleep(GATHER_AGAIN_S)
 
-        threading.Thread(target=empty, name="gather", daemon=True).start()
+        self._gathering.append(threading.Thread(target=empty, name="gather", daemon=True))
+        self._gathering[-1].start()
         if delivery is not None:
             self._begin(delivery, key_expression, history_s, on_told)
         elif on_told is not None:
@@ -447,6 +449,10 @@ class ZenohBus:
             self._voice.close()
         for delivery in self._deliveries:
             delivery.close()
+        # A thread that is in Zenoh's code when the interpreter ends aborts the process: "exception not rethrown".
+        for thread in self._gathering:
+            if thread is not threading.current_thread():
+                thread.join(FLUSH_WITHIN_S)
 
 
 def _published_since(seconds: float) -> str:

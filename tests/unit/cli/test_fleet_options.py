@@ -53,13 +53,13 @@ def test_options_that_do_not_go_together(
     assert why in said_of(options, monkeypatch, capsys)
 
 
-@pytest.mark.parametrize("name", ["missing", "file"])
-def test_a_folder_for_states_that_is_none(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("options", [["--plants", "reactor/*"], []])
+def test_a_folder_for_states_that_cannot_be_made(
+    options: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").touch()
-    line = said_of(["--plants", "reactor/*", "--state", str(tmp_path / name)], monkeypatch, capsys)
-    assert f"state folder {tmp_path / name}" in line
+    line = said_of([*options, "--state", str(tmp_path / "file")], monkeypatch, capsys)
+    assert f"--state {tmp_path / 'file'}: the folder cannot be made" in line
 
 
 @pytest.mark.parametrize("table", ["[monitor]\nstate_file = 'x'\n", "[monitor]\nalarm_state_file = 'x'\n"])

@@ -1,0 +1,58 @@
+"""The authority's own notes on its site, `SITE/authority/site.json`."""
+
+import secrets
+from pathlib import Path
+
+import msgspec
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.atomic import replacing
+from reactorwatch.runtime.access import SERIAL_BYTES, common_name
+
+
+class Register(msgspec.Struct, forbid_unknown_fields=True):
+    """Where the router of a site is, and under which names certificates are valid.
+
+    Attributes:
+        endpoint: the address at which nodes call the router.
+        listen: the address at which it listens.
+        names: common names of certificates by holder, such as `cstr/monitor`, where earlier ones were revoked.
+        revoked: common names that the router refuses, oldest first.
+    """
+
+    endpoint: str
+    listen: str
+    names: dict[str, str] = {}
+    revoked: list[str] = []
+
+    def name_of(self, holder: str) -> str:
+        """The common name of a holder's certificates."""
+        plant, _, role = holder.partition("/")
+        return self.names.get(holder) or common_name(plant, role)
+
+    def revoke(self, holder: str) -> str:
+        """Revoke all certificates of a holder so far; returns the name that they had."""
+        name = self.name_of(holder)
+        plant, _, role = holder.partition("/")
+        self.revoked.append(name)
+        self.names[holder] = f"{common_name(plant, role)}.{secrets.token_hex(SERIAL_BYTES)}"
+        return name
+
+    def write(self, path: Path) -> None:
+        """Write it, whole or not at all."""
+        with replacing(path) as part:
+            part.write_bytes(msgspec.json.encode(self) + b"\n")
+
+
+def read_register(path: Path) -> Register | None:
+    """The notes of a site; None if there are none.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    if not path.exists():
+        return None
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Register)
+    except (OSError, msgspec.DecodeError) as error:
+        raise InputError(f"{path}: cannot be read as what `certify` has written there: {error}") from error

@@ -1,0 +1,94 @@
+"""Files that pages of documentation take for granted, each made once for all pages."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.tank_effects import TANK_EFFECTS
+from reactorwatch.process.tanks import tanks
+from reactorwatch.records.csv_file import write_csv
+from reactorwatch.records.record import Record
+from tests.integration.watched_hour import record_hour
+
+LEAK = "coolant_flow:step:-0.15@120min"
+NARROW = {"kind": "random-steps", "low": 102.41, "high": 104.41}
+
+
+def _record(path: Path) -> None:
+    """A simulated plant whose coolant leaks."""
+    write_csv(path, simulate_record(PlantConfig(seed=3, faults=(LEAK,)), 1500))
+
+
+def _renamed_record(path: Path) -> None:
+    """The same with columns of other names."""
+    _record(path)
+    text = path.read_text(encoding="utf-8")
+    header, rows = text.split("\n", 1)
+    path.write_text(f"{header.replace('qc', 'FC-7').replace('T', 'TI-101')}\n{rows}", encoding="utf-8")
+
+
+def _narrow_record(path: Path) -> None:
+    """A record whose input hardly moves, so that several causes explain it."""
+    config = PlantConfig(seed=4, faults=("coolant_flow:constant:-0.02",), scenario=NARROW)
+    write_csv(path, simulate_record(config, 600))
+
+
+def _tank_record(path: Path) -> None:
+    """Two tanks whose lower outlet is clogged from the 30th minute on."""
+    random = np.random.default_rng(1)
+    time_min = np.arange(900) / 15
+    u = np.repeat(random.uniform(1.5, 2.5, 30), 30)
+    true = parse_fault("outlet_clogging:step:0.2@30min", TANK_EFFECTS).extend(tanks())
+    true = true.with_values({"k1": 2.9})
+    level = Simulator(true).run(time_min, u, np.array([4.0, 4.0])).outputs[:, 0]
+    write_csv(path, Record(time_min, {"u": u, "x2": level + random.normal(0.0, 0.01, level.size)}, path.name))
+
+
+def _recording(path: Path) -> None:
+    """An hour of a plant, recorded with all that its monitor published."""
+    record_hour(path, black_box_min=0.0).stop()
+
+
+def _records(folder: Path) -> None:
+    """Two short records of sound plants."""
+    folder.mkdir()
+    for seed in range(2):
+        write_csv(folder / f"{seed}.csv", simulate_record(PlantConfig(seed=seed), 250))
+
+
+GIVEN: dict[str, Callable[[Path], None]] = {
+    "record.csv": _record,
+    "plant.csv": _renamed_record,
+    "narrow.csv": _narrow_record,
+    "rig.csv": _tank_record,
+    "run.mcap": _recording,
+    "records": _records,
+}
+"""How each is made, by its name on the pages."""
+
+
+class Files:
+    """Gives copies of what is made once.
+
+    Args:
+        folder: where the first copy of each is kept.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def give(self, name: str, folder: Path) -> None:
+        """Put a file or a folder of a page into that page's folder."""
+        made = self._folder / name
+        if not made.exists():
+            GIVEN[name](made)
+        if made.is_dir():
+            shutil.copytree(made, folder / name)
+        else:
+            shutil.copy(made, folder / name)
