@@ -45,9 +45,7 @@ def up(
 ) -> None:
     """Run router, plant, monitor and recorder until stopped."""
     from reactorwatch.cli.supervise import run_until_stopped
-    from reactorwatch.records.output import checked_folder
 
-    checked_folder(out)
     flags = {"name": name, "speed": pace(speed, "--speed"), "seed": seed, "faults": fault or None}
     raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose, site))
 

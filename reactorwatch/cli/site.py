@@ -91,8 +91,8 @@ def router(
 
     from reactorwatch.cli.options import existing
     from reactorwatch.errors import InputError
-    from reactorwatch.runtime.bus_zenoh import router as plain_router
     from reactorwatch.runtime.bus_zenoh import refusals_logged, router_from_file
+    from reactorwatch.runtime.bus_zenoh import router as plain_router
     from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
     from reactorwatch.runtime.logs import configure
     from reactorwatch.runtime.serve import stop_on_signals
