@@ -12,10 +12,10 @@ from typing import Any, TypeVar
 
 from reactorwatch import __version__
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.jobs import Failed, attempt, died, fault, one_line
+from reactorwatch.runtime.jobs import RETRIES, Failed, attempt, died, fault, one_line
 
 CONNECT_WITHIN_S = 10.0
-WORKERS_WITHIN_S = 30.0
+WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -86,16 +86,20 @@ def _client(address: str) -> Iterator[Any]:
 
 
 def _check_workers(client: Any, address: str) -> None:
-    try:
-        client.wait_for_workers(1, timeout=WORKERS_WITHIN_S)
-    except TimeoutError as error:
-        raise InputError(
-            f"--scheduler {address}: has no workers; start some with: dask worker {address} --nthreads 1"
-        ) from error
-    versions = client.run(_asks_for_version(), on_error="return")
+    versions: dict[str, Any] = {}
+    for _ in range(1 + RETRIES):
+        try:
+            client.wait_for_workers(1, timeout=WORKERS_WITHIN_S)
+        except TimeoutError as error:
+            raise InputError(
+                f"--scheduler {address}: has no workers; start some with: dask worker {address} --nthreads 1"
+            ) from error
+        asked = client.run(_asks_for_version(), on_error="return")
+        # A worker that died meanwhile costs a retry of its jobs; if all did, others are being started.
+        versions = {worker: version for worker, version in asked.items() if not isinstance(version, OSError)}
+        if versions:
+            break
     for worker, version in versions.items():
-        if isinstance(version, OSError):  # it died meanwhile, which costs a retry of its jobs
-            continue
         if isinstance(version, Exception):
             raise version
         if version is None:
