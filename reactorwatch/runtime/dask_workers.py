@@ -6,16 +6,19 @@ the latter. That a worker which dies costs a retry is what Dask's scheduler does
 wait at the worker as well, so one that is given up gets a last chance when it has the cluster to itself.
 """
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from reactorwatch import __version__
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.jobs import RETRIES, Failed, attempt, died, fault, one_line
+from reactorwatch.runtime.jobs import Failed, attempt, died, fault, one_line
 
 CONNECT_WITHIN_S = 10.0
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
+
+ASK_AGAIN_S = 0.2
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -46,23 +49,39 @@ class DaskWorkers:
         Raises:
             InputError: there is no scheduler, it has no workers, or they have another version of this software.
         """
-        from distributed import as_completed
         from distributed.scheduler import KilledWorker
 
         with _client(self._address) as client:
             _check_workers(client, self._address)
             numbers = {client.submit(attempt, work, job, pure=False): number for number, job in enumerate(jobs)}
             suspected: list[int] = []
-            for future in as_completed(list(numbers), loop=client.loop):
+            for future in self._as_done(client, list(numbers)):
                 number = numbers.pop(future)
                 if isinstance(future.exception(), KilledWorker):
                     suspected.append(number)
                 else:
                     yield number, _outcome(future)
             for number in suspected:
-                alone = client.submit(attempt, work, jobs[number], pure=False)
+                (alone,) = self._as_done(client, [client.submit(attempt, work, jobs[number], pure=False)])
                 error = alone.exception()
                 yield number, died(error.allowed_failures + 1) if isinstance(error, KilledWorker) else _outcome(alone)
+
+    def _as_done(self, client: Any, futures: list[Any]) -> Iterator[Any]:
+        """Futures as they are done.
+
+        Raises:
+            InputError: the cluster has lost all its workers, and nothing starts others.
+        """
+        from distributed import as_completed
+
+        left = set(futures)
+        while left:
+            try:
+                for future in as_completed(list(left), loop=client.loop, timeout=WORKERS_WITHIN_S):
+                    left.discard(future)
+                    yield future
+            except TimeoutError:  # also where jobs just take long
+                _wait_for_workers(client, self._address)
 
 
 def _outcome(future: Any) -> Any:
@@ -87,18 +106,14 @@ def _client(address: str) -> Iterator[Any]:
 
 def _check_workers(client: Any, address: str) -> None:
     versions: dict[str, Any] = {}
-    for _ in range(1 + RETRIES):
-        try:
-            client.wait_for_workers(1, timeout=WORKERS_WITHIN_S)
-        except TimeoutError as error:
-            raise InputError(
-                f"--scheduler {address}: has no workers; start some with: dask worker {address} --nthreads 1"
-            ) from error
+    deadline_s = time.monotonic() + WORKERS_WITHIN_S
+    while not versions and time.monotonic() < deadline_s:
+        _wait_for_workers(client, address)
         asked = client.run(_asks_for_version(), on_error="return")
         # A worker that died meanwhile costs a retry of its jobs; if all did, others are being started.
         versions = {worker: version for worker, version in asked.items() if not isinstance(version, OSError)}
-        if versions:
-            break
+        if not versions:
+            time.sleep(ASK_AGAIN_S)  # the scheduler still knows those that died
     for worker, version in versions.items():
         if isinstance(version, Exception):
             raise version
@@ -109,6 +124,15 @@ def _check_workers(client: Any, address: str) -> None:
                 f"--scheduler {address}: worker {worker} has reactorwatch {version}, this is {__version__}; "
                 "install the same"
             )
+
+
+def _wait_for_workers(client: Any, address: str) -> None:
+    try:
+        client.wait_for_workers(1, timeout=WORKERS_WITHIN_S)
+    except TimeoutError as error:
+        raise InputError(
+            f"--scheduler {address}: has no workers; start some with: dask worker {address} --nthreads 1"
+        ) from error
 
 
 def _asks_for_version() -> Callable[[], str | None]:

@@ -21,6 +21,13 @@ def cluster() -> Iterator[str]:
         yield address
 
 
+@pytest.fixture(scope="module")
+def mortal_cluster() -> Iterator[str]:
+    """The address of another one, whose workers die: on a busy machine it takes long until others are started."""
+    with dask_cluster(2) as address:
+        yield address
+
+
 @pytest.fixture(params=["here", "one process", "two processes", "cluster"])
 def anyone(request: pytest.FixtureRequest) -> Workers:
     """Each kind of workers in turn."""
@@ -34,7 +41,9 @@ def anyone(request: pytest.FixtureRequest) -> Workers:
 @pytest.fixture(params=["two processes", "cluster"])
 def elsewhere(request: pytest.FixtureRequest) -> Workers:
     """Each kind of workers that can die without us."""
-    return workers(None, request.getfixturevalue("cluster")) if request.param == "cluster" else LocalWorkers(2)
+    if request.param == "cluster":
+        return workers(None, request.getfixturevalue("mortal_cluster"))
+    return LocalWorkers(2)
 
 
 def test_answers_are_those_of_the_function_in_the_order_of_the_jobs(anyone: Workers) -> None:
