@@ -67,7 +67,8 @@ class SignalWatch:
         self._outputs = outputs
         self._stuck_alarms = [board.declare(Stuck.name, name, at_once=True, tells_cause=True) for name in outputs]
         self._spike_alarms = [
-            board.declare(Spike.name, name, at_once=True, priority="low", tells_cause=True) for name in outputs
+            board.declare(Spike.name, name, at_once=True, priority="low", tells_cause=True, is_passing=True)
+            for name in outputs
         ]
         self._stuck: list[Stuck] = []
         self._spikes: list[Spike | None] = []
@@ -179,11 +180,11 @@ class SignalWatch:
             scales: what one standard deviation is, in the outputs' units.
             units: of the outputs.
         """
-        flags, publications = self._none, list[Publication]()
+        flags, publications, is_moved = self._none, list[Publication](), self._board.has_unexplained
         for index, spike in enumerate(self._spikes):
             if spike is None or not isfinite(e[index]):
                 continue
-            alarm, verdict = self._spike_alarms[index], spike.update(e[index])
+            alarm, verdict = self._spike_alarms[index], spike.update(e[index], is_moved=is_moved)
             if verdict.withhold:
                 flags = (*flags[:index], True, *flags[index + 1 :])
             if verdict.spike or not alarm.at_rest:
