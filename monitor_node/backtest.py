@@ -30,6 +30,7 @@ class Backtest:
         refused: counts by reason.
         notes: what people are to be told of the training.
         left_out: signals that are not watched, each with the reason.
+        refused_trainings: number of trainings that were not fit to learn from.
     """
 
     input: str
@@ -43,6 +44,7 @@ class Backtest:
     refused: dict[str, int]
     notes: list[str]
     left_out: dict[str, str]
+    refused_trainings: int
 
     @property
     def raised(self) -> list[tuple[Alarm, int | None]]:
@@ -97,4 +99,5 @@ def run(messages: Iterable[Encoded], config: MonitorConfig) -> Backtest:
         refused=dict(monitor.refusals.by_reason),
         notes=monitor.notes,
         left_out=monitor.left_out,
+        refused_trainings=monitor.refused_trainings,
     )

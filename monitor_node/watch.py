@@ -156,6 +156,11 @@ class PlantWatch:
         return self._reference is not None
 
     @property
+    def refused_trainings(self) -> int:
+        """Number of trainings that were not fit to learn from."""
+        return self._refusals
+
+    @property
     def expected_false_alarms(self) -> float:
         """Alarms that chance alone would have raised by now, on average."""
         return self.rows_watched * self._chance_alarms / self._arl0 if self._arl0 else 0.0

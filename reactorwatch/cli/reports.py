@@ -56,7 +56,9 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     said = backtest_object(result, zero_ns)
     lines = [f"{file}: {said['samples']} rows over {said['span_min']:g} min"]
     lines += [f"  {name} is not watched: {why}" for name, why in result.left_out.items()]
-    if said["trained_until_min"] is None:
+    if said["trained_until_min"] is None and result.refused_trainings:
+        lines.append("nothing was watched: no training was fit to learn from, for the reasons below")
+    elif said["trained_until_min"] is None:
         lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
     else:
         lines.append(
