@@ -238,4 +238,5 @@ def test_simulate_and_backtest_speak_json_to_machines(command: Command, record_c
     said = json.loads(tested.stdout)
     assert said == {
         "samples": 3, "span_min": 0.2, "trained_until_min": None, "expected_false_alarms": 0.0, "alarms": [],
+        "signals": {"inputs": ["qc"], "outputs": ["C", "T"], "left_out": []},
     }  # fmt: skip
