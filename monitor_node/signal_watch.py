@@ -77,7 +77,7 @@ class SignalWatch:
 
     @property
     def silent(self) -> list[bool]:
-        """Which signals are silent, the input first."""
+        """Silence of each signal, the input first."""
         return [silence.standing for silence in self._silences[1:]]
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:

@@ -15,7 +15,7 @@ Back, and over, means within half the limit, so that a change about as large as 
 time it falls below it.
 
 While an alarm stands whose cause is not known, a fault may have moved the residual for good, and then values about its
-new level are no spikes. So as long as it stands, a value is judged against the median of the newest ones, in units of
+new level are no spikes. So as long as it stands, a value is compared with the median of the newest ones, in units of
 their median deviation with a margin (but of no less than before), and nothing is a spike until `LEAST_RECENT` of them
 are there.
 
@@ -47,7 +47,7 @@ BACK = 0.5
 """Of the limit: within it, a value is back."""
 
 RECENT, LEAST_RECENT = 100, 10
-"""Newest values by which a value is judged while an alarm stands, at most and at least."""
+"""Newest values with which a value is compared while an alarm stands, at most and at least."""
 
 ERRORS = 3.0
 """Standard errors that the spread of these values may be larger than it looks: about 1 / sqrt(n) each."""

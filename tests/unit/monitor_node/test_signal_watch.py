@@ -57,7 +57,7 @@ def test_values_that_a_standing_fault_has_moved_are_no_spikes(signal: str, size:
 
 
 def test_a_spike_in_a_standing_incident_belongs_to_it_and_begins_none() -> None:
-    """Ninety minutes after the last change; the spike itself is told."""
+    """Ninety minutes after the last change; the spike raises its own alarm."""
     time_min, columns = leaking_run(-0.05, 110.0, 240.0, 4)
     columns["T"][2000] += 30.0
     run = watched(time_min, columns)
