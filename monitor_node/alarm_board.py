@@ -78,6 +78,7 @@ class AlarmBoard:
         self._config = config
         self._alarms: dict[str, ChartAlarm] = {}
         self._undeclared: dict[str, AlarmMemory] = {}  # of a stored state: settings may bring the alarm back
+        self._passing: set[str] = set()
         self._incidents = Incidents(config.incident_min)
         self._kpis = KpiCounter()
         self._kpi_key = keys.key(config.plant, keys.ALARM_KPIS, KPIS)
@@ -98,6 +99,7 @@ class AlarmBoard:
         at_once: bool = False,
         over_at_once: bool = False,
         tells_cause: bool = False,
+        is_passing: bool = False,
         priority: PriorityName | None = None,
         dead_band: float | None = None,
     ) -> ChartAlarm:
@@ -109,6 +111,8 @@ class AlarmBoard:
             at_once: whether one point out raises it, and not `raise_count` among `window`.
             over_at_once: whether one point back in clears it, and not `clear_count`.
             tells_cause: whether it says itself what its cause is.
+            is_passing: whether it is of a single value: while an alarm stands whose cause is not known, it belongs to
+                the latest incident, so that it takes no suspects away.
             priority: that of the signal if not given.
             dead_band: as set if not given.
         """
@@ -118,6 +122,8 @@ class AlarmBoard:
         urgency = priority or config.priorities.get(signal, "medium")
         band = config.dead_band if dead_band is None else dead_band
         alarm = ChartAlarm(chart, signal, urgency, rule, band, tells_cause=tells_cause)
+        if is_passing:
+            self._passing.add(alarm.name)
         self._alarms[alarm.name] = alarm
         return alarm
 
@@ -341,12 +347,13 @@ class AlarmBoard:
         memory = alarm.memory
         before = memory.state
         alarm.apply(event)
-        if event is Event.CLEARED:
+        if event is Event.CLEARED and (memory.first_in or alarm.name not in self._passing):
             self._incidents.cleared(time_ns, memory.incident)
         if memory.state is State.UNACKNOWLEDGED and before is not State.UNACKNOWLEDGED:
             self._kpis.came_up(time_ns, alarm.name, alarm.priority)
             if not memory.incident:
-                memory.incident = self._incidents.came_up(time_ns, alarm.name)
+                joins = alarm.name in self._passing and self.has_unexplained
+                memory.incident = self._incidents.came_up(time_ns, alarm.name, joins=joins)
                 memory.first_in = self._incidents.state.first_in == alarm.name
                 if memory.first_in:
                     self._suspects = []

@@ -32,6 +32,7 @@ class Backtest:
         refused: counts by reason.
         notes: what people are to be told of the training.
         left_out: signals that are not watched, each with the reason.
+        refused_trainings: number of trainings that were not fit to learn from.
         reference: what rows were judged by, `equations` or `arx`; None if none was.
         noise_levels: standard deviations that the equations judged by: of each sensor in its unit (`sensors`), of each
             state in its unit per square root of a minute (`states`); None where they did not judge.
@@ -50,6 +51,7 @@ class Backtest:
     refused: dict[str, int]
     notes: list[str]
     left_out: dict[str, str]
+    refused_trainings: int
     reference: str | None = None
     noise_levels: dict[str, dict[str, float]] | None = None
 
@@ -114,6 +116,7 @@ def run(messages: Iterable[Encoded], config: MonitorConfig, zero_ns: int = 0) ->
         refused=dict(monitor.refusals.by_reason),
         notes=monitor.notes,
         left_out=monitor.left_out,
+        refused_trainings=monitor.refused_trainings,
         reference=monitor.reference or None,
         noise_levels=monitor.noise_levels,
     )

@@ -37,7 +37,7 @@ class ChartDesign:
         config: of the monitor.
         learned: from the training, one an output.
         e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
-        judged: which outputs are judged; the others have charts of their own that nothing is fed to, and no part in
+        evaluated: which outputs are evaluated; the others have charts of their own that get no values, and no part in
             those of all outputs.
         arl0: run length of each alarm without a fault, in rows.
 
@@ -46,13 +46,13 @@ class ChartDesign:
     """
 
     def __init__(
-        self, config: MonitorConfig, learned: list[Prewhitening], e: Array, judged: list[bool], arl0: float
+        self, config: MonitorConfig, learned: list[Prewhitening], e: Array, evaluated: list[bool], arl0: float
     ) -> None:
         self._config, self._learned, self._arl0 = config, learned, arl0
         self._p = budget.point_probability(arl0, config.raise_count, config.window)
         self._memory = _long_memory(e, config.ewma_weight)
-        self._together = np.flatnonzero(judged)
-        self._e = _complete(e, judged)
+        self._together = np.flatnonzero(evaluated)
+        self._e = _complete(e, evaluated)
         self._covariance = _correlation(self._e)
         self.widths = [budget.shewhart_width(self._p, item) for item in learned]
 
@@ -82,16 +82,16 @@ class ChartDesign:
         return PcaT2(model) if name == PcaT2.name else PcaSpe(model)
 
 
-def joint_obstacle(name: str, outputs: tuple[str, ...], e: Array, judged: list[bool]) -> str:
+def joint_obstacle(name: str, outputs: tuple[str, ...], e: Array, evaluated: list[bool]) -> str:
     """The reason why there can be no chart of all outputs together; empty if there can.
 
     Args:
         name: of the chart.
         outputs: names of the outputs.
         e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
-        judged: which outputs are judged.
+        evaluated: which outputs are evaluated.
     """
-    names, rows = list(compress(outputs, judged)), _complete(e, judged)
+    names, rows = list(compress(outputs, evaluated)), _complete(e, evaluated)
     count = len(names)
     if count < 2:
         return "it needs two outputs or more"
@@ -112,9 +112,9 @@ def joint_obstacle(name: str, outputs: tuple[str, ...], e: Array, judged: list[b
     return ""
 
 
-def _complete(e: Array, judged: list[bool]) -> Array:
-    """The rows in which no judged output is missing, shape (rows, judged outputs)."""
-    e = e[:, np.flatnonzero(judged)]
+def _complete(e: Array, evaluated: list[bool]) -> Array:
+    """The rows in which no evaluated output is missing, shape (rows, evaluated outputs)."""
+    e = e[:, np.flatnonzero(evaluated)]
     return e[np.all(np.isfinite(e), axis=1)]
 
 

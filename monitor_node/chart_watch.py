@@ -134,25 +134,25 @@ class _OfAll:
     Args:
         chart: the chart.
         signals: names of the outputs.
-        judged: which of them the chart looks at.
+        evaluated: which of them the chart looks at.
     """
 
-    def __init__(self, chart: VectorChart, signals: tuple[str, ...], judged: list[bool]) -> None:
+    def __init__(self, chart: VectorChart, signals: tuple[str, ...], evaluated: list[bool]) -> None:
         self._chart = chart
-        self._signals = tuple(compress(signals, judged))
-        self._judged = None if all(judged) else judged  # None: all
+        self._signals = tuple(compress(signals, evaluated))
+        self._evaluated = None if all(evaluated) else evaluated  # None: all
         self._last: list[float] = []
         self._judgement: Judgement | None = None
 
     @classmethod
-    def from_bytes(cls, name: str, data: bytes, signals: tuple[str, ...], judged: list[bool]) -> "_OfAll":
+    def from_bytes(cls, name: str, data: bytes, signals: tuple[str, ...], evaluated: list[bool]) -> "_OfAll":
         """The chart that goes on where it was."""
         if name == Mewma.name:
-            return cls(Mewma.from_state(MewmaState.from_bytes(data)), signals, judged)
+            return cls(Mewma.from_state(MewmaState.from_bytes(data)), signals, evaluated)
         if name == T2.name:
-            return cls(T2.from_state(T2State.from_bytes(data)), signals, judged)
+            return cls(T2.from_state(T2State.from_bytes(data)), signals, evaluated)
         model = PcaModel.from_bytes(data)
-        return cls(PcaT2(model) if name == PcaT2.name else PcaSpe(model), signals, judged)
+        return cls(PcaT2(model) if name == PcaT2.name else PcaSpe(model), signals, evaluated)
 
     def to_bytes(self) -> bytes:
         """All that the chart is and remembers."""
@@ -160,8 +160,8 @@ class _OfAll:
 
     def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
         """Take a row in; whether the chart is out. A row in which an output is missing is left out."""
-        if self._judged is not None:
-            e, known = list(compress(e, self._judged)), list(compress(known, self._judged))
+        if self._evaluated is not None:
+            e, known = list(compress(e, self._evaluated)), list(compress(known, self._evaluated))
         if False in known or True in withheld:
             self._judgement = None
             return False
@@ -214,7 +214,7 @@ class ChartWatch:
             for pair in alarm_names(config)
         }
         self._watched: dict[str, _Watched] = {}
-        self._judged: list[bool] = []
+        self._evaluated: list[bool] = []
         self._chosen: list[str] = []
         self._passed: list[float] = []
         self.widths: list[float] = []
@@ -226,26 +226,26 @@ class ChartWatch:
         ranks: tuple[PriorityName, ...] = ("low", "medium", "high", "critical")
         return max((self._config.priorities.get(name, "medium") for name in self._config.outputs), key=ranks.index)
 
-    def choose(self, judged: list[bool], e: Array) -> dict[str, str]:
+    def choose(self, evaluated: list[bool], e: Array) -> dict[str, str]:
         """Choose the charts that can be made; returns the others, by alarm, each with the reason.
 
         Args:
-            judged: which outputs are judged.
+            evaluated: which outputs are evaluated.
             e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
         """
         names = list[str](dict.fromkeys(chart for chart, _ in self._alarms))
         obstacles = {
             name: why
             for name in names
-            if name in OF_ALL and (why := joint_obstacle(name, self._config.outputs, e, judged))
+            if name in OF_ALL and (why := joint_obstacle(name, self._config.outputs, e, evaluated))
         }
-        self._judged, self._chosen = judged, [name for name in names if name not in obstacles]
+        self._evaluated, self._chosen = evaluated, [name for name in names if name not in obstacles]
         return {self._alarms[name, ALL].name: why for name, why in obstacles.items()}
 
     @property
     def chance_alarms(self) -> int:
-        """How many of their alarms chance can raise."""
-        return sum(sum(self._judged) if name in OF_EACH else 1 for name in self._chosen)
+        """Number of their alarms that chance can raise."""
+        return sum(sum(self._evaluated) if name in OF_EACH else 1 for name in self._chosen)
 
     def start(self, learned: list[Prewhitening], e: Array, arl0: float) -> None:
         """Make the charts, after `choose`.
@@ -256,13 +256,13 @@ class ChartWatch:
             arl0: run length of each alarm without a fault, in rows.
         """
         config = self._config
-        design = ChartDesign(config, learned, e, self._judged, arl0)
+        design = ChartDesign(config, learned, e, self._evaluated, arl0)
         self.widths, self._passed = design.widths, [item.passed for item in learned]
 
         def made(name: str) -> _OfEach | _OfAll:
             if name in OF_EACH:
                 return _OfEach(name, Bank(design.of_each(name)), config.outputs, self._passed)
-            return _OfAll(design.of_all(name), config.outputs, self._judged)
+            return _OfAll(design.of_all(name), config.outputs, self._evaluated)
 
         self._watch(made)
 
@@ -272,12 +272,12 @@ class ChartWatch:
         charts = {name: watched.charts.to_bytes() for name, watched in self._watched.items()}
         return ChartsState(charts, list(self.widths), list(self._passed))
 
-    def restore(self, state: ChartsState, judged: list[bool]) -> None:
+    def restore(self, state: ChartsState, evaluated: list[bool]) -> None:
         """Go on, bit for bit, where charts of the same settings were when `state` was taken; after the board.
 
         Args:
             state: of the other charts.
-            judged: which outputs are judged.
+            evaluated: which outputs are evaluated.
 
         Raises:
             ValueError: the state is damaged.
@@ -285,7 +285,7 @@ class ChartWatch:
         signals = self._config.outputs
         self.widths, self._passed = list(state.widths), list(state.passed)
         names = list[str](dict.fromkeys(chart for chart, _ in self._alarms))
-        self._judged, self._chosen = judged, [name for name in names if name in state.charts]
+        self._evaluated, self._chosen = evaluated, [name for name in names if name in state.charts]
         each = {name for name in names if name in OF_EACH}
         if not each <= set(state.charts) <= set(names) or not len(self.widths) == len(self._passed) == len(signals):
             raise ValueError(f"there must be the charts {', '.join(names)}, got {', '.join(state.charts)}")
@@ -294,7 +294,7 @@ class ChartWatch:
             data = state.charts[name]
             if name in OF_EACH:
                 return _OfEach.from_bytes(name, data, signals, self._passed)
-            return _OfAll.from_bytes(name, data, signals, self._judged)
+            return _OfAll.from_bytes(name, data, signals, self._evaluated)
 
         self._watch(made)
 

@@ -390,6 +390,11 @@ class Monitor:
         return dict.fromkeys(never_came, NO_VALUE) | self._watch.left_out
 
     @property
+    def refused_trainings(self) -> int:
+        """Number of trainings that were not fit to learn from."""
+        return self._watch.refused_trainings
+
+    @property
     def notes(self) -> list[str]:
         """What people are to be told of the training; whoever tells them empties it."""
         notes, failures = self._watch.notes, self.failures.notes

@@ -57,26 +57,26 @@ class DriftWatch:
         self.wanted = told or bool(self._alarms)
         """Whether the models have to adapt at all."""
 
-    def chance_alarms(self, judged: list[bool]) -> int:
-        """How many of its alarms chance can raise.
+    def chance_alarms(self, evaluated: list[bool]) -> int:
+        """Number of its alarms that chance can raise.
 
         Args:
-            judged: which outputs are judged.
+            evaluated: which outputs are evaluated.
         """
-        return sum(judged) if self._alarms else 0
+        return sum(evaluated) if self._alarms else 0
 
-    def start(self, predictors: list[ArxPredictor], judged: list[bool], arl0: float) -> list[str]:
+    def start(self, predictors: list[ArxPredictor], evaluated: list[bool], arl0: float) -> list[str]:
         """Begin to compare; returns what people are to be told where that is not possible.
 
         Args:
             predictors: one an output, with references.
-            judged: which outputs are judged.
+            evaluated: which outputs are evaluated.
             arl0: run length of each alarm without a fault, in rows.
         """
         notes: list[str] = []
         if not self.wanted:
             return notes
-        for signal, predictor in compress(zip(self._outputs, predictors, strict=True), judged):
+        for signal, predictor in compress(zip(self._outputs, predictors, strict=True), evaluated):
             try:
                 predictor.compare(arl0)
             except InputError as error:

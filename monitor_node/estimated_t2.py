@@ -67,7 +67,7 @@ def estimated_t2_quantile(tail: float, freedoms: Array, rows: float) -> float:
 
 
 def _factor(p: int, rows: float) -> tuple[Array, Array]:
-    """What estimated correlations multiply T2 by: values and their probabilities."""
+    """Factor by which estimated correlations widen T2: values and their probabilities."""
     variance = 2.0 / (rows - p + 1.0) - 2.0 / (rows * p)
     mean = (rows - 2.0) / (rows - p - 1.0)
     if p == 1 or variance < 1e-12:

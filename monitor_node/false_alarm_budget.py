@@ -40,7 +40,7 @@ USUAL_PER_30_DAYS = 1.0
 """False alarms of a plant that are promised where the settings ask for no number."""
 
 
-def promised_per_30_days(asked: float | None, alarms: int, period_min: float) -> float:
+def promise_per_30_days(asked: float | None, alarms: int, period_min: float) -> float:
     """The false alarms of a plant in 30 days that are promised.
 
     Args:
@@ -74,7 +74,7 @@ def share_arl0(per_30_days: float, alarms: int, period_min: float) -> float:
     """The run length that each of a plant's alarms is to have without a fault, in rows.
 
     Args:
-        per_30_days: false alarms of the plant that are promised, see `promised_per_30_days`.
+        per_30_days: false alarms of the plant that are promised, see `promise_per_30_days`.
         alarms: number of alarms that share them.
         period_min: of the rows.
     """

@@ -6,7 +6,8 @@ incident; later, or at an earlier time because the plant's clock was set back, i
 begins it is its first-in alarm, the one to look at first.
 
 The window counts from the last change, and not from the last clearing: an alarm that has stood alone for days does not
-make every new fault part of its incident.
+make every new fault part of its incident. A spike begins no incident while an alarm stands whose cause is not known: it
+belongs to the latest one.
 """
 
 from typing import Annotated, TypeAlias
@@ -47,9 +48,17 @@ class Incidents:
         self._window_ns = int(incident_min * MINUTE_NS)
         self.state = Incident()
 
-    def came_up(self, time_ns: int, alarm: str) -> int:
-        """Number of the incident that an alarm which comes up now belongs to."""
+    def came_up(self, time_ns: int, alarm: str, *, joins: bool = False) -> int:
+        """Number of the incident that an alarm which comes up now belongs to.
+
+        Args:
+            time_ns: of the row.
+            alarm: its name.
+            joins: whether it belongs to the latest incident, however long ago that changed, and changes nothing of it.
+        """
         latest = self.state
+        if joins and latest.number:
+            return latest.number
         if not (latest.number and 0 <= time_ns - latest.changed_ns <= self._window_ns):
             latest.number, latest.first_in = latest.number + 1, alarm
         latest.changed_ns = time_ns

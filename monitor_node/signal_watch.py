@@ -74,7 +74,8 @@ class SignalWatch:
         self._outputs = outputs
         self._stuck_alarms = [board.declare(Stuck.name, name, at_once=True, tells_cause=True) for name in outputs]
         self._spike_alarms = [
-            board.declare(Spike.name, name, at_once=True, priority="low", tells_cause=True) for name in outputs
+            board.declare(Spike.name, name, at_once=True, priority="low", tells_cause=True, is_passing=True)
+            for name in outputs
         ]
         self._range_alarms = [
             board.declare(RANGE, name, at_once=True, dead_band=0.0, tells_cause=True) if item.is_bounded else None
@@ -87,7 +88,7 @@ class SignalWatch:
 
     @property
     def silent(self) -> list[bool]:
-        """Which signals are silent, the input first."""
+        """Silence of each signal, the input first."""
         return [silence.standing for silence in self._silences[1:]]
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
@@ -216,11 +217,11 @@ class SignalWatch:
             scales: what one standard deviation is, in the outputs' units.
             units: of the outputs.
         """
-        flags, publications = self._none, list[Publication]()
+        flags, publications, is_moved = self._none, list[Publication](), self._board.has_unexplained
         for index, spike in enumerate(self._spikes):
             if spike is None or not isfinite(e[index]):
                 continue
-            alarm, verdict = self._spike_alarms[index], spike.update(e[index])
+            alarm, verdict = self._spike_alarms[index], spike.update(e[index], is_moved=is_moved)
             if verdict.withhold:
                 flags = (*flags[:index], True, *flags[index + 1 :])
             if verdict.spike or not alarm.at_rest:

@@ -191,7 +191,7 @@ class Silence:
     # --- in the time of the samples --------------------------------------------------------------------------
 
     def unknown_allowed_ns(self) -> int | None:
-        """How long a signal of which too little is known may be missing, if this is the plant; None: not known yet."""
+        """Longest gap of a signal whose own spacing is not known, in the time of this plant; None: not known yet."""
         usual_ns = self._rows.usual_ns()
         return None if usual_ns is None else int(max(UNKNOWN_ROWS, self._limit) * usual_ns)
 

@@ -14,6 +14,11 @@ the correction of a filter, which it would pull. The next value decides:
 Back, and over, means within half the limit, so that a change about as large as the limit is not taken for spikes each
 time it falls below it.
 
+While an alarm stands whose cause is not known, a fault may have moved the residual for good, and then values about its
+new level are no spikes. So as long as it stands, a value is compared with the median of the newest ones, in units of
+their median deviation with a margin (but of no less than before), and nothing is a spike until `LEAST_RECENT` of them
+are there.
+
 Normal values make a false spike at the rate of a small Markov chain, `false_spike_rate`; since every spike has its own
 value beyond the limit, it is never more than P(|z| > limit), and that bound holds for dependent values as well. Where
 tails are heavier than normal, `spike_limit` learns a limit from the training: the largest |z| are taken to exceed
@@ -25,7 +30,9 @@ are, that is how this signal is, and the limit rises until they are none. For ta
 more false spikes than promised; but isolated far values are then what the signal has.
 """
 
+from collections import deque
 from math import ceil, log, sqrt
+from statistics import median
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -39,12 +46,20 @@ from reactorwatch.errors import InputError
 BACK = 0.5
 """Of the limit: within it, a value is back."""
 
+RECENT, LEAST_RECENT = 100, 10
+"""Newest values with which a value is compared while an alarm stands, at most and at least."""
+
+ERRORS = 3.0
+"""Standard errors that the spread of these values may be larger than it looks: about 1 / sqrt(n) each."""
+
 TAIL_SHARE = 0.05
 LEAST_TAIL = 10
 """The largest values of the training from which its tail is estimated: this share, and at least so many."""
 
 SEEN_SHARE = 0.75
 """Of these, the smaller ones whose size counts; the others count as larger."""
+
+_TO_SD = 1.4826  # of the median absolute deviation, for normal values
 
 Phase: TypeAlias = Literal["quiet", "held", "held again", "changed"]
 
@@ -74,11 +89,13 @@ class SpikeState(StoredState, frozen=True):
         phase: whether the value before was in (quiet), is withheld, is withheld right after a spike, or was part of a
             change.
         held: the value that is withheld; 0 if none is.
+        recent: the newest values since an alarm stands, oldest first; none while none stands.
     """
 
     limit: float
     phase: Phase
     held: float
+    recent: list[float]
 
 
 class Spike:
@@ -103,6 +120,7 @@ class Spike:
         self.limit = positive("limit", limit)
         self._phase: Phase = "quiet"
         self._held = 0.0
+        self._recent: deque[float] = deque(maxlen=RECENT)
 
     @classmethod
     def from_state(cls, state: SpikeState) -> "Spike":
@@ -113,19 +131,45 @@ class Spike:
         """
         spike = cls(state.limit)
         spike._phase, spike._held = state.phase, finite(state.held)
+        spike._recent.extend(finite(z) for z in state.recent)
         return spike
 
     @property
     def state(self) -> SpikeState:
         """A copy of all that is set and remembered."""
-        return SpikeState(self.limit, self._phase, self._held)
+        return SpikeState(self.limit, self._phase, self._held, list(self._recent))
 
-    def update(self, z: float) -> Verdict:
+    def update(self, z: float, *, is_moved: bool = False) -> Verdict:
         """Take the next standardised residual in. A missing one is left out: the next that comes decides.
+
+        Args:
+            z: the residual.
+            is_moved: whether an alarm stands, so that a fault may have moved the residual.
 
         Raises:
             ValueError: it is not finite.
         """
+        recent = self._recent
+        if not is_moved:
+            if recent:
+                recent.clear()
+            return self._decide(z)
+        level, spread, is_decided = 0.0, 1.0, recent or self._phase in ("quiet", "changed")
+        if len(recent) >= LEAST_RECENT:
+            level = median(recent)
+            margin = 1.0 + ERRORS / sqrt(len(recent))
+            spread = max(1.0, margin * _TO_SD * median(abs(other - level) for other in recent))
+        elif is_decided:
+            recent.append(finite(z))
+            self._phase, self._held = "changed", 0.0
+            return NO_SPIKE
+        verdict = self._decide((finite(z) - level) / spread)
+        if not verdict.withhold:
+            recent.append(z)
+        return verdict._replace(size=verdict.size * spread)
+
+    def _decide(self, z: float) -> Verdict:
+        """The verdict on a residual about 0."""
         if self._phase == "quiet" and abs(z) <= self.limit:  # as nearly always
             return NO_SPIKE
         beyond, back = abs(finite(z)) > self.limit, abs(z) <= BACK * self.limit
@@ -146,6 +190,7 @@ class Spike:
     def restart(self) -> None:
         """Forget the values seen, as after a gap or a restart of the plant: what was withheld stays undecided."""
         self._phase, self._held = "quiet", 0.0
+        self._recent.clear()
 
 
 def false_spike_rate(limit: float) -> float:

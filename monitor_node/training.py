@@ -58,7 +58,7 @@ NO_VALUE = "no value of it has come"
 """Why a signal that never came is left out."""
 
 NOTHING_LEARNED = Prewhitening(0.0, (), 1.0, FEWEST_ROWS, 0.5 / FEWEST_ROWS, 0.0)
-"""Stands for an output that is left out: no value of it is judged."""
+"""Stands for an output that is left out: no value of it is evaluated."""
 
 
 class Trained(NamedTuple):
@@ -150,7 +150,7 @@ class Training:
             self._known[index] += isfinite(value)
 
     def is_enough(self, silent: list[bool]) -> bool:
-        """Whether there are enough rows to learn from; outputs that are silent are not waited for.
+        """True if there are enough rows to learn from; outputs that are silent are not waited for.
 
         Args:
             silent: one an output.
@@ -179,20 +179,20 @@ class Training:
         if isinstance(reference, ArxReference) and (why := _too_few_values((self._config.input,), inputs[:, None])):
             left_out |= why
         left_out |= _too_few_residuals(outputs, z, time_min, inputs, left_out)
-        judged = [name not in left_out for name in outputs]
-        refused = _refused(outputs, found, judged) if any(judged) else "; ".join(dict.fromkeys(left_out.values()))
-        if refused and last_chance and any(judged):
+        evaluated = [name not in left_out for name in outputs]
+        refused = _refused(outputs, found, evaluated) if any(evaluated) else "; ".join(dict.fromkeys(left_out.values()))
+        if refused and last_chance and any(evaluated):
             refused, found = "", [Undisturbed(np.isfinite(column), [], [], 0) for column in z.T]
-        usable = np.column_stack([item.usable for item in found]) & np.array(judged)
+        usable = np.column_stack([item.usable for item in found]) & np.array(evaluated)
         z = np.where(usable, z, np.nan)
         if isinstance(reference, ProcessReference):
             smallest = [sd / typical for sd, typical in zip(smallest, reference.typical_sd, strict=True)]
         learned = [
-            learn(column, sd) if is_judged else NOTHING_LEARNED
-            for column, sd, is_judged in zip(z.T, smallest, judged, strict=True)
+            learn(column, sd) if is_evaluated else NOTHING_LEARNED
+            for column, sd, is_evaluated in zip(z.T, smallest, evaluated, strict=True)
         ]
         e = np.column_stack([_whitened(column, item) for column, item in zip(z.T, learned, strict=True)])
-        checks = [Check(name="training", result=refused or _left_out(outputs, time_min, found, judged) or "ok")]
+        checks = [Check(name="training", result=refused or _left_out(outputs, time_min, found, evaluated) or "ok")]
         checks += [Check(name="signals", result=f"{name} is left out: {why}") for name, why in left_out.items()]
         return Trained(reference, learned, e, np.where(usable, measured, np.nan), checks, refused, left_out)
 
@@ -325,16 +325,20 @@ def _why_unpredicted(time_min: Array, inputs: Array) -> str:
     return "too often a value is missing in the rows before"
 
 
-def _refused(outputs: tuple[str, ...], found: list[Undisturbed], judged: list[bool]) -> str:
-    refused = [name for name, item, is_judged in zip(outputs, found, judged, strict=True) if item.refused and is_judged]
+def _refused(outputs: tuple[str, ...], found: list[Undisturbed], evaluated: list[bool]) -> str:
+    refused = [
+        name
+        for name, item, is_evaluated in zip(outputs, found, evaluated, strict=True)
+        if item.refused and is_evaluated
+    ]
     return f"more than a third of it was disturbed in {' and '.join(refused)}" if refused else ""
 
 
-def _left_out(outputs: tuple[str, ...], time_min: Array, found: list[Undisturbed], judged: list[bool]) -> str:
+def _left_out(outputs: tuple[str, ...], time_min: Array, found: list[Undisturbed], evaluated: list[bool]) -> str:
     """What was left out, for people; empty if nothing was."""
     told = []
-    for name, item, is_judged in zip(outputs, found, judged, strict=True):
-        if not is_judged:
+    for name, item, is_evaluated in zip(outputs, found, evaluated, strict=True):
+        if not is_evaluated:
             continue
         for (first, last), shift in zip(item.stretches, item.shifts, strict=True):
             digits = max(0, 2 - int(log10(max(time_min[-1] - time_min[0], 1.0))))

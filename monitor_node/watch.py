@@ -83,7 +83,7 @@ class PlantWatch:
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
         self._withheld = (False,) * len(config.outputs)
-        self._judged = [True] * len(config.outputs)
+        self._evaluated = [True] * len(config.outputs)
         self._begin_training(None)
         self.notes: list[str] = []
         self.rows_watched = 0
@@ -146,7 +146,7 @@ class PlantWatch:
         self._leave_out(watched.left_out)
         self._judge_by(self._reference_of(watched.reference), learned, watched.arl0)
         self._whiteners = [Prewhitener.from_state(item) for item in watched.whiteners]
-        self._charts.restore(watched.charts, self._judged)
+        self._charts.restore(watched.charts, self._evaluated)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
         if self._suspicion is not None and watched.suspicion is not None:
@@ -182,6 +182,11 @@ class PlantWatch:
         if self._began_ns is None or last_ns is None:
             return 0.0
         return min(max((last_ns - self._began_ns) / MINUTE_NS / self._config.training_min, 0.0), 1.0)
+
+    @property
+    def refused_trainings(self) -> int:
+        """Number of trainings that were not fit to learn from."""
+        return self._refusals
 
     @property
     def expected_false_alarms(self) -> float:
@@ -282,22 +287,22 @@ class PlantWatch:
     def _leave_out(self, left_out: dict[str, str]) -> None:
         """Watch all signals but these."""
         self.left_out = dict(left_out)
-        self._judged = [name not in left_out for name in self._config.outputs]
+        self._evaluated = [name not in left_out for name in self._config.outputs]
 
     @property
     def _chance_alarms(self) -> int:
-        """How many alarms chance can raise."""
-        of_signals = SignalWatch.CHANCE_ALARMS * sum(self._judged)
-        return self._charts.chance_alarms + of_signals + self._drift.chance_alarms(self._judged)
+        """Number of alarms that chance can raise."""
+        of_signals = SignalWatch.CHANCE_ALARMS * sum(self._evaluated)
+        return self._charts.chance_alarms + of_signals + self._drift.chance_alarms(self._evaluated)
 
     def _start(self, trained: Trained) -> None:
         self._leave_out(trained.left_out)
-        unmade = self._charts.choose(self._judged, trained.e)
+        unmade = self._charts.choose(self._evaluated, trained.e)
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
         )
         asked, period_min = self._config.false_alarms_per_30_days, self._sampling.period_ns / MINUTE_NS
-        promised = false_alarm_budget.promised_per_30_days(asked, self._chance_alarms, period_min)
+        promised = false_alarm_budget.promise_per_30_days(asked, self._chance_alarms, period_min)
         if asked is None and promised != false_alarm_budget.USUAL_PER_30_DAYS:
             text = (
                 f"{promised:.3g} false alarms in 30 days are promised instead of "
@@ -311,7 +316,7 @@ class PlantWatch:
         self._whiteners = [Prewhitener(item) for item in trained.learned]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
-        self.notes += self._drift.start(self._predictors, self._judged, self._arl0)
+        self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
 
@@ -358,7 +363,7 @@ class PlantWatch:
         if self.left_out:
             self._note_late_signals(input_value, values)
             input_value = 0.0 if self._config.input in self.left_out else input_value  # as in the training
-            values = [value if judged else nan for value, judged in zip(values, self._judged, strict=True)]
+            values = [value if evaluated else nan for value, evaluated in zip(values, self._evaluated, strict=True)]
         publications.extend(self.signals.look(time_ns, values, units))
         stuck = self.signals.stuck
         if True in stuck:

@@ -32,7 +32,7 @@ def is_usual(watch: WatchState, watched: WatchedState, reference: ProcessReferen
         reference.filter.inputs == (reference.last_input,)
         and all(not silence.standing and silence.last_ns == last_ns for silence in signals.silences)
         and all(not stuck.learning and stuck.last is not None for stuck in signals.stuck)
-        and all(spike is None or spike.phase == "quiet" for spike in signals.spikes)
+        and all(spike is None or (spike.phase == "quiet" and not spike.recent) for spike in signals.spikes)
         and all(len(item.past) == max(len(item.learned.coefficients), 1) for item in watched.whiteners)
     )
 
@@ -81,7 +81,7 @@ def signals_of(p: np.void, runs: list[EqualRuns], silence_periods: float, least_
         for place, (of_training, arl0) in enumerate(runs)
     ]
     spikes = [
-        SpikeState(float(limit), "quiet", 0.0) if isfinite(limit) else None for limit in p["spike_limit"].tolist()
+        SpikeState(float(limit), "quiet", 0.0, []) if isfinite(limit) else None for limit in p["spike_limit"].tolist()
     ]
     return SignalsState(silences, stuck, spikes)
 

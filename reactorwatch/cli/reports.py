@@ -65,7 +65,9 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
         lines.append(
             f"the plant's clock steps back, or the plant was restarted: {result.runs} runs, watched one by one"
         )
-    if said["trained_until_min"] is None:
+    if said["trained_until_min"] is None and result.refused_trainings:
+        lines.append("nothing was watched: no training was fit to learn from, for the reasons below")
+    elif said["trained_until_min"] is None:
         lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
     else:
         lines.append(

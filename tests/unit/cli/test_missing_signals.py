@@ -94,3 +94,23 @@ def test_identify_names_the_signal_that_has_no_value_and_the_file(
     assert main(["identify", str(records / f"{record}.csv"), "--output", output, *options]) == 2
     told = " ".join(capsys.readouterr().err.split())
     assert f"{record}.csv: {signal} has no measured value, so no model of {output} can be fitted" in told
+
+
+def test_backtest_says_why_no_training_was_fit_and_blames_no_length(
+    main: Command, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Rows at random times, watched by the identified model, which needs one period."""
+    generator = np.random.default_rng(2)
+    times_min = np.cumsum(generator.uniform(0.02, 0.3, 800))
+    rows = [
+        f"{at:.6f},{100 + noise:.4f},{0.1 + 0.001 * noise:.6f},{438 + noise:.4f}"
+        for at, noise in zip(times_min, generator.normal(size=800), strict=True)
+    ]
+    (tmp_path / "irregular.csv").write_text("\n".join(["time_min,qc,C,T", *rows]) + "\n")
+    (tmp_path / "arx.toml").write_text('[monitor]\nreference = "arx"\n')
+    command = ["backtest", str(tmp_path / "irregular.csv"), "--config", str(tmp_path / "arx.toml"), "--training", "30"]
+    assert main(command) == 0
+    told = capsys.readouterr().out
+    assert "nothing was watched: no training was fit to learn from" in told
+    assert "do rows come one by one period?" in told
+    assert "too short" not in told

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 
 from monitor_node import backtest
 from monitor_node.alarm_states import Event, State
+from monitor_node.alarms import SuspectedCause
+from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
@@ -81,6 +83,33 @@ def test_an_alarm_long_after_the_last_change_is_an_incident_of_its_own() -> None
         desk.point(minute, **values)
     told = [(alarm.alarm[-1], alarm.incident, alarm.first_in) for alarm in desk.told(Alarm) if alarm.event == "raised"]
     assert told == [("T", 1, True), ("C", 1, False), ("C", 1, False), ("C", 2, True)]
+
+
+@pytest.mark.parametrize("spike_min", [10.0, 50.0, 300.0])
+def test_a_spike_takes_no_suspects_away_from_the_incident_that_stands(spike_min: float) -> None:
+    """An alarm that follows it is of the incident that it would be of without the spike, with its suspects."""
+    desk = Desk(msgspec.structs.replace(AT_ONCE, incident_min=60.0))
+    spike = desk.board.declare("spike", "T", at_once=True, tells_cause=True, is_passing=True)
+    desk.point(0.0, T=OUT)
+    desk.board.suspect(to_time_ns(1.0), [SuspectedCause("coolant_flow", 0.9)])
+    for minute, out in ((spike_min, True), (spike_min + 0.1, False)):
+        judgement = Judgement(9.0 if out else 0.0, 0.0, -6.0, 6.0, out)
+        desk.said += desk.board.judge(spike, to_time_ns(minute), judgement, "sd")
+    desk.board.suspect(to_time_ns(spike_min + 1.0), [SuspectedCause("coolant_flow", 0.95)])
+    assert [item.probability for item in desk.board.alarm("shewhart/T").suspects] == [0.95]
+    assert desk.board.alarm("spike/T").incident == desk.board.incident == 1
+    assert not desk.board.alarm("spike/T").first_in
+    desk.point(59.0 if spike_min < 59.0 else spike_min + 5.0, C=OUT)
+    follower = desk.board.alarm("shewhart/C")
+    assert follower.incident == (1 if spike_min < 59.0 else 2)
+    assert [item.cause for item in follower.suspects] == (["coolant_flow"] if spike_min < 59.0 else [])
+
+
+def test_a_spike_alone_is_an_incident() -> None:
+    desk = Desk()
+    spike = desk.board.declare("spike", "T", at_once=True, tells_cause=True, is_passing=True)
+    desk.said += desk.board.judge(spike, to_time_ns(1.0), Judgement(9.0, 0.0, -6.0, 6.0, True), "sd")
+    assert (desk.board.incident, desk.board.alarm("spike/T").first_in) == (1, True)
 
 
 def test_a_clock_that_is_set_back_begins_a_new_incident() -> None:

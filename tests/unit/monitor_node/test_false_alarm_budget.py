@@ -154,7 +154,7 @@ def test_the_budget_is_shared_equally_and_counts_rows() -> None:
 @pytest.mark.parametrize("per_30_days", [1e-3, 1e6])
 def test_a_budget_that_no_chart_can_keep_is_refused_with_the_range_that_it_can(per_30_days: float) -> None:
     with pytest.raises(InputError, match=r"false_alarms_per_30_days must be in \[0.022, 4.3e\+04\] for 5 alarms"):
-        budget.promised_per_30_days(per_30_days, 5, 0.1)
+        budget.promise_per_30_days(per_30_days, 5, 0.1)
 
 
 @given(st.floats(1e-5, 1e6), st.integers(3, 1000))
@@ -162,9 +162,9 @@ def test_where_nothing_is_asked_for_the_nearest_promise_that_can_be_kept_is_made
     period_min: float, alarms: int
 ) -> None:
     """From a row every millisecond to one every two years."""
-    promised = budget.promised_per_30_days(None, alarms, period_min)
+    promised = budget.promise_per_30_days(None, alarms, period_min)
     arl0 = budget.share_arl0(promised, alarms, period_min)
-    assert budget.promised_per_30_days(promised, alarms, period_min) == promised
+    assert budget.promise_per_30_days(promised, alarms, period_min) == promised
     assert 50.0 <= arl0 <= 1e8
     assert promised == 1.0 or arl0 in (pytest.approx(50.0), pytest.approx(1e8))
 
@@ -172,10 +172,10 @@ def test_where_nothing_is_asked_for_the_nearest_promise_that_can_be_kept_is_made
 @given(st.floats(1e-5, 1e6), st.integers(3, 1000), st.sampled_from([1e-30, 1e30]))
 def test_the_bounds_in_a_refusal_can_be_asked_for(period_min: float, alarms: int, asked: float) -> None:
     with pytest.raises(InputError) as refused:
-        budget.promised_per_30_days(asked, alarms, period_min)
+        budget.promise_per_30_days(asked, alarms, period_min)
     low, high = str(refused.value).split("[")[1].split("]")[0].split(", ")
     for bound in (low, high):
-        assert budget.promised_per_30_days(float(bound), alarms, period_min) == float(bound)
+        assert budget.promise_per_30_days(float(bound), alarms, period_min) == float(bound)
 
 
 @pytest.mark.parametrize("rows", [50, 100, 200])

@@ -1,4 +1,4 @@
-"""A signal that does not come is told, left out with the reason, and the others are watched."""
+"""A signal that does not come raises an alarm, is left out with the reason, and the others are watched."""
 
 import numpy as np
 import pytest

@@ -7,7 +7,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.messages_pb2 import Alarm
 
-from .samples import samples
+from .samples import leaking_run, samples
 from .watching import minute_ns, sound_run, watched
 
 AT_MIN, AT = 130.0, 1300
@@ -42,6 +42,30 @@ def test_a_real_jump_of_a_sensor_is_no_spike_and_no_row_more_than_one_is_lost() 
     run = watched(time_min, columns)
     assert not [alarm for alarm, _ in run.raised if alarm.startswith("spike")]
     assert run.raised[0][1] <= AT_MIN + 0.2
+
+
+@pytest.mark.parametrize(("signal", "size"), [("T", 1.5), ("C", 0.01), ("leak", -0.02), ("leak", -0.05)])
+def test_values_that_a_standing_fault_has_moved_are_no_spikes(signal: str, size: float) -> None:
+    """A small step, and two hours with it: in each record some values are far from those before it."""
+    for seed in (1, 2):
+        time_min, columns = leaking_run(size if signal == "leak" else 0.0, 110.0, 240.0, seed)
+        if signal != "leak":
+            columns[signal][1100:] += size
+        run = watched(time_min, columns)
+        assert run.raised
+        assert not [name for name, _ in run.raised if name.startswith("spike")]
+
+
+def test_a_spike_in_a_standing_incident_belongs_to_it_and_begins_none() -> None:
+    """Ninety minutes after the last change; the spike raises its own alarm."""
+    time_min, columns = leaking_run(-0.05, 110.0, 240.0, 4)
+    columns["T"][2000] += 30.0
+    run = watched(time_min, columns)
+    told = [item for item in run.alarms if item.event == "raised"]
+    assert [item.time_ns for item in told if item.alarm == "spike/T"] == [minute_ns(200.1)]
+    assert {item.incident for item in told} == {1}
+    assert [item.alarm for item in told if item.first_in] == [told[0].alarm]
+    assert told[0].alarm != "spike/T"
 
 
 def test_a_dead_sensor_is_told_while_the_others_go_on() -> None:

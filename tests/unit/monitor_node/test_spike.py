@@ -90,6 +90,48 @@ def test_after_a_restart_what_was_withheld_stays_undecided() -> None:
     assert not spike.update(0.0).spike
 
 
+# --- while an alarm stands -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", [-20.0, -4.0, 3.0, 5.0, 9.0])
+@pytest.mark.parametrize("spread", [0.5, 1.0, 2.0])
+def test_values_about_a_new_level_are_no_spikes_while_an_alarm_stands(level: float, spread: float) -> None:
+    """Of 5,000 values that a fault has moved; plainly judged, some of them are."""
+    values = level + spread * np.random.default_rng(7).normal(size=5000)
+    moved, plain = Spike(LIMIT), Spike(LIMIT)
+    assert not any(moved.update(z, is_moved=True).spike for z in values.tolist())
+    if 3.0 < abs(level) < 9.0 and spread >= 1.0:
+        assert any(plain.update(z).spike for z in values.tolist())
+
+
+@pytest.mark.parametrize("level", [-20.0, 0.0, 5.0])
+def test_a_spike_beside_the_new_level_is_told_with_its_distance_from_it(level: float) -> None:
+    spike, noise = Spike(LIMIT), np.random.default_rng(8)
+    for z in noise.normal(size=40).tolist():
+        assert not spike.update(level + z, is_moved=True).spike
+    assert spike.update(level + 15.0, is_moved=True).withhold
+    verdict = spike.update(level, is_moved=True)
+    assert verdict.spike
+    assert verdict.size == pytest.approx(15.0, abs=1.0)
+
+
+def test_when_no_alarm_stands_any_more_values_are_judged_about_zero_again() -> None:
+    spike = Spike(LIMIT)
+    for _ in range(40):
+        spike.update(8.0, is_moved=True)
+    assert [spike.update(z).withhold for z in (0.2, 8.0, 0.1)] == [False, True, False]
+    assert spike.state.recent == []
+
+
+def test_a_value_that_was_withheld_when_the_alarm_came_is_decided_by_the_next() -> None:
+    spike = Spike(LIMIT)
+    assert spike.update(9.0).withhold
+    assert spike.update(0.1, is_moved=True).spike
+    spike.restart()
+    assert spike.update(9.0).withhold
+    assert spike.update(9.0, is_moved=True) == (False, False, 0.0)
+
+
 # --- how often chance does it --------------------------------------------------------------------------------
 
 
@@ -166,10 +208,19 @@ def test_a_limit_that_is_none_is_refused(limit: float) -> None:
 # --- state ---------------------------------------------------------------------------------------------------
 
 
-@given(st.lists(st.floats(-20, 20), max_size=30), st.integers(0, 30))
-def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(values: list[float], cut: int) -> None:
+@given(st.lists(st.tuples(st.floats(-20, 20), st.booleans()), max_size=60), st.integers(0, 60))
+def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(
+    values: list[tuple[float, bool]], cut: int
+) -> None:
     through, stopped = Spike(LIMIT), Spike(LIMIT)
-    expected = [through.update(z) for z in values]
-    said = [stopped.update(z) for z in values[:cut]]
+    expected = [through.update(z, is_moved=is_moved) for z, is_moved in values]
+    said = [stopped.update(z, is_moved=is_moved) for z, is_moved in values[:cut]]
     resumed = Spike.from_state(SpikeState.from_bytes(stopped.state.to_bytes()))
-    assert said + [resumed.update(z) for z in values[cut:]] == expected
+    assert said + [resumed.update(z, is_moved=is_moved) for z, is_moved in values[cut:]] == expected
+
+
+@given(st.lists(st.tuples(st.floats(-20, 20), st.booleans()), max_size=60))
+def test_whether_an_alarm_stands_or_not_no_three_values_in_a_row_are_withheld(values: list[tuple[float, bool]]) -> None:
+    spike = Spike(LIMIT)
+    said = "".join("w" if spike.update(z, is_moved=is_moved).withhold else "." for z, is_moved in values)
+    assert "www" not in said
