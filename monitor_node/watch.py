@@ -319,7 +319,8 @@ class PlantWatch:
             self.signals.restart()
             for whitener in self._whiteners:
                 whitener.restart()
-        predictions, sds = reference.update(time_ns, input_value, values, self._withheld)
+        missing = self._sampling.missing
+        predictions, sds = reference.update(time_ns, input_value, values, self._withheld, missing)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             publications.extend(self._estimates(time_ns, values, predictions, sds, scales, units))
