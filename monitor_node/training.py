@@ -18,6 +18,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.predictor import ArxPredictor
 from monitor_node.prewhitening import Prewhitening, learn
 from monitor_node.references import ArxReference, ProcessReference, Reference, tuned
+from monitor_node.signal_range import ranges_of
 from monitor_node.stored_state import StoredState, packed, packed_times, unpacked, unpacked_times
 from monitor_node.undisturbed import Undisturbed, undisturbed
 from reactorwatch.contract.messages_pb2 import Check
@@ -61,6 +62,10 @@ class Trained(NamedTuple):
     measured: Array
     checks: list[Check]
     refused: str
+
+
+MOST_OUT_OF_RANGE = 1.0 / 3.0
+"""Share of a signal's values that the process cannot have; with more of them the plant is not that process."""
 
 
 class TrainingState(StoredState, frozen=True):
@@ -161,17 +166,32 @@ class Training:
         identified, found = _twice(lambda rows: self._identified(time_min, inputs, rows), measured, smallest)
         if self._model is None:
             return ArxReference(inputs), identified, found
+        possible = self._possible(inputs, measured)
+        if possible is None:
+            return ArxReference(inputs), identified, found
+        known_inputs, known = possible
         process: list[ProcessReference] = []
 
         def innovations(rows: Array) -> Array:
-            process.append(self._process_reference(time_min, inputs, rows))
-            return process[-1].run(time_min, inputs, measured)[1]
+            process.append(self._process_reference(time_min, known_inputs, rows))
+            return process[-1].run(time_min, known_inputs, known)[1]
 
-        z, found_by_process = _twice(innovations, measured, [MINOR] * measured.shape[1])
+        z, found_by_process = _twice(innovations, known, [MINOR] * measured.shape[1])
         residuals = z * np.array(process[-1].typical_sd)
         if self._config.reference == "process" or _as_well(residuals, identified):
             return process[-1], z, found_by_process
         return ArxReference(inputs), identified, found
+
+    def _possible(self, inputs: Array, measured: Array) -> tuple[Array, Array] | None:
+        """Inputs and outputs, NaN where the process cannot have such a value; None: too many are, it is another one."""
+        signals = (self._config.input, *self._config.outputs)
+        columns = np.column_stack([inputs, measured])
+        lower, upper = np.array([(item.lower, item.upper) for item in ranges_of(self._model, signals)]).T
+        out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
+        if self._config.reference != "process" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
+            return None
+        columns = np.where(out, np.nan, columns)
+        return columns[:, 0], columns[:, 1:]
 
     def _identified(self, time_min: Array, inputs: Array, measured: Array) -> Array:
         """The residuals of the identified models."""
