@@ -52,10 +52,12 @@ class TimedIsolation:
         self._suspects = Isolation.suspects
 
     def __enter__(self) -> "TimedIsolation":
-        def suspects(isolation: Isolation, not_before_min: float = float("-inf")) -> list[Suspect]:
+        looks, original = self.looks, self._suspects
+
+        def suspects(self: Isolation, not_before_min: float = float("-inf")) -> list[Suspect]:
             began = time.process_time()
-            found = self._suspects(isolation, not_before_min)
-            self.looks.append(Look(time.process_time() - began, isolation.budget.spent, isolation.stopped))
+            found = original(self, not_before_min)
+            looks.append(Look(time.process_time() - began, self.budget.spent, self.stopped))
             return found
 
         Isolation.suspects = suspects  # type: ignore[method-assign]

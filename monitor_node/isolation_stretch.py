@@ -56,7 +56,8 @@ class Stretch:
         self.budget = nominal.budget
         self.times = window.time_min[begin:rows]
         self.earliest_min, self.end_min = max(window.earliest_min, float(self.times[0])), float(self.times[-1])
-        self._record = FilterRecord.of(window.time_min[part], window.inputs[part], window.measured[part])
+        doubt = None if window.doubt is None else window.doubt.of_rows(part)
+        self._record = FilterRecord.of(window.time_min[part], window.inputs[part], window.measured[part], doubt=doubt)
         self._known = np.isfinite(window.measured[part])
         found = nominal.over(self._record, window.states[begin])
         losses, w = self._losses(found, 0)

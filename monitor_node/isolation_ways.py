@@ -51,7 +51,13 @@ class Linearisation:
     def ways(self, window: Window) -> Ways:
         """Those between the rows of a window."""
         ways = self._errors.ways(
-            window.time_min, window.inputs, window.x, window.covariance, window.residual, window.used
+            window.time_min,
+            window.inputs,
+            window.x,
+            window.covariance,
+            window.residual,
+            window.used,
+            doubt=window.doubt,
         )
         by_state = np.concatenate([np.eye(ways.F.shape[1]) - ways.K @ ways.H, ways.L_inverse @ ways.H], axis=1)
         by_shown = np.concatenate([-ways.K, ways.L_inverse], axis=1)

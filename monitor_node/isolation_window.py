@@ -4,6 +4,9 @@ Every hypothesis is compared on the same rows, so what counts is settled here. T
 off from the second one on, as the monitor's own does. A value is an outlier, and counts as missing whatever the cause,
 if it stands out, alone or with its neighbour, from those before and after, which agree with each other. So is the
 newest one, if it is far off and the one before was not: nothing confirms it yet.
+
+Where rows are missing and the input behind them is another, it is not known when it changed (see `process.doubt`): no
+cause may be found in what a lost row leaves.
 """
 
 from collections.abc import Sequence
@@ -14,6 +17,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from monitor_node.sampling import missing_rows
+from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import LONGEST_GAP_MIN, Filter, FilterState
 from reactorwatch.process.model import Array
 
@@ -44,6 +49,7 @@ class Window:
         used: whether a value corrected the filter, shape (rows, n_y).
         states: of the filter after each row.
         first_onset: the first row at which something may set in; at least 1.
+        doubt: ways on which the input changed at an unknown time; None: there are none.
     """
 
     time_min: Array
@@ -53,6 +59,7 @@ class Window:
     used: NDArray[np.bool_]
     states: list[FilterState]
     first_onset: int
+    doubt: Doubt | None = None
 
     @property
     def earliest_min(self) -> float:
@@ -85,7 +92,8 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
         not_before_min: nothing was wrong before.
     """
     kept = _since_gap(_running_on(rows))
-    times = np.array([row[0] for row in kept])
+    times, inputs = np.array([row[0] for row in kept]), np.array([[row[1]] for row in kept])
+    doubt = _doubt(times, inputs)
     first_onset = max(BURN_IN_ROWS, int(np.searchsorted(times, not_before_min)))
     if first_onset >= times.size:
         return None
@@ -98,7 +106,8 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
     accept = [False] * n_y
     kalman.restart()
     for place, (time_min, value, outputs) in enumerate(kept):
-        found = kalman.update(time_min, (value,), outputs, gate=GATE, accept=accept)
+        other = ((value,), doubt.times_min(place)) if doubt is not None and doubt.rows[place] else None
+        found = kalman.update(time_min, (value,), outputs, gate=GATE, accept=accept, doubt=other)
         far = [abs(size) > GATE * sd for size, sd in zip(found.residual, found.sd, strict=True)]
         off[place] = far
         used[place] = [
@@ -114,13 +123,25 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
     outlier[-1] = off[-1] & ~off[-2]
     return Window(
         times,
-        np.array([[row[1]] for row in kept]),
+        inputs,
         np.where(outlier, np.nan, measured),
         np.where(outlier, np.nan, residual),
         used,
         states,
         first_onset,
+        doubt,
     )
+
+
+def _doubt(time_min: Array, inputs: Array) -> Doubt | None:
+    """Ways to rows behind missing rows whose input is another than that of the row before; None: there are none."""
+    if time_min.size < 2:
+        return None
+    spacing, changed = np.diff(time_min), inputs[1:, 0] != inputs[:-1, 0]
+    period, missing = float(np.median(spacing)), np.zeros(time_min.size, dtype=np.intp)
+    for place in np.flatnonzero(changed).tolist():
+        missing[place + 1] = missing_rows(float(spacing[place]) / period)
+    return Doubt.behind(time_min, inputs, missing) if missing.any() else None
 
 
 def _standing_out(values: Array, sd: Array) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ from statistics import median
 LEARN_FROM = 32  # spacings
 TOLERANCE = 0.1  # of the period
 LARGEST_GAP = 2.5  # periods
+WHOLE = 0.25  # of a period: rows that are so near to some whole periods apart have rows missing between them
 
 
 @dataclass
@@ -68,9 +69,29 @@ class SamplingPeriod:
         return state.period_ns if state.period_ns is not None else float(min(state.spacings_ns, default=0))
 
     @property
+    def missing(self) -> int:
+        """Number of rows missing between the newest row and the one before it, by their times."""
+        spacing, period = self.state.spacing_ns, self.state.period_ns
+        if spacing is None or period is None or spacing == period:
+            return 0
+        return missing_rows(spacing / period)
+
+    @property
     def gap(self) -> bool:
         """Whether there is a gap before the row that was taken in last."""
         spacing = self.state.spacing_ns
         if spacing is None or spacing == self.state.period_ns:
             return False
         return spacing <= 0 or spacing > LARGEST_GAP * self.period_ns
+
+
+def missing_rows(periods: float) -> int:
+    """Number of rows missing between two rows that are so many usual periods apart.
+
+    Where rows come irregularly, an interval that is no whole number of periods says nothing of a row that was lost.
+
+    >>> [missing_rows(periods) for periods in (0.9, 1.4, 2.0, 2.4, 3.1)]
+    [0, 0, 1, 0, 2]
+    """
+    whole = round(periods)
+    return whole - 1 if whole > 1 and abs(periods - whole) <= WHOLE else 0

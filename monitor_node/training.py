@@ -23,6 +23,7 @@ from monitor_node.prewhitening import Prewhitening, learn
 from monitor_node.references import ArxReference, ProcessReference, Reference, tuned
 from monitor_node.resolution import resolution_sd
 from monitor_node.sampling import TOLERANCE
+from monitor_node.signal_range import ranges_of
 from monitor_node.stored_state import StoredState, packed, packed_times, unpacked, unpacked_times
 from monitor_node.undisturbed import Undisturbed, undisturbed
 from reactorwatch.contract.messages_pb2 import Check
@@ -81,6 +82,10 @@ class Trained(NamedTuple):
     checks: list[Check]
     refused: str
     left_out: dict[str, str]
+
+
+MOST_OUT_OF_RANGE = 1.0 / 3.0
+"""Share of a signal's values that the process cannot have; with more of them the plant is not that process."""
 
 
 class TrainingState(StoredState, frozen=True):
@@ -216,14 +221,18 @@ class Training:
         identified, found = _twice(lambda rows: (self._identified(time_min, known_input, rows), minor), measured)
         if self._model is None or not np.isfinite(inputs).any():
             return ArxReference(known_input), identified, found
+        possible = self._possible(inputs, measured)
+        if possible is None:
+            return ArxReference(known_input), identified, found
+        possible_inputs, known = possible
         process: list[ProcessReference] = []
 
         def innovations(rows: Array) -> Residuals:
-            process.append(self._process_reference(time_min, inputs, rows, smallest))
-            z = process[-1].run(time_min, inputs, measured)[1]
+            process.append(self._process_reference(time_min, possible_inputs, rows, smallest))
+            z = process[-1].run(time_min, possible_inputs, known)[1]
             return z, [max(MINOR, step / sd) for step, sd in zip(steps, process[-1].typical_sd, strict=True)]
 
-        z, found_by_process = _twice(innovations, measured)
+        z, found_by_process = _twice(innovations, known)
         residuals = z * np.array(process[-1].typical_sd)
         if self._config.reference == "process" or _as_well(residuals, identified):
             return process[-1], z, found_by_process
@@ -238,6 +247,17 @@ class Training:
         for predictor, column in zip(self._predictors, measured.T.tolist(), strict=True):
             for time_ns, value, is_next in zip(times_ns, column, follows, strict=True):
                 predictor.put_by(time_ns, 0.0, value, follows=is_next)
+
+    def _possible(self, inputs: Array, measured: Array) -> tuple[Array, Array] | None:
+        """Inputs and outputs, NaN where the process cannot have such a value; None: too many are, it is another one."""
+        signals = (self._config.input, *self._config.outputs)
+        columns = np.column_stack([inputs, measured])
+        lower, upper = np.array([(item.lower, item.upper) for item in ranges_of(self._model, signals)]).T
+        out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
+        if self._config.reference != "process" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
+            return None
+        columns = np.where(out, np.nan, columns)
+        return columns[:, 0], columns[:, 1:]
 
     def _identified(self, time_min: Array, inputs: Array, measured: Array) -> Array:
         """The residuals of the identified models."""

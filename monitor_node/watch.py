@@ -69,6 +69,7 @@ class PlantWatch:
         self._board = board
         self._points = points
         self.model = _model(config, model)
+        self._is_process = self._is_said_to_be_process = model is not None or config.reference == "process"
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self.signals = SignalWatch(config, board, ranges_of(self.model, (config.input, *config.outputs)))
@@ -204,7 +205,8 @@ class PlantWatch:
         time_ns = row.time_ns
         follows = self._sampling.follows(time_ns) and not row.restarted
         publications.extend(self.signals.hear(time_ns, row.values))
-        input_value, *values = self.signals.measured(time_ns, row.values, publications)
+        measured = self.signals.measured(time_ns, row.values, publications) if self._is_process else row.values
+        input_value, *values = measured
         if self._reference is None:
             self._train(time_ns, input_value, values, units, publications, follows=follows)
         else:
@@ -323,6 +325,7 @@ class PlantWatch:
     def _judge_by(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
         """From now on rows are judged by this reference."""
         self._reference, self._arl0 = reference, arl0
+        self._is_process = self._is_said_to_be_process or isinstance(reference, ProcessReference)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
 
@@ -381,7 +384,8 @@ class PlantWatch:
             self.signals.restart()
             for whitener in self._whiteners:
                 whitener.restart()
-        predictions, sds = reference.update(time_ns, input_value, values, self._withheld)
+        missing = self._sampling.missing
+        predictions, sds = reference.update(time_ns, input_value, values, self._withheld, missing)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             publications.extend(self._estimates(time_ns, values, predictions, sds, scales, units))

@@ -78,6 +78,7 @@ def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
         # the filter
         ("time_min", f, ()),
         ("input", f, ()),
+        ("reach", f, ()),  # see `references.input_reach`
         ("memory", f, (memory,)),
         ("noise", f, (noise,)),  # standard deviations, of sensors and process
         ("variance", f, (noise,)),

@@ -26,7 +26,12 @@ def is_usual(watch: WatchState, watched: WatchedState, reference: ProcessReferen
     sampling, signals = watch.sampling, watch.signals
     if sampling.last_ns != last_ns or sampling.period_ns is None or sampling.spacing_ns is None:
         return False
-    if reference.guessed or reference.filter.time_min != last_ns / MINUTE_NS or True in watched.withheld:
+    if (
+        reference.guessed
+        or reference.held_rows
+        or reference.filter.time_min != last_ns / MINUTE_NS
+        or True in watched.withheld
+    ):
         return False
     return (
         reference.filter.inputs == (reference.last_input,)
@@ -113,6 +118,7 @@ def whitener_of(p: np.void, place: int) -> PrewhitenerState:
 def write_reference(p: np.void, reference: ProcessReferenceState, model: ProcessModel) -> None:
     """Note the filter; of a plant that was judged already."""
     p["time_min"], p["input"] = reference.filter.time_min or 0.0, reference.last_input
+    p["reach"] = reference.reach
     p["memory"] = [*reference.filter.x, *reference.filter.P]
     p["noise"] = [*reference.noise.measurement_sd, *reference.noise.process_sd]
     p["variance"], p["typical_sd"] = variances(model, reference.noise), reference.typical_sd
@@ -128,4 +134,6 @@ def reference_of(p: np.void, states: int) -> ProcessReferenceState:
         last_input,
         False,
         p["typical_sd"].tolist(),
+        0,
+        float(p["reach"]),
     )

@@ -9,8 +9,8 @@ Whatever is out of the ordinary is not dealt with here. The record is then left 
 said to be *odd*: it is for the plant's own monitor (see `quiet_plants`).
 
 Odd are: a sample out of its order, that does not follow from those before it, of another unit or quality, or with a
-value, number or time that no plant has; a row after a gap; one by which the filter begins anew; a value out of the
-signal's range; a silence; equal readings beyond a sensor's limit; a residual that may be a spike;
+value, number or time that no plant has; a row after a gap or a missing row; one by which the filter begins anew; a
+value out of the signal's range; a silence; equal readings beyond a sensor's limit; a residual that may be a spike;
 and a row that raises an alarm. Points beyond a limit that raise no alarm are ordinary, they are only remembered.
 """
 
@@ -30,7 +30,7 @@ from monitor_node.prewhitening import LARGEST_ORDER
 from monitor_node.quiet.layout import LEVELS, Array, Bytes, Ints, Places, Records
 from monitor_node.quiet.ring import VALUE_BYTES, ZERO
 from monitor_node.quiet.samples import allowed_ns
-from monitor_node.sampling import LARGEST_GAP
+from monitor_node.sampling import WHOLE
 from monitor_node.silence import MEMORY
 from monitor_node.stuck import AT_REST, STRETCH
 from reactorwatch.compiled import call_at, compiled
@@ -42,6 +42,7 @@ ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
 _MINUTE_NS = int(MINUTE_NS)
 _MOST_NUMBERS = max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
 _STRETCH, _ORDER, _MEMORY = STRETCH, LARGEST_ORDER, MEMORY
+_MOST_PERIODS = 1.99 - WHOLE  # between rows that are further apart one may be missing
 
 
 @compiled
@@ -78,7 +79,7 @@ def _predicted(
     outputs = values.size - 1
     spacing = row_time_ns - p.last_ns
     step = 0.5 * (time_min - p.time_min)
-    if p.odd or spacing <= 0 or float(spacing) > LARGEST_GAP * p.period_ns:
+    if p.odd or spacing <= 0 or float(spacing) > _MOST_PERIODS * p.period_ns:
         return False
     if not (step > 0.0 and 2.0 * step <= longest_row_min):
         return False

@@ -186,6 +186,7 @@ class Filter:
         gate: float = inf,
         accept: Sequence[bool] = (),
         doubt: tuple[Sequence[float], Sequence[float]] | None = None,
+        between: tuple[float, Sequence[Sequence[float]]] | None = None,
     ) -> Innovation:
         """Take a row in.
 
@@ -197,6 +198,8 @@ class Filter:
             accept: ... unless this says so for its output; empty: for none.
             doubt: the inputs that may have held before the row already, and the times from which on, in order, each as
                 likely (see `doubt`); None: it is known that those of the row before did.
+            between: a time since the row before from which on the inputs are not known, and inputs that may have held
+                from then until this row, each as likely; None: they are known. Not together with `doubt`.
 
         Raises:
             StepsSpentError: the budget does not reach for the row; also raised by `run`, `over` and `stretches`.
@@ -210,6 +213,9 @@ class Filter:
         steps = (step, step)
         if doubt is not None:
             self._predict_in_doubt(before, time_min, inputs, *doubt)
+            steps = (0.0, 0.0)
+        elif between is not None:
+            self._predict_between(before, time_min, inputs, *between)
             steps = (0.0, 0.0)
         elif 2.0 * step > LONGEST_ROW_MIN or self._breaks:
             steps = self._steps(before, time_min, step)
@@ -356,6 +362,26 @@ class Filter:
             if changed < time_min:
                 end = self._walked(self._reset(held, other, changed), other, self._edges(changed, time_min))
             ends.append(self._reset(end, inputs, time_min))
+        self._mix(ends, inputs)
+
+    def _predict_between(
+        self,
+        before: float,
+        time_min: float,
+        inputs: Sequence[float],
+        since: float,
+        others: Sequence[Sequence[float]],
+    ) -> None:
+        """Predict a whole way on which the inputs were one of several from some time on."""
+        held = self._memory.copy()
+        if since > before:
+            held = self._walked(held, self._inputs, self._edges(before, since))
+        edges = self._edges(since, time_min)
+        ends = [self._walked(self._reset(held, other, since), other, edges) for other in others]
+        self._mix([self._reset(end, inputs, time_min) for end in ends], inputs)
+
+    def _mix(self, ends: Sequence[Array], inputs: Sequence[float]) -> None:
+        """The state as the mean of where some ways lead, each as likely, and as uncertain as they are apart."""
         mean = np.mean(ends, axis=0)
         apart = np.array(ends)[:, : self._n_x] - mean[: self._n_x]
         self._memory[:] = mean

@@ -44,6 +44,7 @@ def fail_from(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, from_ns: 
 
 def health_of(said: list[Publication], plant: str) -> Health:
     (found,) = [item.message for item in said if item.key == f"reactor/{plant}/health/monitor"]
+    assert isinstance(found, Health)
     return found
 
 
@@ -102,7 +103,7 @@ def test_alarms_stay_when_the_plant_is_learned_again_and_are_cleared_when_they_a
     runs: dict[str, list[Encoded]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One error after an alarm: no alarm is raised twice, what is active stays active, and the count survives."""
-    run, failed = runs[BROKEN], []
+    run, failed = runs[BROKEN], list[bool]()
     monitor = Monitor(MonitorConfig(plant=BROKEN, training_min=20.0, isolation=False), 0, points=False)
     said = [item for message in run[: 3 * 330] for item in monitor.on_message(message, 0)]
     active = {alarm.alarm for alarm in monitor.alarms.all_alarms() if alarm.raised_ns and not alarm.cleared_ns}
@@ -163,13 +164,13 @@ def test_errors_from_different_places_are_each_reported_once() -> None:
     def fail(values: list[int]) -> None:
         min(values)
 
-    for values in ([], [], [], []):
+    for _ in range(4):
         try:
-            fail(values)
+            fail([])
         except ValueError as error:
             failures.add("row", error, "it starts again")
     try:
-        {}["x\ny"]
+        dict[str, int]()["x\ny"]
     except KeyError as error:
         failures.add("row", error, "it starts again")
     assert failures.by_stage == {"row": 5}

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.references import ProcessReference
+from monitor_node.references import ArxReference, ProcessReference
 from monitor_node.signal_range import ANY, ranges_of
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
@@ -89,14 +89,33 @@ def test_any_value_out_of_range_is_as_good_as_missing_and_raises_one_alarm_at_on
     assert shown.failures.by_stage == {}
 
 
-def test_in_training_it_is_not_learned_from(run: list[Encoded]) -> None:
-    """A training with twenty rows of 9999 ends as one in which these samples are missing."""
-    bad = range(3 * 100 + 2, 3 * 120, 3)
-    shown, missing = Monitor(CONFIG, 0, points=False), Monitor(CONFIG, 0, points=False)
+@pytest.mark.parametrize("reference", ["auto", "process"])
+@pytest.mark.parametrize("signal", [0, 2])
+def test_in_training_it_is_not_learned_from(run: list[Encoded], reference: Any, signal: int) -> None:
+    """A training with twenty rows of 9999 ends as one in which these samples are missing.
+
+    Where the plant is said to be the process there is an alarm already; else that is known when the training ends.
+    """
+    config = MonitorConfig(training_min=20.0, isolation=False, reference=reference)
+    bad = range(3 * 100 + signal, 3 * 120, 3)
+    shown, missing = Monitor(config, 0, points=False), Monitor(config, 0, points=False)
     alarms = fed(shown, [with_value(m, 9999.0) if at in bad else m for at, m in enumerate(run)])
     fed(missing, [m for at, m in enumerate(run) if at not in bad])
-    assert [(item.alarm, item.event) for item in alarms] == [("range/T", "raised"), ("range/T", "cleared")]
+    events = [item.event for item in alarms if item.alarm == f"range/{SIGNALS[signal]}"]
+    assert events == (["raised", "cleared"] if reference == "process" else [])
     assert filter_state(shown) == filter_state(missing)
+
+
+def test_a_plant_that_is_not_the_process_is_watched_whatever_its_values(run: list[Encoded]) -> None:
+    """With temperatures in degC under the signal names of the reactor, the identified model judges."""
+    celsius = [
+        with_value(m, Sample.FromString(m.payload).value - 400.0) if at % 3 == 2 else m for at, m in enumerate(run)
+    ]
+    monitor = Monitor(CONFIG, 0, points=False)
+    alarms = fed(monitor, celsius)
+    assert monitor.phase == "watching"
+    assert isinstance(monitor._watch._reference, ArxReference)
+    assert not [item.alarm for item in alarms if item.alarm.startswith("range/")]
 
 
 @pytest.mark.parametrize("signal", SIGNALS)

@@ -27,6 +27,7 @@ HEALTH = Health(
     late=4,
     refused=7,
     refused_by_reason={"payload": 5, "not_finite": 2},
+    failures={"isolation": 3},
     lag_ms=1.5,
     duplicated=6,
     out_of_order=8,
@@ -100,6 +101,7 @@ def test_the_counts_of_health_are_there_in_base_units(port: int, tell: Told) -> 
     for name, value in expected.items():
         assert found[f"reactorwatch_{name}{{{OF_NODE}}}"] == pytest.approx(value, rel=1e-12), name
     assert found[f'reactorwatch_messages_refused_total{{{OF_NODE},reason="payload"}}'] == 5
+    assert found[f'reactorwatch_failures_total{{{OF_NODE},stage="isolation"}}'] == 3
     assert found[f'reactorwatch_messages_refused_total{{{OF_NODE},reason="not_finite"}}'] == 2
     assert found['reactorwatch_phase{node="monitor",phase="watching",plant="R-101"}'] == 1
     assert found[f'reactorwatch_node_info{{{OF_NODE},version="1.2.3"}}'] == 1
