@@ -77,7 +77,7 @@ def answer(job: Job) -> Answer:
     plant = plant_of(existing_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
     first = FirstSamples(plant)
-    result = run(first.passing(messages(job.at, plant, job.columns)), settings)
+    result = run(first.pass_on(messages(job.at, plant, job.columns)), settings)
     zero_ns = zero_of(job.at, result.first_ns)
     found = backtest_object(result, zero_ns)
     if job.as_json:
