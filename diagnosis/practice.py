@@ -64,7 +64,7 @@ def matters(curves: Curves, bands: Mapping[str, float], starts: tuple[int, ...] 
 
 
 def left_matters(before: Errors, noise_sd: Array, model: ProcessModel, bands: Mapping[str, float]) -> bool:
-    """Whether the nominal free run errs by more than noise and tolerance in an output.
+    """Practical significance: true if the nominal free run errs by more than noise and tolerance in an output.
 
     Args:
         before: errors of the nominal model.

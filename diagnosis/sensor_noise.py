@@ -15,7 +15,7 @@ from diagnosis.wandering import LOW, Noise, power_spectrum
 from reactorwatch.process.model import Array
 
 ROUNDS = 100
-"""Of reweighted least squares: the levels change by less than a thousandth then."""
+"""Of multiplicative steps, after which the levels change by less than a thousandth."""
 
 _LEAST_SHARE = 1e-6
 
@@ -41,7 +41,7 @@ def sensor_noise(noise: Noise, outputs: Sequence[str], residual: Array, measured
 
 
 def _high_frequency_sd(residual: Array, kept: float) -> float:
-    """Of white noise and an autoregression that keeps such a share from row to row; infinite if there is too little."""
+    """Standard deviation of white noise and an AR(1) with this coefficient; infinite if the record is too short."""
     spectrum = power_spectrum(residual)
     if spectrum is None:
         return float("inf")

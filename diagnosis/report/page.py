@@ -51,7 +51,7 @@ class _CauseSaid:
 
 
 @dataclass(frozen=True)
-class _RivalSaid:
+class _RivalRow:
     label: str
     place: str
     size: str
@@ -115,12 +115,12 @@ def as_page(
     )
 
 
-def _rivals(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[list[_RivalSaid], str]]:
+def _rivals(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[list[_RivalRow], str]]:
     """All explanations that the record does not tell apart, and by how much each is worse than the first."""
     explanations = [(diagnosis.causes, 0.0), *((item.explanation, item.delta_bic) for item in diagnosis.alternatives)]
     return [
         (
-            [_RivalSaid(item.label, place_of(item.location), size_said(item, effects), when(item)) for item in causes],
+            [_RivalRow(item.label, place_of(item.location), size_said(item, effects), when(item)) for item in causes],
             f"{worse:.1f}",
         )
         for causes, worse in explanations

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 from diagnosis.report.words import (
     adjusted_said,
+    describe_explanation,
     difference_said,
     error_left,
-    explanation_said,
     size_said,
     verdict,
     when,
@@ -31,7 +31,7 @@ def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
     ]
     ambiguous = diagnosis.verdict == AMBIGUOUS
     if ambiguous:
-        lines += [_line("either", f"{explanation_said(diagnosis.causes, effects)}  (95 %)")]
+        lines += [_line("either", f"{describe_explanation(diagnosis.causes, effects)}  (95 %)")]
         lines += _rivals(diagnosis, effects) + _experiment(diagnosis)
     for cause in () if ambiguous else diagnosis.causes:
         lines += [
@@ -56,7 +56,7 @@ def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
 
 def _rivals(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[str]:
     return [
-        _line("or", f"{explanation_said(item.explanation, effects)}, worse by {item.delta_bic:.1f} in BIC")
+        _line("or", f"{describe_explanation(item.explanation, effects)}, worse by {item.delta_bic:.1f} in BIC")
         for item in diagnosis.alternatives
     ]
 

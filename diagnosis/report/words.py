@@ -89,24 +89,24 @@ def when(cause: Cause, curves: Curves | None = None) -> str:
 
 
 def size_said(cause: Cause, effects: Sequence[Effect]) -> str:
-    """Its size in its unit and meaning with its 95 % interval, and of what in its course that is the size.
+    """Size of a cause in its unit and meaning with its 95 % interval, and the part of the profile it belongs to.
 
     Args:
         cause: of an explanation.
         effects: the catalogue, where it has its meaning.
     """
     of_what = {"ramp": " at the end", "decay": " in the end", "sine": " to either side", "free": " at its largest"}
-    return _size_meant(cause, effects) + of_what.get(cause.profile, "")
+    return _describe_size(cause, effects) + of_what.get(cause.profile, "")
 
 
-def explanation_said(causes: Sequence[Cause], effects: Sequence[Effect]) -> str:
+def describe_explanation(causes: Sequence[Cause], effects: Sequence[Effect]) -> str:
     """Causes that explain a record together, each with its size and since when."""
     return " with ".join(
         f"{item.label} ({item.cause}, {item.profile}): {size_said(item, effects)}, {when(item)}" for item in causes
     )
 
 
-def _size_meant(cause: Cause, effects: Sequence[Effect]) -> str:
+def _describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
     size = cause.parameters["size"]
     effect = next((item for item in effects if item.name == cause.cause), None)
     if effect is None or not effect.larger:
@@ -118,7 +118,7 @@ def _size_meant(cause: Cause, effects: Sequence[Effect]) -> str:
     text = effect.larger
     if amount.value < 0.0 and effect.smaller:
         text, amount = effect.smaller, replace(amount, value=-amount.value)
-    value, half = rounded(amount)
+    value, half = round_estimate(amount)
     unit = "" if amount.unit == "1" else f" {amount.unit}"
     return text.format(value) + (f" (± {half}{unit})" if half else "")
 
@@ -148,16 +148,16 @@ def with_interval(estimate: Estimate) -> str:
     '299.9 min'
     """
     unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-    value, half = rounded(estimate)
+    value, half = round_estimate(estimate)
     return f"{value} ± {half}{unit}" if half else f"{value}{unit}"
 
 
-def rounded(estimate: Estimate) -> tuple[str, str]:
+def round_estimate(estimate: Estimate) -> tuple[str, str]:
     """A number and half the width of its 95 % interval with as many decimals; the latter empty if it is not known.
 
     The interval has one digit, or two if it begins with a 1.
 
-    >>> rounded(Estimate(14.998, 0.0127, "%"))
+    >>> round_estimate(Estimate(14.998, 0.0127, "%"))
     ('15.00', '0.02')
     """
     half = SD_95 * estimate.sd

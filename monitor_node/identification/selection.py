@@ -73,7 +73,7 @@ class Selection:
 
     @property
     def fits(self) -> bool:
-        """Whether the chosen model is fit for use; otherwise it is the best of those that are not."""
+        """True where the chosen model is fit for use; otherwise it is the best of those that are not."""
         return self.chosen.free_run_percent >= LEAST_PERCENT
 
     def table(self) -> str:
@@ -153,13 +153,13 @@ def select(
     structure = Structure.of_order(chosen.order, delay, u.shape[1])
     return replace(
         found,
-        reason=f"no model fits: {name_of(best)} runs best on the held-out half, with "
+        reason=f"no model fits: {describe(best)} runs best on the held-out half, with "
         f"{best.free_run_percent:.1f} % where the mean alone has 0 %; {_why_none_fits(family, structure, u, y, t)}",
     )
 
 
-def name_of(candidate: Candidate) -> str:
-    """What a sentence calls it."""
+def describe(candidate: Candidate) -> str:
+    """Family and order of a candidate, for a sentence."""
     return f"{candidate.family} of order {candidate.order}"
 
 
@@ -211,13 +211,13 @@ def _why_none_fits(family: Family, structure: Structure, u: Array, y: Array, t: 
 
 
 def _reason(chosen: Candidate, best: Candidate, candidates: Sequence[Candidate]) -> str:
-    name, percent = name_of(chosen), chosen.free_run_percent
+    name, percent = describe(chosen), chosen.free_run_percent
     if chosen is best:
         text = f"{name} runs best on the held-out half, {percent:.1f} %"
     else:
         text = (
             f"{name} is the smallest model whose free run on the held-out half, {percent:.1f} %, is within "
-            f"{EQUAL_PERCENT} of the best, {name_of(best)} with {best.free_run_percent:.1f} %"
+            f"{EQUAL_PERCENT} of the best, {describe(best)} with {best.free_run_percent:.1f} %"
         )
     smallest = min(
         (c for c in candidates if c.family == chosen.family and not c.refusal), key=lambda candidate: candidate.bic

@@ -78,7 +78,7 @@ def answer(job: Job) -> Answer:
     plant = plant_of(existing_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
     recording, first = tape(job.at, plant, job.columns), FirstSamples(plant)
-    result = run(first.passing(recording.messages), settings, recording.zero_ns or 0)
+    result = run(first.pass_on(recording.messages), settings, recording.zero_ns or 0)
     if set(settings.outputs) <= result.left_out.keys():
         reasons = "; ".join(f"{name}: {result.left_out[name]}" for name in settings.outputs)
         raise InputError(f"{job.at}: there is no output to watch ({reasons})")

@@ -38,8 +38,8 @@ class FirstSamples:
         self._prefix = keys.key(plant, keys.SAMPLE, "")
         self._series: dict[str, list[tuple[int, float]]] = {}
 
-    def passing(self, messages: Iterable[Encoded]) -> Iterator[Encoded]:
-        """The messages as they are, each sample noted on its way."""
+    def pass_on(self, messages: Iterable[Encoded]) -> Iterator[Encoded]:
+        """Yield the messages unchanged, and note the first samples."""
         for message in messages:
             if message.key.startswith(self._prefix):
                 series = self._series.setdefault(message.key.removeprefix(self._prefix), [])
@@ -56,7 +56,7 @@ class FirstSamples:
             series.append((sample.time_ns, sample.value))
 
     def unit_remark(self, model: ProcessModel) -> str:
-        """See `unit_remark`."""
+        """The remark of `unit_remark` on these samples."""
         columns = {name: np.array([value for _, value in series]) for name, series in self._series.items()}
         times = next(iter(self._series.values()), [])
         return unit_remark(model, columns, np.array([to_minutes(time_ns) for time_ns, _ in times]))
