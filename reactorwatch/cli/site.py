@@ -58,12 +58,12 @@ def router(
     import structlog
 
     from reactorwatch.cli.options import existing
-    from reactorwatch.runtime.bus_zenoh import refusals_logged, router_from_file
+    from reactorwatch.runtime.bus_zenoh import log_refusals, router_from_file
     from reactorwatch.runtime.logs import configure
     from reactorwatch.runtime.serve import stop_on_signals
 
     configure()
-    with refusals_logged(), stop_on_signals() as stop:
+    with log_refusals(), stop_on_signals() as stop:
         bus = router_from_file(existing(file))
         stopped = threading.Event()
         stop.wakes(stopped.set)
