@@ -4,6 +4,7 @@ What was learned over months may be wanted back, with the settings that it was l
 a look.
 """
 
+import contextlib
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -36,14 +37,15 @@ def keep_aside(path: Path, ending: str) -> Path:
                 raise
 
 
-def kept_aside(folder: Path) -> dict[str, list[Path]]:
+def find_kept_aside(folder: Path) -> dict[str, list[Path]]:
     """Files of a folder that were kept aside, the newest first, by the name that they had."""
-    found: dict[str, list[Path]] = {}
+    found: dict[str, list[tuple[int, Path]]] = {}
     for path in folder.iterdir() if folder.is_dir() else []:
         match = _NAME.fullmatch(path.name)
         if match is not None and path.is_file():
-            found.setdefault(match[1], []).append(path)
-    return {name: sorted(paths, key=lambda path: -path.stat().st_mtime_ns) for name, paths in found.items()}
+            with contextlib.suppress(FileNotFoundError):  # another monitor has just put it back
+                found.setdefault(match[1], []).append((path.stat().st_mtime_ns, path))
+    return {name: [path for _, path in sorted(dated, reverse=True)] for name, dated in found.items()}
 
 
 def put_back(path: Path, asides: Iterable[Path], use: Callable[[bytes], None]) -> Path | None:

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 
 from monitor_node.core import Monitor
-from monitor_node.kept_aside import DAMAGED, OTHER_SETTINGS, keep_aside, kept_aside, put_back, read_regular
+from monitor_node.kept_aside import DAMAGED, OTHER_SETTINGS, find_kept_aside, keep_aside, put_back, read_regular
 from monitor_node.monitor_state import OtherSettingsError
 from monitor_node.seal import ForeignFileError
 from reactorwatch.errors import InputError
@@ -107,7 +107,7 @@ class StateFile:
                 found = f"{error}; it is kept as {keep_aside(self._path, ending).name}"
             else:
                 return "the monitor goes on from it"
-        asides = kept_aside(self._path.parent).get(self._path.name, [])
+        asides = find_kept_aside(self._path.parent).get(self._path.name, [])
         fitting = put_back(self._path, asides, self._monitor.from_bytes)
         self.was_aside = fitting is not None
         if fitting is not None:

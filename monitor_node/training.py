@@ -214,12 +214,12 @@ class Training:
     ) -> tuple[Reference, Array, list[Undisturbed]]:
         """The reference, its residuals in its own standard deviations, and what can be learned from them."""
         minor = [max(MINOR * sd, step) for sd, step in zip(smallest, steps, strict=True)]
-        known_input = inputs
-        if np.count_nonzero(np.isfinite(inputs)) < FEWEST_ROWS:
-            known_input = np.zeros(inputs.size)
+        has_input = np.count_nonzero(np.isfinite(inputs)) >= FEWEST_ROWS
+        known_input = inputs if has_input else np.zeros(inputs.size)
+        if not has_input:
             self._predict_without_input(time_min, measured)
         identified, found = _twice(lambda rows: (self._identified(time_min, known_input, rows), minor), measured)
-        if self._model is None or not np.isfinite(inputs).any():
+        if self._model is None or not has_input:
             return ArxReference(known_input), identified, found
         possible = self._possible(inputs, measured)
         if possible is None:

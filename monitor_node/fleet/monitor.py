@@ -224,7 +224,7 @@ class FleetMonitor:
         return monitor
 
     def is_watched(self, plant: str) -> bool:
-        """Whether a plant is watched here."""
+        """True if a plant is watched here."""
         return plant in self._here
 
     def own(self, plant: str) -> Monitor | None:

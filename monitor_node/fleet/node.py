@@ -150,6 +150,11 @@ class FleetNode(FleetMonitor):
         """See `FleetMonitor`; if it is our own that went, others may have our plants."""
         if token == self.crew.token and not is_alive:
             self._absence.begins(now_ns)
+        topic = keys.parse(token)
+        if topic is not None and is_alive and token == keys.monitor_token(topic.plant, token.rpartition("/")[2]):
+            log.warning(
+                "a monitor of its own watches this plant, too; stop it or leave the plant out", plant=topic.plant
+            )
         return self._attended(now_ns) + self._noted(super().on_alive(token, is_alive, now_ns))
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
@@ -352,7 +357,7 @@ def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
         subscriptions=node.subscriptions,
         on_told=node.listens,
         on_messages=node.on_messages,
-        tokens=(node.crew.tokens, f"{plants}/{keys.ALIVE}/*"),
+        tokens=(node.crew.tokens, f"{plants}/{keys.ALIVE}/*", keys.monitor_token(plants.partition("/")[2], "*")),
         on_alive=node.on_alive,
         commands=tuple(f"{plants}/{keys.COMMAND}/{name}" for name in COMMANDS),
         on_ready=lambda: bus.announce(node.crew.token),

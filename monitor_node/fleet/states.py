@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeAlias
 
-from monitor_node.kept_aside import keep_aside, kept_aside, put_back, read_regular
+from monitor_node.kept_aside import find_kept_aside, keep_aside, put_back, read_regular
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import is_full, replacing
 
@@ -68,7 +68,7 @@ class FleetStates:
             if not is_full(error):
                 raise InputError(f"state folder {folder}: {error}") from error
         self._clear_up()
-        self._aside = kept_aside(folder)
+        self._aside = find_kept_aside(folder)
         # A daemon: who does not `close` has nothing to write.
         self._thread = threading.Thread(target=self._write_what_waits, name="states", daemon=True)
         self._thread.start()
@@ -80,7 +80,7 @@ class FleetStates:
 
     @property
     def plants_aside(self) -> list[str]:
-        """Those of which a state is kept aside."""
+        """Plants of which a state is kept aside."""
         return sorted(
             name.removesuffix(ENDING) for name, paths in self._aside.items() if paths and name.endswith(ENDING)
         )

@@ -91,7 +91,7 @@ def router(
 
     from reactorwatch.cli.options import existing
     from reactorwatch.errors import InputError
-    from reactorwatch.runtime.bus_zenoh import refusals_logged, router_from_file
+    from reactorwatch.runtime.bus_zenoh import log_refusals, router_from_file
     from reactorwatch.runtime.bus_zenoh import router as plain_router
     from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
     from reactorwatch.runtime.logs import configure
@@ -102,7 +102,7 @@ def router(
     tables = read_settings(config)
     settings = section(BusConfig, "bus", tables, {"endpoint": endpoint})
     configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
-    with refusals_logged(), stop_on_signals() as stop:
+    with log_refusals(), stop_on_signals() as stop:
         bus = router_from_file(existing(file)) if file is not None else plain_router(settings)
         stopped = threading.Event()
         stop.wakes(stopped.set)

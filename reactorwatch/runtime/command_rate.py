@@ -55,8 +55,8 @@ class CommandRate:
             name: of the sender, as the command has it; empty: a question without one.
             now_ns: the time.
         """
-        left_all = _filled(self._all[bool(name)], ALL, now_ns)
-        left = _filled(self._names.pop(name, (ONE_NAME.at_once, now_ns)), ONE_NAME, now_ns) if name else left_all
+        left_all = _level(self._all[bool(name)], ALL, now_ns)
+        left = _level(self._names.pop(name, (ONE_NAME.at_once, now_ns)), ONE_NAME, now_ns) if name else left_all
         refused = left < 1.0 or left_all < 1.0
         spent = 0.0 if refused else 1.0
         self._all[bool(name)] = left_all - spent, now_ns
@@ -82,7 +82,7 @@ def sender_of(question: Encoded) -> str:
     return str(getattr(command, "by", "")).strip()[:LONGEST_NAME]
 
 
-def _filled(bucket: tuple[float, int], rate: Rate, now_ns: int) -> float:
-    """What is in a bucket now; a clock that was set back fills nothing."""
+def _level(bucket: tuple[float, int], rate: Rate, now_ns: int) -> float:
+    """Commands that a bucket holds now; a clock that was set back fills nothing."""
     left, since_ns = bucket
     return min(left + rate.per_s * max(now_ns - since_ns, 0) / 1e9, rate.at_once)

@@ -41,7 +41,7 @@ def now() -> datetime.datetime:
 
 
 def health(node: str, age_s: float, version: str = __version__) -> Encoded:
-    """What a node says of itself, so old."""
+    """Health of a node, so old."""
     time_ns = round((now().timestamp() - age_s) * 1e9)
     message = Health(time_ns=time_ns, node=node, version=version, phase="watching")
     return encode(Publication(keys.key("cstr", keys.HEALTH, node), message))
@@ -219,7 +219,7 @@ def test_what_a_node_said_a_minute_ago_is_not_taken_for_its_clock(site: Site, tm
         assert wrong(settings(site.folder, "cstr/viewer"), tmp_path, 20.0) == {}
 
 
-def test_a_clock_that_is_off_by_less_than_what_is_remembered_is_told(site: Site, tmp_path: Path) -> None:
+def test_a_clock_that_is_off_by_less_than_what_is_remembered_is_reported(site: Site, tmp_path: Path) -> None:
     others = {node: site.join(f"cstr/{node}") for node in ("plant", "recorder")}
     with nodes(others), nodes_of_a_minute({"monitor": site.join("cstr/monitor")}, late_s=20.0):
         found = wrong(settings(site.folder, "cstr/viewer"), tmp_path, 15.0)
@@ -227,7 +227,7 @@ def test_a_clock_that_is_off_by_less_than_what_is_remembered_is_told(site: Site,
     assert found["monitor"].found.partition("its clock ")[2].startswith(("-20.", "-21."))
 
 
-def test_two_monitors_of_one_plant_are_told(site: Site, tmp_path: Path) -> None:
+def test_two_monitors_of_one_plant_are_reported(site: Site, tmp_path: Path) -> None:
     buses = {node: site.join(f"cstr/{node}") for node in NODES}
     other = site.join("cstr/monitor")
     with nodes(buses):

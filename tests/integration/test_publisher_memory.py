@@ -1,4 +1,4 @@
-"""What a publisher remembers for subscribers that missed it is bounded for every kind of message."""
+"""Memory of a publisher, for subscribers that missed messages, is bounded for every kind of them."""
 
 import pytest
 

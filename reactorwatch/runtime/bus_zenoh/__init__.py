@@ -15,7 +15,7 @@ closed.
 """
 
 from reactorwatch.runtime.bus_zenoh.bus import ZenohBus
-from reactorwatch.runtime.bus_zenoh.refusal_log import refusals_logged
+from reactorwatch.runtime.bus_zenoh.refusal_log import log_refusals
 from reactorwatch.runtime.bus_zenoh.sessions import connect, connect_now, router, router_from_file
 
-__all__ = ["ZenohBus", "connect", "connect_now", "refusals_logged", "router", "router_from_file"]
+__all__ = ["ZenohBus", "connect", "connect_now", "log_refusals", "router", "router_from_file"]

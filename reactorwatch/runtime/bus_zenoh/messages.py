@@ -51,7 +51,7 @@ class Reader:
 
 
 def is_wild(key: str) -> bool:
-    """Whether a message came on a key expression of many keys.
+    """True for the key of a message that is on many keys at once.
 
     Zenoh hands it to the subscribers of all of them, and a router's rules cannot tell it from one on a key of its own.
     """

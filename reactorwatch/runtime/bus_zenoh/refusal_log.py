@@ -62,7 +62,7 @@ class RefusalLog:
 
 
 @contextmanager
-def refusals_logged() -> Iterator[None]:
+def log_refusals() -> Iterator[None]:
     """Log what the router of this process refuses, while the context lasts."""
     before = os.dup(1)
     source, sink = os.pipe()

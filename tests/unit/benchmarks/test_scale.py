@@ -17,7 +17,7 @@ ROWS = 200
 
 @pytest.fixture(scope="module")
 def short_record() -> list[Encoded]:
-    """What a plant publishes, as long as it is needed here."""
+    """Messages of a plant, as many as are needed here."""
     return [encode(item) for item in samples_of(simulate_record(PlantConfig(seed=1), LEARNED_ROWS + ROWS), "p0")]
 
 
@@ -26,7 +26,7 @@ def test_the_part_without_a_bus_takes_a_clock_that_goes_on_while_others_have_the
 ) -> None:
     """A monitor that did not run for more than five seconds asks its bus for the router."""
     clock_ns = itertools.count(10**18, 60 * 10**9)
-    monkeypatch.setattr(scale.time, "time_ns", lambda: next(clock_ns))
+    monkeypatch.setattr("time.time_ns", lambda: next(clock_ns))
     monkeypatch.setattr(scale, "record", lambda: short_record)
     assert scale.without_bus(1) > 0
 

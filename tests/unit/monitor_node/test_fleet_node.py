@@ -14,6 +14,7 @@ from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import LOOK_EVERY_NS, FleetNode
 from monitor_node.fleet.shards import Crew, Shard, home
 from monitor_node.fleet.states import FleetStates
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
 from reactorwatch.runtime.bus import Exchange, MemoryBus
@@ -208,3 +209,11 @@ def test_figures_of_alarms_are_told_from_the_first_alarm_of_a_plant_on() -> None
     figures = [item for item in expected[first:] if isinstance(item.message, AlarmKpis)]
     assert len(figures) > 1
     assert [item for item in said if isinstance(item.message, AlarmKpis)] == figures
+
+
+def test_a_monitor_of_a_plant_alone_is_reported(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    bench.node.on_alive(keys.monitor_token("a", "00-0f"), True, bench.now_ns)
+    assert "a monitor of its own watches this plant, too" in capsys.readouterr().out
+    bench.node.on_alive("reactor/a/alive/monitor", True, bench.now_ns)
+    bench.node.on_alive(keys.monitor_token("a", "00-0f"), False, bench.now_ns)
+    assert "too" not in capsys.readouterr().out

@@ -17,7 +17,7 @@ from monitor_node.fleet import pasts
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import LOOK_EVERY_NS, FleetNode
 from monitor_node.fleet.states import FleetStates
-from monitor_node.kept_aside import keep_aside, kept_aside
+from monitor_node.kept_aside import find_kept_aside, keep_aside
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
 from reactorwatch.errors import InputError
@@ -61,7 +61,7 @@ SETTINGS: list[dict[str, object]] = [{}, {"order": 2}, {"plant": "typo"}, {"isol
 def test_settings_changed_and_changed_back_cost_no_row(
     tmp_path_factory: pytest.TempPathFactory, rows: list[Encoded], starts: list[int]
 ) -> None:
-    """Whatever settings the starts have, each goes on with all rows that were learned with these settings."""
+    """Each start goes on with all rows that were learned with its settings, in any order of starts."""
     folder = tmp_path_factory.mktemp("changed")
     learned = dict.fromkeys(range(len(SETTINGS)), 0)
     for number in starts:
@@ -109,7 +109,7 @@ def test_every_flipped_bit_of_a_head_is_damage_and_no_foreign_file(tmp_path: Pat
         data[bit // 8] ^= 1 << bit % 8
         path.write_bytes(data)
         assert not MonitorNode(config(tmp_path), 0).resumed
-    kept = kept_aside(tmp_path)["monitor.state"]
+    kept = find_kept_aside(tmp_path)["monitor.state"]
     assert len({aside.read_bytes() for aside in kept}) == len(range(0, 8 * 24, 5))
 
 
@@ -176,7 +176,7 @@ def stands(alarm: Alarm) -> bool:
     return alarm.state in (AlarmState.ALARM_STATE_UNACKNOWLEDGED, AlarmState.ALARM_STATE_ACKNOWLEDGED)
 
 
-def as_stored(node: MonitorNode) -> list[Alarm]:
+def stored_alarms(node: MonitorNode) -> list[Alarm]:
     """Its alarms, without the time of the newest row."""
     alarms = node.alarms.all_alarms()
     for alarm in alarms:
@@ -210,7 +210,7 @@ def from_alarms(path: Path, **others: object) -> MonitorNode:
     return MonitorNode(msgspec.structs.replace(WITH_ALARMS, **settings_), 0)
 
 
-def flipped(stored: bytes, bit: int) -> bytes:
+def flip_bit(stored: bytes, bit: int) -> bytes:
     data = bytearray(stored)
     data[bit // 8] ^= 1 << bit % 8
     return bytes(data)
@@ -227,19 +227,19 @@ def is_refused(data: bytes) -> bool:
 def test_every_flipped_bit_of_the_alarms_is_refused(alarm_file: Path) -> None:
     """One in a name would make a standing alarm normal. All are tried on the bytes, some on the file."""
     stored = alarm_file.read_bytes()
-    assert [bit for bit in range(8 * len(stored)) if not is_refused(flipped(stored, bit))] == []
+    assert [bit for bit in range(8 * len(stored)) if not is_refused(flip_bit(stored, bit))] == []
     for bit in range(0, 8 * len(stored), 8 * len(stored) // 5):
-        alarm_file.write_bytes(flipped(stored, bit))
+        alarm_file.write_bytes(flip_bit(stored, bit))
         with pytest.raises(InputError, match=r"^alarm_state_file .*; move it away to begin"):
             from_alarms(alarm_file)
-        assert alarm_file.read_bytes() == flipped(stored, bit)
+        assert alarm_file.read_bytes() == flip_bit(stored, bit)
 
 
 def test_damaged_alarms_beside_a_good_state_are_kept_and_reported(
     alarm_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], rows: list[Encoded]
 ) -> None:
     """The state has the alarms, too: the watch goes on with these."""
-    both, damaged = {"state_file": str(tmp_path / "monitor.state")}, flipped(alarm_file.read_bytes(), 5000)
+    both, damaged = {"state_file": str(tmp_path / "monitor.state")}, flip_bit(alarm_file.read_bytes(), 5000)
     node = from_alarms(alarm_file, **both)
     for message in rows:
         node.on_message(message, 0)
@@ -250,25 +250,25 @@ def test_damaged_alarms_beside_a_good_state_are_kept_and_reported(
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "alarm_state_file" in line]
     assert "is a damaged alarm state" in line
     assert "it is kept as alarms.state.damaged, and the alarms are those of state_file" in line
-    assert (again.rows, as_stored(again)) == (node.rows, as_stored(node))
+    assert (again.rows, stored_alarms(again)) == (node.rows, stored_alarms(node))
     assert (tmp_path / "alarms.state.damaged").read_bytes() == damaged
     assert not is_refused(alarm_file.read_bytes())
 
 
 def test_alarms_of_a_version_without_a_digest_are_read(alarm_file: Path, in_alarm: MonitorNode) -> None:
     alarm_file.write_bytes(in_alarm.alarms.to_bytes())
-    assert as_stored(from_alarms(alarm_file)) == as_stored(in_alarm)
+    assert stored_alarms(from_alarms(alarm_file)) == stored_alarms(in_alarm)
     assert not is_refused(alarm_file.read_bytes())
 
 
 def test_alarms_that_a_setting_leaves_out_come_back_with_it(alarm_file: Path, in_alarm: MonitorNode) -> None:
     few = from_alarms(alarm_file, charts=("shewhart",))
-    assert len(as_stored(few)) < len(as_stored(in_alarm))
-    assert as_stored(from_alarms(alarm_file)) == as_stored(in_alarm)
+    assert len(stored_alarms(few)) < len(stored_alarms(in_alarm))
+    assert stored_alarms(from_alarms(alarm_file)) == stored_alarms(in_alarm)
 
 
 def test_alarms_are_not_older_than_their_file_after_a_state_was_aside(tmp_path: Path, leak: list[Encoded]) -> None:
-    """What people did while other settings were in force stays done."""
+    """A comment made while other settings were in force is kept."""
     both = config(tmp_path, training_min=60.0, alarm_state_file=str(tmp_path / "alarms.state"))
     node = MonitorNode(both, 0)
     for message in leak:

@@ -43,7 +43,7 @@ def _is_disturbed(count: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 
 
 def garbage(row: int) -> list[Encoded]:
-    """What no plant publishes, under a new name in each row."""
+    """Messages that no plant publishes, under a new name in each row."""
     return [
         Encoded(f"reactor/cstr/sample/x{row}", b"?", "text/plain"),
         Encoded("reactor/cstr/sample/T", b"?", f"text/{row}"),
@@ -56,7 +56,7 @@ def objects() -> Counter[str]:
     return Counter(type(item).__name__ for item in gc.get_objects())
 
 
-def grown(before: Counter[str], after: Counter[str]) -> dict[str, int]:
+def growth(before: Counter[str], after: Counter[str]) -> dict[str, int]:
     """Kinds of objects of which there are more than a handful more."""
     return {name: count for name, count in (after - before).items() if count > 20}
 
@@ -71,7 +71,7 @@ def test_a_monitor_holds_as_many_objects_after_each_round(rows: list[list[Encode
             counts.append(objects())
             sizes.append(len(monitor.to_bytes()))
     assert monitor.alarms.incident > 0
-    assert grown(counts[1], counts[-1]) == {}
+    assert growth(counts[1], counts[-1]) == {}
     assert sizes[-1] < sizes[1] + 200
 
 
@@ -91,4 +91,4 @@ def test_a_fleet_s_monitor_holds_as_many_objects_after_each_round(rows: list[lis
             node.rejoin("b", row * 10**9)
             list(node.reports(row * 10**9))
             counts.append(objects())
-    assert grown(counts[1], counts[-1]) == {}
+    assert growth(counts[1], counts[-1]) == {}

@@ -68,7 +68,7 @@ def test_a_signal_that_ends_in_the_training_ends_no_training(signal: str, last: 
     result = watch(leak, signal, 0, last)
     assert result.watching_since_ns == 40 * MINUTE_NS
     assert 0.1 * last < raised_min(result)[f"silence/{signal}"] < 0.1 * last + 10.1
-    assert set(result.left_out) == ({signal} if last < 50 and signal != "qc" else set())
+    assert set(result.left_out) == ({signal} if last < 50 else set())
 
 
 def test_a_signal_that_comes_after_the_training_ends_its_silence_and_is_said_not_to_be_watched(leak: Run) -> None:

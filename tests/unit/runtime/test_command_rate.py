@@ -9,8 +9,8 @@ from reactorwatch.runtime.command_rate import ALL, MOST_NAMES, ONE_NAME, Command
 SECOND = 1_000_000_000
 
 
-def taken(rate: CommandRate, names: list[str], now_ns: int = 0) -> int:
-    """How many of the commands are obeyed."""
+def count_obeyed(rate: CommandRate, names: list[str], now_ns: int = 0) -> int:
+    """Number of the commands that are obeyed."""
     return sum(rate.refusal(name, now_ns) is None for name in names)
 
 
@@ -20,32 +20,32 @@ def taken(rate: CommandRate, names: list[str], now_ns: int = 0) -> int:
     ids=["one name", "made-up names", "questions"],
 )
 def test_of_a_flood_as_many_are_taken_as_may_come_at_once(names: list[str], at_once: float) -> None:
-    assert taken(CommandRate(), names) == at_once
+    assert count_obeyed(CommandRate(), names) == at_once
 
 
 def test_over_a_minute_the_rate_is_taken() -> None:
     rate = CommandRate()
-    obeyed = sum(taken(rate, ["Anna"] * 50, second * SECOND) for second in range(60))
+    obeyed = sum(count_obeyed(rate, ["Anna"] * 50, second * SECOND) for second in range(60))
     assert obeyed == ONE_NAME.at_once + 59 * ONE_NAME.per_s
 
 
 def test_one_person_s_flood_does_not_refuse_another_s_command() -> None:
     rate = CommandRate()
-    assert taken(rate, ["Anna"] * 3000) == ONE_NAME.at_once
-    assert taken(rate, ["Ben"]) == 1
+    assert count_obeyed(rate, ["Anna"] * 3000) == ONE_NAME.at_once
+    assert count_obeyed(rate, ["Ben"]) == 1
 
 
 def test_questions_do_not_refuse_commands() -> None:
     rate = CommandRate()
-    taken(rate, [""] * 3000)
-    assert taken(rate, ["Ben"]) == 1
+    count_obeyed(rate, [""] * 3000)
+    assert count_obeyed(rate, ["Ben"]) == 1
 
 
-def test_a_clock_that_is_set_back_fills_no_bucket_and_locks_nobody_out() -> None:
+def test_a_clock_that_is_set_back_fills_no_bucket_and_ends_the_refusals() -> None:
     rate = CommandRate()
-    taken(rate, ["Anna"] * 3000, 1000 * SECOND)
-    assert taken(rate, ["Anna"], 0) == 0
-    assert taken(rate, ["Anna"], SECOND) == 1
+    count_obeyed(rate, ["Anna"] * 3000, 1000 * SECOND)
+    assert count_obeyed(rate, ["Anna"], 0) == 0
+    assert count_obeyed(rate, ["Anna"], SECOND) == 1
 
 
 def test_made_up_names_take_no_memory() -> None:
