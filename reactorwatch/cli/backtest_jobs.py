@@ -13,6 +13,8 @@ from reactorwatch.cli.batch import Answer, Kind, Row, as_table
 from reactorwatch.cli.options import existing_recording
 from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.sources import plant_of, tape
+from reactorwatch.process.cstr import cstr
+from reactorwatch.runtime.model_file import model_on_the_bus
 
 
 @dataclass(frozen=True)
@@ -73,7 +75,7 @@ def answer(job: Job) -> Answer:
     """
     plant = plant_of(existing_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
-    recording = tape(job.at, plant, job.columns)
+    recording = tape(job.at, plant, job.columns, _units(settings))
     result = run(recording.messages, settings, recording.zero_ns or 0)
     zero_ns = result.first_ns if recording.zero_ns is None else recording.zero_ns
     found = backtest_object(result, zero_ns, recording.zero(result.first_ns))
@@ -82,6 +84,14 @@ def answer(job: Job) -> Answer:
     else:
         said = backtest_text(result, zero_ns, job.file)
     return Answer(said, _row(job.file, found))
+
+
+def _units(settings: MonitorConfig) -> dict[str, str] | None:
+    """The units of the signals, if the settings say of which process they are; None: they do not."""
+    model = model_on_the_bus(settings.model)
+    if model is None and settings.reference == "process":
+        model = cstr()
+    return None if model is None else model.units
 
 
 _COLUMNS = ("samples", "span_min", "trained_until_min", "expected_false_alarms")

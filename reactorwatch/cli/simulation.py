@@ -59,7 +59,7 @@ def _free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Recor
 
 def report(measured: Record, simulated: Record, model: ProcessModel, out: Path, *, as_json: bool) -> str:
     """How far the simulation is from the record, by signal."""
-    rmse, units = {}, {output.name: output.unit for output in model.outputs}
+    rmse, units = {}, model.units
     for name in model.output_names:
         difference = simulated.columns[name] - measured.columns[name]
         rmse[name] = float(np.sqrt(np.nanmean(difference**2)))
@@ -72,5 +72,5 @@ def report(measured: Record, simulated: Record, model: ProcessModel, out: Path, 
         }
         return msgspec.json.encode(said).decode()
     parts = ", ".join(f"{name} {value:.3g} {units[name]}" for name, value in rmse.items())
-    said = f"wrote {out}: {measured.rows} rows; root mean square difference from the record: {parts}"
-    return "\n".join([said, *(f"note: {remark}" for remark in measured.remarks)])
+    text = f"wrote {out}: {measured.rows} rows; root mean square difference from the record: {parts}"
+    return "\n".join([text, *(f"note: {remark}" for remark in measured.remarks)])
