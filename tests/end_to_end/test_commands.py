@@ -237,5 +237,6 @@ def test_simulate_and_backtest_speak_json_to_machines(command: Command, record_c
     assert tested.returncode == 0, tested.stderr
     said = json.loads(tested.stdout)
     assert said == {
-        "samples": 3, "span_min": 0.2, "trained_until_min": None, "expected_false_alarms": 0.0, "alarms": [],
+        "samples": 3, "zero": None, "span_min": 0.2, "runs": 1, "trained_until_min": None,
+        "expected_false_alarms": 0.0, "alarms": [],
     }  # fmt: skip
