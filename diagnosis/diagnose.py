@@ -127,6 +127,7 @@ def diagnose(
     curves = replace(curves, held_out=dict(zip(model.output_names, after.values.T, strict=True)))
     if verdict == UNKNOWN and strange is not None and strange.effect.location == location:
         curves = replace(curves, unknown=strange.course)
+    blind = ~np.all(np.isfinite(found.nominal.fit.found.prediction), axis=1)
     causes = in_minutes_of_runs(causes_of(best, covariances), record)
     parameters = adjusted_parameters(run, model, uncertain or {}, best)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
@@ -143,7 +144,7 @@ def diagnose(
         alternatives=tuple(Alternative(item.key, item.bic - best.bic) for item in rivals),
         location=location,
         significant=verdict != NOMINAL,
-        practical=unexplained or matters(curves, bands, run.starts),
+        practical=unexplained or matters(curves, bands, blind),
         differences=differences_of(model, found, curves),
         gain=_gain(model, found, best, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
