@@ -131,6 +131,7 @@ def diagnose(
     curves = replace(curves, held_out=dict(zip(model.output_names, after.values.T, strict=True)))
     if verdict == UNKNOWN and strange is not None and strange.effect.location == location:
         curves = replace(curves, unknown=strange.course)
+    blind = ~np.all(np.isfinite(found.nominal.fit.found.prediction), axis=1)
     causes = in_minutes_of_runs(causes_of(best, covariances), record)
     parameters = adjusted_parameters(run, model, uncertain or {}, best)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
@@ -147,7 +148,7 @@ def diagnose(
         alternatives=tuple(_alternative(search, item, found.noise, best.bic, record) for item in rivals),
         location=location,
         significant=verdict != NOMINAL,
-        practical=unexplained or matters(curves, bands, run.starts),
+        practical=unexplained or matters(curves, bands, blind),
         differences=differences_of(model, noise_sd, curves),
         gain=_gain(model, found.nominal.bic - best.bic, noise_sd, before, after),
         adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),

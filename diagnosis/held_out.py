@@ -120,7 +120,7 @@ def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovation
         while first < end - 2 and not np.all(np.isfinite(found.x[first])):
             first += 1
         start = found.x[first][: sized.own_states]  # memory is short: it begins at rest
-        if not np.all(np.isfinite(start)) and begin:
+        if run.starts and (end - first < 2 or not np.all(np.isfinite(start))):
             continue  # of a run this short nothing is known but what the filter predicts
         try:
             time_min = run.time_min[first:end]

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from diagnosis.held_out import Errors
 from diagnosis.result import Curves
@@ -46,17 +47,16 @@ def bands_of(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> d
     }
 
 
-def matters(curves: Curves, bands: Mapping[str, float], starts: tuple[int, ...] = ()) -> bool:
+def matters(curves: Curves, bands: Mapping[str, float], blind: NDArray[np.bool_]) -> bool:
     """Whether the free runs of both models differ by more than the tolerance in an output.
 
     Args:
         curves: of both models.
         bands: the tolerances, by output.
-        starts: rows at which the plant started again, see `Run`.
+        blind: rows of which the filter says nothing, as of the first row of a run, shape (rows,).
     """
     for output, band in bands.items():
-        # The filter says nothing of the first row of a run.
-        difference = np.delete(curves.free_after[output] - curves.free_before[output], [0, *starts])
+        difference = (curves.free_after[output] - curves.free_before[output])[~blind]
         known = difference[np.isfinite(difference)]
         if known.size < difference.size or float(np.sqrt(np.mean(known**2))) > band:
             return True

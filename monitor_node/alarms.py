@@ -116,6 +116,22 @@ def remembered(alarm: Alarm) -> AlarmMemory:
     )
 
 
+def quantity(value: float, unit: str, form: str = ".3g") -> str:
+    """A number and its unit, as texts of alarms have it.
+
+    >>> quantity(7.25, "K")
+    '7.25 K'
+    >>> quantity(7.25, "", "+.1f")
+    '+7.2'
+
+    Args:
+        value: the number.
+        unit: empty where it is not known; 1 where there is none.
+        form: of the number.
+    """
+    return f"{value:{form}}" if unit in ("", "1") else f"{value:{form}} {unit}"
+
+
 class Explanation(NamedTuple):
     """What an alarm says when it is raised.
 
@@ -260,8 +276,8 @@ class ChartAlarm:
         off = judgement.statistic - judgement.centre
         allowed = abs(self._memory.limit - judgement.centre)
         text = (
-            f"{self._signal} is {abs(off):.3g} {unit} {'above' if off > 0 else 'below'} what the model expects "
-            f"(allowed: {allowed:.3g} {unit})"
+            f"{self._signal} is {quantity(abs(off), unit)} {'above' if off > 0 else 'below'} what the model expects "
+            f"(allowed: {quantity(allowed, unit)})"
         )
         return Explanation(text, {self._signal: 1.0})
 

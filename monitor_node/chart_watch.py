@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.alarm_board import AlarmBoard
-from monitor_node.alarms import ChartAlarm, Explanation
+from monitor_node.alarms import ChartAlarm, Explanation, quantity
 from monitor_node.chart_design import ChartDesign, VectorChart, joint_obstacle
 from monitor_node.charts.base import Bank, Judgement, SignalChart, SignalState
 from monitor_node.charts.cusum import Cusum
@@ -118,11 +118,11 @@ class _OfEach:
         side = "above" if judgement.statistic > judgement.centre else "below"
         size = abs(judgement.statistic) * scales[place]
         if self._name == Shewhart.name:
-            allowed = judgement.upper_limit * scales[place]
-            text = f"{signal} is {size:.3g} {unit} {side} what the model expects (allowed: {allowed:.3g} {unit})"
+            allowed = quantity(judgement.upper_limit * scales[place], unit)
+            text = f"{signal} is {quantity(size, unit)} {side} what the model expects (allowed: {allowed})"
         elif self._name == Ewma.name:
             # As the lasting shift of the output that would look like this.
-            text = f"{signal} is on average {size / self._passed[place]:.3g} {unit} {side} what the model expects"
+            text = f"{signal} is on average {quantity(size / self._passed[place], unit)} {side} what the model expects"
         else:
             text = f"{signal} has been {side} what the model expects for long"
         return Explanation(text, {signal: 1.0})

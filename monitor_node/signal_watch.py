@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from math import isfinite, nan
 
 from monitor_node.alarm_board import AlarmBoard
-from monitor_node.alarms import ChartAlarm, Explanation, SuspectedCause
+from monitor_node.alarms import ChartAlarm, Explanation, SuspectedCause, quantity
 from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_range import ANY, SignalRange
@@ -201,7 +201,7 @@ class SignalWatch:
             alarm, judgement = self._stuck_alarms[index], self._stuck[index].update(value)
             if judgement.out or not alarm.at_rest:
                 name, times = self._outputs[index], judgement.statistic
-                text = f"{name} is stuck: it has read {value:.6g} {units[index]} {times:.0f} times in a row"
+                text = f"{name} is stuck: it has read {quantity(value, units[index], '.6g')} {times:.0f} times in a row"
                 publications += self._judge(alarm, time_ns, judgement, READINGS, text, name, cause=STUCK_SENSOR)
                 self._note_stuck()
         return publications
@@ -228,9 +228,8 @@ class SignalWatch:
                 name = self._outputs[index]
                 size = verdict.size if verdict.spike else 0.0
                 judgement = Judgement(size, 0.0, -spike.limit, spike.limit, verdict.spike)
-                text = (
-                    f"{name} had a spike of {size * scales[index]:+.3g} {units[index]} one row before; it was left out"
-                )
+                spiked = quantity(size * scales[index], units[index], "+.3g")
+                text = f"{name} had a spike of {spiked} one row before; it was left out"
                 publications += self._judge(alarm, time_ns, judgement, "sd", text, name, cause="spike")
         return flags, publications
 

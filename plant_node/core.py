@@ -104,7 +104,7 @@ class Plant:
             )
         if config.level_control is not None:
             model = _with_level(model, config.level_control.gain_per_min)
-        self.units = {item.name: item.unit for item in model.inputs} | {item.name: item.unit for item in model.outputs}
+        self.units = model.units
         self.trouble: str | None = None
         self._config = config
         self._base = model

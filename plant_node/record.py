@@ -70,4 +70,5 @@ def simulate_record(
     plant = plant_from(config, model, driver)
     measured = [plant.next_row() for _ in range(rows)]
     columns = {signal: np.array([row.readings[signal] for row in measured]) for signal in plant.units}
-    return Record(np.array([row.time_min for row in measured]), columns, f"simulated {config.name}")
+    times = np.array([row.time_min for row in measured])
+    return Record(times, columns, f"simulated {config.name}", units=plant.units)

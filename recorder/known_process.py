@@ -1,7 +1,7 @@
 """What is known of the signals of a run from the equations of the processes there are. Pure."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Mapping
 from functools import cache, lru_cache
 
 import numpy as np
@@ -16,9 +16,9 @@ FARTHEST = 2.0
 """In scales of the states: what is farther from one level of the input to the next is another branch."""
 
 
-def titled(name: str) -> str:
-    """A signal's name with what it means, if a process knows it."""
-    meaning = next((item.meaning for item in _variables() if item.name == name), "")
+def titled(name: str, unit: str) -> str:
+    """A signal's name with what it means, if a process knows a signal of that name and unit."""
+    meaning = next((item.meaning for item in _variables() if (item.name, item.unit) == (name, unit)), "")
     return f"{name}: {meaning}" if meaning else name
 
 
@@ -27,11 +27,13 @@ def is_input(name: str) -> bool:
     return any(item.name == name for model in _models() for item in model.inputs)
 
 
-def process_of(signals: Iterable[str]) -> ProcessModel | None:
-    """The process whose inputs and outputs all are among the signals, if there is one."""
-    there = set(signals)
-    fitting = (model for model in _models() if there.issuperset((*model.input_names, *model.output_names)))
-    return next(fitting, None)
+def process_of(units: Mapping[str, str]) -> ProcessModel | None:
+    """The process whose inputs and outputs all are there, by their names and units; None: there is no such one.
+
+    Args:
+        units: of the signals that are there, by name.
+    """
+    return next((model for model in _models() if model.units.items() <= units.items()), None)
 
 
 @lru_cache(maxsize=256)

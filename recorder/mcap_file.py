@@ -147,6 +147,7 @@ def read_record(path: Path, plant: str | None = None) -> Record:
     signals = {keys.key(plant, keys.SAMPLE, signal): signal for signal in UNITS}
     runs: list[dict[str, tuple[array[int], array[float]]]] = []
     newest: dict[str, tuple[array[int], array[float]]] = {}  # by signal, where its newest sample is
+    units: dict[str, str] = {}
     splitter = RunSplitter()
     for entry in read_messages(path, {keys.SAMPLE}, plant):
         if entry.key not in signals or entry.encoding != _SAMPLE:
@@ -164,6 +165,8 @@ def read_record(path: Path, plant: str | None = None) -> Record:
                     column.pop()
             if number > len(runs):
                 runs.append({signal: (array("q"), array("d")) for signal in UNITS})
+            if sample.unit:
+                units.setdefault(signal, sample.unit)
             newest[signal] = times, values = runs[number - 1][signal]
             times.append(sample.time_ns)
             values.append(value)
@@ -172,7 +175,8 @@ def read_record(path: Path, plant: str | None = None) -> Record:
     metadata = read_metadata(path)
     zero_ns = zero_from(metadata, splitter.runs[0].first_ns)
     rows = [_rows(series, zero_ns, path.name) for series in runs if any(times for times, _ in series.values())]
-    return replace(join_runs(rows), zero_ns=zero_ns if has_clock(metadata) else 0, strays=splitter.strays)
+    clock_ns = zero_ns if has_clock(metadata) else 0
+    return replace(join_runs(rows), zero_ns=clock_ns, strays=splitter.strays, units=units)
 
 
 def zero_from(metadata: dict[str, str], first_ns: int) -> int:

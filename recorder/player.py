@@ -16,7 +16,7 @@ from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication,
 from reactorwatch.contract.commands import command_in
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import UNITS, Record, to_time_ns
+from reactorwatch.records.record import Record, to_time_ns
 from recorder.entry import Entry
 from recorder.run_splitter import ContinuousTime
 
@@ -73,7 +73,7 @@ def samples_of(record: Record, plant: str, zero_ns: int = 0) -> Iterator[Publica
                 time_ns=time_ns,
                 sequence=sequences[signal],
                 value=columns[signal][row],
-                unit=UNITS[signal],
+                unit=record.units.get(signal, ""),
                 quality=messages.QUALITY_GOOD if measured else messages.QUALITY_BAD,
             )
             sequences[signal] += 1

@@ -19,7 +19,6 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import UNITS
 from recorder.entry import Entry
 from recorder.measurement import measured
 from recorder.run import (
@@ -170,7 +169,7 @@ class RunReader:
         self._seen |= {name: _seen(self._seen.get(name), item) for name, item in samples.items()}
         run = Run(
             plant=self._plant,
-            units=UNITS | {item.topic.name: item.unit for item in found if item.unit},
+            units={item.topic.name: item.unit for item in found if item.unit},
             measured=samples,
             estimated={name: Estimated(*columns) for name, columns in of_kind(keys.ESTIMATE)},
             charts={name: Charted(*columns) for name, columns in of_kind(keys.CHART)},

@@ -124,9 +124,12 @@ class SequenceCheck:
             run.advance(sequence, time_ns)
             return Place.IN_RUN
         if sequence == run.next and time_ns > run.newest_ns and len(run.points) > 1:
-            self._before = _Before(run, run.next, run.newest_ns, self.lost, len(run.gaps))
+            self._before = None  # it is known from the points
             run.advance(sequence, time_ns)
             return Place.IN_RUN
+        if self._before is None and len(run.points) > 1:
+            number, then_ns = run.points[-2]
+            self._before = _Before(run, number + 1, then_ns, self.lost, len(run.gaps))
         if not self._continues(run, sequence, time_ns) and self._follows_before(sequence, time_ns):
             self._forget_stray()
             self.update(sequence, time_ns)

@@ -77,7 +77,7 @@ def answer(job: Job) -> Answer:
     """
     plant = plant_of(existing_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
-    recording, first = tape(job.at, plant, job.columns), FirstSamples(plant)
+    recording, first = tape(job.at, plant, job.columns, _units(settings)), FirstSamples(plant)
     result = run(first.pass_on(recording.messages), settings, recording.zero_ns or 0)
     if set(settings.outputs) <= result.left_out.keys():
         reasons = "; ".join(f"{name}: {result.left_out[name]}" for name in settings.outputs)
@@ -89,6 +89,14 @@ def answer(job: Job) -> Answer:
     else:
         said = backtest_text(result, zero_ns, job.file)
     return Answer(said, _row(job.file, found), first.unit_remark(model_on_the_bus(settings.model) or cstr()))
+
+
+def _units(settings: MonitorConfig) -> dict[str, str] | None:
+    """The units of the signals, if the settings say of which process they are; None: they do not."""
+    model = model_on_the_bus(settings.model)
+    if model is None and settings.reference == "process":
+        model = cstr()
+    return None if model is None else model.units
 
 
 _COLUMNS = ("samples", "span_min", "trained_until_min", "expected_false_alarms")

@@ -10,7 +10,7 @@ from monitor_node.identification.selection import Selection, select
 from monitor_node.identification.structure import ALL_ROWS, REPORT_ROWS
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import Array
-from reactorwatch.records.record import UNITS, Record
+from reactorwatch.records.record import Record
 
 INPUT = "qc"
 
@@ -42,7 +42,7 @@ def one(
         choice=REPORT_ROWS if report_rows else ALL_ROWS,
         missing="leave out",
     )
-    return msgspec.json.encode(found).decode() if as_json else f"{_text(found)}{_remarks_text(measured)}"
+    return msgspec.json.encode(found).decode() if as_json else f"{_text(found, measured)}{_remarks_text(measured)}"
 
 
 def compare(measured: Record, output: str, order: int, delay: int, *, neural: bool, as_json: bool) -> str:
@@ -98,8 +98,8 @@ def _selection_json(selection: Selection, output: str) -> str:
     return msgspec.json.encode(said).decode()
 
 
-def _text(found: Identification) -> str:
-    unit = UNITS[found.output]
+def _text(found: Identification, measured: Record) -> str:
+    unit = measured.units.get(found.output, "unit not known")
     names = [f"a{lag}" for lag in range(1, found.order + 1)] + [f"b{lag}" for lag in range(1, found.order + 1)]
     values = [*found.a, *found.b, found.offset]
     deviations = [*found.sd.a, *found.sd.b, found.sd.offset]

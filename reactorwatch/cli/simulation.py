@@ -28,12 +28,13 @@ def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record
     Raises:
         InputError: the record cannot drive the model.
     """
-    simulated = join_runs([_free_run(run, model, faults) for run in measured.each_run()])
+    runs = measured.each_run()
+    simulated = join_runs([_free_run(run, model, faults, alone=len(runs) == 1) for run in runs])
     return replace(simulated, name=f"simulation of {measured.name}")
 
 
-def _free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record:
-    """The free run along one run of a record."""
+def _free_run(measured: Record, model: ProcessModel, faults: list[str], *, alone: bool) -> Record:
+    """The free run along one run of a record; of a single row among other runs it is that row."""
     for text in faults:
         model = parse_fault(text, effects_of(model)).extend(model, end_min=float(measured.time_min[-1]))
     wrong = find_wrong_unit(model, measured.columns, measured.time_min)
@@ -44,8 +45,9 @@ def _free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Recor
     first = {name: float(measured.columns[name][0]) for name in model.output_names}
     if not np.all(np.isfinite(list(first.values()))):
         said = ", ".join(f"{name} = {value:g}" for name, value in first.items())
+        first_row = "the first row" if alone else "the first row of each run"
         raise InputError(
-            f"{measured.name}: the first row must have {' and '.join(first)}, the run starts from them; got {said}"
+            f"{measured.name}: {first_row} must have {' and '.join(first)}, the run starts from them; got {said}"
         )
     if not np.all(np.isfinite(inputs)):
         row = int(np.argmax(~np.all(np.isfinite(inputs), axis=1)))
@@ -53,6 +55,8 @@ def _free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Recor
         raise InputError(
             f"{measured.name}: {names} must be there in every row, it is missing at {measured.time_min[row]:g} min"
         )
+    if measured.rows == 1 and not alone:
+        return replace(measured, columns={name: measured.columns[name] for name in (*model.input_names, *first)})
     start = carried_over(model, first, inputs[0], float(measured.time_min[0]))
     try:
         trajectory = Simulator(model).run(measured.time_min, inputs, start)
@@ -73,7 +77,7 @@ def report(measured: Record, simulated: Record, model: ProcessModel, out: Path |
         out: the file that the simulation was written to; None: it could not be written.
         as_json: for machines.
     """
-    rmse, units = {}, {output.name: output.unit for output in model.outputs}
+    rmse, units = {}, model.units
     for name in model.output_names:
         difference = simulated.columns[name] - measured.columns[name]
         rmse[name] = float(np.sqrt(np.nanmean(difference**2)))

@@ -4,8 +4,9 @@ A folder stands for the recordings in it, as one; where many files may be named,
 `--model` is turned into a process model on the record's clock.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ def record(
     plant: str | None = None,
     columns: dict[str, str] | None = None,
     required: tuple[str, ...] = tuple(UNITS),
+    units: Mapping[str, str] | None = None,
 ) -> Record:
     """The columns of a file.
 
@@ -31,6 +33,7 @@ def record(
         plant: in a recording.
         columns: a .csv's own names, by signal.
         required: signals that a .csv must have.
+        units: of the process's signals, if the columns are known to be these; None: see `read_csv`.
 
     Raises:
         InputError: the file is not one of the two kinds, or is malformed.
@@ -38,7 +41,8 @@ def record(
     if kind(path) == "csv":
         from reactorwatch.records.csv_file import read_csv
 
-        return read_csv(path, columns, required)
+        measured = read_csv(path, columns, required)
+        return measured if units is None else replace(measured, units=units)
     from recorder.mcap_file import read_record
 
     return read_record(path, plant)
@@ -66,8 +70,13 @@ class Tape(NamedTuple):
         return clock_time(first_ns if self.zero_ns is None else self.zero_ns) if self.has_clock else None
 
 
-def tape(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Tape:
-    """The messages of a file, and what its minutes count from.
+def tape(
+    path: Path,
+    plant: str | None = None,
+    columns: dict[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+) -> Tape:
+    """The messages of a file, and what its minutes count from; see `record`.
 
     Raises:
         InputError: as `record`.
@@ -75,7 +84,7 @@ def tape(path: Path, plant: str | None = None, columns: dict[str, str] | None = 
     if kind(path) == "csv":
         from recorder.player import samples_of
 
-        measured = record(path, plant, columns)
+        measured = record(path, plant, columns, units=units)
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
         return Tape((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
     from recorder.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from

@@ -149,6 +149,11 @@ class ProcessModel:
         return tuple(state.name for state in self.states)
 
     @property
+    def units(self) -> dict[str, str]:
+        """The units of its inputs and outputs, by name."""
+        return {item.name: item.unit for item in self.inputs} | {item.name: item.unit for item in self.outputs}
+
+    @property
     def input_names(self) -> tuple[str, ...]:
         """Names of the inputs, in order."""
         return tuple(item.name for item in self.inputs)

@@ -11,6 +11,7 @@ knows the few things more that are fine (quoted numbers, say), and otherwise fin
 import csv
 import io
 import math
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -33,6 +34,7 @@ RUN = "run"
 LARGEST_SHARE_BACK = 1 / 3
 """Of the rows, before which the time steps back: a file with more of them is not in time order."""
 
+_BRACKETED = re.compile(r"[\[(]([^\[\]()]+)[\])]\s*$")
 _MCAP_MAGIC = b"\x89MCAP"
 
 
@@ -52,13 +54,20 @@ class _Layout(NamedTuple):
     runs: NDArray[np.intp] | None
 
 
-def read_csv(path: Path, columns: Mapping[str, str] | None = None, required: tuple[str, ...] = tuple(UNITS)) -> Record:
+def read_csv(
+    path: Path,
+    columns: Mapping[str, str] | None = None,
+    required: tuple[str, ...] = tuple(UNITS),
+    units: Mapping[str, str] = UNITS,
+) -> Record:
     """Read a record.
 
     Args:
         path: the file: UTF-8, comma separated.
         columns: the file's own name for a column, where it has another: `{"T": "reactor_temp", "time_s": "t"}`.
         required: the signals that must be there; the reactor's others are read if they are.
+        units: of the process's signals. A column of the signal's own name has this unit; one of another name has the
+            unit in brackets at its end, and otherwise none that is known.
 
     Returns:
         The record; an empty cell is NaN.
@@ -74,10 +83,20 @@ def read_csv(path: Path, columns: Mapping[str, str] | None = None, required: tup
         values = _parsed_by_row(path, text, layout)
     time_min = values[:, 0] / layout.units_per_minute
     signals = {signal: values[:, number].copy() for number, signal in enumerate(layout.signals, start=1)}
+    known = {signal: _unit(signal, column.name, units) for signal, column in layout.signals.items()}
+    known = {name: unit for name, unit in known.items() if unit}
     lines_below_header = text.rstrip("\n").count("\n") + 1 - layout.header_lines
     first_row = layout.header_lines + 1 if lines_below_header == len(values) else None  # None: blank lines between
     runs = _runs(path, layout, values[:, 0])
-    return Record(time_min=time_min, columns=signals, name=path.name, first_row=first_row, runs=runs)
+    return Record(time_min, signals, path.name, first_row=first_row, runs=runs, units=known)
+
+
+def _unit(signal: str, column: str, units: Mapping[str, str]) -> str:
+    """The unit of a signal in a column; empty: not known."""
+    if column == signal:
+        return units.get(signal, "")
+    bracketed = _BRACKETED.search(column)
+    return bracketed[1].strip() if bracketed else ""
 
 
 def write_csv(path: Path, record: Record) -> None:

@@ -4,7 +4,8 @@ Where the plant's clock steps back, or the plant was restarted, a record has sev
 receipt, and times increase within each run.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from math import ceil
@@ -31,7 +32,7 @@ MOST_SPANS = 5
 """Runs whose times are named to people."""
 
 UNITS = {"qc": "l/min", "C": "mol/l", "T": "K"}
-"""The signals of the reactor and their units."""
+"""The signals of the reactor, which is the process where none is named, and their units."""
 
 
 def to_time_ns(minutes: float, zero_ns: int = 0) -> int:
@@ -74,6 +75,7 @@ class Record:
         zero_ns: the time that its minutes count from, in nanoseconds since 1970-01-01 UTC; 0: not known.
         first_row: number of the first row in the file, as a text editor counts lines; None: the rows are no lines.
         runs: the run that each row is of, shape (rows,), counted from 1; None: there is one.
+        units: of the signals, by name; a signal whose unit is not known has none.
         strays: samples that are in no row, because their number or time fits neither those before nor those after.
     """
 
@@ -83,6 +85,7 @@ class Record:
     zero_ns: int = 0
     first_row: int | None = None
     runs: NDArray[np.intp] | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
     strays: int = 0
 
     def __post_init__(self) -> None:
@@ -131,7 +134,7 @@ class Record:
         if self.runs is None:
             return self.time_min
         counts = np.diff([*self.run_starts, self.rows])
-        return self.time_min + np.repeat(self.run_shifts_min, counts)
+        return np.asarray(self.time_min + np.repeat(self.run_shifts_min, counts))
 
     @property
     def run_shifts_min(self) -> tuple[float, ...]:

@@ -45,7 +45,8 @@ def _plot(run: Run, name: str) -> TimePlot:
         ]
     if rebuilt is not None:
         series.append(Series("reconstructed", rebuilt.time_ns, rebuilt.value, RESIDUAL, width=1.5))
-    return TimePlot(titled(name), run.units.get(name, ""), tuple(series))
+    unit = run.units.get(name, "")
+    return TimePlot(titled(name, unit), unit, tuple(series))
 
 
 PANEL = Panel("Overview", draw, arranged="beside")

@@ -36,7 +36,7 @@ _STANDING = (messages.ALARM_STATE_UNACKNOWLEDGED, messages.ALARM_STATE_ACKNOWLED
 
 def draw(run: Run) -> tuple[PlanePlot, ...]:
     """The path close by, and among all steady states; nothing if no process is known that has these signals."""
-    model = process_of(run.seen)
+    model = process_of({name: run.units.get(name, "") for name in run.seen})
     if model is None or len(model.outputs) < 2 or len(model.inputs) != 1:
         return ()
     (input_,), (x_output, y_output) = model.inputs, model.outputs[:2]

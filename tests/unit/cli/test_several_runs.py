@@ -45,6 +45,15 @@ def test_each_run_is_simulated_from_its_own_first_row(whole: Record, tmp_path: P
     assert "2 runs" in report(record, simulated, cstr(), tmp_path, as_json=False)
 
 
+def test_a_run_of_one_row_is_simulated_as_that_row(whole: Record) -> None:
+    runs = 1 + (np.arange(ROWS) >= 500) + (np.arange(ROWS) >= 501)
+    simulated = free_run(replace(whole, runs=runs), cstr(), [])
+    assert simulated.rows == ROWS
+    assert simulated.columns["T"][500] == whole.columns["T"][500]
+    whole_run = free_run(whole, cstr(), [])
+    assert np.array_equal(simulated.columns["T"][:500], whole_run.columns["T"][:500])
+
+
 @pytest.mark.parametrize("model", ["arx", "oe"])
 @pytest.mark.parametrize("row", [400])
 def test_no_row_is_identified_from_rows_of_another_run(whole: Record, model: str, row: int) -> None:

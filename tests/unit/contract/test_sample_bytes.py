@@ -67,10 +67,10 @@ def test_another_message_is_no_plain_sample_unless_its_bytes_are_one() -> None:
     time_ns=st.integers(-(2**63), 2**63 - 1),
     sequence=st.integers(0, 2**64 - 1),
     value=st.floats(),
-    quality=st.integers(0, 5),
+    quality=st.sampled_from(list(Quality.values())),
 )
 def test_the_number_of_one_sample_is_read_from_its_bytes(
-    time_ns: int, sequence: int, value: float, quality: int
+    time_ns: int, sequence: int, value: float, quality: Quality
 ) -> None:
     sample = Sample(time_ns=time_ns, sequence=sequence, value=value, quality=quality, unit="K")
     assert sample_number(sample.SerializeToString()) == sequence

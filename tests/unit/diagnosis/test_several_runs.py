@@ -73,6 +73,19 @@ def test_a_fault_is_found_at_the_minute_that_the_clock_showed(leaking: Record, b
     assert "2 runs" in text
 
 
+@pytest.mark.parametrize("lengths", [(1, 1, 2, 3), (20, 1, 150), (2, 500, 1)])
+def test_runs_of_a_few_rows_hide_no_fault(leaking: Record, lengths: tuple[int, ...]) -> None:
+    """With values missing in their first rows, too."""
+    ends = 300 + np.cumsum(lengths)
+    runs = 1 + np.searchsorted([300, *ends], np.arange(ROWS), side="right")
+    columns = {name: values.copy() for name, values in leaking.columns.items()}
+    columns["C"][ends - 1] = columns["T"][300] = np.nan
+    found = diagnose(replace(leaking, runs=runs, columns=columns), cstr(), CATALOGUE)
+    assert found.runs == len(lengths) + 2
+    assert found.causes[0].parameters["onset"].value == pytest.approx(ONSET_MIN, abs=0.1)
+    assert all(np.isfinite(item.rmse_after) for item in found.gain.held_out.values())
+
+
 def test_nothing_is_judged_where_the_free_run_is_still_looking_for_the_state() -> None:
     record = sessions(1, 2)
     run = run_of(record, cstr())

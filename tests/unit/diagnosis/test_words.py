@@ -114,8 +114,8 @@ def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
 def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -> None:
     said = json.loads(msgspec.json.encode(as_object(CASES[case], "run.csv", 1.23456)))
     assert list(said) == [
-        "file", "samples", "span_min", "seconds", "verdict", "causes", "alternatives", "location", "significant",
-        "practical", "gain", "adequacy", "experiment", "extended_model",
+        "file", "zero", "samples", "runs", "span_min", "seconds", "verdict", "causes", "alternatives", "location",
+        "significant", "practical", "gain", "adequacy", "experiment", "extended_model",
     ]  # fmt: skip
     assert said["seconds"] == 1.235
     for item in said["gain"]["held_out"].values():

@@ -103,7 +103,10 @@ def test_a_file_that_is_cut_off_is_looked_over_as_far_as_it_goes(tmp_path: Path)
 
 def test_a_sample_at_time_0_is_a_sample() -> None:
     """Alone, or among others before and after it."""
-    at = [messages.Sample(time_ns=time_ns, sequence=n, quality=1) for n, time_ns in enumerate((-SECOND, 0, SECOND))]
+    at = [
+        messages.Sample(time_ns=time_ns, sequence=n, quality=messages.QUALITY_GOOD)
+        for n, time_ns in enumerate((-SECOND, 0, SECOND))
+    ]
     entries = [entry(KEY, item, 1) for item in at]
     assert overview(entries[1:2]).sample_span_ns == (0, 0)
     assert overview(entries).sample_span_ns == (-SECOND, SECOND)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from reactorwatch.records.record import UNITS
 from recorder.panels import phase_plane
 from recorder.panels.base import STABLE, UNSTABLE, PlanePlot
 from recorder.run import Measured, Run, Seen
@@ -125,7 +126,7 @@ def test_of_very_many_rows_the_farthest_are_drawn() -> None:
     times = np.arange(rows, dtype=np.int64) * 6 * 10**9
     seen = {name: Seen(rows, float(v.mean()), float(v.min()), float(v.max())) for name, v in columns.items()}
     measured = {name: Measured(times, values) for name, values in columns.items()}
-    near, _ = both(Run("cstr", {}, measured, {}, {}, (), (), seen=seen))
+    near, _ = both(Run("cstr", UNITS, measured, {}, {}, (), (), seen=seen))
     (path,) = near.paths
     assert path.x.size <= phase_plane.MOST_POINTS
     assert (path.y.max(), path.x.max()) == (470.0, 0.25)

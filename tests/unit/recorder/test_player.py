@@ -108,6 +108,7 @@ def test_a_record_becomes_the_samples_of_a_plant() -> None:
         np.array([0.1, 0.2]),
         {"qc": np.array([100.0, 101.0]), "C": np.array([np.nan, 0.2]), "T": np.array([438.0, 439.0])},
         "x",
+        units={"qc": "l/min", "T": "degC"},
     )
     samples = [(item.key, item.message) for item in samples_of(record, "p", zero_ns=1000)]
     assert [
@@ -116,10 +117,10 @@ def test_a_record_becomes_the_samples_of_a_plant() -> None:
         if isinstance(body, messages.Sample) and body.quality == messages.QUALITY_GOOD
     ] == [
         ("reactor/p/sample/qc", 6_000_001_000, 0, 100.0, "l/min"),
-        ("reactor/p/sample/T", 6_000_001_000, 0, 438.0, "K"),
+        ("reactor/p/sample/T", 6_000_001_000, 0, 438.0, "degC"),
         ("reactor/p/sample/qc", 12_000_001_000, 1, 101.0, "l/min"),
-        ("reactor/p/sample/C", 12_000_001_000, 0, 0.2, "mol/l"),
-        ("reactor/p/sample/T", 12_000_001_000, 1, 439.0, "K"),
+        ("reactor/p/sample/C", 12_000_001_000, 0, 0.2, ""),
+        ("reactor/p/sample/T", 12_000_001_000, 1, 439.0, "degC"),
     ]
 
 

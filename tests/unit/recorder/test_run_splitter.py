@@ -26,7 +26,7 @@ class Session:
 @st.composite
 def sessions(draw: st.DrawFn) -> list[Session]:
     """The clock may step back by any amount, and a restarted plant may also start later."""
-    found = []
+    found: list[Session] = []
     for _ in range(draw(st.integers(1, 4))):
         restarted = draw(st.booleans())
         back_ns = draw(st.one_of(st.integers(0, 600 * PERIOD), st.integers(1, 600).map(lambda rows: rows * PERIOD)))
@@ -40,7 +40,8 @@ def sessions(draw: st.DrawFn) -> list[Session]:
 
 def samples(runs: list[Session], start_ns: int) -> list[tuple[int, str, int, int]]:
     """(run, signal, number, time) in order of receipt."""
-    found, time_ns, number = [], start_ns, 0
+    found: list[tuple[int, str, int, int]] = []
+    time_ns, number = start_ns, 0
     for run, session in enumerate(runs, start=1):
         time_ns += session.step_ns if run > 1 else 0
         number = 0 if session.restarted else number

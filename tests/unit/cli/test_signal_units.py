@@ -1,0 +1,125 @@
+"""Units are those of the process's signals or of the file's columns, and never follow from a name alone."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from monitor_node.alarms import quantity
+from monitor_node.backtest import Backtest, run
+from monitor_node.config import MonitorConfig
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.cli import identification
+from reactorwatch.cli.backtest_jobs import _units
+from reactorwatch.cli.sources import tape
+from reactorwatch.process import MODELS
+from reactorwatch.process.cstr import cstr
+from reactorwatch.records.csv_file import read_csv
+from reactorwatch.records.record import UNITS, Record
+from reactorwatch.runtime.model_file import write_extended_model
+from recorder.convert import import_csv
+from recorder.known_process import process_of, titled
+from recorder.mcap_file import read_messages, read_record
+from recorder.panels.overview import draw
+from recorder.player import samples_of
+from recorder.run_reader import read_run
+
+HEADER = "ts,flow,TI-1 [degC],TI-2"
+COLUMNS = {"time_min": "ts", "qc": "flow", "C": "TI-1 [degC]", "T": "TI-2"}
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two temperatures in degC of some rig, which are no C and T of a reactor; one is stuck, spikes and steps."""
+    measured = simulate_record(PlantConfig(seed=3, faults=("temperature_bias:step:20@50min",)), 700)
+    temperature = measured.columns["T"] - 273.15
+    temperature[400] += 50.0
+    temperature[650:] = temperature[650]
+    path = tmp_path_factory.mktemp("rig") / "rig.csv"
+    columns = [measured.time_min, measured.columns["qc"], temperature, temperature[::-1]]
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=HEADER, comments="", fmt="%.10g")
+    return path
+
+
+def watched(path: Path, **options: object) -> Backtest:
+    config = MonitorConfig(training_min=20.0, isolation=False, **options)  # type: ignore[arg-type]
+    return run(tape(path, "cstr", COLUMNS, _units(config)).messages, config)
+
+
+def test_the_units_of_the_reactor_are_those_of_its_equations() -> None:
+    assert cstr().units == UNITS
+
+
+@pytest.mark.parametrize("reference", ["auto", "arx"])
+def test_alarms_on_renamed_columns_have_the_columns_units(rig: Path, reference: str) -> None:
+    alarms = watched(rig, reference=reference).alarm_messages
+    assert {alarm.alarm.split("/")[1] for alarm in alarms} >= {"C", "T"}
+    for alarm in alarms:
+        assert not any(word in alarm.text.split() for word in ("mol/l", "K", "mol/l)", "K)")), alarm.text
+        assert "  " not in alarm.text
+        if alarm.alarm in ("shewhart/C", "ewma/C"):
+            assert " degC " in alarm.text or alarm.event == "cleared"
+
+
+def test_where_the_process_is_named_columns_have_the_units_of_its_signals(rig: Path, tmp_path: Path) -> None:
+    assert _units(MonitorConfig(reference="process")) == UNITS
+    assert _units(MonitorConfig()) is None
+    write_extended_model(tmp_path / "m.json", {"format": "reactorwatch.model.v1", "model": "cstr", "effects": []})
+    named = _units(MonitorConfig(model=str(tmp_path / "m.json")))
+    assert named == UNITS
+    recorded = read_run(tape(rig, "cstr", COLUMNS, named).messages)
+    assert recorded.units == UNITS
+
+
+@pytest.mark.parametrize("build", MODELS)
+def test_the_signals_of_any_process_are_published_with_its_units(build: object) -> None:
+    assert callable(build)
+    units = build().units
+    record = Record(np.arange(3.0), {name: np.arange(3.0) for name in units}, "x", units=units)
+    said = {item.key.rsplit("/", 1)[1]: item.message.unit for item in samples_of(record, "p")}  # type: ignore[union-attr]
+    assert said == units
+
+
+def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Path) -> None:
+    import_csv(rig, tmp_path / "rig.mcap", "rig", COLUMNS)
+    assert read_record(tmp_path / "rig.mcap").units == {"C": "degC"}
+    drawn = read_run(read_messages(tmp_path / "rig.mcap"))
+    assert drawn.units == {"C": "degC"}
+    assert {(view.title, view.unit) for view in draw(drawn)[:3]} == {("C", "degC"), ("T", ""), ("qc", "")}  # type: ignore[union-attr]
+    assert process_of(drawn.units) is None
+    assert process_of(UNITS) is not None
+    assert titled("T", "K") != "T" == titled("T", "degC")
+
+
+def test_identification_speaks_of_the_unit_that_is_known(rig: Path) -> None:
+    measured = read_csv(rig, COLUMNS)
+    settings = {"order": 2, "delay": 1, "recursive": False, "report_rows": False, "as_json": False}
+    assert "C (degC) from" in identification.one(measured, "C", "arx", **settings)  # type: ignore[arg-type]
+    assert "T (unit not known) from" in identification.one(measured, "T", "arx", **settings)  # type: ignore[arg-type]
+    own = replace(measured, units=UNITS)
+    assert "T (K) from" in identification.one(own, "T", "arx", **settings)  # type: ignore[arg-type]
+
+
+@given(
+    signal=st.sampled_from(["qc", "C", "T"]),
+    name=st.from_regex(r"[A-Za-z][A-Za-z0-9_.-]{2,8}", fullmatch=True),
+    unit=st.sampled_from(["", "degC", "l/min", "%", "m3/h", "K"]),
+    brackets=st.sampled_from(["[]", "()"]),
+)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
+def test_a_renamed_column_has_the_unit_in_its_brackets_or_none(
+    tmp_path: Path, signal: str, name: str, unit: str, brackets: str
+) -> None:
+    column = f"{name} {brackets[0]}{unit}{brackets[1]}" if unit else name
+    header = {"qc": "qc", "C": "C", "T": "T", signal: column}
+    (tmp_path / "run.csv").write_text(f"time_min,{','.join(header.values())}\n0,1,2,3\n")
+    expected = {key: value for key, value in {**UNITS, signal: unit}.items() if value}
+    assert read_csv(tmp_path / "run.csv", {signal: column}).units == expected
+
+
+def test_a_number_without_a_unit_stands_alone() -> None:
+    assert (quantity(1.5, ""), quantity(1.5, "1"), quantity(1.5, "degC")) == ("1.5", "1.5", "1.5 degC")
