@@ -18,7 +18,7 @@ MARGIN_MIN = 1.0
 """So long before the onset that was found the sensor is left out already."""
 
 START_STEPS, START_STEPS_A_ROW = 25_000, A_ROW_ALONE
-"""Filter steps that the rows from before may take: enough for each row and two searches for steady states."""
+"""Filter steps that the rows from before may take: enough for each row and a search for steady states."""
 
 
 class ReconstructionState(StoredState, frozen=True):

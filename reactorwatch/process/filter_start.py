@@ -37,7 +37,7 @@ class Beginning:
         model: of the plant.
 
     Attributes:
-        searches: number of searches for steady states so far, which cost as much as ten thousand rows each.
+        searches: number of searches for steady states so far, which cost as much as thousands of rows each.
     """
 
     def __init__(self, model: ProcessModel) -> None:

@@ -11,10 +11,10 @@ A_RUN = 100
 A_ROW_ALONE = 25
 """Steps for a row that is filtered by itself."""
 
-A_BEGINNING = 150
-"""Steps for a filter that begins at what is measured."""
+A_BEGINNING = 250
+"""Steps for a filter that begins at what is measured, and for the stop of the machine code that this is."""
 
-A_SEARCH = 10_000
+A_SEARCH = 12_000
 """Steps for a search for steady states, from which a filter begins where measurements do not give the whole state."""
 
 
