@@ -1,18 +1,23 @@
-FROM python:3.13-slim
+# Pinned by version; `docs/deployment.md` has the command that gives the digest, to be put behind it as @sha256:...
+ARG PYTHON_IMAGE=python:3.13.9-slim-trixie
+FROM ${PYTHON_IMAGE}
 
-# A home of its own: compiled kernels and models are kept there. /recordings and /state are made here so that new
-# volumes belong to the user.
+# A home of its own: compiled kernels and models are kept there. /recordings, /state and the cache are made here so that
+# new volumes belong to the user; nothing else is written to, so the root may be read-only.
 RUN useradd --create-home --uid 1000 reactorwatch \
-    && install --directory --owner=reactorwatch /recordings /state
+    && install --directory --owner=reactorwatch /recordings /state /home/reactorwatch/.cache
+ENV NUMBA_CACHE_DIR=/home/reactorwatch/.cache/numba
 
 WORKDIR /app
+COPY deploy/requirements.lock ./
+RUN pip install --no-cache-dir --require-hashes -r requirements.lock
 COPY pyproject.toml README.md LICENSE ./
 COPY reactorwatch ./reactorwatch
 COPY plant_node ./plant_node
 COPY monitor_node ./monitor_node
 COPY recorder ./recorder
 COPY diagnosis ./diagnosis
-RUN pip install --no-cache-dir '.[metrics]'
+RUN pip install --no-cache-dir --no-deps --no-build-isolation .
 
 USER reactorwatch
 WORKDIR /home/reactorwatch

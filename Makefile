@@ -1,6 +1,6 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak pictures protobuf clean
+.PHONY: help setup demo test lint bench faults study kills cuts fuzz soak pictures protobuf lock clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -61,6 +61,9 @@ soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs
 	@$(BIN)/python docs/pictures/make.py
+
+lock: $(READY) ## write deploy/requirements.lock: what the image installs, with hashes
+	@$(BIN)/python deploy/lock.py
 
 protobuf: $(READY) ## generate the message classes from messages.proto
 	@cd reactorwatch/contract && ../../$(BIN)/python -m grpc_tools.protoc -I. --python_out=. --pyi_out=. messages.proto

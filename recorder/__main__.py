@@ -73,7 +73,9 @@ def record(
     """
     # both before the waiting for a router
     series = series_for(config)
-    if series.dated:
+    if (
+        series.dated and not series.folder.suffix[1:].isalpha()
+    ):  # run.csv is a file of another kind, not a folder's name
         make_folder(series.folder, "--out")
     files = files_for(config)
     with served(metrics_config, Metrics(config.plant, NODE, files.free_bytes), NODE) as metrics:

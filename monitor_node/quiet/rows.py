@@ -6,7 +6,7 @@ loop takes them from row to row. It does what `PlantWatch` does with such a row,
 are the same bits; the charts' own kernels judge here as well.
 
 Whatever is out of the ordinary is not dealt with here. The record is then left as it was before the row, and the row is
-said to be *odd*: it is for the plant's own monitor (see `quiet_plants`).
+called *odd*: the plant's own monitor evaluates it (see `plants`).
 
 Odd are: a sample out of its order, that does not follow from those before it, of another unit or quality, or with a
 value, number or time that no plant has; a row after a gap or a missing row; one by which the filter begins anew; a

@@ -44,11 +44,14 @@ JOINS_THE_BUS = (
 
 SCREEN = "needs a screen"
 ROOT_ONLY = "is for root and a running systemd, tests/integration/test_systemd.py checks the units"
+REGISTRY = "needs a registry of images"
 INDEX = "needs a package index"
 OTHERS = "is for several machines, tests/unit/runtime/test_jobs.py has a cluster on loopback"
 NOT_HERE = {
     "docs/dashboards.md": [("rerun run.rrd", SCREEN)],
     "docs/deployment.md": [
+        ("docker buildx imagetools inspect --format '{{.Manifest.Digest}}' python:3.13.9-slim-trixie", REGISTRY),
+        ("docker buildx imagetools inspect --format '{{.Manifest.Digest}}' eclipse/zenoh:1.10.2", REGISTRY),
         ("cp deploy/systemd/*.service /etc/systemd/system/", ROOT_ONLY),
         ("systemctl enable --now reactorwatch-router reactorwatch@monitor reactorwatch@record", ROOT_ONLY),
         ("pip install 'reactorwatch[metrics]'", INDEX),

@@ -1,5 +1,6 @@
 """The compose files, without an engine: every service's own command does its work against a router on loopback."""
 
+import re
 import shutil
 import subprocess
 from contextlib import closing
@@ -38,7 +39,7 @@ def test_every_service_is_watched_and_comes_back(file: Path) -> None:
 @pytest.mark.parametrize("node", ["recorder", "monitor"])
 def test_the_recordings_and_what_was_learned_outlive_the_containers(node: str) -> None:
     service = services_of(PLAIN)[node]
-    (mount,) = service["volumes"]
+    (mount,) = [mount for mount in service["volumes"] if not mount.startswith("cache:")]
     volume, target = mount.split(":")
     assert volume in yaml.safe_load(PLAIN.read_text(encoding="utf-8"))["volumes"]
     assert target in service["command"]
@@ -58,3 +59,32 @@ def test_docker_compose_accepts_the_file(file: Path) -> None:
     if program is None:
         pytest.skip("docker-compose is not installed")
     subprocess.run([program, "-f", str(file), "config", "-q"], check=True)
+
+
+@both
+def test_every_service_is_locked_down_and_limited(file: Path) -> None:
+    for name, service in services_of(file).items():
+        assert service["read_only"] is True, name
+        assert service["cap_drop"] == ["ALL"], name
+        assert service["security_opt"] == ["no-new-privileges:true"], name
+        assert re.fullmatch(r"\d+[mg]", service["mem_limit"]), name
+        assert service["pids_limit"] > 0, name
+        assert "cap_add" not in service, name
+        assert not service.get("privileged"), name
+
+
+@both
+def test_what_a_service_writes_is_on_a_volume(file: Path) -> None:
+    """The root is read-only."""
+    for name, service in services_of(file).items():
+        mounted = [mount.split(":")[1] for mount in service.get("volumes", []) if not mount.endswith(":ro")]
+        command = service["command"]
+        written = [command[command.index(option) + 1] for option in ("--out", "--state") if option in command]
+        compiled = [] if name == "router" else ["/home/reactorwatch/.cache"]
+        assert {*written, *compiled} <= set(mounted), name
+
+
+@both
+def test_images_have_versions(file: Path) -> None:
+    for name, service in services_of(file).items():
+        assert re.search(r":\d+\.\d+\.\d+(@sha256:[0-9a-f]{64})?$", service["image"]), name

@@ -46,3 +46,27 @@ def test_a_unit_without_its_settings_ends_with_the_code_that_stops_trying(unit: 
     assert done.returncode == 2
     assert arguments[-1] in done.stderr
     assert "RestartPreventExitStatus=2" in (UNITS / unit).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("unit", "instance"), [ROUTER, NODES[0]])
+def test_a_unit_is_exposed_by_3_of_10_at_most(unit: str, instance: str) -> None:
+    program = shutil.which("systemd-analyze")
+    if program is None:
+        pytest.skip("systemd-analyze is not installed")
+    command = [program, "security", "--offline=true", "--no-pager", "--threshold=30", str(UNITS / unit)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if "unrecognized option" in done.stderr:
+        pytest.skip("this systemd-analyze knows no --offline")
+    assert done.returncode == 0, f"{instance}: {done.stdout}{done.stderr}"
+
+
+@pytest.mark.parametrize(("unit", "instance"), [ROUTER, NODES[0]])
+def test_a_unit_has_limits_and_no_capability(unit: str, instance: str) -> None:
+    """What the checker counts, and what it does not, also where there is no checker."""
+    settings = (UNITS / unit).read_text(encoding="utf-8").split("[Service]")[1].splitlines()
+    for line in (
+        *("NoNewPrivileges=yes", "CapabilityBoundingSet=", "ProtectSystem=strict", "RestrictNamespaces=yes"),
+        *("SystemCallFilter=@system-service", "PrivateUsers=yes", "ProtectKernelModules=yes"),
+    ):
+        assert line in settings, instance
+    assert any(line.startswith("MemoryMax=") for line in settings)

@@ -19,6 +19,7 @@ from reactorwatch.cli.study.study import Study, row_times
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record
 
+DOCS = Path(__file__).parents[3] / "docs"
 CHEAP = (6, 12, 20)
 ROWS = 800
 
@@ -43,6 +44,11 @@ def rgb(colour: str) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
     return np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)])
 
 
+def of_figure(page: str, number: int) -> str:
+    """The part of a page on a figure."""
+    return page.partition(f"## Figure {number}:")[2].partition("\n## ")[0]
+
+
 def test_figures_4_to_20_are_in_the_catalogue_once_each() -> None:
     assert [figure.number for figure in FIGURES] == list(range(4, 21))
     assert all(figure.claim and figure.title for figure in FIGURES)
@@ -61,6 +67,8 @@ def test_a_run_writes_a_page_and_pictures_that_hold_what_is_plotted(tmp_path: Pa
         assert picture.stat().st_size < 80_000
         assert pixels(picture).shape[1] == canvas.WIDTH_PX
     assert len(list((out / "study").iterdir())) == len(CHEAP), "nothing is left beside the pictures"
+    kept = (DOCS / "study.md").read_text(encoding="utf-8")
+    assert of_figure(page, 20) == of_figure(kept, 20), "docs/study.md is older than its code: `make pictures`"
     drawn = np.unique(pixels(out / "study" / "figure-06.png").reshape(-1, 3), axis=0).astype(int)
     for colour in (canvas.BLUE, canvas.VERMILION, canvas.ORANGE, canvas.SKY):
         # A picture has 256 colours of its own, so the nearest one counts.

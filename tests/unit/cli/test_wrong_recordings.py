@@ -59,6 +59,7 @@ def state(folder: Path) -> dict[Path, bytes]:
     [
         (f"record -o away/x.mcap {NO_ROUTER}", "the folder away does not exist"),
         (f"record -o run.csv {NO_ROUTER}", "--out run.csv: is a file, the name of a folder was expected"),
+        (f"record -o missing.csv {NO_ROUTER}", "no .csv file is written, the name of a folder was expected"),
         (f"record -o good.mcap {NO_ROUTER}", "exists already and is not overwritten; choose another name"),
         (f"record --plant a/b {NO_ROUTER}", "plant name must be"),
         ("record --endpoint nonsense", "endpoint must be like 'tcp/127.0.0.1:7447', got 'nonsense'"),

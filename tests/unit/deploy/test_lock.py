@@ -1,0 +1,63 @@
+"""The lock file: every requirement of the image, one version each, with hashes and without an address of an index."""
+
+import importlib.util
+import re
+import tomllib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[3]
+LOCK = (ROOT / "deploy" / "requirements.lock").read_text(encoding="utf-8")
+LINES = re.sub(r"^#.*\n", "", LOCK, flags=re.MULTILINE).replace(" \\\n", " ").splitlines()
+
+
+@pytest.fixture(scope="module")
+def lock() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("lock", ROOT / "deploy" / "lock.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_each_line_is_a_version_with_hashes_and_nothing_else() -> None:
+    assert len(LINES) > 30
+    for line in LINES:
+        assert re.fullmatch(r"[a-z0-9-]+==[\w.]+( +--hash=sha256:[0-9a-f]{64})+", line)
+    names = [line.split("==")[0] for line in LINES]
+    assert names == sorted(set(names))
+
+
+def test_every_requirement_of_the_image_is_locked_at_a_version_that_it_allows(lock: ModuleType) -> None:
+    versions = dict(line.split()[0].split("==") for line in LINES)
+    for text in lock.required(tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))):
+        required = Requirement(text)
+        assert versions[required.name] in required.specifier, f"{text}: `make lock`"
+
+
+def test_a_report_of_pip_becomes_lines_without_its_addresses(lock: ModuleType) -> None:
+    def report(digest: str) -> dict[str, object]:
+        info = {"url": "https://files.example/x.whl", "archive_info": {"hashes": {"sha256": digest}}}
+        return {"install": [{"metadata": {"name": "Some_Name", "version": "1.2"}, "download_info": info}]}
+
+    text = lock.text_of([lock.locked(report("b" * 64)), lock.locked(report("a" * 64))])
+    assert text.splitlines()[2:] == [
+        "some-name==1.2 \\",
+        f"    --hash=sha256:{'a' * 64} \\",
+        f"    --hash=sha256:{'b' * 64}",
+    ]
+
+
+def test_the_image_installs_what_is_locked_and_nothing_else() -> None:
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    installs = [line for line in text.splitlines() if "pip install" in line]
+    assert all(
+        "--require-hashes" in line or ("--no-deps" in line and "--no-build-isolation" in line) for line in installs
+    )
+    assert len(installs) == 2
+    assert re.search(r"^ARG PYTHON_IMAGE=python:\d+\.\d+\.\d+-", text, re.MULTILINE)
+    assert "USER reactorwatch" in text
