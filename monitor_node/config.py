@@ -14,6 +14,10 @@ DEFAULT_PRIORITIES: dict[str, PriorityName] = {"T": "high"}
 """Priorities where the settings give none; an entry holds where its signal is an output."""
 
 
+SMALLEST_SD = {"C": 2e-4, "T": 0.05}
+"""Of the reactor's outputs; other outputs have none unless the settings say so."""
+
+
 class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How a plant is watched.
 
@@ -70,7 +74,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ewma_weight: float = 0.1
     mewma_weight: float = 0.02
     cusum_allowance: float = 0.25
-    smallest_sd: dict[str, float] = msgspec.field(default_factory=lambda: {"C": 2e-4, "T": 0.05})
+    smallest_sd: dict[str, float] = msgspec.field(default_factory=SMALLEST_SD.copy)
     isolation: bool = True
     isolation_rows: int = 600
     raise_count: int = 3
@@ -120,6 +124,8 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
         for signal, sd in self.smallest_sd.items():
+            if signal not in (*self.outputs, *SMALLEST_SD):
+                raise ValueError(f"smallest_sd is by output, {self.outputs}, got {signal!r}")
             if not 0 <= sd < 1e6:
                 raise ValueError(f"smallest_sd of {signal} must be in [0, 1e6), got {sd:g}")
         if self.priorities is DEFAULT_PRIORITIES:

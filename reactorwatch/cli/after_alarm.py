@@ -10,6 +10,7 @@ A plant that ends, or falls silent, while one waits is diagnosed by what there i
 
 from collections import deque
 from collections.abc import Callable
+from math import inf
 from typing import NamedTuple
 
 import msgspec
@@ -66,6 +67,9 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"{what} must be in [{low:g}, 1e+06], got {value:g}")
         if not 0.0 <= self.apart_min <= 1e6:
             raise ValueError(f"apart_min must be in [0, 1e+06], got {self.apart_min:g}")
+        for output, value in self.tolerance.items():
+            if not 0.0 < value < inf:
+                raise ValueError(f"tolerance of {output} must be a positive number, got {value:g}")
         if not self.after_min < self.window_min:
             raise ValueError(
                 f"window_min must be more than after_min, got {self.window_min:g} and {self.after_min:g}; "

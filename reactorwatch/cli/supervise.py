@@ -11,12 +11,14 @@ from typing import Any
 import msgspec
 import structlog
 
+from diagnosis.practice import checked_tolerance
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.joining import VIEWER, Joining, heard_by, joining, open_router, write_node_settings
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.errors import InputError
+from reactorwatch.process.cstr import cstr
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.logs import configure
@@ -109,9 +111,22 @@ def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig
     found = section(DiagnosisConfig, "diagnosis", tables, {"out": str(out) if out is not None else None})
     if found.out is not None and Path(found.out).exists() and not Path(found.out).is_dir():
         raise InputError(f"--diagnose {found.out}: is a file, the name of a folder was expected")
-    if found.out is not None and found.model is not None:
-        read_extended_model(Path(found.model))  # so that what cannot be is told now, and not after an alarm
+    if found.out is not None:
+        check_meant(found)
     return found
+
+
+def check_meant(config: DiagnosisConfig) -> None:
+    """Check what only the model can say of settings, so that it is said now and not after an alarm.
+
+    Raises:
+        InputError: there is no such model, or a tolerance is of none of its outputs.
+    """
+    model = cstr() if config.model is None else read_extended_model(Path(config.model)).build()
+    try:
+        checked_tolerance(model, config.tolerance)
+    except InputError as error:
+        raise InputError(f"settings [diagnosis]: {error}") from error
 
 
 @contextlib.contextmanager

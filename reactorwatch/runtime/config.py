@@ -18,14 +18,13 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from reactorwatch.errors import InputError
+from reactorwatch.runtime.setting_rules import LAST_PORT, check_spans, check_values, checked_endpoint, choices
 
 SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log")
 """The tables that a file may hold."""
 
 LARGEST_FILE = 1_000_000
 """Bytes of a settings file."""
-
-_LAST_PORT = 65535
 
 IDENTITY = ("ca", "certificate", "key")
 """Files by which a node shows who it is, and knows the router."""
@@ -59,8 +58,8 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     key: str | None = None
 
     def __post_init__(self) -> None:
-        if self.endpoint.count("/") != 1 or ":" not in self.endpoint:
-            raise ValueError(f"endpoint must be like 'tcp/127.0.0.1:7447', got {self.endpoint!r}")
+        for endpoint in (self.endpoint, *self.routers):
+            checked_endpoint(endpoint)
         if not 1 <= self.cache_messages <= 10_000_000:
             raise ValueError(f"cache_messages must be in [1, 10000000], got {self.cache_messages}")
         if not 0.0 < self.history_s <= 86_400.0:
@@ -92,8 +91,8 @@ class MetricsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     address: str = "127.0.0.1"
 
     def __post_init__(self) -> None:
-        if self.port is not None and not 1 <= self.port <= _LAST_PORT - 2:
-            raise ValueError(f"port must be in [1, {_LAST_PORT - 2}], got {self.port}")
+        if self.port is not None and not 1 <= self.port <= LAST_PORT - 2:
+            raise ValueError(f"port must be in [1, {LAST_PORT - 2}], got {self.port}")
         try:
             ip_address(self.address)
         except ValueError:
@@ -113,6 +112,9 @@ class LogConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 Section = TypeVar("Section", bound=msgspec.Struct)
+
+_NO_CHOICE = "Invalid enum value"
+"""What msgspec says of a word that is none of those that are valid."""
 
 
 def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
@@ -179,19 +181,23 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
         fields = (*fields, "preset")
         preset = values.pop("preset", None)
         if preset is not None:
-            if preset not in presets:
+            if not isinstance(preset, str) or preset not in presets:
                 raise InputError(f"settings [{name}]: {_unknown(str(preset), tuple(presets), 'preset')}")
             values = {**presets[preset], **values}
     for key in values:
         if key not in fields:
             raise InputError(f"settings [{name}]: {_unknown(key, fields, 'key')}")
-    for key, value in values.items():
-        if isinstance(value, int) and value.bit_length() > 63:
-            raise InputError(f"settings [{name}]: {key} must be a number of 64 bits, got one of {value.bit_length()}")
     try:
-        return msgspec.convert(values, kind)
-    except (msgspec.ValidationError, OverflowError) as error:
+        check_values(values)
+        found = msgspec.convert(values, kind)
+        check_spans(found)
+    except msgspec.ValidationError as error:
+        words = choices(kind, str(error).rpartition("`")[0].rpartition("`")[2]) if _NO_CHOICE in str(error) else ()
+        valid = f" (valid: {', '.join(words)})" if words else ""
+        raise InputError(f"settings [{name}]: {error}{valid}") from error
+    except (ValueError, OverflowError) as error:
         raise InputError(f"settings [{name}]: {error}") from error
+    return found
 
 
 def _unknown(name: str, valid: tuple[str, ...], what: str) -> str:

@@ -1,0 +1,112 @@
+"""Rules that hold for every setting of every node, beside those that each structure has for its own."""
+
+import math
+import re
+import types
+from collections.abc import Iterator
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+
+PROTOCOLS = ("tcp", "tls", "udp", "ws")
+"""Of an endpoint."""
+
+LAST_PORT = 65535
+
+LONGEST_S = 2.0**62 / 1e9
+"""146 years: sums of times must still fit 64 bits of nanoseconds."""
+
+_SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "days": 86_400.0}
+_MOST_BITS = 63
+
+
+def check_values(values: object, name: str = "") -> None:
+    """Check that numbers fit 64 bits and that texts can be names of files.
+
+    Args:
+        values: of a table, as they were read: numbers, texts, lists and tables.
+        name: of the setting, for messages.
+
+    Raises:
+        ValueError: one does not.
+    """
+    if isinstance(values, dict):
+        for key, value in values.items():
+            check_values(key, name or "a name")
+            check_values(value, f"{name}.{key}" if name else str(key))
+    elif isinstance(values, list | tuple):
+        for value in values:
+            check_values(value, name)
+    elif isinstance(values, str) and "\0" in values:
+        raise ValueError(f"{name} must not hold the character NUL, got {values!r}")
+    elif isinstance(values, int) and values.bit_length() > _MOST_BITS:
+        raise ValueError(f"{name} must be a number of 64 bits, got one of {values.bit_length()}")
+
+
+def check_spans(settings: msgspec.Struct) -> None:
+    """Check that durations are ones; a setting's unit ends its name (`l_min` is that of a flow).
+
+    Raises:
+        ValueError: one is longer than 146 years and not infinite.
+    """
+    for name, value in msgspec.structs.asdict(settings).items():
+        if isinstance(value, msgspec.Struct):
+            check_spans(value)
+        seconds = _SECONDS.get(name.rpartition("_")[2])
+        if seconds is None or name.endswith("_l_min") or not isinstance(value, float) or math.isinf(value):
+            continue
+        if not abs(value) <= LONGEST_S / seconds:
+            raise ValueError(f"{name} must be at most {LONGEST_S / seconds:.3g}, which is 146 years, got {value:g}")
+
+
+def checked_endpoint(endpoint: str) -> str:
+    """The address of a router, if it can be one.
+
+    Raises:
+        ValueError: it is not a protocol, a host and a port.
+    """
+    protocol, slash, place = endpoint.partition("/")
+    host, colon, port = re.split(r"[?#]", place, maxsplit=1)[0].rpartition(":")
+    if not (slash and host and colon) or "/" in host:
+        raise ValueError(f"endpoint must be like 'tcp/127.0.0.1:7447', got {endpoint!r}")
+    if protocol not in PROTOCOLS:
+        raise ValueError(
+            f"endpoint must begin with one of {', '.join(f'{item}/' for item in PROTOCOLS)}, got {endpoint!r}"
+        )
+    if not (port.isdecimal() and port.isascii() and 1 <= int(port[: len(str(LAST_PORT)) + 1]) <= LAST_PORT):
+        raise ValueError(f"the port of an endpoint must be in [1, {LAST_PORT}], got {endpoint!r}")
+    return endpoint
+
+
+def choices(kind: object, path: str) -> tuple[str, ...]:
+    """The words that a setting takes.
+
+    Args:
+        kind: the structure of the settings.
+        path: of the setting as msgspec names it, such as `$.charts[0]`.
+
+    Returns:
+        The words; empty if it is no choice.
+    """
+    kinds = [kind]
+    for name in re.findall(r"\.([A-Za-z_]\w*)", path):
+        kinds = [
+            get_type_hints(item)[name]
+            for item in _parts(kinds)
+            if isinstance(item, type) and issubclass(item, msgspec.Struct) and name in item.__struct_fields__
+        ]
+    return tuple(
+        word
+        for item in _parts(kinds)
+        if get_origin(item) is Literal
+        for word in get_args(item)
+        if isinstance(word, str)
+    )
+
+
+def _parts(kinds: list[Any]) -> Iterator[Any]:
+    """Types and, of unions and containers, what they are made of."""
+    for kind in kinds:
+        yield kind
+        if get_origin(kind) in (Union, types.UnionType, tuple, list, dict):
+            yield from _parts(list(get_args(kind)))

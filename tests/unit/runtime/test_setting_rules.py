@@ -1,0 +1,144 @@
+"""Any value of any setting of any node is valid, or one line names table, key, rule and value."""
+
+import math
+import re
+from typing import Any
+
+import msgspec
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from monitor_node.config import MonitorConfig
+from monitor_node.fleet.config import FleetConfig
+from plant_node.config import PlantConfig
+from reactorwatch.cli.after_alarm import DiagnosisConfig
+from reactorwatch.cli.supervise import diagnosis_settings
+from reactorwatch.errors import InputError
+from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, section
+from reactorwatch.runtime.setting_rules import LONGEST_S, PROTOCOLS, checked_endpoint, choices
+from recorder.__main__ import black_box_for
+from recorder.config import RecorderConfig, ReplayConfig
+
+TABLES: dict[str, type[msgspec.Struct]] = {
+    "bus": BusConfig,
+    "plant": PlantConfig,
+    "monitor": MonitorConfig,
+    "fleet": FleetConfig,
+    "recorder": RecorderConfig,
+    "replay": ReplayConfig,
+    "diagnosis": DiagnosisConfig,
+    "metrics": MetricsConfig,
+    "log": LogConfig,
+}
+KEYS = [(table, field.name) for table, kind in TABLES.items() for field in msgspec.structs.fields(kind)]
+
+scalars = (
+    st.sampled_from([0, -1, 1, 2**62, 2**70, 10**400, 1e308, -1e308, 1e-320, math.nan, math.inf, -math.inf])
+    | st.sampled_from(["", "x", "a\0b", "ü", "x" * 300, "a/b", "\x1b[31m", "tcp/127.0.0.1:99999", "foo/127.0.0.1:1"])
+    | st.booleans()
+    | st.floats()
+    | st.text(max_size=5)
+)
+names = st.sampled_from(["C", "T", "t", "kind", ""])
+values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=2) | st.dictionaries(names, inner))
+
+
+def test_every_table_is_tried() -> None:
+    assert TABLES.keys() == set(SECTIONS)
+
+
+@given(key=st.sampled_from([*KEYS, ("plant", "preset")]), value=values)
+@example(key=("plant", "preset"), value=["x"])
+@example(key=("recorder", "black_box_min"), value=1e308)
+@example(key=("recorder", "about"), value={"seed": "a\0b"})
+@example(key=("plant", "duration_min"), value=1e308)
+@example(key=("replay", "from_min"), value=1e308)
+def test_any_value_of_any_setting_is_valid_or_one_line(key: tuple[str, str], value: Any) -> None:
+    table, name = key
+    given_file = {"file": "run.csv"} if table == "replay" else {}
+    refused = ""
+    try:
+        found = section(TABLES[table], table, {table: {**given_file, name: value}}, {})
+    except InputError as error:
+        refused = str(error)
+    if refused:
+        assert refused.startswith(f"settings [{table}]: ")
+        assert "\n" not in refused
+        assert "Invalid enum value" not in refused or "(valid: " in refused
+        return
+    if isinstance(found, RecorderConfig):
+        black_box_for(found)
+    if isinstance(found, PlantConfig):
+        assert found.rows is None or found.rows > 0
+
+
+SPANS = [(table, name) for table, name in KEYS if re.search(r"(?<!_l)_(s|min|h|days)$", name)]
+
+
+@pytest.mark.parametrize(("table", "name"), SPANS)
+def test_no_duration_is_longer_than_146_years(table: str, name: str) -> None:
+    given_file = {"file": "run.csv"} if table == "replay" else {}
+    for value in (LONGEST_S * 1.001, 1e300):
+        with pytest.raises(InputError, match=f"{name} must be"):
+            section(TABLES[table], table, {table: {**given_file, name: value}}, {})
+
+
+@pytest.mark.parametrize(
+    ("table", "name", "path", "word"),
+    [
+        ("log", "format", "$.format", "json"),
+        ("bus", "congestion", "$.congestion", "block"),
+        ("monitor", "reference", "$.reference", "arx"),
+        ("monitor", "charts", "$.charts[0]", "ewma"),
+        ("monitor", "priorities", "$.priorities[...]", "critical"),
+        ("recorder", "fsync", "$.fsync", "chunk"),
+        ("plant", "start", "$.start", "extinguished"),
+    ],
+)
+def test_an_error_on_a_choice_lists_the_valid_words(table: str, name: str, path: str, word: str) -> None:
+    assert word in choices(TABLES[table], path)
+    value: Any = {"charts": ["foo"], "priorities": {"T": "foo"}}.get(name, "foo")
+    with pytest.raises(InputError, match=rf"settings \[{table}\]: .*\(valid: .*\b{word}\b.*\)"):
+        section(TABLES[table], table, {table: {name: value}}, {})
+
+
+@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("host", ["127.0.0.1", "router.example", "[::1]"])
+def test_endpoints_of_every_protocol_are_taken(protocol: str, host: str) -> None:
+    for port in (1, 7447, 65535):
+        assert checked_endpoint(f"{protocol}/{host}:{port}") == f"{protocol}/{host}:{port}"
+
+
+@pytest.mark.parametrize("key", ["endpoint", "routers"])
+@pytest.mark.parametrize(
+    ("endpoint", "said"),
+    [
+        *((f"tcp/127.0.0.1:{port}", "port of an endpoint must be in") for port in (0, 65536, 99999, "1" * 5000, "x²")),
+        *((f"{protocol}/127.0.0.1:1", "one of tcp/, tls/, udp/, ws/") for protocol in ("foo", "TCP", "http", " tcp")),
+        *((text, "endpoint must be like") for text in ("foo/", "tcp/", "tcp/:1", "a/b/c:1", "127.0.0.1:1")),
+    ],
+)
+def test_an_endpoint_that_can_never_be_reached_is_refused_at_once(key: str, endpoint: str, said: str) -> None:
+    table = {key: [endpoint] if key == "routers" else endpoint}
+    with pytest.raises(InputError, match=said):
+        section(BusConfig, "bus", {"bus": table}, {})
+
+
+@pytest.mark.parametrize("out", [None, "reports"])
+@pytest.mark.parametrize("value", [-1.0, 0.0, math.nan, math.inf])
+def test_a_tolerance_that_cannot_be_is_refused_before_anything_runs(value: float, out: str | None) -> None:
+    with pytest.raises(InputError, match=r"settings \[diagnosis\]: tolerance of T must be a positive number"):
+        diagnosis_settings({"diagnosis": {"out": out, "tolerance": {"T": value}}}, MonitorConfig(), None)
+
+
+def test_a_tolerance_of_no_output_is_refused_before_anything_runs() -> None:
+    with pytest.raises(InputError, match=r"settings \[diagnosis\]: tolerance must be of C, T, got t"):
+        diagnosis_settings({"diagnosis": {"out": "reports", "tolerance": {"t": 1.0}}}, MonitorConfig(), None)
+
+
+def test_a_smallest_sd_of_no_output_is_refused() -> None:
+    with pytest.raises(InputError, match=r"smallest_sd is by output, \('C', 'T'\), got 't'"):
+        section(MonitorConfig, "monitor", {"monitor": {"smallest_sd": {"t": 0.05}}}, {})
+    tank = {"outputs": ["h"], "smallest_sd": {"h": 1.0}, "priorities": {}}
+    assert section(MonitorConfig, "monitor", {"monitor": tank}, {})
