@@ -13,6 +13,7 @@ from diagnosis.report.words import (
 )
 from diagnosis.result import AMBIGUOUS, NOMINAL, Diagnosis
 from reactorwatch.process.effects.base import Effect
+from reactorwatch.terminal import printable_lines
 
 INDENT = 14
 
@@ -51,7 +52,7 @@ def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
     if diagnosis.causes and not diagnosis.alternatives:
         lines.append(_line("or", "nothing else in the catalogue comes near"))
     lines += [_line("note", remark) for remark in diagnosis.remarks]
-    return "\n".join(lines)
+    return printable_lines(lines)
 
 
 def _rivals(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[str]:

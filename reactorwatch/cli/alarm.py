@@ -7,6 +7,7 @@ import typer
 
 from reactorwatch.cli.asking import PATIENCE_S, NoAnswerError, ask
 from reactorwatch.cli.options import Endpoint, Json, Plant, Settings
+from reactorwatch.cli.printing import say
 from reactorwatch.contract.keys import ACKNOWLEDGE_RECORDER, LIST_RECORDER_ALARMS, RECORDING
 from reactorwatch.errors import InputError
 
@@ -117,7 +118,7 @@ def _show(reply: "CommandReply", *, json: bool) -> None:
     import msgspec
 
     for alarm in reply.alarms:
-        typer.echo(msgspec.json.encode(_object(alarm)).decode() if json else _line(alarm))
+        say(msgspec.json.encode(_object(alarm)).decode() if json else _line(alarm))
 
 
 def _object(alarm: "Alarm") -> dict[str, object]:

@@ -7,7 +7,6 @@ is done by this process, as if there were no others to think of.
 import csv
 import glob
 import io
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +15,15 @@ from typing import Any, Generic, TypeVar
 import msgspec
 import typer
 
+from reactorwatch.cli.printing import say as print_lines
+from reactorwatch.cli.printing import say_text
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.sources import stands_for
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import filling
 from reactorwatch.runtime.jobs import Failed, in_order, workers
+from reactorwatch.terminal import printable
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
 
@@ -116,7 +118,7 @@ def say(
     if len(jobs) == 1 and scheduler is None:
         with task(f"{kind.doing} {files[0].name}"):
             answer = kind.work(jobs[0])
-        typer.echo(answer.said)
+        say_text(answer.said)
         write_remark(files[0], answer.remark)
         if answer.not_written:
             raise InputError(answer.not_written)
@@ -125,17 +127,17 @@ def say(
     for file, outcome in zip(files, results(kind.work, jobs, kind.doing, processes, scheduler), strict=True):
         if isinstance(outcome, Failed):
             reason = _without_name(outcome.reason, file)
-            sys.stderr.write(f"reactorwatch: {file}: {reason}\n")
+            print_lines(f"reactorwatch: {file}: {reason}", err=True)
             rows.append(kind.failed(file, reason))
         else:
-            typer.echo(outcome.said)
+            say_text(outcome.said)
             write_remark(file, outcome.remark)
             if outcome.not_written:
-                sys.stderr.write(f"reactorwatch: {file}: {outcome.not_written}\n")
+                print_lines(f"reactorwatch: {file}: {outcome.not_written}", err=True)
             rows.append(outcome.row)
     failed = sum(bool(row["error"]) for row in rows)
     if len(rows) > 1 and not as_json:
-        typer.echo(f"\n{kind.summary(rows)}")
+        say_text(f"\n{kind.summary(rows)}")
     if len(rows) > 1 and out is not None and failed < len(rows):
         write_summary(out, rows)
     if failed:
@@ -172,7 +174,7 @@ def results(
 def write_remark(file: Path, remark: str) -> None:
     """Write a remark about a file to standard error, where it disturbs no machine that reads the answer."""
     if remark:
-        sys.stderr.write(f"reactorwatch: {file}: remark: {remark}\n")
+        print_lines(f"reactorwatch: {file}: remark: {remark}", err=True)
 
 
 def _without_name(reason: str, file: Path) -> str:
@@ -204,6 +206,7 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> None:
 
 def as_table(rows: Sequence[dict[str, str]]) -> str:
     """Rows for people, in columns that are as wide as what is in them; an empty column is left out."""
+    rows = [{name: printable(cell) for name, cell in row.items()} for row in rows]
     names = [name for name in rows[0] if any(row[name] for row in rows)]
     widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in names}
     lines = [dict(zip(names, names, strict=True)), *rows]

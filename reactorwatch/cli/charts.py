@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Json
+from reactorwatch.cli.printing import say
 from reactorwatch.errors import InputError
 
 Shift = Annotated[float, typer.Option(help="Of the mean, in standard deviations; 0: the false alarms.")]
@@ -113,13 +114,13 @@ def design(
     if as_json:
         import msgspec
 
-        typer.echo(msgspec.json.encode(found).decode())
+        say(msgspec.json.encode(found).decode())
         return
-    typer.echo(chart)
+    say(chart)
     for name, value in found.parameters.items():
         text = ",".join(map(str, value)) if isinstance(value, list) else f"{value:.6g}"
-        typer.echo(f"  {name:<10} {text}")
-    typer.echo(f"false alarm every {found.arl0:g} samples; a shift of {found.shift:g} is seen after {found.arl:.4g}")
+        say(f"  {name:<10} {text}")
+    say(f"false alarm every {found.arl0:g} samples; a shift of {found.shift:g} is seen after {found.arl:.4g}")
 
 
 def _rules(text: str) -> tuple[int, ...]:
@@ -132,8 +133,8 @@ def _rules(text: str) -> tuple[int, ...]:
 def _tell(length: float, as_json: bool, **chart: object) -> None:
     """The run length: one number, or one object with the chart's parameters."""
     if not as_json:
-        typer.echo(f"{length:.8g}")
+        say(f"{length:.8g}")
         return
     import msgspec
 
-    typer.echo(msgspec.json.encode({**chart, "arl": length}).decode())
+    say(msgspec.json.encode({**chart, "arl": length}).decode())

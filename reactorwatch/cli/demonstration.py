@@ -10,12 +10,11 @@ import threading
 import time
 from pathlib import Path
 
-import typer
-
 from monitor_node import backtest
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from reactorwatch.cli.joining import VIEWER, heard_by, joining, open_router, write_node_settings
+from reactorwatch.cli.printing import say, say_text
 from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.sources import messages
@@ -32,6 +31,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal, stop_on_signals
+from reactorwatch.terminal import printable_lines
 from recorder.config import RecorderConfig
 
 PLANT = "demo"
@@ -131,10 +131,10 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
     try:
         tables = {**nodes, "recorder": heard_by(recorder, site)}
         settings = write_node_settings(folder / SETTINGS_FILE, tables, join, NODES)
-        typer.echo(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
+        say(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
         with stop_on_signals() as stop:
             if not _run_nodes(bus, stop, settings, folder, plant):
-                typer.echo(f"stopped; what was recorded until then is in {folder}", err=True)
+                say(f"stopped; what was recorded until then is in {folder}", err=True)
                 return 130
     finally:
         bus.close()
@@ -243,11 +243,11 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         f"- `{SETTINGS_FILE}`: all settings, seeds included; the `.log` files: what the nodes said.",
         "",
     ]
-    text = "\n".join(lines)
-    typer.echo(text)
+    text = printable_lines(lines)
+    say_text(text)
     with replacing(folder / "summary.md") as temporary:
         temporary.write_text(text, encoding="utf-8")
-    typer.echo(f"All of it is in {folder}")
+    say(f"All of it is in {folder}")
     return 0 if after and not before and same else 1
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reactorwatch.cli.options import Columns, Force, Plant, columns, existing, existing_recording, output_file
+from reactorwatch.cli.printing import say, say_text
 from reactorwatch.errors import InputError
 from reactorwatch.records.output import checked_folder
 
@@ -54,12 +55,12 @@ def dashboard(
     with task(f"drawing {file.name}"):
         recording = tape(existing_recording(file), plant)
         write_rrd(stretches(recording.messages, counted_from_ns=recording.zero_ns), out, diagnosis=drawn)
-    typer.echo(f"wrote {out}")
+    say(f"wrote {out}")
     if png is not None:
         with task("rendering"):
             pictures = render_tabs(out, png)
         for picture in pictures:
-            typer.echo(f"wrote {picture}")
+            say(f"wrote {picture}")
 
 
 def import_csv(
@@ -76,7 +77,7 @@ def import_csv(
     out = output_file(out, ".mcap", (file,), force=force)
     with task(f"importing {file.name}"):
         record = convert(existing(file), out, plant or "cstr", columns(column))
-    typer.echo(_written(out, record))
+    say_text(_written(out, record))
 
 
 def export_csv(
@@ -92,7 +93,7 @@ def export_csv(
     out = output_file(out, ".csv", (file,), force=force)
     with task(f"exporting {file.name}"):
         record = convert(existing_recording(file), out, plant)
-    typer.echo(_written(out, record))
+    say_text(_written(out, record))
 
 
 def _written(out: Path, record: "Record") -> str:

@@ -30,6 +30,7 @@ from reactorwatch.cli import (
     studies,
     view,
 )
+from reactorwatch.cli.printing import say
 from reactorwatch.errors import InputError
 
 # Typer brings a copy of click, or uses the one installed, depending on its version; its errors are one family in both.
@@ -55,7 +56,7 @@ for group in (runs, nodes, view, site, playback, alarm, files, recordings, studi
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"reactorwatch {__version__}")
+        say(f"reactorwatch {__version__}")
         raise typer.Exit
 
 
@@ -99,5 +100,4 @@ def main() -> None:
 def _complain(text: str) -> None:
     line = " ".join(text.split())
     with suppress(OSError):  # the exit code says it, too
-        sys.stderr.write(f"reactorwatch: {line}\n")
-        sys.stderr.flush()
+        say(f"reactorwatch: {line}", err=True)

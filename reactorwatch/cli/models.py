@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Columns, Force, Json, Plant, Processes, Scheduler, columns, existing_recording
+from reactorwatch.cli.printing import say_text
 from reactorwatch.errors import InputError
 
 
@@ -53,7 +54,7 @@ def identify(
             said = identification.one(
                 measured, output, model, order, delay, recursive=recursive, report_rows=report_rows, as_json=as_json
             )
-    typer.echo(said)
+    say_text(said)
     write_remark(file, remark)
 
 
@@ -65,7 +66,7 @@ def linearise(
     """The linear models at all steady states of a coolant flow."""
     from reactorwatch.cli.linear_models import describe
 
-    typer.echo(describe(qc, step, as_json=as_json))
+    say_text(describe(qc, step, as_json=as_json))
 
 
 def reproduce(
@@ -93,4 +94,4 @@ def reproduce(
     measured = record(existing_recording(file), plant, columns(column)) if file else None
     if measured is not None and measured.runs is not None:
         raise InputError(f"--record {file}: must be one run, {measured.describe_runs()}; cut one run out of it")
-    typer.echo(reproduce_figures(out, seed, only, measured, processes=jobs, scheduler=scheduler))
+    say_text(reproduce_figures(out, seed, only, measured, processes=jobs, scheduler=scheduler))

@@ -20,6 +20,7 @@ from reactorwatch.cli.options import (
     pace,
     span_ns,
 )
+from reactorwatch.cli.printing import say
 from reactorwatch.errors import InputError
 
 
@@ -253,5 +254,5 @@ def alive(
 
     _, bus = _settings(config, endpoint, quiet=True)
     there = comes_alive(bus, name or "cstr", node, timeout)
-    typer.echo(f"{node} is {'alive' if there else f'not there within {timeout:g} s'}")
+    say(f"{node} is {'alive' if there else f'not there within {timeout:g} s'}")
     raise typer.Exit(0 if there else 1)

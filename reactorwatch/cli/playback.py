@@ -6,6 +6,7 @@ import typer
 
 from reactorwatch.cli.asking import PATIENCE_S, ask
 from reactorwatch.cli.options import Endpoint, Plant, Settings, pace
+from reactorwatch.cli.printing import say
 
 if TYPE_CHECKING:
     from reactorwatch.contract.messages_pb2 import ReplayCommand
@@ -74,4 +75,4 @@ def _tell(
     import os
 
     message.by = os.environ.get("USER", "")
-    typer.echo(ask("replay", config, endpoint, name, timeout, command, message).text)
+    say(ask("replay", config, endpoint, name, timeout, command, message).text)

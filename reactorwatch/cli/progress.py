@@ -7,7 +7,16 @@ import contextlib
 import sys
 from collections.abc import Callable, Iterator
 
+from reactorwatch.terminal import printable
+
 Advance = Callable[[float, str], None]
+
+
+def _unmarked(text: str) -> str:
+    """A text that neither the terminal nor Rich takes for more than it is: names of files are in it."""
+    from rich.markup import escape
+
+    return escape(printable(text))
 
 
 @contextlib.contextmanager
@@ -22,7 +31,7 @@ def task(text: str) -> Iterator[None]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
-        progress.add_task(text, total=None)
+        progress.add_task(_unmarked(text), total=None)
         yield
 
 
@@ -38,9 +47,9 @@ def bar(text: str, total: float) -> Iterator[Advance]:
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
-        number = progress.add_task(text, total=total)
+        number = progress.add_task(_unmarked(text), total=total)
 
         def advance(completed: float, now: str) -> None:
-            progress.update(number, completed=completed, description=now)
+            progress.update(number, completed=completed, description=_unmarked(now))
 
         yield advance

@@ -6,6 +6,7 @@ from typing import Any
 
 from reactorwatch.contract.messages_pb2 import Priority
 from reactorwatch.records.record import clock_time, to_minutes
+from reactorwatch.terminal import printable_lines
 from recorder.look import Look
 from recorder.mcap_file import has_clock
 from recorder.recover import Saved
@@ -30,7 +31,7 @@ def saved_object(saved: Saved, out: Path) -> dict[str, Any]:
 def saved_text(saved: Saved, file: Path, out: Path) -> str:
     """The same for people."""
     span_s = (saved.last_ns - saved.first_ns) / 1e9
-    return "\n".join(
+    return printable_lines(
         [
             f"{file}: saved {saved.messages} messages of {len(saved.topics)} topics, received over {span_s:.1f} s "
             f"({moment(saved.first_ns)} to {moment(saved.last_ns)})",
@@ -160,7 +161,7 @@ def info_text(seen: Look, file: Path) -> str:
         lines.append("no alarms")
     if seen.damages:
         lines.append(f"not whole: {'; '.join(seen.damages)}; `reactorwatch recover {file}` saves the rest")
-    return "\n".join(lines)
+    return printable_lines(lines)
 
 
 def moment(time_ns: int) -> str:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Force, Json, existing, existing_recording, output_file, span_ns
+from reactorwatch.cli.printing import say, say_text
 from reactorwatch.errors import InputError
 
 
@@ -39,7 +40,7 @@ def recover(
     out = output_file(out, ".mcap", (file,), force=force) if out is not None else _beside(file)
     with task(f"recovering {file.name}"):
         saved = save(file, out)
-    typer.echo(msgspec.json.encode(saved_object(saved, out)).decode() if as_json else saved_text(saved, file, out))
+    say_text(msgspec.json.encode(saved_object(saved, out)).decode() if as_json else saved_text(saved, file, out))
 
 
 def info(
@@ -55,7 +56,7 @@ def info(
 
     with task(f"reading {file.name}"):
         seen = look_over(existing_recording(file))
-    typer.echo(msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file))
+    say_text(msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file))
 
 
 def cut(
@@ -87,7 +88,7 @@ def cut(
         window = sampled_between(sources, zero_ns + from_ns, zero_ns + to_ns)
         about = {**read_metadata(file), "cut": f"from {begin or 'the start'} to {end or 'the end'} of {file.name}"}
         count = copy(sources, out, window, {**about, ZERO_NS: str(zero_ns)})
-    typer.echo(f"wrote {out}: {count} messages")
+    say(f"wrote {out}: {count} messages")
 
 
 def merge(
@@ -108,7 +109,7 @@ def merge(
                 raise InputError(f"{source}: is named twice, and its messages would be there twice; name it once")
         about = {**read_metadata(files[0]), "merged": ", ".join(source.name for source in sources)}
         count = join(sources, out, about)
-    typer.echo(f"wrote {out}: {count} messages")
+    say(f"wrote {out}: {count} messages")
 
 
 def _beside(file: Path) -> Path:

@@ -9,6 +9,7 @@ from monitor_node.backtest import Backtest
 from reactorwatch.contract.messages_pb2 import Alarm, Priority
 from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.records.record import to_minutes
+from reactorwatch.terminal import printable_lines
 
 
 def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> dict[str, Any]:
@@ -88,7 +89,7 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
         lines.append("no alarms")
     if result.refused:
         lines.append("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items())))
-    return "\n".join(lines)
+    return printable_lines(lines)
 
 
 def _judged_by(result: Backtest) -> str:

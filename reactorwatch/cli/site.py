@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Endpoint, Json, Plant, Settings
+from reactorwatch.cli.printing import say
 
 
 def add_to(app: typer.Typer) -> None:
@@ -60,11 +61,9 @@ def certify(
     now, revoked = datetime.now(UTC), tuple(revoke or ())
     for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, now, renew_days=renew, revoke=revoked):
         said = "; signs new certificates, keep it off line" if made.name == AUTHORITY else ""
-        typer.echo(f"{made}{said}")
+        say(f"{made}{said}")
     for holder in revoke or ():
-        typer.echo(
-            f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; start the router again"
-        )
+        say(f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; start the router again")
 
 
 def router(
@@ -139,9 +138,9 @@ def doctor(
         checks.append({"ok": not finding.cure, **finding._asdict()})
         if not as_json:
             cure = f"; {finding.cure}" if finding.cure else ""
-            typer.echo(f"{'WRONG' if finding.cure else 'ok':5s}  {finding.check}: {finding.found}{cure}")
+            say(f"{'WRONG' if finding.cure else 'ok':5s}  {finding.check}: {finding.found}{cure}")
     if as_json:
-        typer.echo(msgspec.json.encode({"ok": is_well, "checks": checks}).decode())
+        say(msgspec.json.encode({"ok": is_well, "checks": checks}).decode())
     raise typer.Exit(0 if is_well else 1)
 
 

@@ -7,8 +7,8 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-import typer
 
+from reactorwatch.cli.printing import say_text
 from reactorwatch.cli.reports import priority_word
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
@@ -17,6 +17,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.serve import stop_on_signals
+from reactorwatch.terminal import printable_lines
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -142,7 +143,7 @@ def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as
             if once or as_json:
                 stopped.wait(listen_s)
                 _ask_alarms(bus, board)
-                typer.echo(_text(board, as_json=as_json), nl=False)
+                say_text(_text(board, as_json=as_json).removesuffix("\n"))
             else:
                 _show(bus, board, stopped)
         finally:
@@ -204,7 +205,7 @@ def _table(board: Board, now_ns: int) -> "Table":
     for name in board.plants:
         plant = board.plant(name, now_ns)
         rate = plant["samples_per_s"]
-        alarms = "\n".join(f"{item['alarm']} ({item['priority']}): {item['state']}" for item in plant["alarms"])
+        alarms = printable_lines(f"{item['alarm']} ({item['priority']}): {item['state']}" for item in plant["alarms"])
         rates = "" if rate is None else f"{rate:.3g}"
         for number, node in enumerate(plant["nodes"] or [{"node": "", "alive": True}]):
             first = number == 0
@@ -219,7 +220,8 @@ def _table(board: Board, now_ns: int) -> "Table":
                 f"{node['said_s_ago']:.0f} s ago" if "said_s_ago" in node else "",
                 (alarms or "none") if first else "",
             )
-            table.add_row(*map(Text, cells))  # what came from the bus is no markup
+            lines = (printable_lines(cell.split("\n")) for cell in cells)
+            table.add_row(*map(Text, lines))  # what came from the bus is no markup
     if not table.row_count:
         table.add_row("nobody is there", *[""] * 8)
     return table

@@ -22,6 +22,7 @@ from reactorwatch.cli.options import (
     output_file,
     tolerances,
 )
+from reactorwatch.cli.printing import say
 from reactorwatch.errors import InputError
 
 
@@ -61,9 +62,9 @@ def simulate(
         try:
             write_csv(out, simulated)
         except InputError:
-            typer.echo(report(measured, simulated, process, None, as_json=as_json))
+            say(report(measured, simulated, process, None, as_json=as_json))
             raise
-    typer.echo(report(measured, simulated, process, out, as_json=as_json))
+    say(report(measured, simulated, process, out, as_json=as_json))
 
 
 def backtest(

@@ -5,18 +5,19 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import typer
 
 from monitor_node.comparison import Difference
 from monitor_node.config import MonitorConfig
 from monitor_node.verification import COMPARED, Verification, verify
 from reactorwatch import __version__
+from reactorwatch.cli.printing import say_text
 from reactorwatch.cli.progress import task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import clock_time, to_minutes
 from reactorwatch.runtime.config import parse_toml, read_settings, section
+from reactorwatch.terminal import printable_lines
 from recorder.look import gaps_in, zero_ns_of
 from recorder.mcap_file import has_clock, one_plant_in, read_messages, read_metadata
 
@@ -65,7 +66,7 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
     ]
     zero_ns = zero_ns_of(file)
     said = _object(found, file, monitor.plant, zero_ns) | {"zero": clock_time(zero_ns) if has_clock(metadata) else None}
-    typer.echo(msgspec.json.encode(said).decode() if as_json else _text(said))
+    say_text(msgspec.json.encode(said).decode() if as_json else _text(said))
     return 0 if found.exact else 1
 
 
@@ -135,7 +136,7 @@ def _text(said: dict[str, Any]) -> str:
     if said["after_the_end"]:
         lines.append(f"{said['after_the_end']} more would have come after the end of the recording")
     lines += [f"note: {note}" for note in said["notes"]]
-    return "\n".join(lines)
+    return printable_lines(lines)
 
 
 def _short(text: str) -> str:

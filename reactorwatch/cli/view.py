@@ -5,6 +5,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Endpoint, Plant, Settings
+from reactorwatch.cli.printing import say
 
 LOOPBACK = "127.0.0.1"
 
@@ -40,4 +41,4 @@ def view(
     from recorder.dashboard.live import Shown, show
 
     bus, recorder = begin_beside_recorder(config, endpoint, name, logging.INFO)
-    show(recorder.plant, bus, Shown(web=web, bind=bind, port=port), typer.echo)
+    show(recorder.plant, bus, Shown(web=web, bind=bind, port=port), say)

@@ -10,6 +10,7 @@ import msgspec
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import logs
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
+from reactorwatch.terminal import printable
 
 Config = TypeVar("Config", bound=msgspec.Struct)
 
@@ -40,6 +41,6 @@ def main(module: str, table: str, kind: type[Config], run: Callable[[Config, Bus
             section(MetricsConfig, "metrics", tables, {}),
         )
     except InputError as error:
-        sys.stderr.write(f"{table}: {error}\n")
+        sys.stderr.write(f"{table}: {printable(str(error))}\n")
         return 2
     return 0

@@ -9,7 +9,20 @@ import sys
 
 import structlog
 from structlog.tracebacks import ExceptionDictTransformer
-from structlog.typing import Processor
+from structlog.typing import EventDict, Processor
+
+from reactorwatch.terminal import printable
+
+_OF_MANY_LINES = frozenset({"exception", "stack"})
+"""Fields that are tracebacks of ours."""
+
+
+def _escape(_logger: object, _method: str, event: EventDict) -> EventDict:
+    """Texts of a line for people, as a terminal may have them; a JSON renderer escapes by itself."""
+    return {
+        printable(name): printable(value) if isinstance(value, str) and name not in _OF_MANY_LINES else value
+        for name, value in event.items()
+    }
 
 
 def configure(level: int = logging.INFO, *, as_json: bool = False) -> None:
@@ -21,6 +34,7 @@ def configure(level: int = logging.INFO, *, as_json: bool = False) -> None:
     """
     form: list[Processor] = [
         structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),
+        _escape,
         structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), pad_event_to=0),
     ]
     if as_json:

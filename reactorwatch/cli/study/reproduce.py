@@ -16,6 +16,7 @@ from reactorwatch.records.folder import filling, make_folder
 from reactorwatch.records.output import checked_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.jobs import Failed
+from reactorwatch.terminal import printable_lines
 
 PAGE = "study.md"
 
@@ -113,4 +114,4 @@ def _chosen(only: str | None) -> Sequence[Figure]:
 
 def _report(out: Path, found: Sequence[tuple[Figure, Finding]]) -> str:
     lines = [f"  {figure.number:>2}  {figure.title}: {finding.verdict.value}" for figure, finding in found]
-    return "\n".join([f"wrote {out / PAGE} and {len(found)} pictures; compared with the report:", *lines])
+    return printable_lines([f"wrote {out / PAGE} and {len(found)} pictures; compared with the report:", *lines])
