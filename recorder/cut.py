@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from mcap.records import Attachment, Metadata
+
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
@@ -20,8 +22,8 @@ from recorder.entry import Entry
 from recorder.gaps import GAP, from_metadata
 from recorder.head import Head
 from recorder.mcap_chunks import damaged, read_summary, span_ns
-from recorder.mcap_scan import FOREVER_NS, Scan, Stored, Wanted
-from recorder.mcap_writer import RecordingWriter
+from recorder.mcap_scan import FOREVER_NS, Scan, Stored, Wanted, profile_of
+from recorder.mcap_writer import METADATA, RecordingWriter
 from recorder.turns import in_turn
 
 STANDING = frozenset({keys.MODEL, keys.ALARM, keys.FAULT})
@@ -93,7 +95,7 @@ def cut(
     found = _sources(sources, tolerant=tolerant)
     refuse_source(out, sources)
     count = 0
-    with replacing(out) as temporary, RecordingWriter(temporary, metadata) as writer:
+    with replacing(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(found)) as writer:
         for stored in _in_order(found, window.received_ns, tolerant=tolerant):
             if stored.repeated or not window.holds(stored):
                 continue
@@ -104,7 +106,7 @@ def cut(
             count += 1
         if not count:
             raise InputError(f"{sources[0]}: holds no message of that time")
-        _copy_gaps(found, writer, window.received_ns)
+        _copy_the_rest(found, writer, window.received_ns)
     return count
 
 
@@ -125,11 +127,11 @@ def merge(sources: Sequence[Path], out: Path, metadata: Mapping[str, str]) -> in
     found = _sources(sources)
     refuse_source(out, sources)
     count = 0
-    with replacing(out) as temporary, RecordingWriter(temporary, metadata) as writer:
+    with replacing(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(found)) as writer:
         for stored in _in_order(found):
             writer.copy(stored)
             count += 1
-        _copy_gaps(found, writer)
+        _copy_the_rest(found, writer)
     return count
 
 
@@ -207,14 +209,31 @@ def _standing(sources: Sequence[_Source], window: Window, begun_ns: int) -> list
     return head.entries(begun_ns)
 
 
-def _copy_gaps(
+def _copy_the_rest(
     sources: Sequence[_Source], writer: RecordingWriter, received_ns: tuple[int, int] = (0, FOREVER_NS)
 ) -> None:
-    """Write what the sources say was lost on the way."""
+    """Write what programs say about the sources and what they attached to them; what several say alike, once.
+
+    What was lost on the way is said of the time that is copied, and our own metadata are new.
+    """
+    written: list[Metadata | Attachment] = []
     for source in sources:
         scan = Scan(source.path, wanted=lambda _: False)
         deque(scan, maxlen=0)
         for record in scan.metadata:
             gap = from_metadata(record.metadata) if record.name == GAP else None
-            if gap is not None and received_ns[0] <= gap.noticed_ns <= received_ns[1]:
-                writer.add_metadata(GAP, record.metadata)
+            if gap is not None and not received_ns[0] <= gap.noticed_ns <= received_ns[1]:
+                continue
+            if record.name != METADATA and (gap is not None or record not in written):
+                writer.add_metadata(record.name, record.metadata)
+                written.append(record)
+        for attachment in scan.attachments():
+            if attachment not in written:
+                writer.add_attachment(attachment)
+                written.append(attachment)
+
+
+def _profile(sources: Sequence[_Source]) -> str:
+    """The profile that all sources name; empty if they name several."""
+    profiles = {profile_of(source.path) for source in sources}
+    return profiles.pop() if len(profiles) == 1 else ""

@@ -26,6 +26,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, decode, encoding_of
 from reactorwatch.errors import InputError
+from reactorwatch.records.reading import files_of
 from reactorwatch.records.record import MINUTE_NS, UNITS, Record, join_runs
 from recorder.entry import Entry
 from recorder.mcap_chunks import entries, is_in_order, metadata_records, read_summary, sorted_entries, span_ns
@@ -215,7 +216,7 @@ def _files(path: Path) -> list[_File]:
     if not path.is_dir():
         summary = read_summary(path)
         return [_File(path, summary, span_ns(summary), first=True)]
-    read = [(file, read_summary(file)) for file in sorted(path.glob("*.mcap"))]
+    read = [(file, read_summary(file)) for file in files_of(path, ".mcap")]
     if not read:
         raise InputError(f"{path}: holds no recording (.mcap)")
     spans = [(span_ns(summary), file, summary) for file, summary in read]

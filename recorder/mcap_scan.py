@@ -10,13 +10,14 @@ import io
 import mmap
 import os
 import struct
+import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, Metadata, Schema
+from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
@@ -36,6 +37,7 @@ _CHUNK_TIMES = struct.Struct("<QQ")  # of its first and of its last message; the
 _BEFORE_COMPRESSION = RECORD.size + 8 + 8 + 8 + 4 + 4  # bytes of a chunk before the name of its compression
 _NAME_LENGTH, _DATA_LENGTH = struct.Struct("<I"), struct.Struct("<Q")
 _INDEX = struct.Struct("<HI")  # channel of a message index, and the length of what follows
+_CHECKSUM = struct.Struct("<I")
 _COMPRESSIONS = (b"zstd", b"lz4")
 _KNOWN = frozenset(Opcode)
 
@@ -86,6 +88,7 @@ class Scan:
     Attributes:
         damages: the places that could not be read; complete after the pass.
         metadata: what programs wrote into the file about it; complete after the pass.
+        profile: that the file says its messages follow; known from the first message on.
         orphans: messages of channels that are described nowhere any more.
         whole: after the pass, whether the file has its end and no damage was seen.
 
@@ -96,6 +99,8 @@ class Scan:
     def __init__(self, path: Path, from_ns: int = 0, to_ns: int = FOREVER_NS, wanted: Wanted | None = None) -> None:
         self.damages: list[Damage] = []
         self.metadata: list[Metadata] = []
+        self.profile = ""
+        self._attached: list[tuple[int, int]] = []
         self.orphans = 0
         self._wanted = wanted
         self._path, self._from_ns, self._to_ns = path, from_ns, to_ns
@@ -145,6 +150,18 @@ class Scan:
             unfinished = f", after {self._size - at} bytes of an unfinished record," if at < self._size else ""
             self.damages.append(Damage(self._size, f"cut off{unfinished}", cut_off=True))
 
+    def attachments(self) -> Iterator[Attachment]:
+        """The files that belong to the recording, after the pass; one that is damaged is a damage, and left out."""
+        for start, end in self._attached:
+            content = self._bytes[start:end]
+            (checksum,) = _CHECKSUM.unpack(content[-_CHECKSUM.size :])
+            try:
+                if checksum not in (0, zlib.crc32(content[: -_CHECKSUM.size])):  # 0: there is none
+                    raise ValueError("its checksum does not agree")
+                yield Attachment.read(_stream(content))
+            except DAMAGE as error:
+                self.damages.append(Damage(start, f"an attachment ({error})"))
+
     def _know_from_summary(self) -> None:
         """Learn from an intact index what a damaged chunk may have described."""
         try:
@@ -191,6 +208,10 @@ class Scan:
                 self._learn(opcode, self._bytes[start:end], sure=False)
             case Opcode.METADATA:
                 self.metadata.append(Metadata.read(_stream(self._bytes[start:end])))
+            case Opcode.HEADER:
+                self.profile = Header.read(_stream(self._bytes[start:end])).profile
+            case Opcode.ATTACHMENT:
+                self._attached.append((start, end))
             case Opcode.FOOTER:
                 if self._bytes[end:] != MCAP0_MAGIC:
                     raise ValueError("the last bytes are not those of a recording")
@@ -280,6 +301,17 @@ class Scan:
             return False
         (data_length,) = _DATA_LENGTH.unpack_from(self._bytes, at + _BEFORE_COMPRESSION + name_length)
         return bool(head + name_length + _DATA_LENGTH.size + data_length == length)
+
+
+def profile_of(path: Path) -> str:
+    """The profile that a file says its messages follow, damaged or not; it stands at the very beginning.
+
+    Raises:
+        InputError: as `Scan`.
+    """
+    scan = Scan(path)
+    next(iter(scan), None)
+    return scan.profile
 
 
 def _stream(content: bytes) -> ReadDataStream:

@@ -19,6 +19,8 @@ import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
+    Attachment,
+    AttachmentIndex,
     Channel,
     Chunk,
     ChunkIndex,
@@ -73,12 +75,13 @@ class McapStream:
         self._index: dict[int, list[int]] = {}  # by channel: log time and offset of each message, one after the other
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
+        self._attachments: list[AttachmentIndex] = []
         self._counts: dict[int, int] = {}  # messages by channel, of the chunks that have ended
         self._compressor = zstandard.ZstdCompressor()
 
-    def start(self, library: str) -> None:
+    def start(self, library: str, profile: str = "") -> None:
         """Write the beginning."""
-        self._sink.write(MCAP0_MAGIC + _bytes_of(Header(profile="", library=library)))
+        self._sink.write(MCAP0_MAGIC + _bytes_of(Header(profile=profile, library=library)))
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
         """Describe a schema; returns its number."""
@@ -120,6 +123,23 @@ class McapStream:
         self._metadata.append(MetadataIndex(offset=offset, length=len(record), name=name))
         self._sink.write(record)
 
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Append a file that belongs to the recording, outside of any chunk."""
+        offset = self._sink.tell()
+        record = _bytes_of(attachment)
+        self._attachments.append(
+            AttachmentIndex(
+                offset=offset,
+                length=len(record),
+                log_time=attachment.log_time,
+                create_time=attachment.create_time,
+                data_size=len(attachment.data),
+                name=attachment.name,
+                media_type=attachment.media_type,
+            )
+        )
+        self._sink.write(record)
+
     def flush(self) -> None:
         """End the chunk, if there is a message in it, and hand on all that was written."""
         self._end_chunk()
@@ -135,7 +155,7 @@ class McapStream:
             (Opcode.CHANNEL, self._channels),
             (Opcode.STATISTICS, [self._statistics()]),
             (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, []),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
             (Opcode.METADATA_INDEX, self._metadata),
         )
         summary, offsets = bytearray(), bytearray()
@@ -198,7 +218,7 @@ class McapStream:
 
     def _statistics(self) -> Statistics:
         return Statistics(
-            attachment_count=0,
+            attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts=self._counts,
             chunk_count=len(self._chunks),

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Self
 
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
-from mcap.records import Channel, Metadata
+from mcap.records import Attachment, Channel, Metadata
 from mcap.well_known import MessageEncoding, SchemaEncoding
 
 from reactorwatch import __version__
@@ -48,13 +48,18 @@ class RecordingWriter:
         path: the file; there must be none of that name yet, finished or not.
         metadata: what the file should say about its origin, beside the version of this software.
         open_part: what opens the file that is written to.
+        profile: that the file says its messages follow.
 
     Raises:
         InputError: the file exists or cannot be written.
     """
 
     def __init__(
-        self, path: Path, metadata: Mapping[str, str], open_part: Callable[[Path], PartFile] = PartFile
+        self,
+        path: Path,
+        metadata: Mapping[str, str],
+        open_part: Callable[[Path], PartFile] = PartFile,
+        profile: str = "",
     ) -> None:
         self._path = path
         self._part = part_of(path)
@@ -69,7 +74,7 @@ class RecordingWriter:
             raise self._failed(error) from error
         self._writer = McapStream(self._stream)
         try:
-            self._writer.start(library=f"reactorwatch {__version__}")
+            self._writer.start(f"reactorwatch {__version__}", profile)
             self._writer.add_metadata(METADATA, {"version": __version__, **metadata})
             self._stream.flush()
         except OSError as error:
@@ -132,6 +137,18 @@ class RecordingWriter:
         try:
             self._writer.flush()
             self._writer.add_metadata(name, metadata)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Append a file that belongs to the recording.
+
+        Raises:
+            WriteError: as `write`.
+        """
+        try:
+            self._writer.flush()
+            self._writer.add_attachment(attachment)
         except OSError as error:
             raise self._failed(error) from error
 

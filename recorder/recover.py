@@ -1,8 +1,8 @@
 """What is whole in a damaged recording, into a recording that is whole.
 
-Everything that `mcap_scan` can read is written again in the order in which it is, with the descriptions of its channels
-and what programs said about the file; the bytes of the messages are not looked into, so files of other programs are
-recovered as well (without their attachments, of which ours have none).
+Everything that `mcap_scan` can read is written again in the order in which it is, with the descriptions of its
+channels, what programs said about the file and what they attached to it; the bytes of the messages are not looked into,
+so files of other programs are recovered as well.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from pathlib import Path
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.output import refuse_source
-from recorder.mcap_scan import Damage, Scan
+from recorder.mcap_scan import Damage, Scan, profile_of
 from recorder.mcap_writer import METADATA, RecordingWriter, own_metadata
 
 RECOVERED = "recovered"
@@ -73,11 +73,13 @@ def recover(path: Path, out: Path) -> Saved:
     topics: Counter[str] = Counter()
     first_ns, last_ns = 2**64, 0
     with replacing(out) as temporary:
-        with RecordingWriter(temporary, origin(path)) as writer:
+        with RecordingWriter(temporary, origin(path), profile=profile_of(path)) as writer:
             for stored in scan:
                 writer.copy(stored)
                 topics[stored.channel.topic] += 1
                 first_ns, last_ns = min(first_ns, stored.log_time_ns), max(last_ns, stored.log_time_ns)
+            for attachment in scan.attachments():
+                writer.add_attachment(attachment)
             saved = Saved(topics.total(), first_ns, last_ns, dict(topics), tuple(scan.damages), scan.orphans)
             if not saved.messages:
                 raise InputError(f"{path}: holds no message that could be saved ({saved.lost or 'it is whole'})")

@@ -51,7 +51,9 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
     plants, tape = _opened(config)
     player = Player(tape, config.rate, loop=config.loop)
     if player.finished:
-        raise InputError(f"{config.file}: holds nothing to play from {config.from_min:g} to {config.to_min:g} min")
+        begin = "the start" if isinf(config.from_min) else f"{config.from_min:g} min"
+        end = "the end" if isinf(config.to_min) else f"{config.to_min:g} min"
+        raise InputError(f"{config.file}: holds nothing to play from {begin} to {end}")
     bus = bus_zenoh.connect(bus_config, NODE, stop)
     if bus is None:
         return 0

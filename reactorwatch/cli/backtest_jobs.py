@@ -79,6 +79,9 @@ def answer(job: Job) -> Answer:
     settings = msgspec.structs.replace(job.settings, plant=plant)
     recording, first = tape(job.at, plant, job.columns, _units(settings)), FirstSamples(plant)
     result = run(first.pass_on(recording.messages), settings, recording.zero_ns or 0)
+    if not result.rows:
+        why = ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items()))
+        raise InputError(f"{job.at}: holds no sample that can be used{f'; refused: {why}' if why else ''}")
     if set(settings.outputs) <= result.left_out.keys():
         reasons = "; ".join(f"{name}: {result.left_out[name]}" for name in settings.outputs)
         raise InputError(f"{job.at}: there is no output to watch ({reasons})")

@@ -22,6 +22,7 @@ from reactorwatch.cli.sources import stands_for
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import filling
+from reactorwatch.records.reading import files_of
 from reactorwatch.runtime.jobs import Failed, in_order, workers
 from reactorwatch.terminal import printable
 
@@ -75,19 +76,24 @@ def files_named(names: Sequence[Path]) -> list[Path]:
             no pattern is taken as it is, there or not.
 
     Raises:
-        InputError: nothing is like a pattern, or a folder holds nothing to be read.
+        InputError: nothing is like a pattern, or a folder that was named holds nothing to be read.
     """
     found: list[Path] = []
     for name in names:
         if glob.has_magic(str(name)) and not name.exists():
-            like = sorted(map(Path, glob.glob(str(name), recursive=True)))  # noqa: PTH207 (Path has none for absolute patterns)
+            paths = sorted(map(Path, glob.glob(str(name), recursive=True)))  # noqa: PTH207 (Path has none for absolute patterns)
+            like = [file for path in paths for file in (_held_by(path) if path.is_dir() else [path])]
             if not like:
                 raise InputError(f"{name}: no file is called like this")
         else:
-            like = [name]
-        for path in like:
-            found += stands_for(path) if path.is_dir() else [path]
+            like = stands_for(name) if name.is_dir() else [name]
+        found += like
     return found
+
+
+def _held_by(folder: Path) -> list[Path]:
+    """What a folder that is like a pattern stands for: nothing, if it is only called so."""
+    return stands_for(folder) if files_of(folder, ".csv") or files_of(folder, ".mcap") else []
 
 
 def say(

@@ -1,5 +1,6 @@
 """Files into other files: `import`, `export`, `dashboard`."""
 
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,6 +13,7 @@ from reactorwatch.records.output import checked_folder
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record
+    from recorder.run import Run
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
 
@@ -54,13 +56,30 @@ def dashboard(
         checked_folder(png, picture_names(), (file,), option="--png", force=force)
     with task(f"drawing {file.name}"):
         recording = tape(existing_recording(file), plant)
-        write_rrd(stretches(recording.messages, counted_from_ns=recording.zero_ns), out, diagnosis=drawn)
+        run = stretches(recording.messages, counted_from_ns=recording.zero_ns)
+        write_rrd(_measured(run, file), out, diagnosis=drawn)
     say(f"wrote {out}")
     if png is not None:
         with task("rendering"):
             pictures = render_tabs(out, png)
         for picture in pictures:
             say(f"wrote {picture}")
+
+
+def _measured(runs: "Iterable[Run]", file: Path) -> "Iterator[Run]":
+    """The stretches of a run as they come.
+
+    Raises:
+        InputError: at the end, in none of them anything was measured.
+    """
+    import numpy as np
+
+    is_measured = False
+    for run in runs:
+        is_measured = is_measured or any(np.isfinite(series.value).any() for series in run.measured.values())
+        yield run
+    if not is_measured:
+        raise InputError(f"{file}: holds no sample that can be used")
 
 
 def import_csv(

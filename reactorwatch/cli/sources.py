@@ -14,6 +14,7 @@ from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import checked_plant
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.reading import files_of
 from reactorwatch.records.record import UNITS, Record, clock_time
 
 DEFAULT_PLANT = "cstr"
@@ -116,7 +117,7 @@ def stands_for(folder: Path) -> list[Path]:
     from recorder.mcap_writer import NUMBER
 
     of_a_piece = {NUMBER, "cut", "merged"}
-    records, recordings = (sorted(folder.glob(f"*.{ending}")) for ending in ("csv", "mcap"))
+    records, recordings = (files_of(folder, suffix) for suffix in (".csv", ".mcap"))
     if not records and not recordings:
         raise InputError(f"{folder}: holds no record (.csv) and no recording (.mcap)")
     origins = []

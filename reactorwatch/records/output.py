@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from reactorwatch.errors import InputError
+from reactorwatch.records.reading import files_of
 
 _FILE_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,6}")
 """A new folder has no such suffix: its name would be taken for that of a file of that kind."""
@@ -138,7 +139,7 @@ def refuse_source(path: Path, sources: Iterable[Path | None]) -> None:
     for source in sources:
         if source is None:
             continue
-        for file in sorted(source.glob("*.mcap")) if source.is_dir() else [source]:
+        for file in files_of(source, ".mcap") if source.is_dir() else [source]:
             if file.exists() and path.samefile(file):
                 raise InputError(f"{path}: is one of the files that are read ({file}); name another file")
 
