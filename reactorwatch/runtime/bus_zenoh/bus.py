@@ -376,7 +376,8 @@ class ZenohBus:
         # Of the same priority as all else: of a lower one, the word that this was all would overtake the replies.
         again = zenoh.ext.RepliesConfig(congestion_control=zenoh.CongestionControl.BLOCK)
         drop, most = self._config.congestion == "drop", self._config.cache_messages
-        if key.split("/", STREAM_PARTS)[STREAM_PARTS - 1] not in EVERY_ROW:
+        topic = keys.parse(key)
+        if topic is None or topic.kind not in EVERY_ROW:
             most = min(most, MOST_KEPT_OF_OTHERS)
         publisher = zenoh.ext.declare_advanced_publisher(
             self._voice,
