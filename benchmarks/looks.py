@@ -1,4 +1,4 @@
-"""How long does a look for causes take, and a row without one, whatever a sensor shows?
+"""Time of a look for causes, and of a row without one, for any value that a sensor shows.
 
 Runs of bad values, of 1 to 50 rows, within the range of a signal and far out of it, in a sound plant whose monitor
 looks for causes. Beside it, in the same run, the peer: looks at faults of the catalogue, which are what the budget of

@@ -256,7 +256,7 @@ def _gain(model: ProcessModel, delta_bic: float, noise_sd: Array, before: Errors
 
 
 def _said_of(record: Record) -> list[str]:
-    """What is to be said of its rows."""
+    """Remarks on the rows of a record, for people."""
     if record.runs is None:
         return record.remarks
     shifts = ", ".join(f"{shift:+.4g}" for shift in record.run_shifts_min[1 : MOST_SPANS + 1])

@@ -51,7 +51,7 @@ def curves_of(
 
 
 def differences_of(model: ProcessModel, noise_sd: Array, curves: Curves) -> dict[str, Difference]:
-    """Of each output: where, when and at which operating points the simulation errs; of the sensors the noise."""
+    """Differences of the simulation by output, time and operating point, beside the noise of the sensors."""
     columns = curves.inputs | curves.free_before
     units = {item.name: item.unit for item in model.inputs} | {item.name: item.unit for item in model.outputs}
     signals = {name: (columns[name], unit) for name, unit in units.items()}

@@ -48,7 +48,7 @@ def bands_of(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> d
 
 
 def matters(curves: Curves, bands: Mapping[str, float], blind: NDArray[np.bool_]) -> bool:
-    """Whether the free runs of both models differ by more than the tolerance in an output.
+    """Compare the simulations by both models with the tolerances; true if an output differs by more.
 
     Args:
         curves: of both models.

@@ -15,7 +15,7 @@ from diagnosis.wandering import LOW, Noise, power_spectrum
 from reactorwatch.process.model import Array
 
 ROUNDS = 100
-"""Of multiplicative steps, after which the levels change by less than a thousandth."""
+"""Number of multiplicative steps, after which the levels change by less than a thousandth."""
 
 _LEAST_SHARE = 1e-6
 

@@ -93,7 +93,7 @@ class _Trial:
 def located(
     model: ProcessModel, effects: Sequence[Effect], run: Run, nominal: Fit, noise: NoiseLevels
 ) -> Located | None:
-    """Where an effect acts that nothing explains; None if the run says nothing of it, or no place is known.
+    """Locate an effect that nothing explains; None if the run holds too little about it, or no place is known.
 
     Args:
         model: of the plant; uncertain parameters as the record has them.
