@@ -30,6 +30,7 @@ from reactorwatch.cli import (
     studies,
     view,
 )
+from reactorwatch.cli.interrupt import handled, raise_until_handled
 from reactorwatch.cli.printing import say
 from reactorwatch.errors import InputError
 
@@ -74,6 +75,7 @@ def main() -> None:
     # the live monitor said, on whatever machine. Who sets it otherwise has to do so for both; nodes inherit it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("RUST_LOG", "off")  # what Rerun logs of a full disk or a closed viewer, we say ourselves
+    raise_until_handled()
     try:
         code = app(prog_name="reactorwatch", standalone_mode=False)
         sys.stdout.flush()
@@ -84,6 +86,7 @@ def main() -> None:
         _complain(str(error))
         code = 2
     except (typer.Abort, KeyboardInterrupt):
+        handled()
         code = 130
     except Exception as error:  # noqa: BLE001 (the one place that turns what is left into a report)
         if isinstance(error, OSError) and error.errno in OF_THE_SYSTEM:
