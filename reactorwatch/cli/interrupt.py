@@ -1,7 +1,7 @@
 """Ctrl-C, also while a kernel is compiled.
 
 The compiler drops exceptions in two places. What is raised within a callback of LLVM is printed and dropped, and the
-kernel with it, as `ctypes` can pass nothing on; and Numba clears what is raised while it looks at types of arguments. An
+kernel with it, as `ctypes` can pass nothing on; and Numba clears what is raised while it looks at argument types. An
 interrupt would be lost, and the command go on. So none is raised within such a callback, and an interrupt is raised
 again until the command handles it.
 """
