@@ -65,7 +65,7 @@ def run_of(record: Record, model: ProcessModel) -> Run:
                 f"{name}: {item.name} must be there in {of_run}; leave out the rows before its first value"
             )
         inputs.append(values)
-    wrong = find_wrong_unit(model, record.columns, record.time_min)
+    wrong = find_wrong_unit(model, record.columns, record.continuous_min)
     if wrong is not None and not wrong.of_times:
         raise InputError(f"{name}: {wrong.text}")
     check_values(record, model)

@@ -9,6 +9,8 @@ import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from reactorwatch.errors import InputError
+
 LONGEST_CAUSE = 300
 """Characters of an exception's own text in a report; a value in it may be of any length."""
 
@@ -21,11 +23,14 @@ class Failures:
         by_stage: number of exceptions since the plant was first watched, by stage.
         notes: lines for people that are not reported yet, oldest first; the reader empties it.
         tracebacks: tracebacks of the same exceptions, oldest first; the reader empties it.
+        passes: exceptions that are not contained. Of a monitor of its own these are settings that cannot be kept, which
+            its user is told; in a fleet they are those of one plant.
     """
 
     by_stage: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     tracebacks: list[str] = field(default_factory=list)
+    passes: type[Exception] | tuple[()] = InputError
     _reported: set[str] = field(default_factory=set)
 
     def add(self, stage: str, error: Exception, cost: str) -> None:
@@ -35,7 +40,12 @@ class Failures:
             stage: the part of the work that failed.
             error: the exception.
             cost: what the plant loses by it, as the end of a sentence.
+
+        Raises:
+            Exception: the exception, where it is one that passes.
         """
+        if isinstance(error, self.passes):
+            raise error
         self.by_stage[stage] = self.by_stage.get(stage, 0) + 1
         frame = traceback.extract_tb(error.__traceback__)[-1]
         place = f"{type(error).__name__} in {frame.name}, line {frame.lineno} of {frame.filename.rsplit('/', 1)[-1]}"

@@ -92,6 +92,8 @@ def cut(
     Raises:
         InputError: nothing was received then, a source is damaged, or the new file cannot be written.
     """
+    if not sources:
+        raise InputError(f"{out.name}: there is no recording of that time; were its files deleted?")
     found = _sources(sources, tolerant=tolerant)
     refuse_source(out, sources)
     count = 0

@@ -80,7 +80,9 @@ class WatchedPlants:
     def unwatched(self, plant: str, now_ns: int) -> Monitor:
         """A new monitor of a plant, which is not among these yet."""
         named = msgspec.structs.replace(self._config, plant=plant)
-        return Monitor(named, now_ns, points=self._points, model=self._model)
+        monitor = Monitor(named, now_ns, points=self._points, model=self._model)
+        monitor.failures.passes = ()
+        return monitor
 
     def add(self, plant: str, monitor: Monitor) -> None:
         """Watch a plant."""

@@ -161,6 +161,7 @@ class QuietPlants:
         slot = self._slots.of[plant]
         p, rows = self._slots.plants[slot], self._slots.newest(slot)
         monitor = Monitor(msgspec.structs.replace(self._config, plant=plant), 0, points=False, model=self._model)
+        monitor.failures.passes = ()
         try:
             monitor.restore(self._form.read(plant, p, self._slots.rest(slot), rows, [row.time_ns for row in waiting]))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet

@@ -91,7 +91,7 @@ def answer(job: Job) -> Answer:
         said = msgspec.json.encode({"file": str(job.file), **found} if job.among else found).decode()
     else:
         said = backtest_text(result, zero_ns, job.file)
-    return Answer(said, _row(job.file, found), first.unit_remark(model_on_the_bus(settings.model) or cstr()))
+    return Answer(said, _row(job.file, found), remark=first.unit_remark(model_on_the_bus(settings.model) or cstr()))
 
 
 def _units(settings: MonitorConfig) -> dict[str, str] | None:

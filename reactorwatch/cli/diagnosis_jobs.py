@@ -102,7 +102,7 @@ def answer(job: Job) -> Answer:
         except InputError as error:
             case, not_written = replace(case, folder=None), str(error)
     said = _said(case, diagnosis, seconds, as_json=job.as_json)
-    return Answer(said, _row(job.file, diagnosis, seconds) | {"error": not_written or None}, not_written)
+    return Answer(said, _row(job.file, diagnosis, seconds) | {"error": not_written or None}, not_written=not_written)
 
 
 def _check(asked: Asked) -> None:

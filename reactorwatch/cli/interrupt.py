@@ -13,7 +13,7 @@ from types import FrameType
 AGAIN_S = 0.2
 
 _CALLBACKS = "_raw_object_cache_"
-"""What the names of the functions begin with that LLVM calls (`llvmlite.binding.executionengine`)."""
+"""Beginning of the names of the functions that LLVM calls; they are in llvmlite's `ExecutionEngine`."""
 
 
 def raise_until_handled() -> None:

@@ -20,6 +20,7 @@ from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
 from reactorwatch.records.folder import make_folder
+from reactorwatch.records.output import check_folder_name
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.model_file import read_extended_model
@@ -73,6 +74,8 @@ def run_until_stopped(
     join = joining(site, plant.name, tables, endpoint)
     diagnosis = diagnosis_settings(tables, monitor, diagnose)
     metrics = section(MetricsConfig, "metrics", tables, {})
+    if Path(recorder.out).suffix != ENDING:
+        check_folder_name(Path(recorder.out), "--out")
     bus = open_router(site, join)  # before anything is written: an address that is taken leaves nothing behind
     try:
         tables_written = {"plant": plant, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}

@@ -44,7 +44,7 @@ def check_values(values: object, name: str = "") -> None:
 
 
 def check_spans(settings: msgspec.Struct) -> None:
-    """Check that durations are ones; a setting's unit ends its name (`l_min` is that of a flow).
+    """Check that durations are ones; a setting's unit ends its name; where that is l/min, it is a flow.
 
     Raises:
         ValueError: one is longer than 146 years and not infinite.

@@ -218,7 +218,7 @@ def test_what_cannot_be_replayed_is_told_before_the_waiting_for_a_router(tmp_pat
     for config, said in (
         (ReplayConfig(file=str(empty)), "holds no samples"),
         (ReplayConfig(file=str(two), plant="c"), "holds samples of b, cstr; they cannot all be played as 'c'"),
-        (ReplayConfig(file=str(path), from_min=60.0), "holds nothing to play from 60 to inf min"),
+        (ReplayConfig(file=str(path), from_min=60.0), "holds nothing to play from 60 min to the end"),
         (ReplayConfig(file=str(tmp_path / "none.csv")), "there is no such file"),
     ):
         with pytest.raises(InputError, match=said):

@@ -2,6 +2,7 @@
 
 import signal
 import subprocess
+import threading
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,8 @@ def test_the_router_logs_whom_it_refused_what(tmp_path: Path) -> None:
     router = subprocess.Popen(
         [REACTORWATCH, "router", str(tmp_path / "router" / "router.json5")], stderr=subprocess.PIPE, text=True
     )
+    overdue = threading.Timer(WITHIN_S, router.kill)  # its log ends, and so does the wait for a line
+    overdue.start()
     try:
         viewer = connect(settings(tmp_path, "cstr/viewer"), "viewer", StopSignal())
         assert viewer is not None
@@ -63,6 +66,7 @@ def test_the_router_logs_whom_it_refused_what(tmp_path: Path) -> None:
         assert router.stderr is not None
         assert any("refused: Put by cstr.viewer on reactor/cstr/sample/T" in line for line in router.stderr)
     finally:
+        overdue.cancel()
         router.send_signal(signal.SIGINT)
         router.communicate(timeout=WITHIN_S)
     assert router.returncode == 0

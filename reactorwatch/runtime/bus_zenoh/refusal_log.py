@@ -68,6 +68,8 @@ def log_refusals() -> Iterator[None]:
     source, sink = os.pipe()
     os.dup2(sink, 1)
     os.close(sink)
+    if os.environ.get("RUST_LOG") == "off":  # the command's own default
+        del os.environ["RUST_LOG"]
     zenoh.init_log_from_env_or(DECISIONS)
     thread = threading.Thread(target=_read, args=(source, before), name="refusals", daemon=True)
     thread.start()

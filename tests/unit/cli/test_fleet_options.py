@@ -59,7 +59,7 @@ def test_a_folder_for_states_that_cannot_be_made(
 ) -> None:
     (tmp_path / "file").touch()
     line = said_of([*options, "--state", str(tmp_path / "file")], monkeypatch, capsys)
-    assert f"--state {tmp_path / 'file'}: the folder cannot be made" in line
+    assert f"--state {tmp_path / 'file'}: is a file, the name of a folder was expected" in line
 
 
 @pytest.mark.parametrize("table", ["[monitor]\nstate_file = 'x'\n", "[monitor]\nalarm_state_file = 'x'\n"])

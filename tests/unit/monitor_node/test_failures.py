@@ -19,6 +19,7 @@ from monitor_node.signal_watch import SignalWatch
 from monitor_node.watch import PlantWatch
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
+from reactorwatch.errors import InputError
 
 from .fleets import QUICK, SECOND_NS, alarms, alone, fleet, of, row_by_row
 
@@ -187,3 +188,12 @@ def test_no_hypothesis_that_overflowed_is_followed() -> None:
     times = np.arange(30) / 10
     window = Window(times, times[:, None], np.zeros((30, 2)), np.zeros((30, 2)), np.ones((30, 2), bool), [], 20)
     assert _begun(scan, window) == []
+
+
+def test_settings_that_cannot_be_kept_end_the_monitor_of_one_plant_and_no_fleet() -> None:
+    error = InputError("false_alarms_per_30_days must be larger")
+    with pytest.raises(InputError, match="must be larger"):
+        Failures().add("row", error, "the plant is learned again")
+    one_of_many = fleet()._here.unwatched("b", 0).failures
+    one_of_many.add("row", error, "the plant is learned again")
+    assert one_of_many.by_stage == {"row": 1}

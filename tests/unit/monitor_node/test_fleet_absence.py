@@ -27,7 +27,7 @@ def test_who_was_cut_off_tells_no_alarm_again_that_another_has_told_and_loses_no
     """
     run, at_home = runs["b"], home("b", 2)
     told = [time_ns for _, _, time_ns in alarms(expected["b"])]
-    cut_at, back_at = places_of(run, told[0]) - 30, places_of(run, told[-1]) - 3
+    cut_at, back_at = places_of(run, told[0]) - 30, places_of(run, told[-1])
     first, second = fleet(shard=Shard(at_home, 2), name="first", ask_past=noting([])), fleet()
     first.on_alive("reactor/b/alive/plant", True, 0)
     said = first.on_past(Past("b", None, run[:cut_at]), 0)
