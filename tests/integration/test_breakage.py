@@ -21,13 +21,15 @@ from reactorwatch.runtime.config import BusConfig
 from .live_run import PLANT, SILENCE, WITHIN_S, LiveRun
 
 DURATION_MIN, SPEED = 40.0, 240.0
+UNHURRIED = 60.0
+"""Eight samples of another are a restarted plant if the first is held up meanwhile: at this speed for 0.8 s."""
 LARGE, GARBAGE = 30, 20_000
 SECOND_NS = 1_000_000_000
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[LiveRun]:
-    with LiveRun(tmp_path, DURATION_MIN, SPEED) as going:
+def run(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LiveRun]:
+    with LiveRun(tmp_path, DURATION_MIN, getattr(request, "param", SPEED)) as going:
         yield going
 
 
@@ -109,6 +111,7 @@ def test_a_flood_of_garbage_and_of_large_payloads_is_refused_and_takes_no_memory
     assert run.recorded_alarms() == run.expected_alarms()
 
 
+@pytest.mark.parametrize("run", [UNHURRIED], indirect=True)
 def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun, tmp_path: Path) -> None:
     """It has a clock of its own, and lives for the middle half of the run."""
     other = msgspec.structs.replace(run.plant, seed=99, zero_ns=0, duration_min=0.5 * DURATION_MIN, wait_for=("leave",))
