@@ -25,7 +25,7 @@ ROWS_AN_OUTPUT = 2
 """Rows of the training that a chart of all outputs needs for each: with fewer their correlations are hardly known."""
 
 LEAST_VARIANCE = 1e-8
-"""Of a combination of the outputs, of those of one that varies alone; with less it varies by rounding only."""
+"""Share of one output's own variance that a combination of outputs must have; with less it varies by rounding only."""
 
 VectorChart: TypeAlias = T2 | Mewma | PcaT2 | PcaSpe
 

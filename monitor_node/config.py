@@ -15,7 +15,7 @@ DEFAULT_PRIORITIES: dict[str, PriorityName] = {"T": "high"}
 
 
 SMALLEST_SD = {"C": 2e-4, "T": 0.05}
-"""Of the reactor's outputs; other outputs have none unless the settings say so."""
+"""Settings of the reactor's outputs; other outputs have none unless the settings say so."""
 
 
 class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

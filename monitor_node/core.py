@@ -370,7 +370,7 @@ class Monitor:
 
     @property
     def restarts(self) -> int:
-        """How often the plant was restarted, or its clock set back, so far."""
+        """Number of times that the plant was restarted, or its clock set back, so far."""
         return self._aligner.state.counts.restarts
 
     @property

@@ -325,7 +325,7 @@ def places(model: ProcessModel, outputs: tuple[str, ...]) -> list[int]:
 
 
 def input_reach(time_min: Array, inputs: Array) -> float:
-    """How far the input of a row was at most from those of the rows before and after it, whichever is nearer.
+    """Largest distance of the input of a row from those of the rows before and after it, whichever is nearer.
 
     It is 0 where each move lasts for two rows at least. Then the input of a missing row was that of a neighbour.
 

@@ -27,10 +27,10 @@ Array = NDArray[np.float64]
 EQUAL_PERCENT = 0.5
 
 LEAST_PERCENT = 20.0
-"""Of a free run on the held-out half: a model that runs worse is not recommended; the mean alone has 0 %."""
+"""Least fit of a simulation on the held-out half; with less no model is recommended (the mean alone has 0 %)."""
 
 UNSEEN_SHARE, BEYOND_SHARE = 0.05, 0.1
-"""Of the held-out half's inputs: so many beyond the fitted half's range by such a share of it are an unseen range."""
+"""Share of the held-out inputs, and of the fitted half's range that they must exceed, for an unseen range."""
 
 
 class Candidate(msgspec.Struct, frozen=True):

@@ -3,8 +3,6 @@
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from monitor_node.backtest import Backtest
 from reactorwatch.contract.messages_pb2 import Alarm, Priority
 from reactorwatch.contract.suspects import suspects_text
@@ -50,11 +48,6 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
             for alarm, cleared_ns in result.raised
         ],
     }
-
-
-def backtest_json(result: Backtest, zero_ns: int) -> str:
-    """The JSON object of the contract, on one line."""
-    return msgspec.json.encode(backtest_object(result, zero_ns)).decode()
 
 
 def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:

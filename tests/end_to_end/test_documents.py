@@ -6,18 +6,13 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
 import pytest
 import typer.main
 
-from monitor_node.config import MonitorConfig
-from monitor_node.fleet.config import FleetConfig
-from plant_node.config import PlantConfig
-from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.main import app
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, read_settings, section
-from recorder.config import RecorderConfig, ReplayConfig
+from reactorwatch.runtime.config import SECTIONS, read_settings, section
+from tests.unit.runtime.test_setting_rules import TABLES
 
 from .conftest import Command
 from .given import Files
@@ -25,17 +20,6 @@ from .machine import Machine
 from .pages import PAGES, ROOT, Block, blocks, inline_commands, words
 
 DOCUMENTS = [*PAGES, ROOT / "CHANGELOG.md", *sorted((ROOT / "docs" / "decisions").glob("*.md"))]
-KINDS: dict[str, type[msgspec.Struct]] = {
-    "bus": BusConfig,
-    "plant": PlantConfig,
-    "monitor": MonitorConfig,
-    "fleet": FleetConfig,
-    "recorder": RecorderConfig,
-    "replay": ReplayConfig,
-    "diagnosis": DiagnosisConfig,
-    "metrics": MetricsConfig,
-    "log": LogConfig,
-}
 JOINS_THE_BUS = (
     *("up", "demo", "plant", "monitor", "record", "replay", "router"),
     *("view", "alive", "doctor", "status", "alarm", "playback"),
@@ -111,7 +95,7 @@ def check_settings(block: Block, path: Path) -> None:
     tables = read_settings(path)
     assert tables, f"line {block.line}: settings without a table"
     for table in tables:
-        section(KINDS[table], table, tables, {})
+        section(TABLES[table], table, tables, {})
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -170,7 +154,7 @@ def test_every_command_within_a_sentence_or_table_has_arguments_that_are_taken()
 
 
 def test_every_table_of_settings_is_read_by_its_own_structure() -> None:
-    assert tuple(KINDS) == SECTIONS
+    assert tuple(TABLES) == SECTIONS
 
 
 def test_there_is_an_example_of_each_addition() -> None:
