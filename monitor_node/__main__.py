@@ -17,6 +17,7 @@ from monitor_node.alarm_file import AlarmFile
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.health import NODE
+from monitor_node.other_monitors import OtherMonitors, log_report
 from monitor_node.state_file import StateFile
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
@@ -57,6 +58,7 @@ class MonitorNode(Monitor):
         self._said: dict[object, str] = {}
         self._rate = CommandRate()
         self.token = keys.monitor_token(config.plant, f"{start_ns:020d}-{secrets.token_hex(4)}")
+        self._others = OtherMonitors(self.token, lambda: (config.plant,))
         paths = [Path(name) for name in (config.alarm_state_file, config.state_file) if name is not None]
         if len({path.resolve() for path in paths}) < len(paths):
             raise InputError(f"state_file and alarm_state_file must be two files, got {paths[0]} for both")
@@ -76,6 +78,11 @@ class MonitorNode(Monitor):
             if line is not None:
                 log.warning(line)
 
+    @property
+    def tokens(self) -> tuple[str, ...]:
+        """Key expressions of the liveliness tokens that it subscribes to: of the plant's monitors, and of fleets."""
+        return keys.monitor_token(self.config.plant, "*"), keys.FLEET_TOKENS
+
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """See `Monitor`; alarms are stored and logged."""
         publications = super().on_message(message, now_ns)
@@ -94,13 +101,8 @@ class MonitorNode(Monitor):
         return reply, publications
 
     def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
-        """Log that another monitor of the plant came or went: two raise every alarm twice, and both answer commands."""
-        if token != self.token:
-            name = token.rpartition("/")[2]
-            if is_alive:
-                log.warning("another monitor watches this plant; stop one of them", plant=self.config.plant, other=name)
-            else:
-                log.info("the other monitor of this plant has gone", plant=self.config.plant, other=name)
+        """Log that another monitor of the plant, or a fleet with the plant in it, came or went."""
+        log_report(self._others.note(token, is_alive=is_alive))
         return []
 
     def on_tick(self, now_ns: int) -> list[Publication]:
@@ -194,7 +196,7 @@ def run(
                 history_s=inf if node.resumed else 0.0,
                 on_told=node.caught_up,
                 commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
-                tokens=(keys.monitor_token(config.plant, "*"),),
+                tokens=node.tokens,
                 on_alive=node.on_alive,
                 on_ready=lambda: announce(node, bus),
                 linger_s=LINGER_S,

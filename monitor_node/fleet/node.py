@@ -21,6 +21,7 @@ from monitor_node.fleet.watched import WatchedPlants
 from monitor_node.health import NODE
 from monitor_node.kept_aside import DAMAGED, OTHER_SETTINGS
 from monitor_node.monitor_state import OtherSettingsError
+from monitor_node.other_monitors import OtherMonitors, log_report
 from monitor_node.refusals import Refusals
 from monitor_node.seal import ForeignFileError
 from reactorwatch.contract import keys
@@ -102,6 +103,7 @@ class FleetNode(FleetMonitor):
         # The older of two with the same shard is in charge: names sort by the time of the start.
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
         self.crew = Crew(self.expression, shards.parsed(fleet.shard), name)
+        self._others = OtherMonitors(self.crew.token, lambda: self.plants)
         model = model_on_the_bus(config.model)
         super().__init__(
             config,
@@ -124,6 +126,12 @@ class FleetNode(FleetMonitor):
         """What it listens to."""
         return keys.samples_of(self.expression), f"{self.expression}/{keys.ALARM}/**"
 
+    @property
+    def tokens(self) -> tuple[str, ...]:
+        """Key expressions of the liveliness tokens that it subscribes to: of fleets, plants and plants' monitors."""
+        monitors = keys.monitor_token(self.expression.removeprefix(f"{keys.ROOT}/"), "*")
+        return keys.FLEET_TOKENS, f"{self.expression}/{keys.ALIVE}/*", monitors
+
     def _show(self, plant: str, ours: bool) -> None:
         token = keys.key(plant, keys.ALIVE, NODE)
         self._stored_at.pop(plant, None)
@@ -135,6 +143,8 @@ class FleetNode(FleetMonitor):
         if ours and self.crew.is_shared:
             self._changed.add(plant)  # another who was only cut off is to find that we have gone on from his state
         log.info("watching" if ours else "no longer watching", plant=plant)
+        for report in self._others.check(plant) if ours else ():
+            log_report(report)
         if ours and len(self._shown) < MOST_TOKENS:
             self._shown.add(token)
             self._bus.announce(token)
@@ -150,11 +160,7 @@ class FleetNode(FleetMonitor):
         """See `FleetMonitor`; if it is our own that went, others may have our plants."""
         if token == self.crew.token and not is_alive:
             self._absence.begins(now_ns)
-        topic = keys.parse(token)
-        if topic is not None and is_alive and token == keys.monitor_token(topic.plant, token.rpartition("/")[2]):
-            log.warning(
-                "a monitor of its own watches this plant, too; stop it or leave the plant out", plant=topic.plant
-            )
+        log_report(self._others.note(token, is_alive=is_alive))
         return self._attended(now_ns) + self._noted(super().on_alive(token, is_alive, now_ns))
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
@@ -348,8 +354,7 @@ def run(
 
 def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
     """Watch the plants until asked to stop."""
-    plants = node.expression
-    log.info("listening", plants=plants)
+    log.info("listening", plants=node.expression)
     serve(
         node,
         bus,
@@ -357,9 +362,9 @@ def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
         subscriptions=node.subscriptions,
         on_told=node.listens,
         on_messages=node.on_messages,
-        tokens=(node.crew.tokens, f"{plants}/{keys.ALIVE}/*", keys.monitor_token(plants.partition("/")[2], "*")),
+        tokens=node.tokens,
         on_alive=node.on_alive,
-        commands=tuple(f"{plants}/{keys.COMMAND}/{name}" for name in COMMANDS),
+        commands=tuple(f"{node.expression}/{keys.COMMAND}/{name}" for name in COMMANDS),
         on_ready=lambda: bus.announce(node.crew.token),
         linger_s=LINGER_S,
         on_publish=node.metrics.published if node.metrics is not None else None,

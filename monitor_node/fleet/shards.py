@@ -100,8 +100,8 @@ class Crew:
 
     def __init__(self, fleet: str, shard: Shard, name: str) -> None:
         self._fleet = blake2b(fleet.encode(), digest_size=8).hexdigest()
-        self._shard, self._name = shard, name
-        self._names: dict[int, set[str]] = {shard.number: {name}}
+        self._shard, self._name = shard, keys.fleet_member(name, fleet)
+        self._names: dict[int, set[str]] = {shard.number: {self._name}}
         self._unseen = set(range(1, shard.of + 1)) - {shard.number}
         self.is_shared = shard.of > 1
 
@@ -109,11 +109,6 @@ class Crew:
     def token(self) -> str:
         """The liveliness token that we show."""
         return keys.fleet_token(self._fleet, str(self._shard.of), str(self._shard.number), self._name)
-
-    @property
-    def tokens(self) -> str:
-        """The key expression of all tokens of the fleet."""
-        return keys.fleet_token(self._fleet, str(self._shard.of), "*", "*")
 
     def note(self, token: str, *, is_alive: bool) -> bool:
         """Take in that a monitor came or went; returns whether that was one of the fleet.

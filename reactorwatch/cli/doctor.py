@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from cryptography.exceptions import InvalidSignature
 
+from monitor_node.other_monitors import OtherMonitors
 from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
@@ -177,11 +178,12 @@ class _Listening:
         self._timeout_s = timeout_s
         self.alive: set[str] = set()
         self.said: dict[str, tuple[Health, float]] = {}
-        self.monitors: set[str] = set()
+        self.monitors = OtherMonitors("", lambda: ())
         self._settled: set[str] = set()
         self._changed = threading.Condition()
         bus.watch_alive(keys.all_of(plant, keys.ALIVE), self._on_token)
-        bus.watch_alive(keys.monitor_token(plant, "*"), self._on_monitor)
+        for tokens in (keys.monitor_token(plant, "*"), keys.FLEET_TOKENS):
+            bus.watch_alive(tokens, self._on_monitor)
         bus.subscribe_live(keys.key(plant, keys.HEALTH, "*"), self._on_health)
 
     def wait(self) -> None:
@@ -198,7 +200,7 @@ class _Listening:
 
     def _on_monitor(self, token: str, is_alive: bool) -> None:
         with self._changed:
-            (self.monitors.add if is_alive else self.monitors.discard)(token)
+            self.monitors.note(token, is_alive=is_alive)
 
     def _on_health(self, message: Encoded) -> None:
         topic = keys.parse(message.key)
@@ -235,9 +237,9 @@ def _nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Finding]:
                 yield Finding(node, f"is alive, and says nothing of itself within {timeout_s:g} s", cure)
         else:
             yield _node(node, *said[node])
-    if len(listening.monitors) > 1:
-        found = f"{len(listening.monitors)} of them watch {plant}: every alarm is raised as often"
-        yield Finding("monitors", found, "stop all but one; for a stand-by, start both with --plants")
+    if (monitors := listening.monitors.count(plant)) > 1:
+        found = f"{monitors} of them watch {plant}: every alarm is raised as often"
+        yield Finding("monitors", found, "stop all but one; for a stand-by, start both with the same --plants")
 
 
 def _node(node: str, health: Health, offset_s: float) -> Finding:

@@ -128,9 +128,26 @@ def fleet_token(fleet: str, of: str, number: str, name: str) -> str:
         fleet: what they share, as one part of a key.
         of: how many shards it has.
         number: of the monitor's shard.
-        name: of the monitor.
+        name: of the monitor, as `fleet_member` makes it.
     """
     return f"{ROOT}/{FLEET}/{ALIVE}/{fleet}/{of}/{number}/{name}"
+
+
+FLEET_TOKENS = fleet_token("*", "*", "*", "*")
+"""The key expression of the tokens of all monitors of all fleets."""
+
+
+def fleet_member(name: str, plants: str) -> str:
+    """The name of a fleet's monitor in its token, from which others see which plants the fleet watches.
+
+    >>> fleet_member("01", "reactor/north_*")
+    '01@north_+'
+
+    Args:
+        name: of the monitor, unlike any other's.
+        plants: the key expression of the fleet's plants. A key cannot hold its `*`, so `+` stands for it.
+    """
+    return f"{name}@{plants.removeprefix(f'{ROOT}/').replace('*', '+')}"
 
 
 class FleetToken(NamedTuple):
@@ -140,6 +157,15 @@ class FleetToken(NamedTuple):
     of: str
     number: str
     name: str
+
+    @property
+    def plants(self) -> str:
+        """The key expression of the fleet's plants; empty if the token does not say it."""
+        expression = f"{ROOT}/{self.name.partition('@')[2].replace('+', '*')}"
+        try:
+            return checked_plants(expression)
+        except ValueError:
+            return ""
 
 
 def parse_fleet_token(token: str) -> FleetToken | None:

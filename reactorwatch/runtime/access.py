@@ -146,7 +146,7 @@ def access_control(
     for plant in plants:
         root = f"{keys.ROOT}/{plant}"
         monitors = keys.monitor_token(plant, "*")
-        everything = [f"{root}/**", f"{root}/**/{MEMORY}", f"{root}/*/{PROOF}", monitors]
+        everything = [f"{root}/**", f"{root}/**/{MEMORY}", f"{root}/*/{PROOF}", monitors, keys.FLEET_TOKENS]
         reading = [
             _rule(plant, "hear", ("ingress",), HEAR_IN, everything),
             _rule(plant, "be told", ("egress",), HEAR_OUT, everything),
