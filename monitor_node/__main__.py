@@ -6,12 +6,13 @@ python -m monitor_node [settings.toml]
 import secrets
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from math import inf
 from pathlib import Path
 
 import structlog
 
+from monitor_node import suspicion
 from monitor_node.alarm_commands import COMMANDS
 from monitor_node.alarm_file import AlarmFile
 from monitor_node.config import MonitorConfig
@@ -34,6 +35,12 @@ from reactorwatch.runtime.serve import serve, stop_on_signals
 
 log = structlog.get_logger()
 
+PREPARE_EVERY_NS = 100_000_000
+"""Samples are handled between two parts of what looks for causes need, which take some hundredths of a second each."""
+
+PREPARED = object()
+"""Returned where no part is left."""
+
 LINGER_S = 0.5
 """Silence on the bus after which a monitor that was asked to stop takes everything as heard."""
 
@@ -51,12 +58,15 @@ class MonitorNode(Monitor):
     Attributes:
         resumed: whether it goes on from a stored state.
         token: the liveliness token of this monitor, unlike any other's.
+        preparation: makes, item by item, what looks for causes need; None: there is nothing to make.
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
         super().__init__(config, start_ns, model=model_on_the_bus(config.model))
         self._said: dict[object, str] = {}
         self._rate = CommandRate()
+        self.preparation: Iterator[None] | None = None
+        self._prepare_ns = start_ns
         self.token = keys.monitor_token(config.plant, f"{start_ns:020d}-{secrets.token_hex(4)}")
         self._others = OtherMonitors(self.token, lambda: (config.plant,))
         paths = [Path(name) for name in (config.alarm_state_file, config.state_file) if name is not None]
@@ -106,7 +116,14 @@ class MonitorNode(Monitor):
         return []
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """See `Monitor`; what was refused is logged, at most once a minute; what could not be stored is tried again."""
+        """See `Monitor`; what was refused is logged, at most once a minute; what could not be stored is tried again.
+
+        Until all is made that looks for causes need, a part of that is made.
+        """
+        if self.preparation is not None and now_ns >= self._prepare_ns:
+            self._prepare_ns = now_ns + PREPARE_EVERY_NS
+            if next(self.preparation, PREPARED) is PREPARED:
+                self.preparation = None
         report = self.refusals.report(now_ns)
         if report is not None:
             log.warning(report)
@@ -115,9 +132,10 @@ class MonitorNode(Monitor):
         return publications
 
     def next_tick_ns(self) -> int:
-        """See `Monitor`; or when it is to be stored."""
-        due_ns = None if self._file is None else self._file.due_ns()
-        return super().next_tick_ns() if due_ns is None else min(super().next_tick_ns(), due_ns)
+        """See `Monitor`; or when it is to be stored, or the next part of what looks for causes need to be made."""
+        stored_ns = None if self._file is None else self._file.due_ns()
+        prepared_ns = None if self.preparation is None else self._prepare_ns
+        return min(item for item in (super().next_tick_ns(), stored_ns, prepared_ns) if item is not None)
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """See `Monitor`; it is stored for the last time."""
@@ -181,6 +199,7 @@ def run(
         InputError: settings that the bus cannot use, or a damaged file of alarm states.
     """
     node = MonitorNode(config, time.time_ns())
+    node.preparation = suspicion.preparation(config, node.model)
     with served(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:

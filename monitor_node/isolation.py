@@ -21,7 +21,7 @@ Causes that imitate each other share the probability, as they should: no more ca
 """
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import exp, inf, isfinite, log, nan
 
@@ -33,10 +33,9 @@ from monitor_node.isolation_fit import Fit, Fitter, WayState
 from monitor_node.isolation_hypothesis import Hypothesis
 from monitor_node.isolation_stretch import HUBER
 from monitor_node.isolation_ways import linearisable
-from monitor_node.isolation_window import Row, Window, window_of
+from monitor_node.isolation_window import Row, Window, newest_rows, window_of
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
-from reactorwatch.process.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP
 from reactorwatch.process.step_budget import StepBudget, StepsSpentError
@@ -46,11 +45,15 @@ UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
 SHARE_OF_RAMPS = 0.3
 """How likely a cause is to grow, beforehand, rather than to set in at once."""
 
-LOOK_STEPS, LOOK_STEPS_A_ROW, SLOW_ROWS = 80_000, 200, 4
+LOOK_STEPS, LOOK_STEPS_A_ROW = 80_000, 200
 """Filter steps that a look may take: so many, and so many more for each row of the window, 200,000 for 600 rows. The
 largest faults of the catalogue take up to 180,000. A sensor that shows anything at all would take millions: filters
-then lose the plant and begin again row after row, and no cause explains it. Rows that are too far apart for two steps
-of the integrator are filtered one by one; the budget is then that many times as large."""
+then lose the plant and begin again row after row, and no cause explains it. The budget is the same however far rows are
+apart: a step takes as long on any way, and a look must not. So of rows some minutes apart the last looks at a large
+fault, over hundreds of rows, may stop where those of rows 0.1 min apart do not."""
+
+LEAST_ROWS = 100
+"""Of rows that are far apart at least so many are looked at, beside two for each row since the first alarm."""
 
 SUMMED_ROWS = (1, 5, 20)
 """Over which innovations are summed, to see whether something is left in them."""
@@ -132,28 +135,36 @@ class Isolation:
     @property
     def steps(self) -> int:
         """Filter steps that a look at the present rows may take."""
-        steps = LOOK_STEPS + LOOK_STEPS_A_ROW * (self._rows.maxlen or len(self._rows))
-        spacing = np.diff([row[0] for row in self._rows])
-        return steps * SLOW_ROWS if spacing.size and np.median(spacing) > LONGEST_ROW_MIN else steps
+        return LOOK_STEPS + LOOK_STEPS_A_ROW * (self._rows.maxlen or len(self._rows))
 
-    def suspects(self, not_before_min: float = -inf) -> list[Suspect]:
+    @property
+    def preparations(self) -> list[Callable[[], None]]:
+        """Make all functions and machine code that looks need, so that the first look takes as long as any other.
+
+        They are parts, of some hundredths of a second each, for the first isolation of a model in this process.
+        """
+        return [self._nominal.prepare, self._bank.prepare, *(item.prepare for item in self._fitter.hypotheses)]
+
+    def suspects(self, not_before_min: float = -inf, since_rows: int = 0) -> list[Suspect]:
         """The causes that come into question, likeliest first, and `UNKNOWN` among them.
 
         A look stops at a budget of filter steps. `UNKNOWN` is then the only suspect, and `stopped` is set.
 
         Args:
             not_before_min: nothing was wrong before.
+            since_rows: number of rows since the first alarm. Of rows that are far apart older ones are left out, but
+                not those in which the fault may have set in.
         """
         self.budget, self.stopped = StepBudget(self.steps), False
         try:
-            return self._compared(not_before_min)
+            return self._compared(newest_rows(tuple(self._rows), LEAST_ROWS + 2 * since_rows), not_before_min)
         except StepsSpentError:  # hypotheses of which some were fitted and some were not cannot be compared
             self.stopped = True
             return [_unknown(1.0)]
 
-    def _compared(self, not_before_min: float) -> list[Suspect]:
+    def _compared(self, rows: Sequence[Row], not_before_min: float) -> list[Suspect]:
         self._nominal.budget = self.budget
-        window = window_of(tuple(self._rows), self._nominal, not_before_min)
+        window = window_of(rows, self._nominal, not_before_min)
         if window is None:
             return [_unknown(1.0)]
         found_by_bank = self._bank.scan(window)

@@ -81,6 +81,10 @@ class Bank:
         self._upper = np.array([effect.upper for effect in effects])
         self._linearisation = Linearisation(model, noise, effects)
 
+    def prepare(self) -> None:
+        """Compile now what the first scan would compile."""
+        self._linearisation.prepare()
+
     def scan(self, window: Window) -> tuple[Scan, Scan]:
         """Compare all causes on the rows up to the first at which one stands out, and on all.
 

@@ -46,6 +46,10 @@ class Hypothesis:
         """Made when it is needed: it takes some milliseconds, and many causes never come into question."""
         return Filter(self._extended, self._noise)
 
+    def prepare(self) -> None:
+        """Make now what the first call of `loss` would make."""
+        self._filter.prepare()
+
     def limited(self, size: float, onset_min: float, end_min: float) -> float:
         """The physically possible size that is nearest to it; a ramp's is so until the end."""
         span = end_min - onset_min if self.profile is RAMP else 1.0

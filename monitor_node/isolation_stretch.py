@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from monitor_node.isolation_window import Window
+from reactorwatch.process.filled import filled
 from reactorwatch.process.filter import Filter, FilterState
 from reactorwatch.process.filter_record import FilterRecord
 from reactorwatch.process.innovations import Innovations
@@ -57,13 +58,16 @@ class Stretch:
         self.times = window.time_min[begin:rows]
         self.earliest_min, self.end_min = max(window.earliest_min, float(self.times[0])), float(self.times[-1])
         doubt = None if window.doubt is None else window.doubt.of_rows(part)
-        self._record = FilterRecord.of(window.time_min[part], window.inputs[part], window.measured[part], doubt=doubt)
-        self._known = np.isfinite(window.measured[part])
+        # Rows that are far apart are filtered one by one, thirty times as slowly, so rows are put in between.
+        rows_near = filled(window.time_min[part], window.inputs[part], window.measured[part], doubt)
+        self._own = rows_near.own
+        self._record = FilterRecord.of(rows_near.time_min, rows_near.inputs, rows_near.measured, doubt=rows_near.doubt)
+        self._known = np.isfinite(rows_near.measured)
         found = nominal.over(self._record, window.states[begin])
-        losses, w = self._losses(found, 0)
+        losses, self._w = self._losses(found, 0)
         self._before = [0.0, *np.cumsum(losses).tolist()]
         self._found, self._states = found, {0: window.states[begin]}
-        self.nothing = Loss(self._before[-1], w)
+        self.nothing = Loss(self._before[-1], self._w[self._own])
 
     def loss(self, kalman: Filter, onset_min: float) -> Loss:
         """That of a filter whose deviation sets in then.
@@ -76,7 +80,7 @@ class Stretch:
         if row == len(self._known):
             return self.nothing
         losses, w = self._losses(kalman.over(self._record.rest(row), self._state(row)), row)
-        return Loss(self._before[row] + float(np.sum(losses)), np.concatenate([self.nothing.w[:row], w]))
+        return Loss(self._before[row] + float(np.sum(losses)), np.concatenate([self._w[:row], w])[self._own])
 
     def _losses(self, found: Innovations, row: int) -> tuple[Array, Array]:
         """Of each row from one on, and the whitened innovations."""
@@ -84,7 +88,8 @@ class Stretch:
         w = np.where(self._known[row:], np.where(np.isfinite(found.whitened), found.whitened, LOST), 0.0)
         size = np.abs(w)
         within = np.minimum(size, HUBER)
-        divisors = np.where(np.isfinite(found.conditional_sd), found.conditional_sd, 1.0)
+        sd = found.conditional_sd
+        divisors = np.where(np.isfinite(sd) & (sd > 0.0), sd, 1.0)
         return np.sum(within * (size - 0.5 * within) + np.log(divisors), axis=1), w
 
     def _state(self, row: int) -> FilterState:

@@ -48,6 +48,10 @@ class Linearisation:
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
         self._errors = _compiled(model, tuple(effects)).with_noise(noise)
 
+    def prepare(self) -> None:
+        """Compile now what the first call of `ways` would compile."""
+        self._errors.prepare()
+
     def ways(self, window: Window) -> Ways:
         """Those between the rows of a window."""
         ways = self._errors.ways(

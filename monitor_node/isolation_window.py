@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from monitor_node.sampling import missing_rows
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import LONGEST_GAP_MIN, Filter, FilterState
+from reactorwatch.process.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import Array
 
 Row: TypeAlias = tuple[float, float, Sequence[float]]
@@ -35,6 +36,11 @@ _OF_THREE = 1.5**0.5  # standard deviation of a value less the mean of its neigh
 
 GAP_PERIODS = 5.0
 """Rows that are so many usual periods apart have a gap between them, in which nobody knows what the input was."""
+
+
+MOST_PIECES = 6_000
+"""Pieces of two integration steps that the way through a window has at most, beside one for each row: 600 rows that are
+a minute apart. A filter takes some microseconds for each, so of rows that are farther apart fewer are looked at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +137,19 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
         first_onset,
         doubt,
     )
+
+
+def newest_rows(rows: Sequence[Row], least: int = 0) -> Sequence[Row]:
+    """The newest rows between which there are no more than `MOST_PIECES` pieces.
+
+    Args:
+        rows: oldest first.
+        least: number of rows that are kept in any case.
+    """
+    apart = np.diff([row[0] for row in rows])
+    pieces = np.where((apart > 0.0) & (apart <= LONGEST_GAP_MIN), np.ceil(apart / LONGEST_ROW_MIN) - 1.0, 0.0)
+    before = int(np.searchsorted(np.cumsum(pieces[::-1]), MOST_PIECES, side="right")) + 1
+    return rows[-max(before, least, 1) :]
 
 
 def _doubt(time_min: Array, inputs: Array) -> Doubt | None:

@@ -8,16 +8,16 @@ this holds for a sensor that drifts, sticks or fails in any other way. What it c
 from collections.abc import Iterable, Sequence
 from math import isfinite, nan, sqrt
 
-from monitor_node.isolation_window import Row
+from monitor_node.isolation_window import MOST_PIECES, Row, newest_rows
 from monitor_node.stored_state import StoredState
 from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.step_budget import A_ROW_ALONE, StepBudget, StepsSpentError
+from reactorwatch.process.step_budget import A_ROW_ALONE, A_WALK, StepBudget, StepsSpentError
 
 MARGIN_MIN = 1.0
 """So long before the onset that was found the sensor is left out already."""
 
-START_STEPS, START_STEPS_A_ROW = 25_000, A_ROW_ALONE
+START_STEPS, START_STEPS_A_ROW = 25_000 + A_WALK * MOST_PIECES, A_ROW_ALONE
 """Filter steps that the rows from before may take: enough for each row and a search for steady states."""
 
 
@@ -46,7 +46,7 @@ class Reconstruction:
         self._place = place
         self._variance = noise.measurement_sd[place] ** 2
         self._input = nan
-        past = list(rows)
+        past = newest_rows(list(rows))
         self._filter.budget = StepBudget(START_STEPS + START_STEPS_A_ROW * len(past))
         try:
             for time_min, input_value, measured in past:

@@ -22,7 +22,7 @@ from monitor_node.references import ArxReference, ArxReferenceState, ProcessRefe
 from monitor_node.sampling import SamplingPeriod
 from monitor_node.signal_range import ranges_of
 from monitor_node.signal_watch import SignalWatch
-from monitor_node.suspicion import Suspicion
+from monitor_node.suspicion import Suspicion, has_causes
 from monitor_node.training import MOST_REFUSALS, NO_VALUE, Trained, Training
 from monitor_node.watch_state import WatchedState, WatchState
 from reactorwatch.contract import keys
@@ -330,9 +330,7 @@ class PlantWatch:
         self._suspicion = self._new_suspicion(reference)
 
     def _new_suspicion(self, reference: Reference) -> Suspicion | None:
-        if not (self._config.isolation and isinstance(reference, ProcessReference)):
-            return None
-        if reference.model.name != cstr().name:  # the causes are those of the reactor
+        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.model)):
             return None
         return Suspicion(self._config, self._board, reference)
 

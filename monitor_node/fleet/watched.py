@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator
 
 import msgspec
 
+from monitor_node import suspicion
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.dues import Dues
@@ -44,6 +45,7 @@ class WatchedPlants:
     def __init__(self, config: MonitorConfig, start_ns: int, model: ProcessModel | None, *, points: bool) -> None:
         self._config, self._model, self._points = config, model, points
         first = Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
+        self._first_model = first.model
         self.alarms = tuple(alarm.alarm for alarm in first.alarms.all_alarms())
         form = None if points or first.model is None else QuietForm.of(config, first.model)
         self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
@@ -72,6 +74,8 @@ class WatchedPlants:
         monitors of the fleet would take us for gone.
         """
         RecursiveLeastSquares(1).update([1.0], 1.0)
+        for _ in suspicion.preparation(self._config, self._first_model):
+            pass
         if self._quiet is not None:
             self._quiet.prepare()
 

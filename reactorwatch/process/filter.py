@@ -49,7 +49,7 @@ from reactorwatch.process.filter_stretches import Stretch, Stretches, alone
 from reactorwatch.process.innovations import Innovation, Innovations
 from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import Array, ProcessModel
-from reactorwatch.process.step_budget import A_BEGINNING, A_ROW_ALONE, A_RUN, A_SEARCH, StepBudget
+from reactorwatch.process.step_budget import A_BEGINNING, A_ROW_ALONE, A_RUN, A_SEARCH, A_WALK, StepBudget
 
 LONGEST_GAP_MIN = 30.0
 
@@ -301,6 +301,11 @@ class Filter:
         said, known = found is not self._nothing, self._time_min is not None
         told[row], memory[row] = self._told if said else nan, self._memory if said or known else nan
 
+    def prepare(self) -> None:
+        """Make now what is otherwise made at its first use; filters of the same model share most of it."""
+        self.code.prepare()
+        _ = self._walk, self._beginning
+
     @cached_property
     def code(self) -> RowCode:
         """Of its rows, see `filter_step`."""
@@ -341,6 +346,7 @@ class Filter:
     def _walked(self, memory: Array, inputs: Sequence[float], edges: Sequence[float]) -> Array:
         """State and covariance after some steps, two by two."""
         walk = self._walk
+        self._spend(A_WALK * (len(edges) // 2))
         walk.arguments[2][0] = self._constants
         for begin, middle, end in zip(edges[:-2:2], edges[1:-1:2], edges[2::2], strict=True):
             walk.arguments[0][0] = memory
@@ -409,8 +415,9 @@ class Filter:
         self._time_min = None
         searches = self._beginning.searches
         found = self._beginning.at(time_min, inputs, measured, self._noise.measurement_sd, self._changes)
-        self._spend(A_BEGINNING + A_SEARCH * (self._beginning.searches - searches))
+        self._spend(A_SEARCH * (self._beginning.searches - searches))
         if found is not None:
+            self._spend(A_BEGINNING)
             x, P = found
             if self._lasting and self._learned:
                 self._keep_lasting(x, P)

@@ -25,7 +25,7 @@ from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_step import exponential
 from reactorwatch.process.integrate import LONGEST_STEP_MIN, passed_min, symbolic_step
-from reactorwatch.process.machine_code import RowCode
+from reactorwatch.process.machine_code import LANES, RowCode
 from reactorwatch.process.model import Array, ProcessModel
 
 _LEAST_PIVOT = 1e-12
@@ -144,6 +144,15 @@ class FilterErrors:
             F = np.where(anew, kept, F)
             G, H, D, K = (np.where(anew, 0.0, item) for item in (G, H, D, K))
         return Ways(*(np.ascontiguousarray(item) for item in (F, G, H, D, K, L_inverse, w)))  # once, for all kernels
+
+    def prepare(self) -> None:
+        """Compile now what `ways` needs, by calls on a made-up path: for one row, and for as many as taken at once."""
+        n_x, n_u, n_y = len(self.model.states), len(self.model.inputs), len(self.model.outputs)
+        for rows in (2, LANES + 1):
+            x = np.tile([state.scale for state in self.model.states], (rows, 1))
+            P, nothing = np.tile(np.eye(n_x), (rows, 1, 1)), np.zeros((rows, n_y))
+            time_min = np.linspace(0.0, LONGEST_STEP_MIN, rows)
+            self.ways(time_min, np.ones((rows, n_u)), x, P, nothing, np.zeros((rows, n_y), dtype=np.bool_))
 
     def about(self, time_min: Array, inputs: Array, x: Array, doubt: Doubt | None = None) -> "Path":
         """The equations along a path that need not be a filter's.

@@ -54,8 +54,8 @@ class Beginning:
         self._points: list[SteadyState] = []
         self._wide = np.diag(np.square([START_SD * state.scale for state in own.states]))
         self._memory = np.array([state.scale * (state.name in model.at_rest) for state in model.states])
-        self._completed = ArrayFunction(_with_derivative(rest_function(model)))
-        self._begun = ArrayFunction(_with_derivative(reset_function(model)))
+        completed, begun = _memory_functions(model)
+        self._completed, self._begun = ArrayFunction(completed), ArrayFunction(begun)
 
     def at(
         self,
@@ -162,6 +162,12 @@ def corrected_function(model: ProcessModel) -> ca.Function:
         P = rest @ P @ rest.T + K @ K.T * r[place]
     after = ca.fmin(ca.fmax(x + change, lower), upper)
     return ca.Function("corrected", [x, u, p, t, y, r, wide], [after, ca.densify(P)])
+
+
+@lru_cache(maxsize=COMPILED)
+def _memory_functions(model: ProcessModel) -> tuple[ca.Function, ca.Function]:
+    """`rest_function` and `reset_function`, with their derivatives."""
+    return _with_derivative(rest_function(model)), _with_derivative(reset_function(model))
 
 
 def _with_derivative(function: ca.Function) -> ca.Function:

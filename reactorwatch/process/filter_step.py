@@ -55,6 +55,7 @@ def row_function(model: ProcessModel) -> ca.Function:
     return ca.Function("row", [memory, new, constants], results, ["memory", "new", "constants"], ["after", "told"])
 
 
+@lru_cache(maxsize=COMPILED)
 def walk_function(model: ProcessModel) -> ca.Function:
     """Part of a way without a measurement: (memory, [inputs, time, first step, second step], constants) -> memory."""
     n_u = len(model.inputs)
@@ -64,6 +65,7 @@ def walk_function(model: ProcessModel) -> ca.Function:
     return ca.Function("walk", [memory, new, constants], [ca.densify(ca.vertcat(x, ca.vec(P)))])
 
 
+@lru_cache(maxsize=COMPILED)
 def output_function(model: ProcessModel) -> ca.Function:
     """(x, u, p, t) -> (y, dy/dx)."""
     x, u, p = model.arguments()

@@ -124,6 +124,12 @@ class RowCode:
         for count, array in zip(self._frame.counts, results, strict=True):
             _check(array, rows * count)
 
+    def prepare(self) -> None:
+        """Compile now what is otherwise compiled at the first use."""
+        _ = self._alone
+        if not self._frame.chained:
+            _ = self._together
+
     @cached_property
     def address(self) -> int:
         """Where the machine code is, for kernels (`compiled.call_at`).

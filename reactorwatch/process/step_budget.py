@@ -11,8 +11,12 @@ A_RUN = 100
 A_ROW_ALONE = 25
 """Steps for a row that is filtered by itself."""
 
+A_WALK = 3
+"""Steps for two integration steps on the way to such a row, other than the last two."""
+
 A_BEGINNING = 250
-"""Steps for a filter that begins at what is measured, and for the stop of the machine code that this is."""
+"""Steps for a filter that begins at what is measured, and for the stop of the machine code that this is. Where nothing
+is measured it waits, which costs no more than a row by itself."""
 
 A_SEARCH = 12_000
 """Steps for a search for steady states, from which a filter begins where measurements do not give the whole state."""

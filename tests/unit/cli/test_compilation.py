@@ -26,8 +26,17 @@ def register(*function, **options):
 
 
 numba.njit = register
+from monitor_node.config import MonitorConfig
+from monitor_node.suspicion import preparation
 from reactorwatch.cli import compilation
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.machine_store import MachineStore
 
+made, keep = [], MachineStore._keep
+MachineStore._keep = lambda self, path, code: made.append(path.name)
+parts = sum(1 for _ in preparation(MonitorConfig(), cstr()))
+MachineStore._keep = keep
+print(parts, len(made))
 compilation.FAULT = "feed_temperature:step:3@40min"
 compilation.compile_kernels()
 print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
@@ -39,7 +48,9 @@ def test_another_record_finds_every_kernel_compiled() -> None:
     command = [sys.executable, "-m", "reactorwatch", "compile"]
     subprocess.run(command, check=True, capture_output=True)
     run = subprocess.run([sys.executable, "-c", PROGRAM], check=True, capture_output=True, text=True)
-    hits, missed = run.stdout.splitlines()
+    prepared, hits, missed = run.stdout.splitlines()
+    parts, made = map(int, prepared.split())
+    assert (parts > 10, made) == (True, 0)  # all that a look for causes needs was on the disk
     assert int(hits) > 10
     assert missed == "[]"
 

@@ -1,0 +1,211 @@
+"""The first look for causes of a process costs what later ones cost, and no more where rows are far apart."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from monitor_node import __main__ as monitor_main
+from monitor_node import suspicion
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from monitor_node.fleet import node as fleet_node
+from monitor_node.fleet.config import FleetConfig
+from monitor_node.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
+from monitor_node.isolation_window import MOST_PIECES, newest_rows
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.process import filter_errors
+from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.process.cstr import cstr
+from reactorwatch.process.filter_start import corrected_function
+from reactorwatch.process.filter_step import row_code, row_function, walk_function
+from reactorwatch.process.machine_code import RowCode
+from reactorwatch.process.step_budget import A_SEARCH
+from reactorwatch.runtime.config import BusConfig
+
+from .faulty import SENSORS
+from .samples import leaking_run, samples
+
+CONFIG = MonitorConfig(training_min=15.0)
+ROWS = 600
+
+
+class Work:
+    """Counts what is compiled, and the rows that filters go through."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.compiled = self.calls = self.machine_rows = 0
+        self._made = self._functions()
+        compile_, fill, call = RowCode._compiled, RowCode.fill, ArrayFunction.__call__
+
+        def compiled(code: RowCode, lanes: int) -> Any:
+            self.compiled += 1
+            return compile_(code, lanes)
+
+        def filled(code: RowCode, rows: int, *arrays: Any) -> int:
+            done = fill(code, rows, *arrays)
+            self.machine_rows += done if code._frame.chained else 0
+            return done
+
+        def called(function: ArrayFunction) -> None:
+            self.calls += 1
+            call(function)
+
+        monkeypatch.setattr(RowCode, "_compiled", compiled)
+        monkeypatch.setattr(RowCode, "fill", filled)
+        monkeypatch.setattr(ArrayFunction, "__call__", called)
+
+    @staticmethod
+    def _functions() -> int:
+        kept = (row_function, row_code, walk_function, corrected_function)
+        return sum(item.cache_info().misses for item in kept) + len(filter_errors._whitened.signatures)  # type: ignore[attr-defined]
+
+    @property
+    def made(self) -> int:
+        """Number of functions made and pieces of machine code compiled so far."""
+        return self.compiled + self._functions() - self._made
+
+    def forget(self) -> None:
+        """Count from now on."""
+        self.compiled = self.calls = self.machine_rows = 0
+        self._made = self._functions()
+
+
+@pytest.fixture
+def work(monkeypatch: pytest.MonkeyPatch) -> Work:
+    return Work(monkeypatch)
+
+
+def looked_at(fault: str, period_min: float, after: int) -> Isolation:
+    """An isolation with the rows of a record with a fault, up to some rows after its onset."""
+    onset_min = ROWS * period_min
+    config = PlantConfig(seed=4, period_min=period_min, faults=(f"{fault}@{onset_min}min",))
+    record = simulate_record(config, ROWS + after)
+    columns = (record.time_min, record.columns["qc"], record.columns["C"], record.columns["T"])
+    isolation = Isolation(cstr(), SENSORS, ROWS)
+    for time_min, flow, concentration, temperature in zip(*(item.tolist() for item in columns), strict=True):
+        isolation.add(time_min, flow, (concentration, temperature))
+    return isolation
+
+
+def test_looks_of_a_monitor_that_is_prepared_compile_nothing(work: Work, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model of its own, of which this process has compiled nothing yet."""
+    steps: list[int] = []
+    suspects = Isolation.suspects
+
+    def noted(self: Isolation, *arguments: Any) -> list[Any]:
+        before = work.made
+        found = suspects(self, *arguments)
+        steps.append(work.made - before)
+        return found
+
+    monkeypatch.setattr(Isolation, "suspects", noted)
+    monitor = Monitor(CONFIG, 0, points=False, model=replace(cstr()))
+    work.forget()
+    assert sum(1 for _ in suspicion.preparation(CONFIG, monitor.model)) > 10
+    assert work.made > 40
+    for message in samples(*leaking_run(-0.2, 18.0, 23.0, seed=3)):
+        monitor.on_message(message, 0)
+    assert len(steps) > 1
+    assert set(steps) == {0}
+
+
+@pytest.mark.parametrize("config", [MonitorConfig(isolation=False), MonitorConfig(reference="arx")])
+def test_a_monitor_that_looks_for_no_causes_prepares_nothing(config: MonitorConfig) -> None:
+    assert list(suspicion.preparation(config, Monitor(config, 0).model)) == []
+
+
+def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    """There it is contained, counted and logged; a monitor starts all the same."""
+
+    def fail(_: object) -> None:
+        raise RuntimeError("made on purpose")
+
+    monkeypatch.setattr("monitor_node.isolation_hypothesis.Hypothesis.prepare", fail)
+    assert len(list(suspicion.preparation(CONFIG, cstr()))) == 2
+    monkeypatch.setattr("monitor_node.isolation.Bank", fail)
+    assert list(suspicion.preparation(CONFIG, cstr())) == []
+    monitor = Monitor(CONFIG, 0, points=False)
+    for message in samples(*leaking_run(-0.2, 18.0, 20.0, seed=3)):
+        monitor.on_message(message, 0)
+    assert monitor.failures.by_stage["isolation"] >= 1
+
+
+def test_a_monitor_prepares_part_by_part_once_it_listens_and_then_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    prepared: list[int] = []
+
+    def preparation(*_: object) -> Iterator[None]:
+        for part in range(3):
+            prepared.append(part)
+            yield
+
+    def serve(node: monitor_main.MonitorNode, *_: object, **__: object) -> None:
+        assert prepared == []
+        for parts in (1, 2, 3, 3, 3):
+            now_ns = max(node.next_tick_ns(), node._prepare_ns)
+            node.on_tick(now_ns)
+            node.on_tick(now_ns)  # within the tenth of a second
+            assert len(prepared) == parts
+        assert node.next_tick_ns() > now_ns + 10**9  # health: nothing else is due
+
+    class Closed:
+        def close(self) -> None:
+            """Nothing is open."""
+
+    monkeypatch.setattr(suspicion, "preparation", preparation)
+    monkeypatch.setattr(monitor_main, "serve", serve)
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_: Closed())
+    monitor_main.run(MonitorConfig(), BusConfig())
+    assert prepared == [0, 1, 2]
+
+
+def test_a_fleet_prepares_before_it_joins_the_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    def preparation(*_: object) -> Iterator[None]:
+        done.append("prepared")
+        yield
+
+    monkeypatch.setattr(suspicion, "preparation", preparation)
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_, **__: done.append("connected"))
+    fleet_node.run(CONFIG, FleetConfig(plants="reactor/*"), BusConfig())
+    assert done == ["prepared", "connected"]
+
+
+@pytest.mark.parametrize("period_min", [0.1, 0.2, 1.0, 15.0])
+def test_a_look_takes_no_more_steps_where_rows_are_far_apart(period_min: float, work: Work) -> None:
+    """What is counted as a step is at least a row of machine code, or a third of a call on the way to a single row."""
+    isolation = looked_at("coolant_flow:step:-0.3", period_min, 100)
+    work.forget()
+    isolation.suspects(since_rows=100)
+    spent, limit = isolation.budget.spent, LOOK_STEPS + LOOK_STEPS_A_ROW * ROWS
+    assert spent <= limit + A_SEARCH + MOST_PIECES + ROWS
+    assert work.machine_rows + 3 * work.calls <= spent
+
+
+@pytest.mark.parametrize(
+    ("fault", "period_min", "after"),
+    [
+        ("coolant_flow:step:-0.05", 0.2, 100),
+        ("temperature_bias:step:30", 0.5, 30),
+        ("temperature_bias:step:30", 1.0, 10),
+    ],
+)
+def test_a_fault_is_found_within_the_budget_where_rows_are_far_apart(fault: str, period_min: float, after: int) -> None:
+    isolation = looked_at(fault, period_min, after)
+    likeliest = isolation.suspects(since_rows=after)[0]
+    assert not isolation.stopped
+    assert (likeliest.cause, likeliest.probability > 0.5) == (fault.split(":")[0], True)
+
+
+@pytest.mark.parametrize("period_min", [0.1, 1.0, 5.0, 29.0])
+def test_of_rows_far_apart_the_newest_are_looked_at_and_all_since_the_alarm(period_min: float) -> None:
+    rows = [(period_min * place, 100.0, (0.1, 440.0)) for place in range(ROWS)]
+    kept = newest_rows(rows)
+    pieces = max(round(period_min / 0.1) - 1, 0)
+    assert list(kept) == rows[-len(kept) :]
+    assert pieces * (len(kept) - 1) <= MOST_PIECES
+    assert len(kept) == ROWS or pieces * len(kept) > MOST_PIECES
+    assert len(newest_rows(rows, 400)) == max(400, len(kept))
