@@ -14,8 +14,15 @@ anew, its clock was set, or it paused. One sample does not tell which, but the n
   the plant was started anew. (Fewer where rows wait for fewer others: those of one signal must find the others'.)
 
 None of these is lost: a pause costs a delay of one sample, a clock that was set one of two, a plant that begins anew
-one of seven; and of two plants with one name the first is watched on as long as it lives. What is decided depends on
-the samples alone, so a replay decides the same.
+one of seven; and of two plants with one name the first is watched on as long as its samples keep coming. What is
+decided depends on the samples alone, so a replay decides the same.
+
+The limit of that: where the first of two plants is held up, by a busy machine, while eight samples of the second come,
+the second is watched, and the first refused when it is back. Until then all that a sample holds, and a recording of it,
+is the same as after a restart of the first. Its liveliness token does not tell: both plants show the same, recordings
+hold none, and that of a killed plant may outlast it by a lease of ten seconds. A larger `CONFIRMED` would only trade
+longer stalls for a later start after each restart. To tell the two apart at once, a sample would have to name the
+process that published it.
 """
 
 from dataclasses import dataclass, field

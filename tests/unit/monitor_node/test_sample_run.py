@@ -123,6 +123,25 @@ def test_a_damaged_time_or_number_is_refused(seed: int) -> None:
         assert refused == [strange]
 
 
+@pytest.mark.parametrize("held_up", range(1, CONFIRMED))
+def test_a_second_plant_is_refused_while_the_first_is_held_up_for_less_than_a_restart_takes(held_up: int) -> None:
+    """When it goes on, both take turns."""
+    first, second = regular(0, 121), regular(0, held_up + 20, -9000 * PERIOD)
+    turns = [sample for pair in zip(first[100:], second[held_up:], strict=False) for sample in pair]
+    assert taken([*first[:100], *second[:held_up], *turns, first[120]]) == (first, second)
+
+
+def test_a_first_plant_that_is_held_up_for_longer_cannot_be_told_from_one_that_was_started_again() -> None:
+    """The samples up to the decision are the same, so the second is watched, and the first refused when it is back."""
+    first, second = regular(0, 120), regular(0, 60, -9000 * PERIOD)
+    restart = [*first[:100], *second[:CONFIRMED]]
+    assert taken(restart) == (restart, [])
+    turns = [sample for pair in zip(second[CONFIRMED:], first[100:], strict=False) for sample in pair]
+    believed, refused = taken([*restart, *turns, *second[CONFIRMED + 20 :]])
+    assert believed == [*first[:100], *second]
+    assert refused == first[100:]
+
+
 def test_memory_is_bounded() -> None:
     """Whatever comes, no more than the samples that would be a run are held."""
     draw, run = random.Random(5), SampleRun()
