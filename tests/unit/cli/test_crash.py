@@ -18,13 +18,14 @@ from hypothesis import strategies as st
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli import crash, diagnosis
+from reactorwatch.cli import diagnosis
 from reactorwatch.cli.main import main
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.records.csv_file import write_csv
+from reactorwatch.runtime import crash
 from reactorwatch.runtime.config import read_settings
 from recorder.config import RecorderConfig
 from recorder.entry import Entry
