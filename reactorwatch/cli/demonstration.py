@@ -129,8 +129,7 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
     nodes = {"plant": plant, "monitor": monitor}
     about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **nodes})}
     recorder = RecorderConfig(plant=PLANT, out=str(recording), linger_s=LINGER_S, black_box_min=0.0, about=about)
-    bus = open_router(site, join)
-    try:
+    with open_router(site, join) as bus:
         make_folder(folder, "--out")
         tables = {**nodes, "recorder": heard_by(recorder, site)}
         settings = write_node_settings(folder / SETTINGS_FILE, tables, join, NODES)
@@ -139,8 +138,6 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
             if not _run_nodes(bus, stop, settings, folder, plant):
                 say(f"stopped; what was recorded until then is in {folder}", err=True)
                 return 130
-    finally:
-        bus.close()
     return _conclude(folder, recording, monitor, str(specification))
 
 

@@ -76,8 +76,7 @@ def run_until_stopped(
     metrics = section(MetricsConfig, "metrics", tables, {})
     if Path(recorder.out).suffix != ENDING:
         check_folder_name(Path(recorder.out), "--out")
-    bus = open_router(site, join)  # before anything is written: an address that is taken leaves nothing behind
-    try:
+    with open_router(site, join):  # before anything is written: an address that is taken leaves nothing behind
         tables_written = {"plant": plant, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
         nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", "plant")
         settings = _write_down(recorder, plant.seed, {**tables_written, "log": log_config}, join, nodes)
@@ -94,8 +93,6 @@ def run_until_stopped(
                         log.info("ended by itself", node=node, code=code)
                     return 1 if any(ended.values()) else 0
             return 0
-    finally:
-        bus.close()
 
 
 def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig, out: Path | None) -> DiagnosisConfig:
