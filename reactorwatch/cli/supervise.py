@@ -13,6 +13,7 @@ import structlog
 
 from diagnosis.practice import checked_tolerance
 from monitor_node.config import MonitorConfig
+from monitor_node.watch import check_promise
 from plant_node.config import PlantConfig
 from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.joining import VIEWER, Joining, heard_by, joining, open_router, write_node_settings
@@ -68,6 +69,10 @@ def run_until_stopped(
     waiting = {"wait_for": ["monitor", "recorder"]}
     plant = section(PlantConfig, "plant", {"plant": {**waiting, **tables.get("plant", {})}}, flags)
     monitor = section(MonitorConfig, "monitor", tables, {"plant": name or plant.name})
+    try:
+        check_promise(monitor, plant.period_min)
+    except InputError as error:
+        raise InputError(f"settings [monitor]: {error}") from error
     of_recorder = {"recorder": {"out": DEFAULT_OUT, **tables.get("recorder", {})}}
     recorder_flags = {"plant": name or plant.name, "out": str(out) if out is not None else None}
     recorder = heard_by(section(RecorderConfig, "recorder", of_recorder, recorder_flags), site)
