@@ -12,7 +12,8 @@ from math import isfinite, nan
 from monitor_node import false_alarm_budget
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alignment import Row
-from monitor_node.chart_watch import ChartWatch
+from monitor_node.chart_watch import ChartWatch, alarm_names
+from monitor_node.charts.parameters import ParameterT2
 from monitor_node.config import MonitorConfig
 from monitor_node.drift_watch import DriftWatch
 from monitor_node.failures import Failures
@@ -32,6 +33,22 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+
+
+def check_promise(config: MonitorConfig, period_min: float) -> None:
+    """Check that the false alarms that the settings promise can be kept where every output is watched.
+
+    Args:
+        config: how the plant is watched.
+        period_min: of the rows.
+
+    Raises:
+        InputError: charts cannot keep the promise.
+    """
+    outputs = len(config.outputs)
+    of_drift = outputs if ParameterT2.name in config.charts else 0
+    alarms = len(alarm_names(config)) + SignalWatch.CHANCE_ALARMS * outputs + of_drift
+    false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
 
 
 class PlantWatch:
@@ -86,6 +103,7 @@ class PlantWatch:
         self._withheld = (False,) * len(config.outputs)
         self._evaluated = [True] * len(config.outputs)
         self._begin_training(None)
+        self._promise_checked = False
         self.notes: list[str] = []
         self.rows_watched = 0
         self.left_out: dict[str, str] = {}
@@ -258,6 +276,9 @@ class PlantWatch:
         follows: bool,
     ) -> None:
         config = self._config
+        if not self._promise_checked and self._sampling.state.period_ns is not None:
+            check_promise(config, self._sampling.period_ns / MINUTE_NS)
+            self._promise_checked = True
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
         trained_min = (time_ns - self._began_ns) / MINUTE_NS

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reactorwatch.cli.asking import PATIENCE_S, NoAnswerError, ask
-from reactorwatch.cli.options import Endpoint, Json, Plant, Settings
+from reactorwatch.cli.options import LONGEST_WAIT_S, Endpoint, Json, Plant, Settings, sendable
 from reactorwatch.cli.printing import say
 from reactorwatch.contract.keys import ACKNOWLEDGE_RECORDER, LIST_RECORDER_ALARMS, RECORDING
 from reactorwatch.errors import InputError
@@ -14,10 +14,14 @@ from reactorwatch.errors import InputError
 if TYPE_CHECKING:
     from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 
-Name = Annotated[str, typer.Argument(help="As `alarm list` names it: shewhart/T.", show_default=False)]
-By = Annotated[str, typer.Option("--by", help="Who you are.", show_default=False)]
-Comment = Annotated[str, typer.Option("--comment", help="Why.", show_default=False)]
-Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the monitor.", min=0.1)]
+Name = Annotated[
+    str, typer.Argument(help="As `alarm list` names it: shewhart/T.", callback=sendable, show_default=False)
+]
+By = Annotated[str, typer.Option("--by", help="Who you are.", callback=sendable, show_default=False)]
+Comment = Annotated[str, typer.Option("--comment", help="Why.", callback=sendable, show_default=False)]
+Timeout = Annotated[
+    float, typer.Option("--timeout", help="Seconds to wait for the monitor.", min=0.1, max=LONGEST_WAIT_S)
+]
 
 MONITOR, RECORDER = "monitor", "recorder"
 

@@ -28,6 +28,7 @@ from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
 from reactorwatch.runtime.bus_zenoh import ZenohBus
+from reactorwatch.runtime.config import section
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal, stop_on_signals
@@ -113,22 +114,23 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
     configure()
     specification = parse_fault(fault)
     join = joining(site, PLANT, {}, free_endpoint() if site is None else None)
-    folder = _new_folder(out)
+    folder = _free_folder(out)
     recording = folder / f"{PLANT}.mcap"
-    plant = PlantConfig(
-        name=PLANT,
-        speed=speed,
-        duration_min=duration_min,
-        seed=seed,
-        faults=(str(specification),),
-        wait_for=("monitor", "recorder"),
-    )
+    of_plant = {
+        "name": PLANT,
+        "speed": speed,
+        "duration_min": duration_min,
+        "seed": seed,
+        "faults": (str(specification),),
+        "wait_for": ("monitor", "recorder"),
+    }
+    plant = section(PlantConfig, "plant", {}, of_plant)
     monitor = MonitorConfig(plant=PLANT)
     nodes = {"plant": plant, "monitor": monitor}
     about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **nodes})}
     recorder = RecorderConfig(plant=PLANT, out=str(recording), linger_s=LINGER_S, black_box_min=0.0, about=about)
-    bus = open_router(site, join)
-    try:
+    with open_router(site, join) as bus:
+        make_folder(folder, "--out")
         tables = {**nodes, "recorder": heard_by(recorder, site)}
         settings = write_node_settings(folder / SETTINGS_FILE, tables, join, NODES)
         say(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
@@ -136,16 +138,14 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
             if not _run_nodes(bus, stop, settings, folder, plant):
                 say(f"stopped; what was recorded until then is in {folder}", err=True)
                 return 130
-    finally:
-        bus.close()
     return _conclude(folder, recording, monitor, str(specification))
 
 
-def _new_folder(out: Path | None) -> Path:
+def _free_folder(out: Path | None) -> Path:
     folder = out or Path("runs") / time.strftime("demo-%Y%m%d-%H%M%S")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(f"--out {folder}: is there already and not empty; choose another, or remove it")
-    return make_folder(folder, "--out")
+    return folder
 
 
 def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folder: Path, plant: PlantConfig) -> bool:

@@ -4,7 +4,8 @@ In a site each node shows a certificate of its own, so each has settings of its 
 settings that are written down beside them are for who looks on, as the site's viewer.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from reactorwatch.cli.options import existing
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.bus_zenoh import ZenohBus, router, router_from_file
+from reactorwatch.runtime.bus_zenoh import ZenohBus, log_refusals, router, router_from_file
 from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.site import ROUTER, ROUTER_SETTINGS, SETTINGS
 from recorder.config import RecorderConfig
@@ -56,15 +57,22 @@ def joining(site: Path | None, plant: str, tables: dict[str, dict[str, Any]], en
     return found
 
 
-def open_router(site: Path | None, join: Joining) -> ZenohBus:
-    """Be the router that the nodes join.
+@contextmanager
+def open_router(site: Path | None, join: Joining) -> Iterator[ZenohBus]:
+    """Be the router that the nodes join, while the context lasts; that of a site logs what it refuses.
 
     Raises:
         InputError: nothing can listen at its address, or it has no settings.
     """
-    if site is None:
-        return router(join[VIEWER])
-    return router_from_file(existing(site.absolute() / ROUTER / ROUTER_SETTINGS))
+    with nullcontext() if site is None else log_refusals():
+        if site is None:
+            bus = router(join[VIEWER])
+        else:
+            bus = router_from_file(existing(site.absolute() / ROUTER / ROUTER_SETTINGS))
+        try:
+            yield bus
+        finally:
+            bus.close()
 
 
 def heard_by(recorder: RecorderConfig, site: Path | None) -> RecorderConfig:

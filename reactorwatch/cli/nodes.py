@@ -7,6 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from reactorwatch.cli.options import (
+    LONGEST_WAIT_S,
     Columns,
     Diagnose,
     Endpoint,
@@ -247,7 +248,7 @@ def alive(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    timeout: Annotated[float, typer.Option(help="Seconds to wait for it.", min=0.1)] = 5.0,
+    timeout: Annotated[float, typer.Option(help="Seconds to wait for it.", min=0.1, max=LONGEST_WAIT_S)] = 5.0,
 ) -> None:
     """Is a node there? A health check: ends with 0 or 1."""
     from reactorwatch.cli.liveliness import comes_alive

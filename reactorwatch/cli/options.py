@@ -17,6 +17,9 @@ Settings = Annotated[
 Endpoint = Annotated[str | None, typer.Option(help="Address of the router [tcp/127.0.0.1:7447].", show_default=False)]
 Plant = Annotated[str | None, typer.Option("--plant", help="Name of the plant [cstr].", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object, for machines.")]
+LONGEST_WAIT_S = 86_400.0
+"""The system's clocks count no endless times."""
+
 Columns = Annotated[
     list[str] | None,
     typer.Option("--column", help="A column of another name, as signal=column: --column T=reactor_temp."),
@@ -55,6 +58,19 @@ Scheduler = Annotated[
         help="Of a Dask cluster to do it, such as tcp://127.0.0.1:8786 (reactorwatch[cluster]).", show_default=False
     ),
 ]
+
+
+def sendable(text: str) -> str:
+    """A text that a message can carry.
+
+    Raises:
+        BadParameter: the terminal sent bytes that are no UTF-8.
+    """
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise typer.BadParameter(f"must be UTF-8, got {text!r}") from error
+    return text
 
 
 def columns(pairs: list[str] | None) -> dict[str, str]:

@@ -5,13 +5,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from reactorwatch.cli.asking import PATIENCE_S, ask
-from reactorwatch.cli.options import Endpoint, Plant, Settings, pace
+from reactorwatch.cli.options import LONGEST_WAIT_S, Endpoint, Plant, Settings, pace
 from reactorwatch.cli.printing import say
+from reactorwatch.terminal import printable
 
 if TYPE_CHECKING:
     from reactorwatch.contract.messages_pb2 import ReplayCommand
 
-Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the replay.", min=0.1)]
+Timeout = Annotated[
+    float, typer.Option("--timeout", help="Seconds to wait for the replay.", min=0.1, max=LONGEST_WAIT_S)
+]
 
 playback = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
@@ -43,7 +46,7 @@ def resume(
 
 @playback.command("step")
 def step(
-    rows: Annotated[int, typer.Argument(help="How many rows.", min=1)] = 1,
+    rows: Annotated[int, typer.Argument(help="How many rows.", min=1, max=1_000_000_000)] = 1,
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
@@ -74,5 +77,5 @@ def _tell(
 ) -> None:
     import os
 
-    message.by = os.environ.get("USER", "")
+    message.by = printable(os.environ.get("USER", ""))  # its bytes may be no UTF-8, which a message cannot carry
     say(ask("replay", config, endpoint, name, timeout, command, message).text)

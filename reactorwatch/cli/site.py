@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Endpoint, Json, Plant, Settings
+from reactorwatch.cli.options import LONGEST_WAIT_S, Endpoint, Json, Plant, Settings
 from reactorwatch.cli.printing import say
 
 
@@ -117,7 +117,7 @@ def doctor(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    timeout: Annotated[float, typer.Option(help="Seconds to listen for nodes.", min=0.1)] = 12.0,
+    timeout: Annotated[float, typer.Option(help="Seconds to listen for nodes.", min=0.1, max=LONGEST_WAIT_S)] = 12.0,
     as_json: Json = False,
 ) -> None:
     """Check a deployment from here: one line a check, with the cure. Ends with 0 if all is well, 1 if not."""
@@ -151,7 +151,9 @@ def status(
         str | None, typer.Option("--plant", help="Which plant [all that may be read].", show_default=False)
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="Show it once.")] = False,
-    seconds: Annotated[float, typer.Option(help="How long to listen before showing it once.", min=0.1)] = 4.0,
+    seconds: Annotated[
+        float, typer.Option(help="How long to listen before showing it once.", min=0.1, max=LONGEST_WAIT_S)
+    ] = 4.0,
     as_json: Json = False,
 ) -> None:
     """Show plants, nodes, rates and alarms as they are now, until stopped."""

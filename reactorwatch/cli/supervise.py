@@ -13,6 +13,7 @@ import structlog
 
 from diagnosis.practice import checked_tolerance
 from monitor_node.config import MonitorConfig
+from monitor_node.watch import check_promise
 from plant_node.config import PlantConfig
 from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.joining import VIEWER, Joining, heard_by, joining, open_router, write_node_settings
@@ -68,6 +69,10 @@ def run_until_stopped(
     waiting = {"wait_for": ["monitor", "recorder"]}
     plant = section(PlantConfig, "plant", {"plant": {**waiting, **tables.get("plant", {})}}, flags)
     monitor = section(MonitorConfig, "monitor", tables, {"plant": name or plant.name})
+    try:
+        check_promise(monitor, plant.period_min)
+    except InputError as error:
+        raise InputError(f"settings [monitor]: {error}") from error
     of_recorder = {"recorder": {"out": DEFAULT_OUT, **tables.get("recorder", {})}}
     recorder_flags = {"plant": name or plant.name, "out": str(out) if out is not None else None}
     recorder = heard_by(section(RecorderConfig, "recorder", of_recorder, recorder_flags), site)
@@ -76,8 +81,7 @@ def run_until_stopped(
     metrics = section(MetricsConfig, "metrics", tables, {})
     if Path(recorder.out).suffix != ENDING:
         check_folder_name(Path(recorder.out), "--out")
-    bus = open_router(site, join)  # before anything is written: an address that is taken leaves nothing behind
-    try:
+    with open_router(site, join):  # before anything is written: an address that is taken leaves nothing behind
         tables_written = {"plant": plant, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
         nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", "plant")
         settings = _write_down(recorder, plant.seed, {**tables_written, "log": log_config}, join, nodes)
@@ -94,8 +98,6 @@ def run_until_stopped(
                         log.info("ended by itself", node=node, code=code)
                     return 1 if any(ended.values()) else 0
             return 0
-    finally:
-        bus.close()
 
 
 def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig, out: Path | None) -> DiagnosisConfig:

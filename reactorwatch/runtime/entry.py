@@ -7,10 +7,9 @@ from typing import TypeVar
 
 import msgspec
 
-from reactorwatch.errors import InputError
 from reactorwatch.runtime import logs
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
-from reactorwatch.terminal import printable
+from reactorwatch.runtime.crash import UNUSABLE, complain, guard
 
 Config = TypeVar("Config", bound=msgspec.Struct)
 
@@ -25,14 +24,15 @@ def main(module: str, table: str, kind: type[Config], run: Callable[[Config, Bus
         run: the node.
 
     Returns:
-        The exit code: 2 if something that was given cannot be used.
+        The exit code, see `crash`.
     """
     arguments = sys.argv[1:]
     if len(arguments) > 1:
-        sys.stderr.write(f"usage: python -m {module} [settings.toml]\n")
-        return 2
+        complain(table, f"usage: python -m {module} [settings.toml]")
+        return UNUSABLE
     logs.configure()
-    try:
+
+    def run_node() -> int:
         tables = read_settings(Path(arguments[0]) if arguments else None)
         logs.configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
         run(
@@ -40,7 +40,6 @@ def main(module: str, table: str, kind: type[Config], run: Callable[[Config, Bus
             section(BusConfig, "bus", tables, {}),
             section(MetricsConfig, "metrics", tables, {}),
         )
-    except InputError as error:
-        sys.stderr.write(f"{table}: {printable(str(error))}\n")
-        return 2
-    return 0
+        return 0
+
+    return guard(table, run_node)

@@ -6,6 +6,7 @@ run in its own threads and only put what came into the inbox.
 """
 
 import contextlib
+import os
 import signal
 import threading
 import time
@@ -28,6 +29,7 @@ LARGEST_INBOX = (
 )
 LARGEST_INBOX_BYTES = 64 << 20  # of payload, likewise
 LOOK_AGAIN_S = 0.1
+_END = b"\0"  # no signal has this number
 BATCH = 256  # messages handled before the loop looks at the clock again
 
 
@@ -121,30 +123,37 @@ class StopSignal:
 def stop_on_signals() -> Iterator[StopSignal]:
     """A stop signal that SIGINT (Ctrl-C) and SIGTERM set, while the context lasts.
 
-    A handler runs in the main thread between two of its instructions, whatever lock that thread holds just then; waking
-    others takes locks, of an event for instance, and would wait for itself for ever. So the handler only puts a word
-    into a queue whose `put` may interrupt itself (`queue.SimpleQueue`), and a thread of its own does the waking.
+    A handler of Python runs in the main thread between two of its instructions: whatever lock that thread holds just
+    then, and not before it has waited to the end if the signal came just before it began to wait. So the handler does
+    nothing; the interpreter writes the signal's number into a pipe at once (`signal.set_wakeup_fd`), and a thread that
+    reads it wakes the others.
     """
     stop = StopSignal()
-    asked: SimpleQueue[bool] = SimpleQueue()
+    source, sink = os.pipe()
+    os.set_blocking(sink, False)
 
     def handler(_number: int, _frame: FrameType | None) -> None:
-        asked.put(True)
+        pass
 
     def wake_when_asked() -> None:
-        while asked.get():
-            stop.set()
+        while _END not in (numbers := os.read(source, 64)):
+            if set(numbers) & {signal.SIGINT, signal.SIGTERM}:
+                stop.set()
 
     waker = threading.Thread(target=wake_when_asked, name="stop", daemon=True)
     waker.start()
     previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
+    previous_fd = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)
     try:
         yield stop
     finally:
+        signal.set_wakeup_fd(previous_fd)
         for number, old in previous.items():
             signal.signal(number, old)
-        asked.put(False)
+        os.write(sink, _END)
         waker.join()
+        os.close(source)
+        os.close(sink)
 
 
 def serve(

@@ -30,6 +30,7 @@ AUTHORITY, ROUTER = "authority", "router"
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 ROUTER_SETTINGS, SETTINGS = "router.json5", "settings.toml"
 PLACE = "site.json"
+FILES = (CA, CERTIFICATE, KEY, ROUTER_SETTINGS, SETTINGS, PLACE)
 DEFAULT_ENDPOINT = "tls/127.0.0.1:7447"
 AUTHORITY_DAYS = 3650.0
 
@@ -78,7 +79,6 @@ def make_site(
     """
     _check(plants, days)
     there = _plants_in(folder)
-    register = _register_of(folder, there, endpoint, listen)
     plants = tuple(sorted({*there, *plants}))
     if not plants and not (folder / AUTHORITY).is_dir():
         plants = ("cstr",)
@@ -88,6 +88,8 @@ def make_site(
             raise InputError(
                 f"--revoke {holder}: is no PLANT/ROLE of this site (valid: {', '.join(holders) or 'none'})"
             )
+    _check_places(folder, holders)
+    register = _register_of(folder, there, endpoint, listen)
     try:
         ca, made = _authority(folder / AUTHORITY, now, is_old=_is_old(folder, there))
         for holder in revoke:
@@ -126,6 +128,22 @@ def _check(plants: tuple[str, ...], days: float) -> None:
             )
     if not 1.0 <= days <= LONGEST_DAYS:
         raise InputError(f"--days must be in [1, {LONGEST_DAYS:g}], got {days:g}")
+
+
+def _check_places(folder: Path, holders: list[str]) -> None:
+    """Check, before anything is written, that every folder and file of a site can be one.
+
+    Raises:
+        InputError: something else is in the place of one.
+    """
+    for name in (AUTHORITY, ROUTER, *holders):
+        home = folder / name
+        for place in (folder, home.parent, home):
+            if (place.exists() or place.is_symlink()) and not place.is_dir():
+                raise InputError(f"{place}: is no folder, and a site has one there; move it out of the site")
+        for file in (home / name for name in FILES):
+            if file.exists() and not file.is_file():
+                raise InputError(f"{file}: is no regular file, and a site has one there; move it out of the site")
 
 
 def _plants_in(folder: Path) -> list[str]:
@@ -239,6 +257,8 @@ class _Issuer:
 def _place(folder: Path, write: Write, mode: int = 0o777) -> None:
     """Have files written into a new folder beside `folder`, then put them into it; a new folder appears complete."""
     new = folder.with_name(f".{folder.name}.new")
+    if new.is_symlink() or new.is_file():
+        new.unlink()
     shutil.rmtree(new, ignore_errors=True)
     new.mkdir(parents=True, mode=mode)
     write(new)

@@ -5,7 +5,9 @@ health says when the run's first sample came.
 """
 
 import contextlib
-from collections.abc import Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from queue import Empty, SimpleQueue
 from typing import NamedTuple
 
 from google.protobuf.message import Message
@@ -17,7 +19,9 @@ from reactorwatch.runtime.bus import Bus
 from recorder.run_reader import LISTED, SUSPECTED
 
 ANSWER_WITHIN_S = 5.0
-COMMANDS = ("list_alarms", keys.LIST_RECORDER_ALARMS)
+AGAIN_S = 1.0
+COMMANDS = {"monitor": "list_alarms", "recorder": keys.LIST_RECORDER_ALARMS}
+"""Commands that list alarms, by the node that answers them."""
 
 
 class Past(NamedTuple):
@@ -26,26 +30,86 @@ class Past(NamedTuple):
     Attributes:
         alarms: messages of the changes that led to the alarms' present state.
         zero_ns: the time of the run's first sample; None: no monitor says it.
+        answered: the nodes that listed their alarms.
     """
 
     alarms: tuple[Encoded, ...] = ()
     zero_ns: int | None = None
+    answered: frozenset[str] = frozenset()
 
 
 def ask_for_past(bus: Bus, plant: str) -> Past:
     """Ask the nodes of a plant for its past; nodes that are not there are not waited for."""
-    listed: list[messages.Alarm] = []
-    for command in COMMANDS:
+    listed, answered = list[messages.Alarm](), set[str]()
+    for node, command in COMMANDS.items():
         question = Encoded(keys.key(plant, keys.COMMAND, command), *encode_message(messages.ListAlarms()))
         for reply in _decoded(bus.ask(question, ANSWER_WITHIN_S)):
             if isinstance(reply, messages.CommandReply):
                 listed += reply.alarms
+                answered.add(node)
     zero_ns: int | None = None
     for health in _decoded(bus.recall(keys.all_of(plant, keys.HEALTH))):
         if isinstance(health, messages.Health) and health.heard_from_ns:
             zero_ns = min(health.heard_from_ns.values())
     alarms = (encode(Publication(keys.key(plant, keys.ALARM, item.alarm), item)) for item in changes(listed))
-    return Past(tuple(alarms), zero_ns)
+    return Past(tuple(alarms), zero_ns, frozenset(answered))
+
+
+class PastQuery:
+    """Asks for the past of a plant again when a node that lists alarms appears, until it answers; never blocks.
+
+    Args:
+        ask: what is asked: `ask_for_past`.
+        answered: nodes that have answered before.
+    """
+
+    def __init__(self, ask: Callable[[], Past], answered: frozenset[str] = frozenset()) -> None:
+        self._ask = ask
+        self._lock, self._ended = threading.Lock(), threading.Event()
+        self._waiting, self._answered = set[str](), set(answered)
+        self._thread: threading.Thread | None = None
+        self._answers: SimpleQueue[Past] = SimpleQueue()
+
+    def on_alive(self, token: str, is_alive: bool) -> None:
+        """Take note that a node came or went; one that came again, as after a restart, is asked again."""
+        topic = keys.parse(token)
+        if topic is None or topic.name not in COMMANDS:
+            return
+        with self._lock:
+            if not is_alive:
+                self._answered.discard(topic.name)
+                self._waiting.discard(topic.name)
+            elif topic.name not in self._answered:
+                self._waiting.add(topic.name)
+                if self._thread is None:
+                    self._thread = threading.Thread(target=self._ask_until_answered, name="past", daemon=True)
+                    self._thread.start()
+
+    def answers(self) -> Iterator[Past]:
+        """The answers that came since the last call."""
+        with contextlib.suppress(Empty):
+            while True:
+                yield self._answers.get_nowait()
+
+    def end(self) -> None:
+        """Ask no more, before the bus is closed."""
+        self._ended.set()
+        with self._lock:
+            thread = self._thread
+        if thread is not None:
+            thread.join()
+
+    def _ask_until_answered(self) -> None:
+        while not self._ended.is_set():
+            past = self._ask()
+            self._answers.put(past)
+            with self._lock:
+                self._answered |= past.answered & self._waiting
+                self._waiting -= past.answered
+                if not self._waiting:
+                    self._thread = None
+                    return
+            self._ended.wait(AGAIN_S)
 
 
 def changes(listed: Iterable[messages.Alarm]) -> Iterator[messages.Alarm]:

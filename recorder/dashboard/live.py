@@ -29,7 +29,7 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_port
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.dashboard.drawing import Drawing
-from recorder.dashboard.late_joiner import Past, ask_for_past
+from recorder.dashboard.late_joiner import Past, PastQuery, ask_for_past
 from recorder.dashboard.stream import APPLICATION
 from recorder.dashboard.viewer import viewer
 from recorder.panels import PANELS
@@ -44,6 +44,8 @@ LOOPBACK = ("127.0.0.1", "::1")
 DRAW_EVERY_NS = 500_000_000
 START_WITHIN_S = 30.0
 LOOK_EVERY_S = 0.1
+MOST_KNOWN = 10_000
+"""Changes of alarms that are remembered, so that one that is listed is not shown again."""
 
 
 class Shown(NamedTuple):
@@ -90,8 +92,17 @@ def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], N
             try:
                 recording = stream_to(data, shown.bind, f"{plant}-{time.time_ns()}")
                 past = ask_for_past(bus, plant)
-                dashboard = LiveDashboard(recording, lambda: process.poll() is not None, time.time_ns(), past)
-                serve(dashboard, bus, stop, subscriptions=(f"{keys.ROOT}/{plant}/**",), history_s=bus_config.history_s)
+                query = PastQuery(lambda: ask_for_past(bus, plant), past.answered)
+                dashboard = LiveDashboard(recording, lambda: process.poll() is not None, time.time_ns(), past, query)
+                serve(
+                    dashboard,
+                    bus,
+                    stop,
+                    subscriptions=(f"{keys.ROOT}/{plant}/**",),
+                    history_s=bus_config.history_s,
+                    tokens=(keys.all_of(plant, keys.ALIVE),),
+                    on_alive=dashboard.on_alive,
+                )
                 recording.disconnect()
             finally:
                 bus.close()
@@ -105,6 +116,7 @@ class LiveDashboard:
         is_closed: whether the viewer is.
         now_ns: the clock.
         past: what was before it began to listen.
+        query: asks for alarms again when a node appears; None: nothing is asked again.
     """
 
     def __init__(
@@ -113,13 +125,15 @@ class LiveDashboard:
         is_closed: Callable[[], bool],
         now_ns: int,
         past: Past = Past(),  # noqa: B008 (it is frozen)
+        query: PastQuery | None = None,
     ) -> None:
         self._recording = recording
         self._is_closed = is_closed
         self._drawing = Drawing(recording)
         self._reader = RunReader(past.zero_ns)
         self._has_zero = past.zero_ns is not None
-        self._known = {_change(message) for message in past.alarms}
+        self._query = query
+        self._known = dict.fromkeys(map(_change, past.alarms))
         self._taken = len(past.alarms)
         for message in past.alarms:
             self._reader.take(message)
@@ -127,10 +141,9 @@ class LiveDashboard:
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Keep it until there is something to be drawn."""
-        if self._known and _change(message) in self._known:
+        if self._is_known(message):
             return []  # publishers remember it, and it was listed
-        self._reader.take(message)
-        self._taken += 1
+        self._take(message)
         if self._taken >= STRETCH or now_ns >= self._next_ns:
             self._draw(now_ns)
         return []
@@ -139,8 +152,18 @@ class LiveDashboard:
         """Nobody asks a dashboard."""
         raise AssertionError(question.key)
 
+    def on_alive(self, token: str, is_alive: bool, _now_ns: int) -> list[Publication]:
+        """Ask a node that appears for its alarms."""
+        if self._query is not None:
+            self._query.on_alive(token, is_alive)
+        return []
+
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Draw what has come."""
+        for past in self._query.answers() if self._query is not None else ():
+            for message in past.alarms:
+                if not self._is_known(message):
+                    self._take(message)
         self._draw(now_ns)
         return []
 
@@ -155,8 +178,26 @@ class LiveDashboard:
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """Draw the last."""
+        if self._query is not None:
+            self._query.end()
         self._draw(now_ns)
         return []
+
+    def _take(self, message: Encoded) -> None:
+        self._reader.take(message)
+        self._taken += 1
+
+    def _is_known(self, message: Encoded) -> bool:
+        """True if it is a change of an alarm that was taken before; it counts as one from now on."""
+        change = _change(message)
+        if change is None:
+            return False
+        if change in self._known:
+            return True
+        self._known[change] = None
+        if len(self._known) > MOST_KNOWN:
+            del self._known[next(iter(self._known))]
+        return False
 
     def _draw(self, now_ns: int) -> None:
         self._next_ns = now_ns + DRAW_EVERY_NS

@@ -31,10 +31,10 @@ class OneAttempt(StopSignal):
         return self._asked > 1
 
 
-def make(folder: Path, endpoint: str = "") -> str:
+def make(folder: Path, endpoint: str = "", plants: tuple[str, ...] = PLANTS) -> str:
     """A site of two plants, with a router that is called at the endpoint returned."""
     endpoint = endpoint or f"tls/127.0.0.1:{free_port()}"
-    make_site(folder, PLANTS, endpoint, endpoint, 90.0, datetime.datetime.now(datetime.UTC))
+    make_site(folder, plants, endpoint, endpoint, 90.0, datetime.datetime.now(datetime.UTC))
     return endpoint
 
 

@@ -2,6 +2,7 @@
 
 import signal
 import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -12,7 +13,6 @@ from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.bus_zenoh.refusal_log import LOG_EVERY_NS, RefusalLog
 from reactorwatch.runtime.serve import StopSignal
 
-from ..end_to_end.conftest import REACTORWATCH
 from .site import WITHIN_S, make, settings
 
 
@@ -51,15 +51,27 @@ def test_other_lines_go_on_to_standard_output() -> None:
     assert not RefusalLog().add(b"ERROR zenoh: something else")
 
 
-def test_the_router_logs_whom_it_refused_what(tmp_path: Path) -> None:
-    make(tmp_path)
+WITHOUT_NODES = (
+    "from reactorwatch.cli.main import main; from reactorwatch.cli.processes import Processes; "
+    "Processes.start = lambda *_: None; main()"
+)
+
+
+@pytest.mark.parametrize(
+    ("typed", "code"), [("router site/router/router.json5", 0), ("up --site site", 0), ("demo --site site -o new", 130)]
+)
+def test_every_command_that_is_the_router_of_a_site_logs_whom_it_refused_what(
+    tmp_path: Path, typed: str, code: int
+) -> None:
+    """The nodes of `up` and `demo` are left out."""
+    make(tmp_path / "site", plants=("cstr", "demo"))
     router = subprocess.Popen(
-        [REACTORWATCH, "router", str(tmp_path / "router" / "router.json5")], stderr=subprocess.PIPE, text=True
+        [sys.executable, "-c", WITHOUT_NODES, *typed.split()], stderr=subprocess.PIPE, text=True, cwd=tmp_path
     )
     overdue = threading.Timer(WITHIN_S, router.kill)  # its log ends, and so does the wait for a line
     overdue.start()
     try:
-        viewer = connect(settings(tmp_path, "cstr/viewer"), "viewer", StopSignal())
+        viewer = connect(settings(tmp_path / "site", "cstr/viewer"), "viewer", StopSignal())
         assert viewer is not None
         viewer.publish(Encoded("reactor/cstr/sample/T", b"made up", ""))
         viewer.close()
@@ -69,4 +81,4 @@ def test_the_router_logs_whom_it_refused_what(tmp_path: Path) -> None:
         overdue.cancel()
         router.send_signal(signal.SIGINT)
         router.communicate(timeout=WITHIN_S)
-    assert router.returncode == 0
+    assert router.returncode == code

@@ -63,26 +63,31 @@ class RefusalLog:
 
 @contextmanager
 def log_refusals() -> Iterator[None]:
-    """Log what the router of this process refuses, while the context lasts."""
+    """Log what the router of this process refuses, while the context lasts; begun before the router is opened."""
     before = os.dup(1)
     source, sink = os.pipe()
     os.dup2(sink, 1)
     os.close(sink)
-    if os.environ.get("RUST_LOG") == "off":  # the command's own default
+    asked = os.environ.get("RUST_LOG")
+    if asked == "off":  # the command's own default
         del os.environ["RUST_LOG"]
     zenoh.init_log_from_env_or(DECISIONS)
-    thread = threading.Thread(target=_read, args=(source, before), name="refusals", daemon=True)
+    if asked is not None:
+        os.environ["RUST_LOG"] = asked  # for processes that are started from here on
+    ended = threading.Event()
+    thread = threading.Thread(target=_read, args=(source, before, ended), name="refusals", daemon=True)
     thread.start()
     try:
         yield
     finally:
-        os.dup2(before, 1)  # the last end to write to is closed, so the thread ends
+        os.dup2(before, 1)  # the last end to write to is closed, unless a process started here has outlived it
+        ended.set()
         thread.join()
         os.close(source)
         os.close(before)
 
 
-def _read(source: int, before: int) -> None:
+def _read(source: int, before: int, ended: threading.Event) -> None:
     refusals, rest = RefusalLog(), b""
     while True:
         is_ready = bool(select([source], [], [], LOG_EVERY_NS / 1e9)[0])
@@ -94,6 +99,6 @@ def _read(source: int, before: int) -> None:
         said = refusals.report(time.monotonic_ns())
         if said is not None:
             log.warning(said)
-        if is_ready and not data:
+        if not data and (is_ready or ended.is_set()):
             os.write(before, rest)
             return

@@ -1,35 +1,31 @@
 """What is no mistake of a person's: one line, the path of a report, exit code 70; and no known input comes to that."""
 
-import inspect
-import random
 import re
 import shlex
 import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
 
 import pytest
-import typer
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli import crash, diagnosis
+from reactorwatch.cli import diagnosis
 from reactorwatch.cli.main import main
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.records.csv_file import write_csv
+from reactorwatch.runtime import crash
 from reactorwatch.runtime.config import read_settings
 from recorder.config import RecorderConfig
 from recorder.entry import Entry
 from recorder.mcap_file import RecordingWriter
-from tests.unit.cli.test_outputs import commands
 from tests.unit.diagnosis.cases import CASES
 
 Shown = pytest.CaptureFixture[str]
@@ -247,107 +243,6 @@ def test_a_report_that_cannot_be_made_leaves_no_half_of_it(
     assert capsys.readouterr().out == ""
     assert {path: path.read_bytes() for path in (folder / "report").rglob("*")} == before
     assert (folder / "report").exists() == there
-
-
-VALUES = [
-    *[
-        "-1",
-        "0",
-        "1",
-        "2",
-        "1e308",
-        "-1e308",
-        "nan",
-        "inf",
-        "1e-320",
-        "1e400",
-        "-0",
-        "x",
-        "ü",
-        "a/b",
-        "C",
-        "T",
-        "C=0.1",
-        "T=nan",
-        "C=1e308",
-        "qc=1..2",
-        "qc=nan..1",
-        "a=b",
-        "T=T",
-    ],
-    *[
-        "K3=2%",
-        "K3=1e400%",
-        "10min",
-        "1,2,3",
-        "arx",
-        "oe",
-        "shewhart",
-        "cusum",
-        "mewma",
-        "t2",
-        "%s",
-        "{}",
-        "coolant_flow:step:-0.05@30min",
-    ],
-    *["coolant_flow:step:nan@nanmin", "coolant_flow:ramp:1e308"],
-    *("9" * 400, "", "\x1b[31m", "\udcff"),
-]
-PATHS = [*["good.csv", "plant0.mcap", "plant5.mcap", "bad.csv", "none.csv", ".", "*.toml"], "x" * 300, "a\nb.csv", ""]
-OUTPUTS = ["x.csv", "x.mcap", "x.rrd", "good.csv", "x", ""]
-NOT_HERE = {"up", "demo", "view", "plant", "monitor", "record", "router", "certify", "doctor", "status", "alive"}
-"""They need a router, or run until they are stopped."""
-NOT_NOW = {"reproduce", "diagnose", "dashboard", "compile"}
-"""They take seconds; what they read is read by others here, and `compile` reads nothing."""
-LINES = 12
-FUZZED = {
-    name: function
-    for name, function in commands()
-    if name not in NOT_HERE | NOT_NOW and not name.startswith(("alarm", "playback"))
-}
-
-
-def line_of(name: str, function: Callable[..., object], choose: random.Random) -> list[str]:
-    """A command line with any of its options and arguments, of strange values."""
-    hints = get_type_hints(function, include_extras=True)
-    typed, arguments = name.split(), list[str]()
-    for parameter in inspect.signature(function).parameters.values():
-        kind, *more = get_args(hints[parameter.name]) or (hints[parameter.name],)
-        about: Any = next(
-            (item for item in (*more, parameter.default) if isinstance(item, typer.models.ParameterInfo)), None
-        )
-        is_argument = isinstance(about, typer.models.ArgumentInfo)
-        if choose.random() > (0.95 if parameter.default is inspect.Parameter.empty else 0.3):
-            continue
-        is_path = bool({Path, list[Path]} & {kind, *get_args(kind)})
-        value = choose.choice(OUTPUTS if parameter.name == "out" else PATHS if is_path else VALUES)
-        if is_argument:
-            arguments.append(choose.choice(["good.csv", "plant0.mcap", value]) if is_path else value)
-            continue
-        names = [item for item in (about.param_decls if about else ()) or () if item.startswith("--")]
-        typed.append(names[0] if names else f"--{parameter.name.replace('_', '-')}")
-        if bool not in (kind, *get_args(kind)):
-            typed.append(value)
-    return [*typed, *(["--verify"] if name == "replay" else []), *arguments]
-
-
-@pytest.mark.parametrize("name", FUZZED)
-def test_no_command_line_ends_in_a_traceback(folder: Path, name: str, monkeypatch: Patch, capsys: Shown) -> None:
-    """Exit code 70 would be one; a mistake is one line on standard error."""
-    choose = random.Random(name)
-    (folder / "bad.csv").write_text("time_min,qc,C,T\n0,1,2,3\n1,1e308,2,3\n")
-    for _ in range(LINES):
-        typed = line_of(name, FUZZED[name], choose)
-        code = run(typed, monkeypatch)
-        said = capsys.readouterr().err
-        assert code in (0, 1, 2), (typed, said)
-        assert code != 2 or said.count("\n") == 1 or said.startswith("Usage"), (typed, said)
-    assert not list((folder / "reports").iterdir())
-
-
-def test_the_fuzz_reaches_every_command_that_needs_no_router() -> None:
-    names = {name.split()[0] for name, _ in commands()}
-    assert names == {name.split()[0] for name in FUZZED} | NOT_HERE | NOT_NOW | {"alarm", "playback"}
 
 
 def test_an_input_error_is_not_a_crash(folder: Path, monkeypatch: Patch, capsys: Shown) -> None:

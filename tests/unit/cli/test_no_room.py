@@ -115,7 +115,7 @@ def test_where_nothing_can_be_printed_the_exit_code_says_so(
     monkeypatch.setattr(sys, "stdout", Full())
     assert run(shlex.split(typed), monkeypatch) == 2
     said = capsys.readouterr().err
-    assert said == "reactorwatch: what is said here cannot be written: No space left on device\n"
+    assert said == "reactorwatch: standard output cannot be written: No space left on device\n"
 
 
 def test_a_process_of_its_own_says_the_same_and_nothing_more() -> None:

@@ -1,5 +1,6 @@
 """Where nodes write and what they take without settings: defaults hold for any process, folders are made."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -46,16 +47,12 @@ def test_a_recorder_makes_the_folder_that_it_writes_to(tmp_path: Path, out: str)
 def test_up_records_where_flag_then_settings_then_default_say(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, settings: str, flag: str | None, expected: str
 ) -> None:
-    class Closed:
-        def close(self) -> None:
-            pass
-
     def stop_here(*_arguments: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.chdir(tmp_path)
     Path("settings.toml").write_text(settings, encoding="utf-8")
-    monkeypatch.setattr(supervise, "open_router", lambda *_: Closed())
+    monkeypatch.setattr(supervise, "open_router", lambda *_: nullcontext())
     monkeypatch.setattr(supervise, "Processes", stop_here)
     with pytest.raises(KeyboardInterrupt):
         supervise.run_until_stopped(Path("settings.toml"), None, Path(flag) if flag else None, {})
@@ -64,11 +61,7 @@ def test_up_records_where_flag_then_settings_then_default_say(
 
 
 def test_up_leaves_a_recording_of_that_name_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    class Closed:
-        def close(self) -> None:
-            pass
-
-    monkeypatch.setattr(supervise, "open_router", lambda *_: Closed())
+    monkeypatch.setattr(supervise, "open_router", lambda *_: nullcontext())
     (tmp_path / "run.mcap").write_bytes(b"")
     with pytest.raises(InputError, match="a recording of that name exists"):
         supervise.run_until_stopped(None, None, tmp_path / "run.mcap", {})

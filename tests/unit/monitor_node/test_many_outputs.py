@@ -131,3 +131,31 @@ def test_a_promise_that_is_asked_for_and_cannot_be_kept_is_refused_with_the_rang
     text = r"must be in \[1.1, 2.1e\+06\] for 41 alarms .* got 1; set it within that range, or leave it out"
     with pytest.raises(InputError, match=text):
         watch(Monitor(config, 0, points=False), plant(10, 160), row_ns=10**9)
+
+
+@pytest.mark.parametrize("charts", [("shewhart", "ewma", "mewma"), ("cusum",), ("t2", "parameters")])
+@pytest.mark.parametrize(("outputs", "period_s"), [(10, 1.0), (2, 0.01), (1, 6000.0)])
+@pytest.mark.parametrize("bound", [0, 1])
+def test_a_promise_that_cannot_be_kept_is_refused_once_the_period_of_the_rows_is_known(
+    outputs: int, period_s: float, charts: tuple[ChartName, ...], bound: int
+) -> None:
+    """Not when the training ends, a thousand rows later; the nearest number that can be kept is not refused."""
+    names = len(charts) * outputs if "t2" not in charts else (outputs > 1) + outputs
+    alarms = names + 2 * outputs if "mewma" not in charts else 4 * outputs + (outputs > 1)
+    nearest = 30 * 86_400 / period_s * alarms / (1e8, 50.0)[bound]
+    values = plant(outputs, 40)
+    for factor, is_kept in ((0.9, bound == 1), (1.1, bound == 0)):
+        asked = nearest * factor
+        if not 1e-3 <= asked <= 1e6:
+            continue
+        settings = config_of(outputs, 10, charts)
+        config = msgspec.structs.replace(
+            settings, training_min=1000 * period_s / 60, false_alarms_per_30_days=asked, snapshot_min=1e6
+        )
+        monitor = Monitor(config, 0, points=False)
+        if is_kept:
+            watch(monitor, values, row_ns=round(period_s * 1e9))
+            continue
+        with pytest.raises(InputError, match=f"for {alarms} alarms and rows every"):
+            watch(monitor, values, row_ns=round(period_s * 1e9))
+        assert monitor.rows <= 34

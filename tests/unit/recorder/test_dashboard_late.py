@@ -1,5 +1,6 @@
 """A live view that is opened late shows every active alarm, with its suspects, at the minute at which it was raised."""
 
+import threading
 from pathlib import Path
 
 import pytest
@@ -11,7 +12,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
 from recorder.dashboard import late_joiner
-from recorder.dashboard.late_joiner import Past, ask_for_past, changes
+from recorder.dashboard.late_joiner import Past, PastQuery, ask_for_past, changes
 from recorder.dashboard.live import DRAW_EVERY_NS, LiveDashboard
 from recorder.dashboard.stream import RUN_TIME
 
@@ -138,3 +139,63 @@ def test_alarms_that_come_before_the_first_sample_are_not_lost(tmp_path: Path) -
 
 def test_without_a_monitor_nothing_is_waited_for_and_nothing_is_known() -> None:
     assert ask_for_past(MemoryBus(Exchange()), "cstr") == Past()
+
+
+class Answering:
+    """What a plant's past is, answer by answer; the last one again and again."""
+
+    def __init__(self, *answers: Past) -> None:
+        self._answers, self.asked, self.was_last = list(answers), 0, threading.Event()
+
+    def __call__(self) -> Past:
+        self.asked += 1
+        answer = self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
+        if len(self._answers) == 1 and answer.answered:
+            self.was_last.set()
+        return answer
+
+
+MONITOR = keys.key("cstr", keys.ALIVE, "monitor")
+
+
+def test_a_monitor_that_comes_later_answers_late_and_restarts_is_asked_until_it_answers(
+    tmp_path: Path, past: Past, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each alarm is shown once, also those that came by themselves."""
+    monkeypatch.setattr(late_joiner, "AGAIN_S", 0.0)
+    assert past.answered == {"monitor"}
+    ask = Answering(Past(), Past(), past)
+    query = PastQuery(ask)
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "sent.rrd")
+    dashboard = LiveDashboard(recording, lambda: False, 0, Past(zero_ns=ZERO_NS), query)
+    dashboard.on_message(sample(NOW_NS), 0)
+    by_itself = alarm("drift/C")
+    by_itself.time_ns, by_itself.event = by_itself.raised_ns, "raised"
+    dashboard.on_message(encode(Publication("reactor/cstr/alarm/drift/C", by_itself)), 0)
+    for round_of in range(3):
+        ask.was_last.clear()
+        for token in (keys.key("cstr", keys.ALIVE, "plant"), keys.monitor_token("cstr", "x"), MONITOR):
+            dashboard.on_alive(token, True, 0)
+        assert ask.was_last.wait(60.0)
+        if (thread := query._thread) is not None:
+            thread.join(60.0)
+        dashboard.on_alive(MONITOR, True, 0)  # as a token that is shown again; it has answered
+        assert ask.asked == 3 + round_of
+        dashboard.on_tick(DRAW_EVERY_NS * (1 + round_of))
+        dashboard.on_alive(MONITOR, False, 0)
+    dashboard.on_stop(DRAW_EVERY_NS * 10)
+    recording.flush()
+    recording.disconnect()
+    lines = logged(tmp_path / "sent.rrd")
+    assert [text.partition("  ")[2].partition(":")[0] for _, text in lines].count("drift/C") == 1
+    assert len(lines) == len(RAISED_MIN) + 2
+
+
+def test_a_monitor_that_never_answers_is_asked_no_more_once_the_view_ends() -> None:
+    query = PastQuery(Answering(Past()))
+    query.on_alive(MONITOR, True)
+    thread = query._thread
+    assert thread is not None
+    query.end()
+    assert not thread.is_alive()

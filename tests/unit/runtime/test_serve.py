@@ -238,6 +238,25 @@ def test_a_signal_that_comes_while_the_main_thread_holds_a_lock_still_wakes_who_
         assert stop.is_set
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_that_the_waiting_main_thread_does_not_notice_stops_it(number: signal.Signals) -> None:
+    """As one that comes between its last instruction and its wait: here another thread gets it."""
+    woken, waits = threading.Event(), threading.Event()
+
+    def take_the_signal() -> None:
+        waits.wait()
+        signal.pthread_kill(threading.get_ident(), number)
+
+    with stop_on_signals() as stop:
+        stop.wakes(woken.set)
+        taker = threading.Thread(target=take_the_signal)
+        taker.start()
+        waits.set()
+        assert woken.wait(WITHIN_S)
+        taker.join()
+        assert stop.is_set
+
+
 def test_signals_are_handled_as_before_once_the_context_is_left() -> None:
     before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
     with stop_on_signals():

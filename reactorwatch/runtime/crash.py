@@ -1,0 +1,119 @@
+"""The guard of every process of this software: an error that nothing else dealt with ends in one line and an exit code.
+
+Input that cannot be used, and a file or disk that the system refuses, end with 2. Everything else is a fault of this
+software: it ends with 70, and the line names a file with the traceback.
+"""
+
+import errno
+import os
+import platform
+import sys
+import tempfile
+import traceback
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from reactorwatch import __version__
+from reactorwatch.errors import InputError
+from reactorwatch.terminal import printable
+
+EXIT_CODE = 70
+"""EX_SOFTWARE of sysexits.h: no process of ours ends with it for another reason."""
+
+INTERRUPTED = 130
+"""Exit code of a process that Ctrl-C ended before it could end in order: 128 and the number of the signal."""
+
+UNUSABLE = 2
+"""Exit code where something that was given cannot be used, or the system refuses a file."""
+
+_NAMES = "EACCES EDQUOT EFBIG EIO EISDIR ELOOP EMFILE ENAMETOOLONG ENFILE ENOSPC ENOTDIR EPERM EROFS"
+_OF_THE_SYSTEM = frozenset(getattr(errno, name) for name in _NAMES.split(" "))
+"""Errors that say something about a file or a disk, and nothing about this software."""
+
+_LONGEST_REASON = 200
+
+
+def guard(name: str, run: Callable[[], int]) -> int:
+    """Run a program to its end.
+
+    Args:
+        name: of the program, with which its line begins.
+        run: the program, which returns its exit code.
+
+    Returns:
+        The exit code of the process, after one line on standard error if `run` raised.
+    """
+    try:
+        return run()
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except InputError as error:
+        complain(name, str(error))
+        return UNUSABLE
+    except Exception as error:  # noqa: BLE001 (the one place that turns an unexpected error into a report)
+        if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
+            complain(name, f"{error.filename or 'standard output cannot be written'}: {error.strerror}")
+            return UNUSABLE
+        complain(name, report_crash(error))
+        return EXIT_CODE
+
+
+def complain(name: str, text: str) -> None:
+    """Write one line to standard error, whatever is in it.
+
+    Args:
+        name: of the program.
+        text: of the line.
+    """
+    line = " ".join(text.split())
+    with suppress(OSError):  # the exit code says it, too
+        sys.stderr.write(printable(f"{name}: {line}") + "\n")
+        sys.stderr.flush()
+
+
+def report_crash(error: BaseException) -> str:
+    """Write the report of an error.
+
+    Args:
+        error: that the command could not deal with.
+
+    Returns:
+        A line for people: the error, and the path of the report; where none can be written, the place in the code.
+    """
+    reason = " ".join(f"{type(error).__name__}: {error}".split())
+    if len(reason) > _LONGEST_REASON:
+        reason = f"{reason[:_LONGEST_REASON]}…"
+    path = _write(_report(error))
+    if path is not None:
+        where = f"please send {path}, which says where, and the files that it names"
+    else:
+        frames = traceback.extract_tb(error.__traceback__)
+        where = f"please report {frames[-1].filename}:{frames[-1].lineno}" if frames else "please report it"
+    return f"this is a fault of the program and not yours: {reason}; {where}"
+
+
+def _report(error: BaseException) -> str:
+    lines = [
+        f"reactorwatch {__version__}, Python {platform.python_version()}, {platform.platform()}",
+        f"folder: {Path.cwd()}",
+        f"command: {sys.argv}",
+        "",
+        *traceback.format_exception(error),
+    ]
+    return "\n".join(line.rstrip("\n") for line in lines) + "\n"
+
+
+def _write(text: str) -> Path | None:
+    """The file in the system's folder for temporary files, which only its owner can read; None if it cannot be."""
+    with suppress(OSError):
+        handle, name = tempfile.mkstemp(prefix="reactorwatch-crash-", suffix=".txt")
+        path = Path(name)
+        try:
+            with os.fdopen(handle, "w", encoding="utf-8", errors="backslashreplace") as file:
+                file.write(text)
+        except OSError:
+            path.unlink()
+            raise
+        return path
+    return None
