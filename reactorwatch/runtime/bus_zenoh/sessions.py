@@ -14,6 +14,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh.bus import ZenohBus
 from reactorwatch.runtime.bus_zenoh.messages import first_line
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.heap import return_large_blocks
 from reactorwatch.runtime.identity import ROUTER_FILES, TLS, client_settings
 from reactorwatch.runtime.serve import StopSignal
 
@@ -55,6 +56,7 @@ def connect(
         InputError: the endpoint is not one that Zenoh understands.
     """
     client = _client(config)
+    return_large_blocks()
     woken = threading.Event()
     stop.wakes(woken.set)
     retry_s = FIRST_RETRY_S
@@ -125,6 +127,7 @@ def router(config: BusConfig) -> ZenohBus:
         "scouting/multicast/enabled": False,
         **_TRANSPORT,
     }
+    return_large_blocks()
     try:
         session = zenoh.open(_checked(settings, config.endpoint))
     except zenoh.ZError as error:
@@ -144,6 +147,7 @@ def router_from_file(path: Path) -> ZenohBus:
     Raises:
         InputError: it cannot be read or makes no sense, or nothing can listen where it says.
     """
+    return_large_blocks()
     try:
         config = zenoh.Config.from_file(str(path))
         config.insert_json5(_SHARED_MEMORY, "false")
