@@ -3,7 +3,7 @@
 A router, two monitors that share the fleet and keep its states in a folder, two processes of plants and a stranger who
 publishes garbage run for minutes. From a seed: a quarter of the plants get a large fault each, at a time of its own;
 monitors and the router are killed and started again, links are cut for seconds, floods come. In the end every sample is
-accounted for, every fault was alarmed once, and memory is flat: see `findings`.
+accounted for, every fault was alarmed once, and memory is level: see `findings`.
 
     python -m benchmarks.soak [minutes] [plants] [seed] [rows a second of each plant]
 """
@@ -58,7 +58,7 @@ def soak(plan: Plan, folder: Path, *, tell: bool = False) -> Findings:
         while rows < (rows := sum(item.rows for item in witness.health.values())):  # as long as they go on
             if witness.wait(lambda: all(_is_heard(plan, witness, plant) for plant in plan.plants), CATCH_UP_S):
                 break
-        return found(plan, zero_ns, witness.alarms, witness.health, witness.longest_lag_ms, strange, site.memory_mb)
+        return found(plan, zero_ns, witness.alarms, witness.health, witness.longest_lag_ms, strange, site.memory)
 
 
 def _is_heard(plan: Plan, witness: Witness, plant: str) -> bool:
@@ -85,7 +85,11 @@ def table(plan: Plan, findings: Findings) -> str:
         f"longest wait in a monitor           {findings.lag_ms / 1e3:.1f} s; {findings.stalls} stalls of a second",
     ]
     for name, (first, middle, last) in findings.memory_mb.items():
-        lines.append(f"most memory of {name:20s} {first:.0f}, {middle:.0f}, {last:.0f} MB in the thirds of the run")
+        grown = findings.grown_mb.get(name)
+        change = "restarted" if grown is None else f"median {grown:+.1f} MB from the second to the last"
+        lines.append(
+            f"own memory of {name:21s} at most {first:.0f}, {middle:.0f}, {last:.0f} MB in the thirds; {change}"
+        )
     return "\n".join(lines)
 
 

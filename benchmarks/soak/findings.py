@@ -1,4 +1,4 @@
-"""What came of a soak: is every sample accounted for, was every fault alarmed once, is memory flat?
+"""What came of a soak: is every sample accounted for, was every fault alarmed once, is memory level?
 
 - **Samples.** A monitor puts each sample of a plant into a row, or counts it as lost (it never came, by its number) or
   late (its row had been judged). The rows have three places each, of which one or two are empty in each incomplete
@@ -12,9 +12,7 @@
 - **Nothing else.** What was said of alarms, silences apart, is what one monitor says that heard all and was never
   stopped: `backtest` on what the plants have published. Of a plant of which something was counted as lost or late that
   cannot be asked.
-- **Memory.** What a process took at most in the last third of the run is not above what it took at most in the
-  second third by more than `GROWTH_MB`. A monitor that is started anew is the same process in this; both thirds hold
-  times in which it watches the plants of the other, too.
+- **Memory.** It is level after the warm-up: see `memory`.
 """
 
 from collections import Counter
@@ -24,6 +22,7 @@ from typing import NamedTuple
 
 import msgspec
 
+from benchmarks.soak.memory import GROWTH_MB, Taken, find_growth_mb, most_in_thirds
 from benchmarks.soak.plan import PERIOD_MIN, Plan
 from benchmarks.soak.site import WATCH
 from monitor_node import backtest
@@ -35,9 +34,6 @@ from recorder.player import samples_of
 
 SIGNALS = 3
 SOON_ROWS = 20
-GROWTH_MB = 32.0
-"""Buffers keep the size that a flood has given them. In ten minutes with 200 plants, where a third is 240,000 samples,
-to keep a hundred and fifty bytes of each is more."""
 SILENCE = "silence/"
 ROW_NS = round(PERIOD_MIN * MINUTE_NS)
 
@@ -76,6 +72,8 @@ class Findings:
         silences_told_twice: how often one that was known already was told as raised.
         standing_silences: those that were not over in the end.
         memory_mb: by process, the most it took in each third of the run.
+        grown_mb: by process that ran since the first third, how much the median of the last third is above that of the
+            second.
     """
 
     published: int
@@ -98,11 +96,7 @@ class Findings:
     silences_told_twice: int
     standing_silences: int
     memory_mb: dict[str, tuple[float, float, float]]
-
-    @property
-    def grown_mb(self) -> dict[str, float]:
-        """By process, how much more it took in the last third than in the second."""
-        return {name: last - middle for name, (_, middle, last) in self.memory_mb.items()}
+    grown_mb: dict[str, float]
 
     def broken(self, growth_mb: float = GROWTH_MB) -> Iterator[str]:
         """What is not as it has to be.
@@ -181,7 +175,7 @@ def found(
     health: Mapping[str, Health],
     lag_ms: float,
     strange: int,
-    memory_mb: Mapping[str, Sequence[tuple[int, float]]],
+    memory: Mapping[str, Sequence[Taken]],
 ) -> Findings:
     """Judge a soak.
 
@@ -192,7 +186,7 @@ def found(
         health: by plant, what its monitor said last.
         lag_ms: the longest.
         strange: messages that the stranger has published.
-        memory_mb: by process, at which row how much it took.
+        memory: by process, what it took in the course of the run.
     """
     told = [health.get(plant, Health()) for plant in plan.plants]
     refused: Counter[str] = Counter()
@@ -246,7 +240,10 @@ def found(
         silences=len(raised),
         silences_told_twice=len(events["raised"]) - len(raised),
         standing_silences=len(raised - over),
-        memory_mb={name: _thirds(taken, plan.rows) for name, taken in memory_mb.items()},
+        memory_mb={name: most_in_thirds(taken, plan.rows) for name, taken in memory.items()},
+        grown_mb={
+            name: grown for name, taken in memory.items() if (grown := find_growth_mb(taken, plan.rows)) is not None
+        },
     )
 
 
@@ -258,12 +255,3 @@ def _different(told: Sequence[Change], expected: Sequence[Change], zero_ns: int)
         for sign, changes in (("+", more), ("-", fewer))
         for change in sorted(changes.elements())
     ]
-
-
-def _thirds(taken: Sequence[tuple[int, float]], rows: int) -> tuple[float, float, float]:
-    """The most in each third of the run."""
-    most = [0.0, 0.0, 0.0]
-    for row, memory_mb in taken:
-        place = min(3 * row // rows, 2)
-        most[place] = max(most[place], memory_mb)
-    return most[0], most[1], most[2]

@@ -62,7 +62,8 @@ KINDS: tuple[tuple[Kind, Manner], ...] = (
     ("kill router", "closed"),
     ("flood", "closed"),
 )
-"""What befalls the processes. Each comes once before any comes again."""
+"""What befalls the processes. Each comes once before any comes again. Only the second monitor is killed: the memory of
+the first is to be seen for the whole run."""
 
 
 class Blow(NamedTuple):
@@ -161,7 +162,7 @@ def drawn(seed: int, plants: int, rows: int, rows_per_s: float) -> Plan:
             row=round((number + draw.uniform(0.0, 0.5)) * share),
             kind=kind,
             manner=manner,
-            whom=draw.randrange(2),
+            whom=max(draw.randrange(2), int(kind == "kill monitor")),
             rows=round(draw.uniform(SHORTEST_S, LONGEST_S) * rows_per_s),
         )
         for number, (kind, manner) in enumerate(kinds[:count], start=1)

@@ -4,7 +4,6 @@ A router, two monitors that share the fleet and the folder of its states, two pr
 of both monitors and of the second half of the plants go through proxies.
 """
 
-import os
 import subprocess
 import sys
 import threading
@@ -16,6 +15,7 @@ import msgspec
 
 from benchmarks.link_cuts import Proxy, Router
 from benchmarks.soak import publisher, stranger
+from benchmarks.soak.memory import Taken, own_memory_mb
 from benchmarks.soak.plan import PERIOD_MIN, TRAINING_ROWS, Blow, Plan
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
@@ -101,8 +101,8 @@ class Site:
         self._plants: list[subprocess.Popen[str]] = []
         self._stranger: subprocess.Popen[str] | None = None
         self._said: dict[str, Lines] = {}
-        self.memory_mb: dict[str, list[tuple[int, float]]] = {}
-        """By process, at which row how much it takes."""
+        self.memory: dict[str, list[Taken]] = {}
+        """By process, what it takes in the course of the run."""
 
     # --- start and end ---------------------------------------------------------------------------------------
 
@@ -232,21 +232,12 @@ class Site:
         numbers |= {f"monitor {number + 1}": process.pid for number, process in enumerate(self._monitors)}
         numbers |= {f"plants {part + 1}": process.pid for part, process in enumerate(self._plants)}
         for name, pid in numbers.items():
-            taken = _memory_mb(pid)
+            taken = own_memory_mb(pid)
             if taken:
-                self.memory_mb.setdefault(name, []).append((int(line), taken))
+                self.memory.setdefault(name, []).append(Taken(int(line), pid, taken))
 
 
 def _tell(process: "subprocess.Popen[str]", line: str) -> None:
     assert process.stdin is not None
     process.stdin.write(f"{line}\n")
     process.stdin.flush()
-
-
-def _memory_mb(pid: int) -> float:
-    """What a process holds of the machine's memory; 0 if it is gone."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
-    except (OSError, IndexError):
-        return 0.0
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

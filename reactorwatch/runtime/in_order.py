@@ -23,6 +23,7 @@ moment (`GATHER_NS`) nothing came that was older than what he had heard already.
 """
 
 from bisect import bisect_right
+from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import accumulate
 from operator import itemgetter
@@ -40,9 +41,8 @@ MOST_LOST = 100_000
 MOST_STREAMS = 100_000
 """That are remembered. A publisher that is started anew is another stream, so is each plant of a fleet."""
 STRANGE_NS = 60_000_000_000
-FEW_STREAMS = 1000
-"""A stream of which one number came, that nobody had told of and that is not its first, is nobody's: of more than a few
-streams such ones are forgotten when they have been silent for so long. Garbage makes a stream a message."""
+"""A stream that began with another number than 0, of which no last number was known and no second message came in this
+time, is forgotten: garbage makes a stream a message."""
 
 
 class Gap(NamedTuple):
@@ -79,7 +79,7 @@ class InOrder(Generic[Item]):
         self._by_key: dict[str, Stream[Item]] = {}  # that went on last on a key
         self._waiting: dict[tuple[int, str], Stream[Item]] = {}  # all in which something waits; perhaps others
         self._gathering = gathering
-        self._look_at = FEW_STREAMS  # so many streams: whether some are nobody's
+        self._unproven = deque[tuple[int, tuple[int, str]]]()  # when each stream was new; the oldest stand first
 
     def takes_next(self, publisher: int, key: str, number: int, now_ns: int) -> bool:
         """Take a message in if it is the one that is expected, and nothing waits: it goes on. As nearly always."""
@@ -196,27 +196,25 @@ class InOrder(Generic[Item]):
         return self._streams.get((publisher, stream)) or self._new((publisher, stream), 0)
 
     def _new(self, name: tuple[int, str], now_ns: int) -> Stream[Item]:
-        """Begin to remember a stream."""
-        if len(self._streams) >= min(self._look_at, MOST_STREAMS):
-            self._forget(now_ns)
-            self._look_at = max(2 * len(self._streams), FEW_STREAMS)
+        """Begin to remember a stream; forget what is due."""
+        while self._unproven and (now_ns - self._unproven[0][0] >= STRANGE_NS or len(self._streams) >= MOST_STREAMS):
+            _, oldest = self._unproven.popleft()
+            if (found := self._streams.get(oldest)) is not None and found.is_strange:
+                self._forget(oldest)
+        if len(self._streams) >= MOST_STREAMS:
+            idle = [(state.heard_ns, known) for known, state in self._streams.items() if state.waiting is None]
+            for _, longest_silent in sorted(idle)[: MOST_STREAMS // 10]:
+                self._forget(longest_silent)
         state: Stream[Item] = Stream(*name)
         self._streams[name] = state
+        self._unproven.append((now_ns, name))
         return state
 
-    def _forget(self, now_ns: int) -> None:
-        """Forget streams that are nobody's; if there are too many still, those that were silent for longest."""
-        gone = [
-            name for name, state in self._streams.items() if state.is_strange and now_ns - state.heard_ns >= STRANGE_NS
-        ]
-        if len(self._streams) - len(gone) >= MOST_STREAMS:
-            idle = [(state.heard_ns, name) for name, state in self._streams.items() if state.waiting is None]
-            gone = [name for _, name in sorted(idle)[: MOST_STREAMS // 10]]
-        for name in gone:
-            state = self._streams.pop(name)
-            for key in state.keys:
-                if self._by_key.get(key) is state:
-                    del self._by_key[key]
+    def _forget(self, name: tuple[int, str]) -> None:
+        state = self._streams.pop(name)
+        for key in state.keys:
+            if self._by_key.get(key) is state:
+                del self._by_key[key]
 
     def _released(self, waiting: Waiting[Item], number: int) -> Item:
         item = waiting.held.pop(number)[1]

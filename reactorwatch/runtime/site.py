@@ -285,11 +285,12 @@ def _router_settings(rules: dict[str, Any], listen: str) -> str:
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "adminspace": {"enabled": False},
         "transport": {
+            "shared_memory": {"enabled": False},
             "link": {
                 "protocols": ["tls"],
                 "tls": tls,
                 "tx": {"queue": {"congestion_control": {"block": {"wait_before_close": 1_000_000}}}},
-            }
+            },
         },
         "access_control": rules,
     }

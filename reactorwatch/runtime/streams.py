@@ -15,7 +15,8 @@ from reactorwatch.runtime.bus import matches
 
 STREAM_PARTS = 3
 """Parts of a key that a stream has in common: root, plant and kind."""
-MOST_CACHED = 100_000
+MOST_CACHED = 1000
+"""Names below a plant whose role is kept: all plants have the same ones, and made-up names push each other out."""
 
 _KEY_SPACES = sorted(
     ((expression, role) for role in ROLES for expression in role.key_space),
@@ -25,6 +26,7 @@ _KEY_SPACES = sorted(
 """The narrowest first: the recorder's own alarms are among the keys that the monitor's expression names."""
 
 
+@lru_cache(maxsize=MOST_CACHED)
 def role_of_key(name: str) -> Role | None:
     """The role that may publish on a key; None if no role may.
 
@@ -39,7 +41,6 @@ def role_of_key(name: str) -> Role | None:
     return next((role for expression, role in _KEY_SPACES if matches(expression, name)), None)
 
 
-@lru_cache(maxsize=MOST_CACHED)
 def stream_of(key: str) -> str:
     """The stream that a key is in: root, plant and kind; and the role, where it does not publish all of the kind.
 

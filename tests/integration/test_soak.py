@@ -34,6 +34,7 @@ def test_in_a_minute_of_kills_cuts_and_garbage_no_sample_is_unaccounted_for_and_
     broken = list(findings.broken(GROWTH_MB))
     assert not broken, "\n".join([*broken, table(plan, findings)])
     assert (findings.alarmed_once, len(findings.memory_mb)) == (len(plan.faults), 5)
+    assert {"monitor 1", "plants 1", "plants 2"} <= findings.grown_mb.keys()
 
 
 @pytest.mark.parametrize(

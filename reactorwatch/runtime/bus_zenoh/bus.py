@@ -39,7 +39,9 @@ log = structlog.get_logger()
 FLUSH_WITHIN_S = 10.0
 HEARTBEAT_S = 0.5
 EVERY_ROW = frozenset({keys.SAMPLE, keys.ESTIMATE, keys.RECONSTRUCTION, keys.CHART})
-"""Kinds that are published with every row. What is published less often would fill `cache_messages` for days."""
+"""Kinds that are published with every row, apart from `SELDOM_CHARTS`. What is published less often would fill
+`cache_messages` for days."""
+SELDOM_CHARTS = frozenset({"parameters"})
 MOST_KEPT_OF_OTHERS = 600
 """Messages kept on each key of another kind: of what is published each plant minute, `history_s` at `--speed 600`."""
 LAST_RECOVERY_S = 1.0  # that a bus stays open after its last message, so that who missed it can ask for it
@@ -375,15 +377,12 @@ class ZenohBus:
         self._numbers.setdefault(stream, 0)
         # Of the same priority as all else: of a lower one, the word that this was all would overtake the replies.
         again = zenoh.ext.RepliesConfig(congestion_control=zenoh.CongestionControl.BLOCK)
-        drop, most = self._config.congestion == "drop", self._config.cache_messages
-        topic = keys.parse(key)
-        if topic is None or topic.kind not in EVERY_ROW:
-            most = min(most, MOST_KEPT_OF_OTHERS)
+        drop = self._config.congestion == "drop"
         publisher = zenoh.ext.declare_advanced_publisher(
             self._voice,
             key,
             congestion_control=zenoh.CongestionControl.DROP if drop else zenoh.CongestionControl.BLOCK,
-            cache=zenoh.ext.CacheConfig(most, replies_config=again),
+            cache=zenoh.ext.CacheConfig(most_kept(key, self._config.cache_messages), replies_config=again),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=HEARTBEAT_S, sporadic_heartbeat=None),
             publisher_detection=True,
         )
@@ -454,6 +453,18 @@ class ZenohBus:
         for thread in self._gathering:
             if thread is not threading.current_thread():
                 thread.join(FLUSH_WITHIN_S)
+
+
+def most_kept(key: str, cache_messages: int) -> int:
+    """Return how many messages a publisher keeps on a key.
+
+    Args:
+        key: The key.
+        cache_messages: Messages that are kept on a key that is published with every row.
+    """
+    topic = keys.parse(key)
+    is_of_every_row = topic is not None and topic.kind in EVERY_ROW and topic.name.split("/")[0] not in SELDOM_CHARTS
+    return cache_messages if is_of_every_row else min(cache_messages, MOST_KEPT_OF_OTHERS)
 
 
 def _published_since(seconds: float) -> str:

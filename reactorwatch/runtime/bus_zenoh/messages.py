@@ -10,6 +10,8 @@ from reactorwatch.runtime.delivery import Numbered
 from reactorwatch.runtime.streams import STREAM_PARTS
 
 LONGEST_ENCODING = 1000
+LONGEST_KEY = 1000
+"""Characters of a key whose messages are put in order. A key may have 65,535, and the names of streams are kept."""
 
 NUMBERED = struct.Struct("<QQ")  # who published a message, and its number in the stream
 
@@ -36,7 +38,7 @@ class Reader:
         self._encoding, self._text = encoding, encoding_text(encoding)
 
     def read(self, sample: zenoh.Sample, now_ns: int) -> tuple[tuple[int, int] | None, Encoded]:
-        """A message that has come, and before it who published it as which number, if he told."""
+        """A message, and before it its publisher and number, if it has them and its key is at most `LONGEST_KEY`."""
         encoding = sample.encoding
         if encoding != self._encoding:
             self._encoding, self._text = encoding, encoding_text(encoding)
@@ -44,7 +46,7 @@ class Reader:
             (str(sample.key_expr), payload_of(sample.payload), self._text, now_ns)
         )  # the fastest way
         attachment = sample.attachment
-        if attachment is None:
+        if attachment is None or len(message.key) > LONGEST_KEY:
             return None, message
         name = attachment.to_bytes()
         return NUMBERED.unpack(name) if len(name) == NUMBERED.size else None, message

@@ -14,6 +14,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh.bus import ZenohBus
 from reactorwatch.runtime.bus_zenoh.messages import first_line
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.heap import return_large_blocks
 from reactorwatch.runtime.identity import ROUTER_FILES, TLS, client_settings
 from reactorwatch.runtime.serve import StopSignal
 
@@ -24,7 +25,13 @@ LONGEST_RETRY_S = 2.0
 SAY_AGAIN_S = 30.0
 STUCK_S = 1.0
 
-_STUCK = {"transport/link/tx/queue/congestion_control/block/wait_before_close": round(STUCK_S * 1e6)}
+_SHARED_MEMORY = "transport/shared_memory/enabled"
+_TRANSPORT = {
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": round(STUCK_S * 1e6),
+    _SHARED_MEMORY: False,
+}
+"""Zenoh hands messages of more than 3 kB over in memory that both processes map. A session keeps the 18 MB of a process
+that has ended, and 2 MB beside it, for as long as it runs: each restart of a process would take 20 MB in all others."""
 _RETRY = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
 
 
@@ -49,6 +56,7 @@ def connect(
         InputError: the endpoint is not one that Zenoh understands.
     """
     client = _client(config)
+    return_large_blocks()
     woken = threading.Event()
     stop.wakes(woken.set)
     retry_s = FIRST_RETRY_S
@@ -90,7 +98,7 @@ def _client(config: BusConfig) -> zenoh.Config:
         "connect/timeout_ms": 0,
         "scouting/multicast/enabled": False,
         "timestamping/enabled": True,  # by which the age of what was published is known
-        **_STUCK,
+        **_TRANSPORT,
         **client_settings(config),
     }
     return _checked(settings, config.endpoint)
@@ -117,8 +125,9 @@ def router(config: BusConfig) -> ZenohBus:
         "connect/timeout_ms": {"router": -1},
         "connect/exit_on_failure": {"router": False},
         "scouting/multicast/enabled": False,
-        **_STUCK,
+        **_TRANSPORT,
     }
+    return_large_blocks()
     try:
         session = zenoh.open(_checked(settings, config.endpoint))
     except zenoh.ZError as error:
@@ -138,8 +147,10 @@ def router_from_file(path: Path) -> ZenohBus:
     Raises:
         InputError: it cannot be read or makes no sense, or nothing can listen where it says.
     """
+    return_large_blocks()
     try:
         config = zenoh.Config.from_file(str(path))
+        config.insert_json5(_SHARED_MEMORY, "false")
         for name in ROUTER_FILES:
             file = json.loads(config.get_json(f"{TLS}/{name}"))
             if file is not None:

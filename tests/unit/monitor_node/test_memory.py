@@ -2,18 +2,22 @@
 
 import gc
 from collections import Counter
+from functools import partial
 
 import numpy as np
 import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
+from reactorwatch.runtime.bus_zenoh.bus import most_kept
 
 from .fleets import fleet, of_plant
 from .samples import leaking_run, samples
 
 TRAINING_ROWS, ROUND = 200, 400
+CACHE_MESSAGES = 10_000
 ROUNDS = 4
 """Each has an alarm, a silence and what cannot be used; the first two fill what is bounded."""
 
@@ -92,3 +96,17 @@ def test_a_fleet_s_monitor_holds_as_many_objects_after_each_round(rows: list[lis
             list(node.reports(row * 10**9))
             counts.append(objects())
     assert growth(counts[1], counts[-1]) == {}
+
+
+def test_all_that_publishers_keep_in_full_is_published_with_every_row() -> None:
+    """What comes less often and is kept in full takes more memory for days, until there are `cache_messages` of it."""
+    training_rows, watched_rows = 600, 200
+    monitor, counts = Monitor(MonitorConfig(training_min=training_rows / 10, isolation=False), 0), Counter[str]()
+    time_min, columns = leaking_run(0.0, 1.0, (training_rows + watched_rows) / 10, seed=4)
+    for number, message in enumerate(samples(time_min, columns)):
+        counts.update(told.key for told in monitor.on_message(message, number * 10**9))
+    kept = {key for key in counts if most_kept(key, CACHE_MESSAGES) == CACHE_MESSAGES}
+    chart = partial(keys.key, "cstr", keys.CHART)
+    assert {chart("ewma/T"), chart("shewhart/T"), keys.key("cstr", keys.ESTIMATE, "T")} <= kept
+    assert {chart("parameters/T"), keys.key("cstr", keys.MODEL, "T")} <= counts.keys() - kept
+    assert {key: counts[key] for key in kept if counts[key] < 0.9 * watched_rows} == {}

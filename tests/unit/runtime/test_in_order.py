@@ -7,7 +7,6 @@ import pytest
 
 from reactorwatch.runtime import in_order, numbered_stream
 from reactorwatch.runtime.in_order import (
-    FEW_STREAMS,
     GATHER_NS,
     LOOK_AGAIN_NS,
     PATIENCE_NS,
@@ -366,7 +365,22 @@ def test_publishers_of_one_message_that_nobody_had_told_of_are_forgotten() -> No
         assert fed(order, [2**40 + number], now_ns=now_ns, publisher=1 + number) == []
         if (due_ns := order.due_ns()) is not None and due_ns <= now_ns:
             list(order.overdue(now_ns))
-        assert len(order._streams) <= 4000
+        assert len(order._streams) <= 1002  # those of the last minute, and the plant's
+
+
+def test_a_flood_of_made_up_publishers_pushes_out_its_own_and_not_those_that_are_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """More of them in a minute than there is room for: the plant's own alarms may be silent for longer than they."""
+    monkeypatch.setattr(in_order, "MOST_STREAMS", 100)
+    order = InOrder[int]()
+    assert fed(order, [0, 1]) == [0, 1]
+    for number in range(1000):
+        fed(order, [2**40], now_ns=number, publisher=2 + number)
+        list(order.overdue(number + GATHER_NS))
+        assert len(order._streams) <= 100
+        assert len(order._unproven) <= 100
+    assert fed(order, [3, 2], now_ns=1000) == [2, 3]
 
 
 def test_publishers_that_were_told_of_or_heard_from_their_beginning_are_not_forgotten() -> None:
@@ -375,7 +389,7 @@ def test_publishers_that_were_told_of_or_heard_from_their_beginning_are_not_forg
     order.tell_last(1, STREAM, "T", 7)
     assert list(order.gathered(0)) == []
     assert fed(order, [0], publisher=2) == [0]
-    for number in range(3 * FEW_STREAMS):
+    for number in range(1000):
         fed(order, [2**40], now_ns=2 * number * STRANGE_NS, publisher=3 + number)
         assert order.due_ns() is not None
         list(order.overdue(2 * number * STRANGE_NS + GATHER_NS))

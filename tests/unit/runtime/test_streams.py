@@ -11,7 +11,7 @@ from reactorwatch.runtime.access import ROLES, access_control
 from reactorwatch.runtime.bus import matches
 from reactorwatch.runtime.delivery import Delivery, Numbered
 from reactorwatch.runtime.in_order import Gap
-from reactorwatch.runtime.streams import keys_of, stream_of
+from reactorwatch.runtime.streams import MOST_CACHED, keys_of, role_of_key, stream_of
 
 ROOT = "reactor/cstr"
 KINDS = (
@@ -92,3 +92,14 @@ def test_numbers_that_another_role_uses_up_suppress_no_message(intruder: str, *,
         delivery.close()
         assert [item.key for item in heard].count(victim_key) == 6, victim_key
         assert stream_of(victim_key) not in {gap.stream for gap in gaps}
+
+
+def test_of_keys_without_number_a_thousand_names_are_kept_and_of_plants_none() -> None:
+    """A key may have 65,535 characters, and its sender chooses them."""
+    role_of_key.cache_clear()
+    for number in range(2 * MOST_CACHED):
+        assert stream_of(f"reactor/p{number}/sample/T") == f"reactor/p{number}/sample"
+    assert role_of_key.cache_info().currsize == 1
+    for number in range(2 * MOST_CACHED):
+        assert stream_of(f"reactor/cstr/sample/x{number}") == "reactor/cstr/sample"
+    assert role_of_key.cache_info().currsize == MOST_CACHED == 1000
