@@ -4,6 +4,8 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+# bytecode is kept: without it each of the processes that tests start compiles every module again
+unexport PYTHONDONTWRITEBYTECODE
 # each has a target of its own
 LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py)
 READY := .venv/.ready

@@ -19,7 +19,7 @@ from math import inf, log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize, special
+from scipy import special
 
 Array = NDArray[np.float64]
 
@@ -50,6 +50,8 @@ def estimated_t2_quantile(tail: float, freedoms: Array, rows: float) -> float:
     Returns:
         The quantile; infinite if it is beyond `LARGEST`.
     """
+    from scipy import optimize  # a fifth of a second, which a monitor need not take before it is there
+
     p = freedoms.size
     factor, share = _factor(p, rows)
     reach = 4.0 * float(special.chdtri(p, tail))

@@ -1,12 +1,17 @@
 """What tests of several parts share."""
 
+import contextlib
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
 import pytest
 import structlog
+
+from tests.running import Command
 
 ROOT = Path(__file__).parents[1]
 
@@ -37,6 +42,23 @@ def daisy_csv() -> Path:
     if not path.is_file():
         pytest.skip(f"the DaISy record is not at {path}; name its folder's parent in REACTORWATCH_SHARED")
     return path
+
+
+@pytest.fixture
+def called(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Run `reactorwatch` with arguments to its end within this process: to start another one takes a second."""
+    from reactorwatch.cli.main import main
+
+    def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+        words = ["reactorwatch", *map(str, arguments)]
+        monkeypatch.setattr(sys, "argv", words)
+        capsys.readouterr()
+        with contextlib.chdir(cwd or Path.cwd()), pytest.raises(SystemExit) as ended:
+            main()
+        assert isinstance(ended.value.code, int)
+        return subprocess.CompletedProcess(words, ended.value.code, *capsys.readouterr())
+
+    return run
 
 
 @pytest.fixture(autouse=True)

@@ -1,5 +1,6 @@
 """What runs in a thread while a test talks to it."""
 
+import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -7,6 +8,9 @@ from contextlib import contextmanager
 from reactorwatch.runtime.serve import StopSignal
 
 WITHIN_S = 60.0
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
+"""Runs `reactorwatch` with arguments to its end."""
 
 
 @contextmanager

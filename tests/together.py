@@ -3,8 +3,8 @@
 Tests of a file share what is made once for them: a demonstration that was run, a cluster, a record that was diagnosed.
 Several workers would each make it. And where no machine code of a diagnosis was ever made, whoever diagnoses first
 makes it, for a quarter of a minute; it is on the disk for those that come after. It is the same with the monitors of a
-fleet. So the files named here are two pieces of work, which are begun first; all other tests go one by one to whoever
-is free.
+fleet. So the files named here are three pieces of work, which are begun first; all other tests go one by one to the
+worker that is free.
 
 The marks of pytest-xdist for this, `xdist_group`, group nothing with pytest 9.2 (pytest-dev/pytest-xdist#1386).
 """
@@ -21,6 +21,7 @@ PIECES = {
     "tests/hidden_effect/test_outside.py": "diagnosing",
     "tests/integration/test_fleet_on_router.py": "fleets",
     "tests/integration/test_soak.py": "fleets",
+    "tests/unit/runtime/test_jobs.py": "clusters",
 }
 
 

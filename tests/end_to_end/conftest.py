@@ -1,6 +1,5 @@
 """Real processes on a real router, all on loopback, all ended with the test."""
 
-import contextlib
 import subprocess
 import sys
 import threading
@@ -9,17 +8,16 @@ from pathlib import Path
 
 import pytest
 
-from reactorwatch.cli.main import main
 from reactorwatch.runtime.bus_zenoh import ZenohBus, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
+from tests.running import Command as Command
 
 REACTORWATCH = str(Path(sys.executable).with_name("reactorwatch"))
 PATIENCE_S = 60.0
 COMMAND_WITHIN_S = 300.0
 """A diagnosis is half a minute of computing, and a busy machine takes several times that."""
 
-Command = Callable[..., subprocess.CompletedProcess[str]]
 Start = Callable[..., subprocess.Popen[str]]
 WaitAlive = Callable[..., None]
 
@@ -37,22 +35,6 @@ def command() -> Command:
             check=False,
             cwd=cwd,
         )
-
-    return run
-
-
-@pytest.fixture
-def called(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """The same within this process, for what is told before anything begins: a process takes a second to start."""
-
-    def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-        words = ["reactorwatch", *map(str, arguments)]
-        monkeypatch.setattr(sys, "argv", words)
-        capsys.readouterr()
-        with contextlib.chdir(cwd or Path.cwd()), pytest.raises(SystemExit) as ended:
-            main()
-        assert isinstance(ended.value.code, int)
-        return subprocess.CompletedProcess(words, ended.value.code, *capsys.readouterr())
 
     return run
 

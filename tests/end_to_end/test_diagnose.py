@@ -74,10 +74,10 @@ def test_machines_get_one_object_and_a_report(said: subprocess.CompletedProcess[
 
 
 def test_simulate_with_the_extended_model_is_the_free_run_of_the_diagnosis(
-    said: subprocess.CompletedProcess[str], folder: Path, known: Diagnosis, command: Command
+    said: subprocess.CompletedProcess[str], folder: Path, known: Diagnosis, called: Command
 ) -> None:
     assert said.returncode == 0
-    done = command("simulate", "leak.csv", "-o", "free.csv", "--model", "report/extended.json", cwd=folder)
+    done = called("simulate", "leak.csv", "-o", "free.csv", "--model", "report/extended.json", cwd=folder)
     assert done.returncode == 0, done.stderr
     simulated = read_csv(folder / "free.csv").columns
     assert known.curves is not None
@@ -89,23 +89,23 @@ def test_simulate_with_the_extended_model_is_the_free_run_of_the_diagnosis(
 
 
 def test_the_same_record_against_the_extended_model_is_nominal(
-    said: subprocess.CompletedProcess[str], folder: Path, command: Command
+    said: subprocess.CompletedProcess[str], folder: Path, called: Command
 ) -> None:
     assert said.returncode == 0
-    done = command("diagnose", "leak.csv", "--model", "report/extended.json", cwd=folder)
+    done = called("diagnose", "leak.csv", "--model", "report/extended.json", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "The simulation is right" in done.stdout
 
 
 def test_the_monitor_takes_the_extended_model_for_its_reference(
-    said: subprocess.CompletedProcess[str], folder: Path, command: Command
+    said: subprocess.CompletedProcess[str], folder: Path, called: Command
 ) -> None:
     assert said.returncode == 0
     settings = "[monitor]\ntraining_min = 60.0\nisolation = false\n"
     (folder / "nominal.toml").write_text(settings)
     (folder / "settings.toml").write_text(f'{settings}model = "report/extended.json"\n')
-    without = json.loads(command("backtest", "leak.csv", "--config", "nominal.toml", "--json", cwd=folder).stdout)
-    done = command("backtest", "leak.csv", "--config", "settings.toml", "--json", cwd=folder)
+    without = json.loads(called("backtest", "leak.csv", "--config", "nominal.toml", "--json", cwd=folder).stdout)
+    done = called("backtest", "leak.csv", "--config", "settings.toml", "--json", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert without["alarms"]
     assert json.loads(done.stdout)["alarms"] == []
@@ -126,47 +126,37 @@ def test_a_plant_of_the_extended_model_has_the_fault_in_it(
     assert parse_fault(text).effect.name == "coolant_flow"
 
 
-def test_several_files_give_one_line_each_in_their_order(
-    folder: Path, command: Command, said: subprocess.CompletedProcess[str]
+def test_several_files_give_one_line_each_in_their_order_and_a_bad_one_stops_none_of_the_rest(
+    folder: Path, called: Command
 ) -> None:
-    assert said.returncode == 0
-    write_csv(folder / "quiet.csv", simulate_record(PlantConfig(seed=6), 600))
+    write_csv(folder / "quiet.csv", simulate_record(PlantConfig(seed=6), 300))
     (folder / "again").mkdir()
-    write_csv(folder / "again" / "quiet.csv", simulate_record(PlantConfig(seed=8), 600))
-    files = ["quiet.csv", "again/quiet.csv"]
-    done = command("diagnose", *files, "--json", "-o", "all", cwd=folder)
-    assert done.returncode == 0, done.stderr
+    write_csv(folder / "again" / "quiet.csv", simulate_record(PlantConfig(seed=8), 300))
+    (folder / "short.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,0.1,440\n")
+    files = ["short.csv", "quiet.csv", "nowhere.csv", "again/quiet.csv"]
+    done = called("diagnose", *files, "--json", "--jobs", "1", "-o", "all", cwd=folder)
+    assert done.returncode == 2
     found = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [item["file"] for item in found] == files
+    assert [item["file"] for item in found] == ["quiet.csv", "again/quiet.csv"]
     assert {item["verdict"] for item in found} == {"nominal"}
     assert [item["location"] for item in found] == [None, None]
+    assert done.stderr.splitlines() == [
+        "reactorwatch: short.csv: a diagnosis needs at least 200 rows, got 2; record for longer",
+        "reactorwatch: nowhere.csv: there is no such file",
+    ]
     assert sorted(path.name for path in (folder / "all").iterdir()) == [
         "quiet",
         "quiet-2",
         "summary.csv",
         "summary.json",
     ]
-
-
-def test_one_bad_file_among_several_is_told_in_a_line_and_the_rest_is_finished(folder: Path, command: Command) -> None:
-    write_csv(folder / "right.csv", simulate_record(PlantConfig(seed=6), 600))
-    (folder / "short.csv").write_text("time_min,qc,C,T\n0,100,0.1,440\n0.1,100,0.1,440\n")
-    done = command("diagnose", "short.csv", "right.csv", "nowhere.csv", "--json", "-o", "rest", cwd=folder)
-    assert done.returncode == 2
-    (line,) = done.stdout.splitlines()
-    assert json.loads(line)["file"] == "right.csv"
-    assert done.stderr.splitlines() == [
-        "reactorwatch: short.csv: a diagnosis needs at least 200 rows, got 2; record for longer",
-        "reactorwatch: nowhere.csv: there is no such file",
-    ]
-    assert sorted(path.name for path in (folder / "rest").iterdir()) == ["right", "summary.csv", "summary.json"]
-    rows = json.loads((folder / "rest" / "summary.json").read_text())
-    assert (rows["files"], rows["failed"]) == (3, 2)
-    assert [row["verdict"] for row in rows["results"]] == [None, "nominal", None]
+    rows = json.loads((folder / "all" / "summary.json").read_text())
+    assert (rows["files"], rows["failed"]) == (4, 2)
+    assert [row["verdict"] for row in rows["results"]] == [None, "nominal", None, "nominal"]
     assert rows["results"][2]["error"] == "there is no such file"
 
 
-def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, command: Command) -> None:
+def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, called: Command) -> None:
     narrow = PlantConfig(
         seed=2,
         faults=("heat_loss:constant:0.02",),
@@ -174,7 +164,7 @@ def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, c
     )
     write_csv(tmp_path / "narrow.csv", simulate_record(narrow, 1200))
     limits = ["--limits", "qc=97..110,T=425..455"]
-    done = command("diagnose", "narrow.csv", "--json", "-o", "report", *limits, cwd=tmp_path)
+    done = called("diagnose", "narrow.csv", "--json", "-o", "report", *limits, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     listed = [item["causes"] for item in found["alternatives"]]
@@ -193,7 +183,7 @@ def test_the_proposed_experiment_is_a_file_that_drives_a_plant(tmp_path: Path, c
     np.testing.assert_array_equal(driven.columns["qc"], expected)
 
     write_csv(tmp_path / "right.csv", simulate_record(PlantConfig(seed=6), 600))
-    again = command("diagnose", "right.csv", "-o", "report", cwd=tmp_path)
+    again = called("diagnose", "right.csv", "-o", "report", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert not (tmp_path / "report" / "experiment.csv").exists()  # that of the earlier report
 

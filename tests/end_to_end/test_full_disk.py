@@ -46,26 +46,26 @@ def fill(bus: ZenohBus) -> None:
 
 
 def test_a_full_disk_is_listed_with_the_other_alarms_and_can_be_acknowledged(
-    tmp_path: Path, bus: ZenohBus, endpoint: str, command: Command, start: Start, wait_alive: WaitAlive
+    tmp_path: Path, bus: ZenohBus, endpoint: str, called: Command, start: Start, wait_alive: WaitAlive
 ) -> None:
     start("monitor", "--endpoint", endpoint)
     with recording(tmp_path, endpoint):
         wait_alive("cstr", "monitor", "recorder")
-        early = command("alarm", "acknowledge", DISK, "--by", "Ada", "--endpoint", endpoint)
+        early = called("alarm", "acknowledge", DISK, "--by", "Ada", "--endpoint", endpoint)
         assert (early.returncode, early.stderr) == (2, f"reactorwatch: alarm {DISK} has not come up\n")
         fill(bus)
         listed = [
-            json.loads(line) for line in command("alarm", "list", "--json", "--endpoint", endpoint).stdout.splitlines()
+            json.loads(line) for line in called("alarm", "list", "--json", "--endpoint", endpoint).stdout.splitlines()
         ]
         (disk,) = [alarm for alarm in listed if alarm["alarm"] == DISK]
         assert (disk["state"], disk["priority"]) == ("unacknowledged", "critical")
         assert "shewhart/T" in {alarm["alarm"] for alarm in listed}
-        done = command("alarm", "acknowledge", DISK, "--by", "Ada", "--comment", "I make room", "--endpoint", endpoint)
+        done = called("alarm", "acknowledge", DISK, "--by", "Ada", "--comment", "I make room", "--endpoint", endpoint)
         assert (done.returncode, done.stderr) == (0, "")
         assert done.stdout.startswith(f"{DISK} (critical): acknowledged; ")
         assert done.stdout.rstrip().endswith("Ada: I make room")
-        shelved = command("alarm", "shelve", DISK, "--by", "Ada", "--minutes", "5", "--endpoint", endpoint)
+        shelved = called("alarm", "shelve", DISK, "--by", "Ada", "--minutes", "5", "--endpoint", endpoint)
         assert (shelved.returncode, shelved.stdout) == (2, "")
         assert "can be acknowledged and nothing else" in shelved.stderr
-    gone = command("alarm", "acknowledge", DISK, "--by", "Ada", "--endpoint", endpoint)
+    gone = called("alarm", "acknowledge", DISK, "--by", "Ada", "--endpoint", endpoint)
     assert (gone.returncode, gone.stderr.count("no recorder of plant 'cstr' answered")) == (2, 1)

@@ -13,8 +13,8 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus
 from .conftest import PATIENCE_S, Command, Start, WaitAlive
 
 
-def test_the_equations_reproduce_the_record(daisy_csv: Path, tmp_path: Path, command: Command) -> None:
-    done = command("simulate", daisy_csv, "-o", tmp_path / "simulated.csv")
+def test_the_equations_reproduce_the_record(daisy_csv: Path, tmp_path: Path, called: Command) -> None:
+    done = called("simulate", daisy_csv, "-o", tmp_path / "simulated.csv")
     assert done.returncode == 0, done.stderr
     measured, simulated = read_csv(daisy_csv), read_csv(tmp_path / "simulated.csv")
     assert np.array_equal(simulated.time_min, measured.time_min)
@@ -25,7 +25,14 @@ def test_the_equations_reproduce_the_record(daisy_csv: Path, tmp_path: Path, com
 
 
 def test_replayed_it_is_watched_recorded_and_drawn(
-    daisy_csv: Path, tmp_path: Path, bus: ZenohBus, endpoint: str, start: Start, wait_alive: WaitAlive, command: Command
+    daisy_csv: Path,
+    tmp_path: Path,
+    bus: ZenohBus,
+    endpoint: str,
+    start: Start,
+    wait_alive: WaitAlive,
+    command: Command,
+    called: Command,
 ) -> None:
     recording = tmp_path / "daisy.mcap"
     recorder = start("record", "--endpoint", endpoint, "--out", recording)
@@ -37,19 +44,19 @@ def test_replayed_it_is_watched_recorded_and_drawn(
         node.send_signal(signal.SIGTERM)
         assert node.wait(PATIENCE_S) == 0
     exported = tmp_path / "exported.csv"
-    assert command("export", recording, "-o", exported).returncode == 0
+    assert called("export", recording, "-o", exported).returncode == 0
     measured, back = read_csv(daisy_csv), read_csv(exported)
     for name, values in measured.columns.items():
         assert np.array_equal(back.columns[name], values), name
     assert np.allclose(back.time_min, measured.time_min - measured.time_min[0], atol=1e-9)
 
-    drawing = command("dashboard", recording, "-o", tmp_path / "daisy.rrd")
+    drawing = called("dashboard", recording, "-o", tmp_path / "daisy.rrd")
     assert drawing.returncode == 0, drawing.stderr
     assert (tmp_path / "daisy.rrd").stat().st_size > 100_000
 
     said = {}
     for name, file in (("csv", daisy_csv), ("mcap", recording)):
-        done = command("backtest", file, "--json")
+        done = called("backtest", file, "--json")
         assert done.returncode == 0, done.stderr
         said[name] = json.loads(done.stdout)
     assert said["csv"]["samples"] == said["mcap"]["samples"] == 7500
@@ -59,17 +66,17 @@ def test_replayed_it_is_watched_recorded_and_drawn(
 
 
 def test_a_fault_put_into_the_record_is_found_in_either_format_at_the_same_minute(
-    daisy_csv: Path, tmp_path: Path, command: Command
+    daisy_csv: Path, tmp_path: Path, called: Command
 ) -> None:
     """Its thermometer reads 2 K too much from row 5000 on."""
     measured = read_csv(daisy_csv)
     measured.columns["T"][5000:] += 2.0
     csv, recording = tmp_path / "biased.csv", tmp_path / "biased.mcap"
     write_csv(csv, measured)
-    assert command("import", csv, "-o", recording).returncode == 0
+    assert called("import", csv, "-o", recording).returncode == 0
     said = []
     for file in (csv, recording):
-        done = command("backtest", file, "--json")
+        done = called("backtest", file, "--json")
         assert done.returncode == 0, done.stderr
         said.append(json.loads(done.stdout))
     onset = measured.time_min[5000]
@@ -81,10 +88,10 @@ def test_a_fault_put_into_the_record_is_found_in_either_format_at_the_same_minut
         assert ours["suspect"] == theirs["suspect"]
 
 
-def test_import_and_export_give_the_same_rows(daisy_csv: Path, tmp_path: Path, command: Command) -> None:
+def test_import_and_export_give_the_same_rows(daisy_csv: Path, tmp_path: Path, called: Command) -> None:
     recording, exported = tmp_path / "a.mcap", tmp_path / "b.csv"
-    assert command("import", daisy_csv, "-o", recording).returncode == 0
-    assert command("export", recording, "-o", exported).returncode == 0
+    assert called("import", daisy_csv, "-o", recording).returncode == 0
+    assert called("export", recording, "-o", exported).returncode == 0
     measured, back = read_csv(daisy_csv), read_csv(exported)
     for name, values in measured.columns.items():
         assert np.array_equal(back.columns[name], values)

@@ -98,23 +98,23 @@ def test_a_browser_shows_the_lines_of_a_run_while_it_runs(page: Browser, setting
     assert not listens("127.0.0.1", port), "the viewer ends with the command"
 
 
-def test_a_port_that_somebody_has_is_told(command: Command) -> None:
+def test_a_port_that_somebody_has_is_told(called: Command) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        done = command("view", "--web", "--port", str(port - 1))  # the data go by the next
+        done = called("view", "--web", "--port", str(port - 1))  # the data go by the next
     assert done.returncode == 2
     assert f"nothing can listen at 127.0.0.1 port {port}" in done.stderr
     assert "choose another --port" in done.stderr
 
 
 def test_without_a_screen_there_is_no_window_and_one_line_says_what_to_do(
-    command: Command, monkeypatch: pytest.MonkeyPatch
+    called: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
-    done = command("view")
+    done = called("view")
     assert done.returncode == 2
     assert "--web" in done.stderr
     assert "Traceback" not in done.stderr
@@ -122,12 +122,12 @@ def test_without_a_screen_there_is_no_window_and_one_line_says_what_to_do(
 
 
 def test_a_viewer_that_finds_no_screen_ends_the_command_while_it_waits_for_a_router(
-    command: Command, monkeypatch: pytest.MonkeyPatch
+    called: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("DISPLAY", ":4711")
-    done = command("view", "--endpoint", f"tcp/127.0.0.1:{free_port()}")
+    done = called("view", "--endpoint", f"tcp/127.0.0.1:{free_port()}")
     assert done.returncode == 2
     assert "the viewer ended with code" in done.stderr
     assert "try --web" in done.stderr

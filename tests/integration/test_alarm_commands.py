@@ -18,9 +18,8 @@ from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus_zenoh import ZenohBus, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
+from tests.running import Command
 from tests.unit.monitor_node.samples import leaking_run, samples
-
-from ..end_to_end.conftest import REACTORWATCH
 
 WITHIN_S = 60.0
 END_MIN = 140.0
@@ -33,10 +32,12 @@ class Control:
         bus: the router.
         endpoint: where it listens.
         folder: for settings and the file of alarm states.
+        called: runs a command.
     """
 
-    def __init__(self, bus: ZenohBus, endpoint: str, folder: Path) -> None:
+    def __init__(self, bus: ZenohBus, endpoint: str, folder: Path, called: Command) -> None:
         self.bus = bus
+        self._called = called
         self.file = folder / "alarms.state"
         self.heard: list[Message] = []
         self.alive = False
@@ -78,8 +79,7 @@ class Control:
 
     def alarm(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         """`reactorwatch alarm` to its end."""
-        command = [REACTORWATCH, "alarm", *arguments, "--config", str(self._settings)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=WITHIN_S, check=False)
+        return self._called("alarm", *arguments, "--config", str(self._settings))
 
     def listed(self) -> dict[str, dict[str, Any]]:
         """What `alarm list --json` says, by alarm."""
@@ -99,10 +99,10 @@ class Control:
 
 
 @pytest.fixture
-def control(tmp_path: Path) -> Iterator[Control]:
+def control(tmp_path: Path, called: Command) -> Iterator[Control]:
     endpoint = free_endpoint()
     bus = router(BusConfig(endpoint=endpoint))
-    yield Control(bus, endpoint, tmp_path)
+    yield Control(bus, endpoint, tmp_path, called)
     bus.close()
 
 

@@ -142,24 +142,10 @@ def test_what_is_counted_of_each_plant_is_on_the_monitor_s_page(bus_config: BusC
         assert f'reactorwatch_messages_received_total{{node="monitor",plant="{plant}"}} 0.0' in page
 
 
-def test_one_monitor_answers_a_command_and_that_of_the_plant(bus_config: BusConfig, tmp_path: Path) -> None:
+def test_one_monitor_answers_for_each_plant_and_another_takes_over_the_plants_of_one_that_is_killed(
+    bus_config: BusConfig, tmp_path: Path
+) -> None:
     payload, encoding = encode_message(ListAlarms())
-    with client(bus_config) as bus, monitor(bus_config, tmp_path, "1/2"), monitor(bus_config, tmp_path, "2/2"):
-        watchers = Watchers()
-        bus.watch_alive("reactor/*/alive/monitor", watchers.on_token)
-        crew_are = crew_of(bus)
-        crew_are(2)
-        for plant in PLANTS:
-            bus.announce(f"reactor/{plant}/alive/plant")
-        watchers.wait_for(set(PLANTS))
-        for plant in PLANTS:
-            (answer,) = bus.ask(Encoded(f"reactor/{plant}/command/list_alarms", payload, encoding), WITHIN_S)
-            reply = decode(answer.payload, answer.encoding)
-            assert isinstance(reply, CommandReply)
-            assert "ewma/T" in [alarm.alarm for alarm in reply.alarms]
-
-
-def test_the_plants_of_a_monitor_that_is_killed_are_taken_over(bus_config: BusConfig, tmp_path: Path) -> None:
     with (
         client(bus_config) as bus,
         monitor(bus_config, tmp_path, "1/2"),
@@ -172,6 +158,11 @@ def test_the_plants_of_a_monitor_that_is_killed_are_taken_over(bus_config: BusCo
         for plant in PLANTS:
             bus.announce(f"reactor/{plant}/alive/plant")
         watchers.wait_for(set(PLANTS))
+        for plant in PLANTS:
+            (answer,) = bus.ask(Encoded(f"reactor/{plant}/command/list_alarms", payload, encoding), WITHIN_S)
+            reply = decode(answer.payload, answer.encoding)
+            assert isinstance(reply, CommandReply)
+            assert "ewma/T" in [alarm.alarm for alarm in reply.alarms]
         alarms: SimpleQueue[str] = SimpleQueue()
         bus.subscribe("reactor/*/alarm/**", lambda message: alarms.put(_raised(message)))
         second.send_signal(signal.SIGKILL)

@@ -1,6 +1,6 @@
 """A fleet runs for a minute while its processes are killed, its links cut and garbage comes; ten minutes: `make soak`.
 
-The same code with 40 plants instead of 200, and five times faster: the time goes into starting processes, and on a
+The same code with 20 plants instead of 200, and five times faster: the time goes into starting processes, and on a
 machine with other things to do 200 plants would be late, which says nothing. What happens is counted in rows of the
 plants, which wait for it, so that a slow machine does the same, later. A minute is too short for memory to be level, as
 buffers grow to what the first flood wants; only what grows without end would be found.
@@ -18,7 +18,7 @@ from reactorwatch.contract.messages_pb2 import Health
 
 ROWS = 500
 ROWS_PER_S = 10.0
-PLANTS = 40
+PLANTS = 20
 SEED = 1
 GROWTH_MB = 150.0
 
