@@ -153,6 +153,10 @@ class RunReader:
         elif kind == keys.MODEL:
             self._models.setdefault((into.topic.name, _use(message)), []).append(_snapshot(message, time_ns))
 
+    def count_from(self, time_ns: int) -> None:
+        """Set the time that the run's minutes count from, before anything of it was cut."""
+        self._counted_from_ns = time_ns
+
     @property
     def has_samples(self) -> bool:
         """True once there was a sample, before the last cut or since."""

@@ -48,9 +48,9 @@ def ask_for_past(bus: Bus, plant: str) -> Past:
                 listed += reply.alarms
                 answered.add(node)
     zero_ns: int | None = None
-    for health in _decoded(bus.recall(keys.all_of(plant, keys.HEALTH))):
-        if isinstance(health, messages.Health) and health.heard_from_ns:
-            zero_ns = min(health.heard_from_ns.values())
+    for message in bus.recall(keys.all_of(plant, keys.HEALTH)):
+        said_ns = zero_of(message)
+        zero_ns = zero_ns if said_ns is None else said_ns
     alarms = (encode(Publication(keys.key(plant, keys.ALARM, item.alarm), item)) for item in changes(listed))
     return Past(tuple(alarms), zero_ns, frozenset(answered))
 
@@ -110,6 +110,14 @@ class PastQuery:
                     self._thread = None
                     return
             self._ended.wait(AGAIN_S)
+
+
+def zero_of(message: Encoded) -> int | None:
+    """The time of a run's first sample, if a message is a monitor's report of health that says it."""
+    for health in _decoded([message]):
+        if isinstance(health, messages.Health) and health.heard_from_ns:
+            return min(health.heard_from_ns.values())
+    return None
 
 
 def changes(listed: Iterable[messages.Alarm]) -> Iterator[messages.Alarm]:

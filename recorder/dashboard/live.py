@@ -29,7 +29,7 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_port
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.dashboard.drawing import Drawing
-from recorder.dashboard.late_joiner import Past, PastQuery, ask_for_past
+from recorder.dashboard.late_joiner import Past, PastQuery, ask_for_past, zero_of
 from recorder.dashboard.stream import APPLICATION
 from recorder.dashboard.viewer import viewer
 from recorder.panels import PANELS
@@ -42,6 +42,8 @@ SCREENS = ("WAYLAND_DISPLAY", "WAYLAND_SOCKET", "DISPLAY")  # whichever of them 
 ENDED_WELL = (None, 0, 130, -signal.SIGINT, -signal.SIGTERM)  # it runs, was closed, or was asked to end as we were
 LOOPBACK = ("127.0.0.1", "::1")
 DRAW_EVERY_NS = 500_000_000
+ZERO_WITHIN_NS = 15_000_000_000
+"""Three times the usual period of reports of health."""
 START_WITHIN_S = 30.0
 LOOK_EVERY_S = 0.1
 MOST_KNOWN = 10_000
@@ -132,6 +134,8 @@ class LiveDashboard:
         self._drawing = Drawing(recording)
         self._reader = RunReader(past.zero_ns)
         self._has_zero = past.zero_ns is not None
+        # a fleet's monitor remembers no report of health: the next one says the zero
+        self._zero_within_ns = now_ns + (ZERO_WITHIN_NS if not self._has_zero and "monitor" in past.answered else 0)
         self._query = query
         self._known = dict.fromkeys(map(_change, past.alarms))
         self._taken = len(past.alarms)
@@ -143,6 +147,9 @@ class LiveDashboard:
         """Keep it until there is something to be drawn."""
         if self._is_known(message):
             return []  # publishers remember it, and it was listed
+        if now_ns < self._zero_within_ns and not self._has_zero and (zero_ns := zero_of(message)) is not None:
+            self._reader.count_from(zero_ns)
+            self._has_zero = True
         self._take(message)
         if self._taken >= STRETCH or now_ns >= self._next_ns:
             self._draw(now_ns)
@@ -201,7 +208,7 @@ class LiveDashboard:
 
     def _draw(self, now_ns: int) -> None:
         self._next_ns = now_ns + DRAW_EVERY_NS
-        if not self._taken:
+        if not self._taken or (not self._has_zero and now_ns < self._zero_within_ns and self._taken < STRETCH):
             return
         if not (self._has_zero or self._reader.has_samples) and self._taken < STRETCH:
             return  # the time of the run begins with its first sample
@@ -210,6 +217,7 @@ class LiveDashboard:
         if not (self._has_zero or self._reader.has_samples):
             return
         self._drawing.draw(run, PANELS)
+        self._zero_within_ns = 0  # the minutes of what is drawn stay
         if self._drawing.layout.changed:
             self._recording.send_blueprint(self._drawing.layout.blueprint(live=True))
 

@@ -13,7 +13,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
 from recorder.dashboard import late_joiner
 from recorder.dashboard.late_joiner import Past, PastQuery, ask_for_past, changes
-from recorder.dashboard.live import DRAW_EVERY_NS, LiveDashboard
+from recorder.dashboard.live import DRAW_EVERY_NS, ZERO_WITHIN_NS, LiveDashboard
 from recorder.dashboard.stream import RUN_TIME
 
 MINUTE = 60_000_000_000
@@ -199,3 +199,23 @@ def test_a_monitor_that_never_answers_is_asked_no_more_once_the_view_ends() -> N
     assert thread is not None
     query.end()
     assert not thread.is_alive()
+
+
+@pytest.mark.parametrize("reports", [True, False])
+def test_the_minutes_of_a_fleet_s_plant_count_from_its_first_sample_once_its_monitor_reports(
+    tmp_path: Path, past: Past, *, reports: bool
+) -> None:
+    """Nothing is drawn before; without a report, they count from the first sample that came, after a while."""
+    recording = rr.RecordingStream("test")
+    recording.save(tmp_path / "sent.rrd")
+    dashboard = LiveDashboard(recording, lambda: False, 0, past._replace(zero_ns=None))
+    dashboard.on_message(sample(NOW_NS), 0)
+    dashboard.on_tick(DRAW_EVERY_NS)
+    recording.flush()
+    if reports:
+        dashboard.on_message(encode(Publication("reactor/cstr/health/monitor", HEALTH)), DRAW_EVERY_NS)
+    dashboard.on_tick(2 * DRAW_EVERY_NS if reports else ZERO_WITHIN_NS)
+    recording.flush()
+    recording.disconnect()
+    minutes = {text.partition("  ")[2].partition(":")[0]: minute for minute, text in logged(tmp_path / "sent.rrd")}
+    assert minutes["drift/C"] == (402.0 if reports else 402.0 - 500.0)
