@@ -76,7 +76,7 @@ class LiveRun:
         """The monitor's last."""
         self._changed = threading.Condition()
         self._first_ns: int | None = None
-        self._now_min = self._judged_min = 0.0
+        self.now_min = self._judged_min = 0.0
         self._alive: set[str] = set()
         self.bus.watch_alive(f"reactor/{PLANT}/alive/*", self._on_alive)
         for kind in (keys.SAMPLE, keys.ESTIMATE, keys.ALARM, keys.HEALTH):
@@ -101,7 +101,7 @@ class LiveRun:
 
     def wait_until(self, minute: float) -> None:
         """Wait until the plant has come so far."""
-        self.wait(lambda: self._now_min >= minute)
+        self.wait(lambda: self.now_min >= minute)
 
     def wait(self, condition: Callable[[], bool]) -> None:
         """Wait until what was heard makes it so."""
@@ -128,15 +128,15 @@ class LiveRun:
 
     def _of_plant(self, recorded: Iterable[Encoded]) -> Iterable[Encoded]:
         for message in recorded:
-            if _is_of_plant(_read(message)):
+            if is_of_plant(_read(message)):
                 yield message
 
     def _on_message(self, message: Encoded) -> None:
         body = _read(message)
         with self._changed:
-            if isinstance(body, Sample) and _is_of_plant(body) and message.key.endswith("/T"):
+            if isinstance(body, Sample) and is_of_plant(body) and message.key.endswith("/T"):
                 self._first_ns = self._first_ns or body.time_ns
-                self._now_min = (body.time_ns - self._first_ns) / MINUTE_NS
+                self.now_min = (body.time_ns - self._first_ns) / MINUTE_NS
             elif isinstance(body, Estimate) and self._first_ns is not None:
                 self._judged_min = max(self._judged_min, (body.time_ns - self._first_ns) / MINUTE_NS)
             elif isinstance(body, Alarm):
@@ -169,7 +169,7 @@ def _read(message: Encoded) -> Message | None:
         return None
 
 
-def _is_of_plant(body: Message | None) -> bool:
+def is_of_plant(body: Message | None) -> bool:
     """Whether it is a sample of this run's plant: strangers' clocks are at another time."""
     return isinstance(body, Sample) and abs(body.time_ns / 1e9 - time.time()) < 36_000.0
 

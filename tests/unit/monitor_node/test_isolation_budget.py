@@ -1,6 +1,7 @@
 """A look for causes stops at a budget of filter steps, whatever the sensors show, and says so."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -46,7 +47,7 @@ def looks() -> Iterator[list[int]]:
     found: list[int] = []
     suspects = Isolation.suspects
 
-    def noted(self: Isolation, *arguments: float) -> list[object]:
+    def noted(self: Isolation, *arguments: Any) -> list[object]:
         try:
             return list(suspects(self, *arguments))
         finally:
