@@ -28,6 +28,9 @@ STATES: Mapping[State, AlarmState] = {
     State.OUT_OF_SERVICE: AlarmState.ALARM_STATE_OUT_OF_SERVICE,
 }
 
+STUCK_SENSOR = "stuck_sensor"
+"""The cause that the check for stuck values names."""
+
 LAST_NS = 2**63 - 1
 TimeNs: TypeAlias = Annotated[int, msgspec.Meta(ge=-(2**63), le=LAST_NS)]
 """A time that messages can carry."""

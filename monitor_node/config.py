@@ -4,7 +4,7 @@ from typing import Literal
 
 import msgspec
 
-from monitor_node.persistence import check_rule
+from monitor_node.charts.m_of_n import check_rule
 from reactorwatch.contract.keys import checked_plant
 
 ChartName = Literal["shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe", "parameters"]

@@ -27,9 +27,9 @@ import numpy as np
 from scipy import special
 
 from monitor_node.charts.base import Array
+from monitor_node.charts.m_of_n import false_alarm_rate
 from monitor_node.charts.run_length.design import LONGEST_DESIGN, SHORTEST, cusum_limit, ewma_limit, mewma_limit
 from monitor_node.estimated_t2 import estimated_t2_quantile
-from monitor_node.persistence import false_alarm_rate
 from monitor_node.prewhitening import Prewhitening
 from reactorwatch.errors import InputError
 
@@ -86,8 +86,8 @@ def point_probability(arl0: float, raise_count: int, window: int) -> float:
 
     Args:
         arl0: run length to the alarm without a fault.
-        raise_count: see `persistence`.
-        window: see `persistence`.
+        raise_count: see `m_of_n`.
+        window: see `m_of_n`.
     """
     from scipy import optimize  # only here: to import it is a tenth of a start
 

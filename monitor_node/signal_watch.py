@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from math import isfinite, nan
 
 from monitor_node.alarm_board import AlarmBoard
-from monitor_node.alarms import ChartAlarm, Explanation, SuspectedCause, quantity
+from monitor_node.alarms import STUCK_SENSOR, ChartAlarm, Explanation, SuspectedCause, quantity
 from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_range import ANY, SignalRange
@@ -21,8 +21,6 @@ from reactorwatch.contract.codec import Publication
 
 PLANT = "plant"
 """What the silence of all signals together is of."""
-
-STUCK_SENSOR = "stuck_sensor"
 
 RANGE, OUT_OF_RANGE = "range", "out_of_range"
 """The alarm of a signal that shows what the process cannot be, and what its suspect is called."""

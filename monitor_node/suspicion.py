@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from math import inf
 
 from monitor_node.alarm_board import AlarmBoard
-from monitor_node.alarms import SuspectedCause
+from monitor_node.alarms import STUCK_SENSOR, SuspectedCause
 from monitor_node.config import MonitorConfig
 from monitor_node.isolation import UNKNOWN, Isolation, Suspect
 from monitor_node.isolation_causes import CAUSES
@@ -19,7 +19,6 @@ from monitor_node.isolation_fit import WayState
 from monitor_node.isolation_window import Row
 from monitor_node.reconstruction import Reconstruction, ReconstructionState
 from monitor_node.references import ProcessReference, places
-from monitor_node.signal_watch import STUCK_SENSOR
 from monitor_node.stored_state import StoredState, packed, unpacked
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication

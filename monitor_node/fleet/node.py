@@ -29,7 +29,7 @@ from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
-from reactorwatch.runtime.bus import Bus, matches
+from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.command_rate import CommandRate, sender_of
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.metrics import FleetMetrics, served
@@ -118,7 +118,7 @@ class FleetNode(FleetMonitor):
             in_charge=self._show,
         )
         for plant in sorted({*states.plants, *states.plants_aside}) if states is not None else []:
-            if matches(self.expression, f"{keys.ROOT}/{plant}"):
+            if keys.matches(self.expression, f"{keys.ROOT}/{plant}"):
                 self.meet(plant, start_ns, vouched=True)
 
     @property

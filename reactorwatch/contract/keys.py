@@ -6,6 +6,7 @@ A key is `reactor/{plant}/{kind}/{name}`; the name of a chart point or an alarm 
 
 import itertools
 import re
+from functools import lru_cache
 from typing import NamedTuple
 
 ROOT = "reactor"
@@ -199,3 +200,35 @@ def checked_plants(expression: str) -> str:
             f"got {expression!r}"
         )
     return expression
+
+
+def matches(key_expression: str, key: str) -> bool:
+    """Match a key with a key expression: `*` stands for letters of one part, `**` for any number of parts.
+
+    No `*` stands for a part that begins with `@`.
+
+    >>> matches("reactor/*/sample/**", "reactor/cstr/sample/T"), matches("reactor/**", "reactor")
+    (True, True)
+    >>> matches("reactor/**", "reactor/@fleet/alive/1")
+    False
+    """
+    return _pattern(key_expression).fullmatch("/" + key) is not None
+
+
+@lru_cache(maxsize=256)
+def _pattern(key_expression: str) -> re.Pattern[str]:
+    pattern = ""
+    for part in key_expression.split("/"):
+        if part == "**":
+            pattern += "(/[^/@][^/]*)*"
+        else:
+            first, *others = part.split("*")
+            pattern += (
+                "/"
+                + re.escape(first)
+                + "".join(
+                    ("[^/]*" if first or number else "(?!@)[^/]*") + re.escape(piece)
+                    for number, piece in enumerate(others)
+                )
+            )
+    return re.compile(pattern)

@@ -5,18 +5,17 @@ order of publication, so that a whole chain of nodes can be tested without a net
 """
 
 import contextlib
-import re
 import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
 from queue import Empty, SimpleQueue
 from typing import Protocol
 
 from google.protobuf.message import Message
 
 from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.contract.keys import matches
 from reactorwatch.runtime.in_order import Gap
 
 MOST_GATHERED = 2000
@@ -101,38 +100,6 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Send what is still to be sent, and leave."""
-
-
-def matches(key_expression: str, key: str) -> bool:
-    """Whether a key is in a key expression: `*` stands for letters of one part, `**` for any number of parts.
-
-    No `*` stands for a part that begins with `@`.
-
-    >>> matches("reactor/*/sample/**", "reactor/cstr/sample/T"), matches("reactor/**", "reactor")
-    (True, True)
-    >>> matches("reactor/**", "reactor/@fleet/alive/1")
-    False
-    """
-    return _pattern(key_expression).fullmatch("/" + key) is not None
-
-
-@lru_cache(maxsize=256)
-def _pattern(key_expression: str) -> re.Pattern[str]:
-    pattern = ""
-    for part in key_expression.split("/"):
-        if part == "**":
-            pattern += "(/[^/@][^/]*)*"
-        else:
-            first, *others = part.split("*")
-            pattern += (
-                "/"
-                + re.escape(first)
-                + "".join(
-                    ("[^/]*" if first or number else "(?!@)[^/]*") + re.escape(piece)
-                    for number, piece in enumerate(others)
-                )
-            )
-    return re.compile(pattern)
 
 
 @dataclass(frozen=True)

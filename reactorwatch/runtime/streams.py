@@ -11,7 +11,6 @@ from functools import lru_cache
 
 from reactorwatch.contract import keys
 from reactorwatch.runtime.access import ROLES, Role
-from reactorwatch.runtime.bus import matches
 
 STREAM_PARTS = 3
 """Parts of a key that a stream has in common: root, plant and kind."""
@@ -38,7 +37,7 @@ def role_of_key(name: str) -> Role | None:
     >>> role_of_key("health/somebody") is None
     True
     """
-    return next((role for expression, role in _KEY_SPACES if matches(expression, name)), None)
+    return next((role for expression, role in _KEY_SPACES if keys.matches(expression, name)), None)
 
 
 def stream_of(key: str) -> str:

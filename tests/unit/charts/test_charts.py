@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from monitor_node.charts import CHARTS
 from monitor_node.charts.base import Bank, SignalChart
+from monitor_node.charts.catalogue import CHARTS
 from monitor_node.charts.ewma import Ewma
 from monitor_node.charts.shewhart import Shewhart
 from reactorwatch.errors import InputError

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from monitor_node.charts.m_of_n import false_alarm_rate
 from monitor_node.charts.shewhart import probability_out
-from monitor_node.persistence import Persistence, false_alarm_rate
+from monitor_node.persistence import Persistence
 
 
 def changes(rule: Persistence, points: str) -> list[tuple[int, bool]]:

@@ -3,8 +3,9 @@
 import pytest
 
 from reactorwatch.contract.codec import Encoded
+from reactorwatch.contract.keys import matches
 from reactorwatch.contract.messages_pb2 import CommandReply
-from reactorwatch.runtime.bus import Exchange, MemoryBus, Request, matches
+from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,8 @@ import pytest
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
+from reactorwatch.contract.keys import matches
 from reactorwatch.runtime.access import ROLES, access_control
-from reactorwatch.runtime.bus import matches
 from reactorwatch.runtime.delivery import Delivery, Numbered
 from reactorwatch.runtime.in_order import Gap
 from reactorwatch.runtime.streams import MOST_CACHED, keys_of, role_of_key, stream_of
