@@ -21,8 +21,8 @@ from scipy.integrate import solve_ivp
 
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
-from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
 
 REPEATS = 9

@@ -13,7 +13,7 @@ from math import log
 import numpy as np
 from scipy import special
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 LAGS = 20
 CUT = 4.0

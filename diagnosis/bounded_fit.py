@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 _TURNS, _RIDGE = 4, 1e-9
 

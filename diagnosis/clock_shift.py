@@ -7,7 +7,7 @@ for what has set in cannot act before it does: of a step the states first stand 
 import numpy as np
 
 from diagnosis.courses import Signal
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 
 def felt(signal: Signal, time_min: Array) -> Signal:

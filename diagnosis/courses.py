@@ -17,7 +17,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 
 class Signal(NamedTuple):

@@ -35,9 +35,10 @@ from diagnosis.sensor_noise import sensor_noise
 from diagnosis.uncertain import with_uncertain
 from diagnosis.unknown import MARGIN, Located, bic_of, located
 from diagnosis.wandering import Noise
+from reactorwatch.arrays import Array
 from reactorwatch.process import effects_of
 from reactorwatch.process.effects.base import TIMING, Effect
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MOST_SPANS, Record
 
 LEAST_GAIN = 10.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 BINS, LEAST_ROWS = 8, 20
 """Ranges along each axis, and how many rows one holds at least."""

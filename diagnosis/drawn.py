@@ -9,7 +9,8 @@ from diagnosis.held_out import free_run
 from diagnosis.result import Curves
 from diagnosis.run import Run
 from diagnosis.search import Explained
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.arrays import Array
+from reactorwatch.process.model import ProcessModel
 
 
 def curves_of(

@@ -10,7 +10,8 @@ from diagnosis.result import Adjusted, Cause, Estimate
 from diagnosis.rough_numbers import settled
 from diagnosis.run import Run
 from diagnosis.search import Explained, Search
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.arrays import Array
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 
 

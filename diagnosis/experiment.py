@@ -23,7 +23,8 @@ from diagnosis.rivals import Rivals
 from diagnosis.run import Run
 from diagnosis.search import Explained
 from diagnosis.wandering import Noise
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.arrays import Array
+from reactorwatch.process.model import ProcessModel
 
 MOST_RIVALS = 5
 

@@ -27,8 +27,9 @@ from diagnosis.courses import Signal, hats
 from diagnosis.forcing_filter import Linear, smoothed, whitened
 from diagnosis.run import Run, doubt_of
 from diagnosis.size_inputs import SizedModel, with_size_inputs
+from reactorwatch.arrays import Array
 from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 KNOTS = 10
 LENGTH = 0.4

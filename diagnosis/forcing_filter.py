@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.compiled import compiled
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.numba_kernel import compiled
 
 
 class Linear(NamedTuple):

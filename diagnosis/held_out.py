@@ -19,9 +19,9 @@ from diagnosis.run import Run
 from diagnosis.search import Explained
 from diagnosis.sized import Sized
 from diagnosis.uncertain import beginning_with
+from reactorwatch.arrays import Array
 from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.integrate import SimulationError
-from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
 
 EVERY, BLOCK_MIN, FEWEST_BLOCKS = 4, 10.0, 7.5

@@ -18,9 +18,9 @@ from diagnosis.courses import Course, Signal
 from diagnosis.run import Run
 from diagnosis.sized import HUBER, Known, Sized, clipped
 from diagnosis.uncertain import last_state, offsets
+from reactorwatch.arrays import Array
 from reactorwatch.process.filter_errors import Ways
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.model import Array
 
 SETTLED, WELL_SETTLED = 0.05, 0.005
 """In log likelihood: a rough fit ends with a step that gains less, and any fit where none promises the second."""

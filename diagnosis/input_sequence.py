@@ -13,7 +13,7 @@ from math import ceil, floor, log10
 
 import numpy as np
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 HOLDS_ROWS = (5, 10, 20, 50, 100)
 SEED = 1

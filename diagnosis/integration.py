@@ -11,9 +11,10 @@ import casadi as ca
 import numpy as np
 
 from diagnosis.run import Run
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.machine_code import RowCode
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 LEAST_CORRELATION = 0.15
 """Of the residuals with that error, in every output; by chance, in a thousand rows, it is some hundredths."""

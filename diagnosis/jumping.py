@@ -16,8 +16,8 @@ import numpy as np
 from diagnosis.hypothesis import MOST_STEPS, Fit, Hypothesis
 from diagnosis.run import Run
 from diagnosis.sized import loss_of, row_losses
-from reactorwatch.process.machine_code import LANES
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import LANES
 
 _SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
 _FINELY = ((1.06, 25), (1.006, 25), (1.0006, 25))

@@ -14,7 +14,7 @@ from diagnosis.courses import Free, hats
 from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
 from diagnosis.sized import clipped
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 FEWEST_KNOTS, MOST_KNOTS = 3, 80
 GRID = 161

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnosis.run import Run, doubt_of
+from reactorwatch.arrays import Array
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.model import Array
 
 
 class Moved(NamedTuple):

@@ -7,8 +7,9 @@ from typing import TypeAlias
 import numpy as np
 
 from diagnosis.run import Run
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 Limits: TypeAlias = dict[str, tuple[float, float]]
 """Lowest and highest value, by signal."""

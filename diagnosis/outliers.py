@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from diagnosis.run import Run
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 from reactorwatch.process.noise import rough_sensor_sd
 
 FAR = 5.0

@@ -24,8 +24,8 @@ from diagnosis.pair_screen import PairLead, PairScreen, Remembered
 from diagnosis.screen import KNOTS, Lead
 from diagnosis.search import IN_QUESTION, Explained, Found, Key, Search, keep
 from diagnosis.sized import Followed, clipped
+from reactorwatch.arrays import Array
 from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.model import Array
 
 LEAST_PAIR_GAIN = 40.0
 """In BIC, of a pair over the best single cause."""

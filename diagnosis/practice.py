@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from diagnosis.held_out import Errors
 from diagnosis.result import Curves
 from diagnosis.run import Run
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 PRACTICAL_SHARE = 0.02
 """Of an output's range in the record: a difference in it that matters, where the user does not say."""

@@ -6,8 +6,9 @@ from numpy.typing import NDArray
 from diagnosis.impossible_values import check_values
 from diagnosis.run import Run
 from diagnosis.units import find_wrong_unit
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 
 FEWEST_ROWS = 200

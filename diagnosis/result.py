@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from diagnosis.difference import Difference
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 NOMINAL, NAMED, AMBIGUOUS, UNKNOWN = "nominal", "named", "ambiguous", "unknown"
 

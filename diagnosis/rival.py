@@ -29,8 +29,8 @@ from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.jumping import fitted
 from diagnosis.result import LISTED
 from diagnosis.run import Run
+from reactorwatch.arrays import Array
 from reactorwatch.process.integrate import SimulationError
-from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator, Trajectory
 
 REFINED_STEPS = 1

@@ -11,7 +11,8 @@ from diagnosis.rival import Rival
 from diagnosis.run import Run
 from diagnosis.search import Explained
 from diagnosis.wandering import Noise
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.arrays import Array
+from reactorwatch.process.model import ProcessModel
 
 MARGIN_SD = 3.0
 """Standard deviations of its noise that an output stays away from its limits, so that what is measured keeps them."""

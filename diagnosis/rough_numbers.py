@@ -20,8 +20,8 @@ from diagnosis.courses import Step
 from diagnosis.hypothesis import Fit
 from diagnosis.search import Explained, Search
 from diagnosis.sized import row_losses
-from reactorwatch.process.machine_code import LANES
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import LANES
 
 OFFSETS = (0.5, 1.0, 2.0)
 """To either side, in standard deviations that the fit has found, and at least rows."""

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.doubt import Doubt
-from reactorwatch.process.model import Array
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,9 +21,10 @@ from diagnosis.hypothesis import Fit, Hypothesis
 from diagnosis.run import Run
 from diagnosis.size_inputs import with_size_inputs
 from diagnosis.sized import Sized, clipped, ways_between
+from reactorwatch.arrays import Array
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter_errors import FilterErrors, Ways
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 KNOTS = 12
 DECAYS = (0.02, 0.1, 0.4)

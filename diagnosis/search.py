@@ -25,8 +25,9 @@ from diagnosis.run import Run
 from diagnosis.screen import Lead, Screen
 from diagnosis.sized import Followed, Sized
 from diagnosis.wandering import Noise, suspected
+from reactorwatch.arrays import Array
 from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 FIRST_LEADS, MOST_LEADS, LEADS, A_CAUSE = 3, 8, 10, 2
 """How many leads of the first screen are fitted, and if none of them gains anything; of each later one; of a cause."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from diagnosis.outliers import resolution
 from diagnosis.wandering import LOW, Noise, power_spectrum
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 ROUNDS = 100
 """Number of multiplicative steps, after which the levels change by less than a thousandth."""

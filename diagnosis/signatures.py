@@ -21,9 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from reactorwatch.compiled import compiled
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.numba_kernel import compiled
 from reactorwatch.process.filter_errors import Ways
-from reactorwatch.process.model import Array
 
 PART = 256
 """Rows whose signatures are summed up while they are still at hand."""

@@ -14,7 +14,9 @@ from diagnosis.late_output import Moved, gathered, moved
 from diagnosis.run import Run, doubt_of
 from diagnosis.size_inputs import SizedModel, with_size_inputs
 from diagnosis.wandering import Noise, first_rate_sd, learned, with_wandering
-from reactorwatch.compiled import compiled
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import LANES
+from reactorwatch.codegen.numba_kernel import compiled
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filled import Filled, filled
 from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
@@ -22,8 +24,7 @@ from reactorwatch.process.filter_errors import FilterErrors, Ways
 from reactorwatch.process.filter_record import FilterRecord
 from reactorwatch.process.filter_stretches import together
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.machine_code import LANES
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.noise import tune_with
 
 HUBER = 4.0

@@ -16,9 +16,10 @@ from math import isfinite
 import casadi as ca
 import numpy as np
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.model import Array, Parameter, ProcessModel, parameter, variable
+from reactorwatch.process.model import Parameter, ProcessModel, parameter, variable
 
 _OFF, _BEGIN = ".off", ".begin"
 _STATED = re.compile(r"\+?([\d.]+(?:[eE][-+]?\d+)?)\s*(\D.*)?")

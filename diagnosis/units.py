@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from diagnosis.impossible_values import bounds_of
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.arrays import Array
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
 FACTORS = (60.0, 1000.0, 3600.0, 1000.0 / 60.0, 3.6, 1e6, 100.0)

@@ -19,8 +19,9 @@ import casadi as ca
 import msgspec
 import numpy as np
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.filter import NoiseLevels
-from reactorwatch.process.model import Array, ProcessModel, parameter, variable
+from reactorwatch.process.model import ProcessModel, parameter, variable
 
 LOW, HIGH = (0.375, 0.625), (0.75, 1.0)
 """Bands of frequency, in shares of the highest that a record shows."""

@@ -30,9 +30,10 @@ from numpy.typing import NDArray
 
 from monitor_node.isolation_ways import Linearisation, Ways
 from monitor_node.isolation_window import Window
+from reactorwatch.arrays import Array
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import NoiseLevels
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 PROFILES = ("step", "ramp")
 """How a deviation goes in time. The size of a ramp is its slope here, in a minute."""

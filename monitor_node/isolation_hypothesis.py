@@ -14,10 +14,11 @@ from math import inf, sqrt
 import numpy as np
 
 from monitor_node.isolation_stretch import HUBER, Loss, Stretch
+from reactorwatch.arrays import Array
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_step import COMPILED
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP, STEP, Profile
 
 SETTLED = 0.05

@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from monitor_node.isolation_window import Window
+from reactorwatch.arrays import Array
 from reactorwatch.process.filled import filled
 from reactorwatch.process.filter import Filter, FilterState
 from reactorwatch.process.filter_record import FilterRecord
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.model import Array
 
 HUBER = 4.0
 LOST = 100.0

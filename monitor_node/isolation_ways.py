@@ -7,11 +7,12 @@ from functools import lru_cache
 import numpy as np
 
 from monitor_node.isolation_window import Window
+from reactorwatch.arrays import Array
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors
 from reactorwatch.process.filter_step import COMPILED
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 
 @dataclass(frozen=True, eq=False)

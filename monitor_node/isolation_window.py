@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.sampling import missing_rows
+from reactorwatch.arrays import Array
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import LONGEST_GAP_MIN, Filter, FilterState
 from reactorwatch.process.filter_record import LONGEST_ROW_MIN
-from reactorwatch.process.model import Array
 
 Row: TypeAlias = tuple[float, float, Sequence[float]]
 """Time in minutes, input, outputs; NaN where missing."""

@@ -24,13 +24,14 @@ from plant_node.disturbances import process_noise
 from plant_node.initial_state import carried_over, start_state
 from plant_node.scenario import SIGNAL, Scenario
 from plant_node.sensors import Sensor
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.errors import InputError
-from reactorwatch.process.array_function import ArrayFunction
 from reactorwatch.process.effects.base import TIMING
 from reactorwatch.process.fault import FaultSpecification
 from reactorwatch.process.integrate import SimulationError, Stepper
 from reactorwatch.process.level_control import with_level_control
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import to_minutes, to_time_ns
 
 MOST_FAULTS = 32

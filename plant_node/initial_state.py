@@ -7,8 +7,9 @@ from typing import Literal
 import casadi as ca
 import numpy as np
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import steady_states
 
 BEFORE_MIN = nextafter(0.0, -1.0)

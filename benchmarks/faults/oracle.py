@@ -22,7 +22,7 @@ from math import inf, log
 
 import numpy as np
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 
 def log_likelihood_ratio(measured: Array, nominal: Array, faulty: Array, noise_sd: Array) -> Array:

@@ -16,9 +16,9 @@ from benchmarks.faults.bank import BANK, Case
 from benchmarks.faults.runs import NOISE_SD, Truth, measured_of, profile_changes, simulator_of
 from monitor_node.isolation_causes import CAUSES
 from plant_node.scenario import SIGNAL
+from reactorwatch.arrays import Array
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.integrate import SimulationError
-from reactorwatch.process.model import Array
 from reactorwatch.records.record import Record
 
 REACH = 3.0

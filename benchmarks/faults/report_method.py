@@ -25,7 +25,7 @@ from monitor_node.identification.linear_model import LinearModel
 from monitor_node.identification.output_error import fit_oe
 from monitor_node.identification.structure import Structure
 from plant_node.scenario import SIGNAL
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 from reactorwatch.records.record import Record
 
 ORDER = 3

@@ -11,9 +11,9 @@ from plant_node.config import PlantConfig
 from plant_node.initial_state import start_state
 from plant_node.record import simulate_record
 from plant_node.scenario import SIGNAL, RandomSteps
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from diagnosis.report.svg import Band, Line, plot
 from diagnosis.result import NOMINAL, SD_95, Cause, Curves, Diagnosis, Experiment
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.arrays import Array
+from reactorwatch.process.model import ProcessModel
 
 BEFORE_ROWS, AFTER_ROWS = 100, 200
 """What is shown of the record about the moment that is looked at closely."""

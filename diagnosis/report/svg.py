@@ -10,8 +10,8 @@ from html import escape
 
 import numpy as np
 
+from reactorwatch.arrays import Array
 from reactorwatch.axis import Axis, axis
-from reactorwatch.process.model import Array
 
 WIDTH, HEIGHT = 900, 250
 LEFT, RIGHT, TOP, BOTTOM = 64, 10, 8, 30

@@ -28,7 +28,7 @@ from monitor_node.charts.base import (
     finite,
     positive,
 )
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 from reactorwatch.errors import InputError
 
 _MEMORIES = 2

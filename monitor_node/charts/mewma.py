@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from monitor_node.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, positive, vector
 from monitor_node.charts.t2 import Whitening
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 from reactorwatch.errors import InputError
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from monitor_node.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, positive, vector
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 from reactorwatch.errors import InputError
 
 

@@ -24,7 +24,7 @@ the bits are the same. (Per-plant branches are written as selections for this re
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 
 TILE_PLANTS = 64
 LARGEST_VALUE = 1e30

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from monitor_node.identification.regressor import rows_of, unbroken
 from monitor_node.identification.structure import Structure, as_columns
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 
 _AWAY = 1e100  # a free run beyond this has left for good
 

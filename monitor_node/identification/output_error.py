@@ -34,7 +34,7 @@ from monitor_node.identification.instrumental_variable import instrumental_varia
 from monitor_node.identification.linear_model import LinearModel, RunPlan, plan_run
 from monitor_node.identification.regressor import rows_of
 from monitor_node.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 from reactorwatch.errors import InputError
 
 _ITERATIONS = 200

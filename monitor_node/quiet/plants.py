@@ -21,13 +21,13 @@ from monitor_node.receipt import STALL_NS, Receipt
 from monitor_node.references import GATE, ProcessReference
 from monitor_node.sample_limits import LARGEST_SAMPLE, USABLE
 from monitor_node.signal_range import ranges_of
+from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
 from reactorwatch.contract.sample_bytes import SampleColumns, sample_columns
 from reactorwatch.process.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.filter_step import row_function
-from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 

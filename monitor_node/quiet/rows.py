@@ -33,7 +33,7 @@ from monitor_node.quiet.samples import allowed_ns
 from monitor_node.sampling import WHOLE
 from monitor_node.silence import MEMORY
 from monitor_node.stuck import AT_REST, STRETCH
-from reactorwatch.compiled import call_at, compiled
+from reactorwatch.codegen.numba_kernel import call_at, compiled
 from reactorwatch.records.record import MINUTE_NS
 
 ORDINARY, NEW_MINUTE, ODD = 0, 1, 2

@@ -16,7 +16,7 @@ from monitor_node.sample_run import ALIKE, TOLERANCE
 from monitor_node.sample_run import DEVIATIONS as RUN_DEVIATIONS
 from monitor_node.sample_run import MEMORY as RUN_MEMORY
 from monitor_node.silence import BURST, DEVIATIONS, LEARN_FROM, MEMORY
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 
 # Under names of this module: compiled code keeps them as they are now.
 _MEMORY, _LEARN_FROM = MEMORY, LEARN_FROM

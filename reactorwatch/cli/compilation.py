@@ -1,8 +1,9 @@
 """`compile`: make the machine code that is otherwise made when it is first needed.
 
-Numerical kernels are compiled at their first call and kept on disk (`reactorwatch.compiled`, `process.machine_code`).
-On a new machine that call comes in the middle of a watch or of a diagnosis, and takes half a minute in all. So all
-that compiles is run here once, over a short simulated record: by `make setup`, by the images, or by hand.
+Numerical kernels are compiled at their first call and kept on disk (`reactorwatch.codegen.numba_kernel`,
+`codegen.compiled_function`). On a new machine that call comes in the middle of a watch or of a diagnosis, and takes
+half a minute in all. So all that compiles is run here once, over a short simulated record: by `make setup`, by the
+images, or by hand.
 """
 
 import typer

@@ -8,8 +8,8 @@ from monitor_node.identification.identify import Identification
 from monitor_node.identification.identify import identify as identify_model
 from monitor_node.identification.selection import Selection, select
 from monitor_node.identification.structure import ALL_ROWS, REPORT_ROWS
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import Array
 from reactorwatch.records.record import Record
 
 INPUT = "qc"

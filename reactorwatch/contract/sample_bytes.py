@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 
 _TIME, _SEQUENCE, _VALUE, _UNIT, _QUALITY = 0x09, 0x10, 0x19, 0x22, 0x28  # field and wire type of each
 _TIME_TAG, _SEQUENCE_TAG = bytes([_TIME]), bytes([_SEQUENCE])

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 
 class Doubt(NamedTuple):

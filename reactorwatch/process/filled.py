@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import LONGEST_GAP_MIN
 from reactorwatch.process.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.model import Array
 
 
 class Filled(NamedTuple):

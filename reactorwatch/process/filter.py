@@ -40,15 +40,16 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter_record import LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.process.filter_start import Beginning
 from reactorwatch.process.filter_step import row_code, row_function, walk_function
 from reactorwatch.process.filter_stretches import Stretch, Stretches, alone
 from reactorwatch.process.innovations import Innovation, Innovations
-from reactorwatch.process.machine_code import RowCode
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.step_budget import A_BEGINNING, A_ROW_ALONE, A_RUN, A_SEARCH, A_WALK, StepBudget
 
 LONGEST_GAP_MIN = 30.0

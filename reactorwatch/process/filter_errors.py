@@ -20,13 +20,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.compiled import compiled
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import LANES, RowCode
+from reactorwatch.codegen.numba_kernel import compiled
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_step import exponential
 from reactorwatch.process.integrate import LONGEST_STEP_MIN, passed_min, symbolic_step
-from reactorwatch.process.machine_code import LANES, RowCode
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 _LEAST_PIVOT = 1e-12
 _LONGEST_PIECE_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a piece is two steps; times are rounded

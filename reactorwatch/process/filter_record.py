@@ -7,9 +7,9 @@ from math import inf
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.integrate import LONGEST_STEP_MIN
-from reactorwatch.process.model import Array
 
 LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded
 

@@ -15,10 +15,11 @@ from math import inf
 import casadi as ca
 import numpy as np
 
-from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.process.filter_step import COMPILED, output_function
 from reactorwatch.process.memory import reset_function, rest_function
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
 START_SD = 3.0

@@ -14,8 +14,8 @@ from math import inf, nan
 import casadi as ca
 import numpy as np
 
+from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.process.integrate import passed_min, symbolic_step
-from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import ProcessModel
 

@@ -1,17 +1,17 @@
 """Runs of filters over records, stretch by stretch: each by itself, or several of one model at once.
 
 Most rows of a record are two steps behind the one before; a stretch of them is taken by machine code without a stop.
-Several filters of the same model may go through their stretches together, in lanes (see `machine_code`), each with its
-own record and its own noise: four of them take little longer than one, and each says what it would say alone, to the
-last bit.
+Several filters of the same model may go through their stretches together, in lanes (see `compiled_function`), each with
+its own record and its own noise: four of them take little longer than one, and each says what it would say alone, to
+the last bit.
 """
 
 from collections.abc import Generator, Sequence
 from typing import NamedTuple, TypeAlias
 
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import LANES, RowCode
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.machine_code import LANES, RowCode
-from reactorwatch.process.model import Array
 
 LEAST_ROWS = 1000
 """Of a stretch: for fewer the lanes are not worth what it takes to make their code."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 
 class Innovation(NamedTuple):

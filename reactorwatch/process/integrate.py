@@ -20,9 +20,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.process.memory import reset_function
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 LONGEST_STEP_MIN = 0.05
 SHORTEST_STEP_MIN = 1e-9

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import expm
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.linearise import LinearModel, linearise
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import SteadyState
 

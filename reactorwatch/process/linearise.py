@@ -8,7 +8,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.arrays import Array
+from reactorwatch.process.model import ProcessModel
 
 COMPILED = 64
 """Models whose derivatives are kept."""

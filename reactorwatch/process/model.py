@@ -20,9 +20,8 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from reactorwatch.arrays import Array
 
 
 @dataclass(frozen=True, eq=False)

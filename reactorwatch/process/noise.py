@@ -28,13 +28,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_record import FilterRecord
 from reactorwatch.process.filter_stretches import together
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.machine_code import LANES
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 SHARES = (0.3, 0.03, 0.003)
 """Process noise to begin with, in scales of the state per square root of a minute; the noisiest finds its way best."""

@@ -19,11 +19,12 @@ from math import inf
 import casadi as ca
 import numpy as np
 
-from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
-from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.memory import reset_function, rest_function
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 
 @dataclass(frozen=True, eq=False)

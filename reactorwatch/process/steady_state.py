@@ -13,10 +13,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.process.linearise import linearise
-from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.memory import rest_function
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 
 STARTS = 1024
 ITERATIONS = 80

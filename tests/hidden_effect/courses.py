@@ -10,7 +10,7 @@ from math import exp, floor, pi, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 
 Array = NDArray[np.float64]
 

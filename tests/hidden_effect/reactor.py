@@ -13,7 +13,7 @@ Each m is that of the effect that its place in the equation belongs to. Then com
 
 from math import exp
 
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 from tests.hidden_effect.courses import Array
 
 CATALOGUE = (

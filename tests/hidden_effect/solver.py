@@ -8,7 +8,7 @@ a solver of SciPy with a tight tolerance, and against its order.
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 from tests.hidden_effect import reactor
 from tests.hidden_effect.courses import Array, value
 from tests.hidden_effect.reactor import (

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 from monitor_node.config import MonitorConfig
 from monitor_node.persistence import Persistence
 from plant_node.presets import ONSET_MIN, PRESETS
+from reactorwatch.arrays import Array
 from reactorwatch.cli.study.canvas import GREEN, ORANGE, label, panels
 from reactorwatch.cli.study.control_limits import draw_residuals, out_of, watched
 from reactorwatch.cli.study.figure import Finding, Verdict
 from reactorwatch.cli.study.study import TRAINING_ROWS, Study
-from reactorwatch.process.model import Array
 from reactorwatch.records.record import UNITS
 
 if TYPE_CHECKING:

@@ -17,11 +17,11 @@ from monitor_node.identification.excitation import (
 )
 from monitor_node.identification.regressor import rows_of
 from monitor_node.identification.structure import ALL_ROWS, REPORT_ROWS, RowChoice, Scaling, Structure
+from reactorwatch.arrays import Array
 from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION, label, panels
 from reactorwatch.cli.study.figure import Finding, Verdict
 from reactorwatch.cli.study.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, Study
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import Array
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:

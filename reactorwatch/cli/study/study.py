@@ -16,8 +16,9 @@ from plant_node.config import NoiseSd, PlantConfig
 from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
 from plant_node.scenario import Scenario
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, cstr
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import SteadyState, steady_states
 from reactorwatch.records.record import Record

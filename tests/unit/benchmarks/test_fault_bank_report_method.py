@@ -13,7 +13,7 @@ from benchmarks.faults.report_method import (
     calibrated_width,
 )
 from benchmarks.faults.score import Interval
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 from reactorwatch.records.record import Record
 
 ARX, OE = METHODS

@@ -6,7 +6,7 @@ import sys
 import numba
 import pytest
 
-from reactorwatch.compiled import compiled
+from reactorwatch.codegen.numba_kernel import compiled
 
 PROGRAM = """
 import numba
@@ -30,7 +30,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.suspicion import preparation
 from reactorwatch.cli import compilation
 from reactorwatch.process.cstr import cstr
-from reactorwatch.process.machine_store import MachineStore
+from reactorwatch.codegen.cache import MachineStore
 
 made, keep = [], MachineStore._keep
 MachineStore._keep = lambda self, path, code: made.append(path.name)

@@ -19,7 +19,7 @@ from diagnosis.result import (
     Gain,
     HeldOut,
 )
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 ROWS = 2000
 

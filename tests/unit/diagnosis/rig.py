@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 from reactorwatch.records.record import Record
 
 PERIOD_MIN = 1 / 15

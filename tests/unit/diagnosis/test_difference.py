@@ -5,7 +5,7 @@ import pytest
 
 from diagnosis.difference import BINS, TIME, Difference, difference
 from diagnosis.report.words import difference_said
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 ROWS, NOISE = 8000, 0.3
 T_MIN: Array = np.linspace(0.0, 800.0, ROWS)

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from diagnosis.forcing_filter import Linear, smoothed, whitened
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 ROWS, N_X, N_Y = 7, 2, 2
 VARIANCE = 0.7

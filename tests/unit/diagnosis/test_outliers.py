@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from diagnosis.outliers import gross_outliers, outliers, without
 from diagnosis.run import Run
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 ROWS = 5000
 

@@ -12,9 +12,9 @@ from diagnosis.result import NAMED
 from diagnosis.screen import Screen
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.model import Array
 from tests.unit.diagnosis.runs import record_of, run_of
 
 FOLLOWING = Noise((0.002, 0.3), (0.001, 0.3))

@@ -11,7 +11,7 @@ from diagnosis.rival import Rival, going_on, probability
 from diagnosis.run import Run
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 from tests.unit.diagnosis.linear_tank import NOISE, NOISE_SD, PERIOD_MIN, RATE, Gain, Shift, explained, follows, tank
 from tests.unit.diagnosis.linear_tank import record as tank_record
 

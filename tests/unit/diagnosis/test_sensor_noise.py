@@ -12,10 +12,10 @@ from diagnosis.diagnose import diagnose
 from diagnosis.result import UNKNOWN
 from diagnosis.sensor_noise import sensor_noise
 from diagnosis.wandering import Noise, Wandering
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.model import Array
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.runs import record_of
 

@@ -12,11 +12,11 @@ from diagnosis.run import Run
 from diagnosis.screen import Screen
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter_errors import Ways
-from reactorwatch.process.model import Array
 from tests.unit.diagnosis.runs import run_of
 
 NOISY = Noise((0.002, 0.3), (0.001, 0.3))

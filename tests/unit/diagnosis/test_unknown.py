@@ -13,10 +13,11 @@ from diagnosis.run import Run
 from diagnosis.sized import Sized
 from diagnosis.unknown import Located, input_answers, located
 from diagnosis.wandering import Noise
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.noise import tune
 from reactorwatch.process.simulate import Simulator
 

@@ -9,8 +9,8 @@ from scipy.signal import lfilter
 from diagnosis.run import Run
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise, suspected
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import OPERATING_STATE, cstr
-from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
 
 NAMES = ("C", "T")

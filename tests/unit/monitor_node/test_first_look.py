@@ -16,12 +16,12 @@ from monitor_node.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
 from monitor_node.isolation_window import MOST_PIECES, newest_rows
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.process import filter_errors
-from reactorwatch.process.array_function import ArrayFunction
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.filter_start import corrected_function
 from reactorwatch.process.filter_step import row_code, row_function, walk_function
-from reactorwatch.process.machine_code import RowCode
 from reactorwatch.process.step_budget import A_SEARCH
 from reactorwatch.runtime.config import BusConfig
 

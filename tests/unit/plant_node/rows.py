@@ -4,7 +4,7 @@ import numpy as np
 
 from plant_node.config import NoiseSd
 from plant_node.core import Plant, Row
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 QUIET = NoiseSd(C=0.0, T=0.0, qc=0.0)
 

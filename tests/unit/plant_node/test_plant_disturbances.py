@@ -14,10 +14,11 @@ from plant_node.controllers import LevelControl
 from plant_node.core import Plant
 from plant_node.disturbances import ProcessNoise
 from plant_node.record import plant_from, simulate_record
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.linearise import linearise
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import steady_states
 from tests.unit.plant_node.rows import QUIET
 

@@ -6,7 +6,7 @@ from math import exp
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 Rates = Callable[[float, Array, float], list[float]]
 """dx/dt at a time, in min, of a state and a coolant flow, in l/min."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.fault import parse_fault
@@ -16,7 +17,7 @@ from reactorwatch.process.filled import filled
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors
 from reactorwatch.process.innovations import Innovations
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.noise import tune_with
 
 SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 import reactorwatch.process.effects as catalogue
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import LOCATIONS, Effect
 from reactorwatch.process.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.effects.heat_transfer import HeatTransfer
 from reactorwatch.process.memory import reset_function
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE, PROFILES, RAMP, STEP, Profile, free_profile
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process.effect_named import effect_of

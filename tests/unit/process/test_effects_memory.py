@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import OPERATING_STATE
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process import by_hand
 from tests.unit.process.by_hand import Rates, balances, duty, nominal

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from reactorwatch.process.array_function import ArrayFunction
+from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.process.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.effects.heat_transfer import HeatTransfer

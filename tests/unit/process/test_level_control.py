@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.level_control import with_level_control
-from reactorwatch.process.model import Array
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states
 

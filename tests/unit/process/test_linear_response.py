@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.linear_response import compare_step, step_response
 from reactorwatch.process.linearise import linearise
-from reactorwatch.process.model import Array
 from reactorwatch.process.steady_state import steady_states
 
 FLOWS = (85.0, 100.0, 110.0)

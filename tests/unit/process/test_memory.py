@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.effects.base import Effect
 from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from reactorwatch.arrays import Array
 from reactorwatch.process.cstr import cstr
 from reactorwatch.process.linearise import linearise
-from reactorwatch.process.model import Array, ProcessModel
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
 
 # Computed from the published equations of the benchmark (De Moor, DaISy; Lightbody & Irwin 1997) by the project's

@@ -2,13 +2,13 @@
 
 A call of a `ca.Function` converts every argument and every result, which costs a hundred times the arithmetic of our
 small functions. Here the function reads and writes arrays that stay where they are. For many rows at once see
-`machine_code`.
+`compiled_function`.
 """
 
 import casadi as ca
 import numpy as np
 
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
 
 
 class ArrayFunction:

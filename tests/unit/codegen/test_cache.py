@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from reactorwatch.process.machine_store import MachineStore
+from reactorwatch.codegen.cache import MachineStore
 
 
 class Maker:

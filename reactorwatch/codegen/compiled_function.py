@@ -8,7 +8,7 @@ faster. It is told not to optimise, which would take longer than most functions 
 moved or joined with another, so the results are those of CasADi to the last bit.
 
 Rows that do not depend on each other are taken four at a time, and so are four chains of rows if there are several
-(see `machine_text`), which makes them two to three times faster again.
+(see `llvm_ir`), which makes them two to three times faster again.
 """
 
 import ctypes
@@ -22,9 +22,9 @@ import casadi as ca
 import llvmlite.binding as llvm
 import numpy as np
 
-from reactorwatch.process.machine_store import users_store
-from reactorwatch.process.machine_text import BEFORE, EACH, SAME, TEXT_VERSION, Frame, check, text_of
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.cache import users_store
+from reactorwatch.codegen.llvm_ir import BEFORE, EACH, SAME, TEXT_VERSION, Frame, check, text_of
 
 LANES = 4
 """Rows, or chains of rows, that are taken at once."""

@@ -4,9 +4,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from reactorwatch.compiled import call_at, compiled
-from reactorwatch.process.machine_code import RowCode
-from reactorwatch.process.model import Array
+from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.codegen.numba_kernel import call_at, compiled
 
 VALUES = np.array([0.5, -1.2, 0.0, -0.0, 3.0, 1e-300, 1e300, 0.9999, -7.25, np.nan, np.inf, -np.inf])
 

@@ -1,0 +1,1 @@
+"""Machine code for numerical kernels, from CasADi functions and from Python."""
