@@ -24,7 +24,7 @@ from rich.progress import Progress
 from benchmarks.hidden.classes import CLASSES, StudyClass, class_named, drawn
 from benchmarks.hidden.tables import confusion_table, failures, main_table
 from diagnosis.diagnose import diagnose
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.runtime.jobs import Failed, workers
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.judge import Judged, failed, judge

@@ -17,7 +17,7 @@ from monitor_node import drift
 from monitor_node.charts.base import Array
 from monitor_node.charts.parameters import ParameterT2
 from monitor_node.charts.run_length.parameters import parameter_limit
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 
 NAMES = ["a1", "b1", "c"]

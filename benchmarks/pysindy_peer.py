@@ -32,8 +32,8 @@ from diagnosis.diagnose import diagnose
 from diagnosis.held_out import held_out_rows
 from diagnosis.record_checks import run_of
 from diagnosis.run import Run
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.integrate import SimulationError
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from tests.hidden_effect.draw import Hidden

@@ -22,7 +22,7 @@ from scipy.integrate import solve_ivp
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 
 REPEATS = 9

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import casadi as ca
 
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel, Variable
 
 

@@ -37,7 +37,7 @@ from diagnosis.unknown import MARGIN, Located, bic_of, located
 from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
 from reactorwatch.process import effects_of
-from reactorwatch.process.effects.base import TIMING, Effect
+from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MOST_SPANS, Record
 

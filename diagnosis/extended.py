@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from diagnosis.result import Cause
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import extended_model_of
 from reactorwatch.process.fault import FaultSpecification
 from reactorwatch.process.model import ProcessModel

@@ -28,7 +28,7 @@ from diagnosis.forcing_filter import Linear, smoothed, whitened
 from diagnosis.run import Run, doubt_of
 from diagnosis.size_inputs import SizedModel, with_size_inputs
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
 KNOTS = 10

@@ -13,7 +13,7 @@ from diagnosis.adequacy import DOUBTFUL, minus_log10_p
 from diagnosis.courses import Constant, Step
 from diagnosis.hypothesis import Hypothesis
 from diagnosis.search import FAR_OUT, SETTLED_NOISE, Explained, Found, Search
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 
 OTHERS, ROUNDS = 2, 2
 

@@ -17,7 +17,7 @@ from diagnosis.run import Run
 from diagnosis.screen import DECAYS, EDGE_ROWS, KNOTS, Lead
 from diagnosis.sized import Followed, clipped
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 
 Follow: TypeAlias = Callable[[Effect, Sequence[Signal]], Sequence[Followed]]
 """From some deviations of an effect to what filters that know of them make of the run."""

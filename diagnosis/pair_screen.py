@@ -22,7 +22,7 @@ from diagnosis.courses import Constant, Course, Free, Sine
 from diagnosis.run import Run
 from diagnosis.screen import KNOTS, Screen, usable
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter_errors import Ways
 
 TAKEN_AWAY, SINES_SHARE = 2, 0.3

@@ -25,7 +25,7 @@ from diagnosis.screen import KNOTS, Lead
 from diagnosis.search import IN_QUESTION, Explained, Found, Key, Search, keep
 from diagnosis.sized import Followed, clipped
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 
 LEAST_PAIR_GAIN = 40.0
 """In BIC, of a pair over the best single cause."""

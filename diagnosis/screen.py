@@ -22,7 +22,7 @@ from diagnosis.run import Run
 from diagnosis.size_inputs import with_size_inputs
 from diagnosis.sized import Sized, clipped, ways_between
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter_errors import FilterErrors, Ways
 from reactorwatch.process.model import ProcessModel
 

@@ -26,7 +26,7 @@ from diagnosis.screen import Lead, Screen
 from diagnosis.sized import Followed, Sized
 from diagnosis.wandering import Noise, suspected
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
 FIRST_LEADS, MOST_LEADS, LEADS, A_CAUSE = 3, 8, 10, 2

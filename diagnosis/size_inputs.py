@@ -10,7 +10,7 @@ import numpy as np
 from diagnosis import clock_shift
 from diagnosis.courses import Signal
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors
 from reactorwatch.process.filter_step import COMPILED

@@ -17,7 +17,7 @@ from diagnosis.wandering import Noise, first_rate_sd, learned, with_wandering
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.codegen.numba_kernel import compiled
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filled import Filled, filled
 from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors, Ways

@@ -26,7 +26,7 @@ from diagnosis.result import UnknownCourse
 from diagnosis.run import Run
 from diagnosis.search import Explained
 from diagnosis.sized import loss_of
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter import LEAST_PROCESS_SD, NoiseLevels
 from reactorwatch.process.model import ProcessModel
 

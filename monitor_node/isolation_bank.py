@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from monitor_node.isolation_ways import Linearisation, Ways
 from monitor_node.isolation_window import Window
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.model import ProcessModel
 

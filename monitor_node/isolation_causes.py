@@ -7,8 +7,8 @@ monitor was trained with has taken them in; some bring states of their own, from
 deviation; and each cause that another imitates takes probability from it. Those are for a diagnosis of the record.
 """
 
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects import EFFECTS
 
 NAMES = (
     "feed_temperature",

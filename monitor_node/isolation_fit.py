@@ -21,7 +21,7 @@ from monitor_node.isolation_stretch import Stretch
 from monitor_node.isolation_window import Window
 from monitor_node.stored_state import StoredState
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP, STEP

@@ -15,7 +15,7 @@ import numpy as np
 
 from monitor_node.isolation_stretch import HUBER, Loss, Stretch
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_step import COMPILED
 from reactorwatch.process.model import ProcessModel

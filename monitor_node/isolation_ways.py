@@ -8,7 +8,7 @@ import numpy as np
 
 from monitor_node.isolation_window import Window
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors
 from reactorwatch.process.filter_step import COMPILED

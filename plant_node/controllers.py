@@ -30,7 +30,7 @@ from plant_node.actuators import CoolantValve
 from plant_node.scenario import SIGNAL
 from reactorwatch.errors import InputError
 from reactorwatch.process import level_control
-from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, OPERATING_STATE
+from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE
 from reactorwatch.process.model import ProcessModel
 
 CONTROLLED = "T"

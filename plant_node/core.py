@@ -27,7 +27,7 @@ from plant_node.sensors import Sensor
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.errors import InputError
-from reactorwatch.process.effects.base import TIMING
+from reactorwatch.process.effect import TIMING
 from reactorwatch.process.fault import FaultSpecification
 from reactorwatch.process.integrate import SimulationError, Stepper
 from reactorwatch.process.level_control import with_level_control

@@ -9,8 +9,8 @@ from msgspec.structs import replace as with_changes
 from plant_node.config import PlantConfig
 from plant_node.core import Plant
 from plant_node.scenario import FromFile, HeldRecord
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects.base import TIMING
+from reactorwatch.process.effect import TIMING
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import Record

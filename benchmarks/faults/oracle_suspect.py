@@ -17,7 +17,7 @@ from benchmarks.faults.runs import NOISE_SD, Truth, measured_of, profile_changes
 from monitor_node.isolation_causes import CAUSES
 from plant_node.scenario import SIGNAL
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.records.record import Record
 

@@ -12,8 +12,8 @@ from plant_node.initial_state import start_state
 from plant_node.record import simulate_record
 from plant_node.scenario import SIGNAL, RandomSteps
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 

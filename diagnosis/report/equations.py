@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import casadi as ca
 
 from diagnosis.report import mathml
-from reactorwatch.process.effects.base import TIMING, Effect
+from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.model import ProcessModel
 
 

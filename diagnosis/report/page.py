@@ -24,7 +24,7 @@ from diagnosis.report.words import (
     with_interval,
 )
 from diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES
 

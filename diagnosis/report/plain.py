@@ -12,7 +12,7 @@ from diagnosis.report.words import (
     when,
 )
 from diagnosis.result import AMBIGUOUS, NOMINAL, Diagnosis
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.terminal import printable_lines
 
 INDENT = 14

@@ -8,7 +8,7 @@ import numpy as np
 
 from diagnosis.difference import TIME, Difference
 from diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, SD_95, Adjusted, Cause, Curves, Diagnosis, Estimate, HeldOut
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 
 MOSTLY_NOISE, WORSE = 0.9, 1.2
 """Of the mean square error: nothing worth locating is left. Times the error of all rows: a range is told as worse."""

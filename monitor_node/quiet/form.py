@@ -53,7 +53,7 @@ from monitor_node.watch_state import WatchedState, WatchState
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import AlarmKpis
 from reactorwatch.contract.sample_bytes import unit_digest
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 

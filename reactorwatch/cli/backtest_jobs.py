@@ -15,7 +15,7 @@ from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.sources import plant_of, tape
 from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.runtime.model_file import model_on_the_bus
 
 

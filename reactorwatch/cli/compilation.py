@@ -30,7 +30,7 @@ def compile_kernels() -> None:
     from plant_node.record import simulate_record
     from reactorwatch.cli.progress import task
     from reactorwatch.contract.codec import encode
-    from reactorwatch.process.cstr import cstr
+    from reactorwatch.process.library.cstr.model import cstr
     from recorder.player import samples_of
 
     record = simulate_record(PlantConfig(seed=1, faults=(FAULT,)), ROWS)

@@ -19,7 +19,7 @@ from reactorwatch.cli.batch import SUMMARY, Answer, Kind, Row, as_table
 from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, REPORT, Asked, Case, case_of, diagnosed, write_report
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.output import checked_folder
 from reactorwatch.runtime.model_file import read_extended_model
 

@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.linear_response import compare_step
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
+from reactorwatch.process.step_response import compare_step
 
 
 def describe(qc: float, step: float, *, as_json: bool) -> str:

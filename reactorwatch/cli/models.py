@@ -43,7 +43,7 @@ def identify(
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.sources import record
     from reactorwatch.cli.unit_remarks import unit_remark
-    from reactorwatch.process.cstr import cstr
+    from reactorwatch.process.library.cstr.model import cstr
 
     measured = record(existing_recording(file), plant, columns(column))
     remark = unit_remark(cstr(), measured.columns, measured.time_min)

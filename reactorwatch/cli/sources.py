@@ -135,7 +135,7 @@ def signals_of(path: Path | None) -> tuple[str, ...]:
     Raises:
         InputError: as `process_model`.
     """
-    from reactorwatch.process.cstr import cstr
+    from reactorwatch.process.library.cstr.model import cstr
     from reactorwatch.runtime.model_file import read_extended_model
 
     model = cstr() if path is None else read_extended_model(path).build()
@@ -150,7 +150,7 @@ def process_model(path: Path | None, measured: Record) -> ProcessModel:
     Raises:
         InputError: the file cannot be read, or holds no model.
     """
-    from reactorwatch.process.cstr import cstr
+    from reactorwatch.process.library.cstr.model import cstr
     from reactorwatch.runtime.model_file import read_extended_model
 
     if path is None:

@@ -19,7 +19,7 @@ from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.joining import VIEWER, Joining, heard_by, joining, open_router, write_node_settings
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.output import check_folder_name
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section

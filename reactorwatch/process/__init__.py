@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
+from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.tank_effects import TANK_EFFECTS
-from reactorwatch.process.tanks import tanks
 
 MODELS = (cstr, tanks)
 """The process models there are: functions that build them."""

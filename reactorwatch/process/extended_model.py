@@ -23,7 +23,7 @@ import msgspec
 
 from reactorwatch.errors import InputError
 from reactorwatch.process import EFFECTS_OF, MODELS, effects_of
-from reactorwatch.process.effects.base import TIMING, Effect
+from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_profile

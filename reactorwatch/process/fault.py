@@ -19,8 +19,8 @@ from math import inf, isfinite
 from typing import TypeVar
 
 from reactorwatch.errors import InputError
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_profile
 

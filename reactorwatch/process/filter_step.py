@@ -15,8 +15,8 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.process.effect_states import reset_function
 from reactorwatch.process.integrate import passed_min, symbolic_step
-from reactorwatch.process.memory import reset_function
 from reactorwatch.process.model import ProcessModel
 
 COMPILED = 64

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.process.memory import reset_function
+from reactorwatch.process.effect_states import reset_function
 from reactorwatch.process.model import ProcessModel
 
 LONGEST_STEP_MIN = 0.05

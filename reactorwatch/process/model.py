@@ -37,7 +37,7 @@ class Variable:
         meaning: a few words for people.
         symbol: stands for it in the expressions.
         balance: of a state whose equation is the balance of something, the place in the plant that this is (one of
-            `effects.base.LOCATIONS`); else empty.
+            `process.effect.LOCATIONS`); else empty.
     """
 
     name: str

@@ -22,8 +22,8 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.process.effect_states import reset_function, rest_function
 from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
-from reactorwatch.process.memory import reset_function, rest_function
 from reactorwatch.process.model import ProcessModel
 
 

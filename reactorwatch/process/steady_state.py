@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.process.effect_states import rest_function
 from reactorwatch.process.linearise import linearise
-from reactorwatch.process.memory import rest_function
 from reactorwatch.process.model import ProcessModel
 
 STARTS = 1024

@@ -9,9 +9,9 @@ import numpy as np
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
+from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.process.tank_effects import TANK_EFFECTS
-from reactorwatch.process.tanks import tanks
 from reactorwatch.records.csv_file import write_csv
 from reactorwatch.records.record import Record
 from tests.integration.watched_hour import record_hour

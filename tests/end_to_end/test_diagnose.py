@@ -12,8 +12,8 @@ from diagnosis.diagnose import diagnose
 from diagnosis.result import Diagnosis
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.record import Record
 

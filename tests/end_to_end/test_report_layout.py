@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from diagnosis.report.page import as_page
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.cases import CASES
 
 from .browser import Browser, browser

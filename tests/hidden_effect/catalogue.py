@@ -7,8 +7,8 @@ that, or where the reactor begins to leave its branch.
 
 from dataclasses import dataclass
 
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect import reactor
 
 BOTH, UP, DOWN = (1.0, -1.0), (1.0,), (-1.0,)

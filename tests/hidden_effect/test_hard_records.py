@@ -7,7 +7,7 @@ import pytest
 
 from diagnosis.diagnose import diagnose
 from diagnosis.result import NOMINAL, Diagnosis
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import Hidden, draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES, Circumstances

@@ -10,8 +10,8 @@ from diagnosis.hypothesis import Hypothesis
 from diagnosis.record_checks import run_of
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import HiddenEffect, named
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES

@@ -5,7 +5,7 @@ from functools import cache
 
 from diagnosis.diagnose import diagnose
 from diagnosis.result import UNKNOWN
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import OUTSIDE
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES

@@ -7,9 +7,9 @@ from diagnosis.courses import Step
 from diagnosis.run import Run
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
-from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr
 from reactorwatch.process.profiles import CONSTANT, STEP, Profile
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states

@@ -5,13 +5,16 @@ from pathlib import Path
 import pytest
 
 import monitor_node.charts
-import reactorwatch.process.effects
+import reactorwatch.process.library.cstr.effects
 import recorder.panels
 from monitor_node.charts.catalogue import CHARTS
 from recorder.panels.base import Panel
 
 FAMILIES = {
-    "effects": (reactorwatch.process.effects, {type(e).__module__ for e in reactorwatch.process.effects.EFFECTS}),
+    "effects": (
+        reactorwatch.process.library.cstr.effects,
+        {type(e).__module__ for e in reactorwatch.process.library.cstr.effects.EFFECTS},
+    ),
     "charts": (monitor_node.charts, {chart.__module__ for chart in CHARTS}),
     "panels": (recorder.panels, {panel.draw.__module__ for panel in recorder.panels.PANELS}),
 }
@@ -27,7 +30,7 @@ def test_every_file_of_the_folder_is_listed(family: str) -> None:
 
 def test_names_in_a_catalogue_differ() -> None:
     for names in (
-        [effect.name for effect in reactorwatch.process.effects.EFFECTS],
+        [effect.name for effect in reactorwatch.process.library.cstr.effects.EFFECTS],
         [chart.name for chart in CHARTS],
         [panel.title for panel in recorder.panels.PANELS if isinstance(panel, Panel)],
     ):

@@ -13,9 +13,9 @@ from plant_node.record import simulate_record
 from reactorwatch.cli.study.canvas import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, label, legend_below, panels
 from reactorwatch.cli.study.figure import Finding
 from reactorwatch.cli.study.study import NAMES, Study
-from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, OPERATING_STATE
 from reactorwatch.process.level_control import GAIN as LEVEL_GAIN
 from reactorwatch.process.level_control import with_level_control
+from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE
 from reactorwatch.process.simulate import Simulator
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from reactorwatch.cli.study.canvas import BLUE, ORANGE, VERMILION, label, legend_below, panels
 from reactorwatch.cli.study.figure import Finding, verdict
 from reactorwatch.cli.study.study import NAMES, Study
-from reactorwatch.process.linear_response import compare_step
+from reactorwatch.process.step_response import compare_step
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

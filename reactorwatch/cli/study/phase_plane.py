@@ -9,7 +9,7 @@ import numpy as np
 from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, ORANGE, label, legend_below, panels
 from reactorwatch.cli.study.figure import Finding, verdict
 from reactorwatch.cli.study.study import NAMES, Study, row_times
-from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW
+from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

@@ -17,7 +17,7 @@ from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
 from plant_node.scenario import Scenario
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import OPERATING_COOLANT_FLOW, cstr
+from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import SteadyState, steady_states

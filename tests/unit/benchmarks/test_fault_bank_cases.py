@@ -10,8 +10,8 @@ from benchmarks.faults.runs import NOISE_SD, fault_free, record_of, truth_of
 from monitor_node.isolation_causes import CAUSES
 from plant_node.initial_state import start_state
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record

@@ -29,7 +29,7 @@ numba.njit = register
 from monitor_node.config import MonitorConfig
 from monitor_node.suspicion import preparation
 from reactorwatch.cli import compilation
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.codegen.cache import MachineStore
 
 made, keep = [], MachineStore._keep

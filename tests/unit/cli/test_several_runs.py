@@ -17,7 +17,7 @@ from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.simulation import free_run, report
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record, join_runs
 from recorder.player import samples_of
 

@@ -17,7 +17,7 @@ from reactorwatch.cli import identification
 from reactorwatch.cli.backtest_jobs import _units
 from reactorwatch.cli.sources import tape
 from reactorwatch.process import MODELS
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import UNITS, Record
 from reactorwatch.runtime.model_file import write_extended_model

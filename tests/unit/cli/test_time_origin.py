@@ -17,8 +17,8 @@ from reactorwatch.cli.options import span_ns
 from reactorwatch.cli.recordings import cut
 from reactorwatch.cli.simulation import free_run
 from reactorwatch.cli.sources import process_model, record, tape
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import write_csv
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model

@@ -15,7 +15,7 @@ from monitor_node.config import MonitorConfig
 from reactorwatch.cli import backtest_jobs
 from reactorwatch.cli.main import app
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import write_csv
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.runs import record_of

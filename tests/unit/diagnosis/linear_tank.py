@@ -12,7 +12,7 @@ from diagnosis.search import Explained
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects.base import Effect, ParameterEffect, ParameterShift
+from reactorwatch.process.effect import Effect, ParameterEffect, ParameterShift
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
 
 RATE, PERIOD_MIN, NOISE_SD = 0.5, 0.1, 0.2

@@ -10,8 +10,8 @@ from diagnosis.hypothesis import MOST_STEPS, Hypothesis
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import run_of
 
 TIMES: Array = np.cumsum(np.append(0.0, np.random.default_rng(3).choice([0.05, 0.1, 0.2], 100)))

@@ -12,7 +12,7 @@ from diagnosis.record_checks import run_of
 from diagnosis.result import NAMED, NOMINAL, UNKNOWN
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.runs import record_of

@@ -19,8 +19,8 @@ from diagnosis.wandering import Noise
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.linear_tank import NOISE, Gain, Shift, explained, tank
 from tests.unit.diagnosis.linear_tank import record as tank_record

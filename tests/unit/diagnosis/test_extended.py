@@ -8,9 +8,9 @@ import pytest
 from diagnosis.courses import Course, Decay, Free, Ramp, Sine, Step
 from diagnosis.extended import extended_model
 from diagnosis.result import Cause, Estimate
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
 from reactorwatch.process.extended_model import parse_extended_model
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 
 TIMES_MIN = np.arange(0.0, 100.05, 0.1)

@@ -12,8 +12,8 @@ from diagnosis.record_checks import run_of
 from reactorwatch.cli.diagnosis import Asked, case_of
 from reactorwatch.cli.simulation import free_run
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.tanks import tanks
+from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.rig import Rig

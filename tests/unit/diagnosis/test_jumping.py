@@ -8,8 +8,8 @@ from diagnosis.courses import Constant, Step
 from diagnosis.hypothesis import Hypothesis
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 
 from .runs import run_of
 

@@ -7,8 +7,8 @@ from diagnosis.courses import Free
 from diagnosis.hypothesis import Hypothesis
 from diagnosis.knots import best_resolved, fine
 from diagnosis.search import Explained, Search
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import run_of
 
 LAST_MIN = 149.9

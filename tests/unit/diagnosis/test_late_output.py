@@ -8,8 +8,8 @@ from diagnosis.late_output import moved
 from diagnosis.run import Run
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import run_of
 
 SENSORS = Noise((0.002, 0.3), (0.0, 0.0))

@@ -8,7 +8,7 @@ from diagnosis.memory_screen import MemoryScreen
 from diagnosis.run import Run
 from diagnosis.screen import DECAYS
 from reactorwatch.arrays import Array
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
 
 TIME_MIN: Array = np.arange(0.0, 100.0, 0.1)
 LAG = next(effect for effect in EFFECTS if effect.name == "jacket_lag")

@@ -11,9 +11,9 @@ from diagnosis.report.machine import as_object
 from diagnosis.report.page import as_page
 from diagnosis.report.plain import as_text
 from diagnosis.result import NAMED, NOMINAL, UNKNOWN
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.linear_tank import NOISE_SD, PERIOD_MIN, Shift, follows, tank
 from tests.unit.diagnosis.runs import record_of

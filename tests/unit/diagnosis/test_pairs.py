@@ -13,8 +13,8 @@ from diagnosis.screen import Screen
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import record_of, run_of
 
 FOLLOWING = Noise((0.002, 0.3), (0.001, 0.3))

@@ -15,9 +15,9 @@ from diagnosis.report.equations import balances
 from diagnosis.report.page import as_page
 from diagnosis.report.svg import COLUMNS, decimated
 from diagnosis.result import UnknownCourse
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from tests.unit.diagnosis.cases import ADJUSTED, CASES
 

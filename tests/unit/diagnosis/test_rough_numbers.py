@@ -9,8 +9,8 @@ from diagnosis.record_checks import run_of as of_record
 from diagnosis.result import Estimate
 from diagnosis.rough_numbers import WITHIN_ROW, settled
 from diagnosis.search import Search
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES

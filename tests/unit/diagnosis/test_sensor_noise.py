@@ -13,9 +13,9 @@ from diagnosis.result import UNKNOWN
 from diagnosis.sensor_noise import sensor_noise
 from diagnosis.wandering import Noise, Wandering
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.runs import record_of
 

@@ -12,9 +12,9 @@ from diagnosis.record_checks import run_of
 from diagnosis.report.machine import as_object
 from diagnosis.report.plain import as_text
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.extended_model import parse_extended_model
+from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record, join_runs
 from tests.unit.diagnosis.runs import record_of
 

@@ -13,10 +13,10 @@ from diagnosis.screen import Screen
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter_errors import Ways
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import run_of
 
 NOISY = Noise((0.002, 0.3), (0.001, 0.3))

@@ -15,7 +15,7 @@ from diagnosis.report.words import verdict
 from diagnosis.result import NAMED, NOMINAL, Diagnosis
 from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.process.tanks import tanks
+from reactorwatch.process.library.cascaded_tanks.model import tanks
 from tests.unit.diagnosis.rig import NOISE_V, Rig, record_of
 
 

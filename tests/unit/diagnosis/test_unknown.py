@@ -14,9 +14,9 @@ from diagnosis.sized import Sized
 from diagnosis.unknown import Located, input_answers, located
 from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.noise import tune
 from reactorwatch.process.simulate import Simulator

@@ -10,7 +10,7 @@ from diagnosis.run import Run
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise, suspected
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.simulate import Simulator
 
 NAMES = ("C", "T")

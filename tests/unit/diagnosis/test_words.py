@@ -10,9 +10,9 @@ from diagnosis.report.machine import as_object, with_differences
 from diagnosis.report.plain import as_text
 from diagnosis.report.words import size_said, verdict, with_interval
 from diagnosis.result import Cause, Diagnosis, Estimate
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.tank_effects import TANK_EFFECTS
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
 from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
 
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Quality, Sample
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import UNITS, to_time_ns

@@ -19,9 +19,9 @@ from plant_node.record import simulate_record
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.process import filter_errors
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.filter_start import corrected_function
 from reactorwatch.process.filter_step import row_code, row_function, walk_function
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.step_budget import A_SEARCH
 from reactorwatch.runtime.config import BusConfig
 

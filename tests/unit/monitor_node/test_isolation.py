@@ -10,9 +10,9 @@ import pytest
 from monitor_node.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, Suspect
 from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_window import Row
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.filter import NoiseLevels
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel, variable
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 
 from monitor_node import backtest
 from monitor_node.config import MonitorConfig
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 
 from .samples import samples

@@ -10,8 +10,8 @@ from monitor_node.isolation_window import Row
 from monitor_node.reconstruction import Reconstruction
 from plant_node.config import NoiseSd
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.filter import NoiseLevels
+from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 
 QUIET = NoiseSd(C=0.0, T=0.0)

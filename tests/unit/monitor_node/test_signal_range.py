@@ -13,9 +13,9 @@ from monitor_node.references import ArxReference, ProcessReference
 from monitor_node.signal_range import ANY, ranges_of
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects.temperature_bias import TemperatureBias
-from reactorwatch.process.tanks import tanks
+from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cstr.effects.temperature_bias import TemperatureBias
+from reactorwatch.process.library.cstr.model import cstr
 
 from .samples import leaking_run, samples
 

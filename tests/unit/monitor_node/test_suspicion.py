@@ -5,8 +5,8 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.messages_pb2 import Alarm, Reconstruction
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 
 from .samples import Rows

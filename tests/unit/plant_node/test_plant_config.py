@@ -11,7 +11,7 @@ import pytest
 from plant_node.config import PlantConfig
 from plant_node.controllers import LevelControl, TemperatureControl
 from reactorwatch.errors import InputError
-from reactorwatch.process.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.runtime.config import read_settings, section
 
 

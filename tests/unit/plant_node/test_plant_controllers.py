@@ -14,8 +14,8 @@ from plant_node.controllers import GAIN, TemperatureControl
 from plant_node.core import Plant
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.runtime.config import section
 from tests.unit.plant_node.reactor import Reactor, coolant_for, resting
 from tests.unit.plant_node.rows import QUIET, column, rows

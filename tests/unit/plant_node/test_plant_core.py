@@ -13,8 +13,8 @@ from plant_node.config import NoiseSd, PlantConfig, Resolution
 from plant_node.core import Plant
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.csv_file import read_csv

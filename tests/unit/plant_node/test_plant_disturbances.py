@@ -16,7 +16,7 @@ from plant_node.disturbances import ProcessNoise
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import steady_states

@@ -12,10 +12,10 @@ from plant_node.controllers import LevelControl, TemperatureControl
 from plant_node.core import Plant
 from plant_node.record import simulate_record
 from plant_node.scenario import Constant
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.plant_node.reactor import Reactor
 from tests.unit.plant_node.rows import QUIET
 

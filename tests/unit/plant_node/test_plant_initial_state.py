@@ -12,9 +12,9 @@ from plant_node.core import Plant
 from plant_node.initial_state import carried_over, start_state
 from plant_node.scenario import Constant
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import FaultSpecification
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel, variable
 from reactorwatch.process.profiles import CONSTANT
 

@@ -12,8 +12,8 @@ from plant_node.presets import ONSET_MIN, PRESETS
 from plant_node.record import simulate_record
 from reactorwatch.cli.main import app
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.steady_state import steady_states
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.config import BusConfig, section

@@ -1,8 +1,8 @@
 """An effect of the reactor's catalogue by its name, and a model with it."""
 
-from reactorwatch.process.cstr import cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, STEP
 

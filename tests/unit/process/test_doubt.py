@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.doubt import Doubt
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.filled import filled
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_errors import FilterErrors
 from reactorwatch.process.innovations import Innovations
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.noise import tune_with
 

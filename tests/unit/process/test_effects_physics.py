@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.level_control import with_level_control
+from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import RAMP
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process.by_hand import duty, run

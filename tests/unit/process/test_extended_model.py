@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, parse_extended_model
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 
 FAULTS = (

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.process.cstr import OPERATING_STATE, cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.fault import parse_fault
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.filter_record import FilterRecord
 from reactorwatch.process.filter_stretches import LEAST_ROWS, together
 from reactorwatch.process.innovations import Innovations
+from reactorwatch.process.library.cstr.model import cstr
 
 ROWS = 2 * LEAST_ROWS
 LEVELS = [NoiseLevels((1e-3 * (1 + n), 0.2), (1e-4, 0.02 * n)) for n in range(6)]

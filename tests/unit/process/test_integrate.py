@@ -8,10 +8,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.process.cstr import OPERATING_STATE, cstr
-from reactorwatch.process.effects.coolant_flow import CoolantFlow
-from reactorwatch.process.effects.heat_transfer import HeatTransfer
 from reactorwatch.process.integrate import SimulationError, Stepper, step_grid, symbolic_step
+from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.effects.heat_transfer import HeatTransfer
+from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import STEP
 from tests.unit.process.by_hand import nominal
 

@@ -6,8 +6,8 @@ import pytest
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import cstr
 from reactorwatch.process.filter import NoiseLevels
+from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.noise import tune
 
 SMALLEST = (2e-4, 0.05)

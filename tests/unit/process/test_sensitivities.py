@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import OPERATING_STATE, cstr
-from reactorwatch.process.effects import EFFECTS
-from reactorwatch.process.effects.base import Effect
-from reactorwatch.process.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE, PROFILES, STEP, Profile, free_profile
 from reactorwatch.process.simulate import Simulator

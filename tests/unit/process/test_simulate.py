@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.cstr import OPERATING_STATE, cstr
-from reactorwatch.process.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.csv_file import read_csv

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-import reactorwatch.process.tank_effects as catalogue
-from reactorwatch.process.effects.base import Effect
+import reactorwatch.process.library.cascaded_tanks.effects as catalogue
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
+from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.profiles import CONSTANT, FREE, PROFILES, Profile
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states
-from reactorwatch.process.tank_effects import TANK_EFFECTS
-from reactorwatch.process.tanks import tanks
 
 TIMES = np.arange(60) / 15
 FLOWS = np.repeat(np.random.default_rng(1).uniform(2.0, 5.0, 12), 5)

@@ -1,0 +1,27 @@
+"""The level sensor is off by the same everywhere."""
+
+from typing import ClassVar
+
+import casadi as ca
+
+from reactorwatch.process.effect import ReadingEffect
+
+
+class LevelBias(ReadingEffect):
+    """The measured level is x2 + m."""
+
+    name = "level_bias"
+    label = "bias of the level sensor"
+    location = "level_sensor"
+    unit = "V"
+    larger = "level sensor shows {} V too much"
+    smaller = "level sensor shows {} V too little"
+    lower = -10.0
+    upper = 10.0
+    typical = 0.05
+    output = "x2"
+    labels: ClassVar[dict[str, str]] = {"ramp": "drift of the level sensor"}
+
+    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """See `ReadingEffect`."""
+        return value + size

@@ -1,0 +1,45 @@
+"""The upper tank runs over."""
+
+import casadi as ca
+
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel
+
+BRIM_V = 10.0
+"""Level of the brim of the upper tank."""
+
+INTO_THE_LOWER = 0.5
+"""Share of what runs over that the lower tank catches; the rest is lost."""
+
+SOFT_V = 0.005
+"""How far about the brim the flow over it sets in."""
+
+
+class Overflow(Effect):
+    """m times the level above the brim, 10 V, runs over: half of it into the lower tank, the rest beside it.
+
+    What runs over has a kink at the brim, where a filter's equations have no derivative; so it sets in within some
+    hundredths of a volt, as (h + (h^2 + s^2)^(1/2)) / 2 of the level h above the brim. The larger m is, the more
+    firmly it holds the level at the brim.
+    """
+
+    name = "overflow"
+    label = "overflow of the upper tank"
+    location = "upper_tank"
+    unit = "1/min"
+    larger = "overflow of {} 1/min of the level above the brim"
+    lower = 0.0
+    upper = 60.0
+    typical = 5.0
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`.
+
+        Raises:
+            ValueError: the model lacks a state x1 or x2, or a parameter k1 or k2.
+        """
+        above = model.states[model.state_index("x1")].symbol - BRIM_V
+        twice = above + ca.sqrt(above**2 + SOFT_V**2)
+        # k1 and k2 are of one flow over the cross-section of either tank.
+        widths = model.parameter("k2").symbol / model.parameter("k1").symbol
+        return model.added_to("x1", -0.5 * size * twice).added_to("x2", 0.5 * INTO_THE_LOWER * size * widths * twice)

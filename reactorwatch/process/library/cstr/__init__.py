@@ -1,0 +1,1 @@
+"""The stirred-tank reactor."""

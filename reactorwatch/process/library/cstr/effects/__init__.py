@@ -1,0 +1,55 @@
+"""The catalogue of the reactor's effects. A new one: a file here, and a line below."""
+
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.library.cstr.effects.activation_energy import ActivationEnergy
+from reactorwatch.process.library.cstr.effects.bypass import Bypass
+from reactorwatch.process.library.cstr.effects.concentration_bias import ConcentrationBias
+from reactorwatch.process.library.cstr.effects.concentration_delay import ConcentrationDelay
+from reactorwatch.process.library.cstr.effects.concentration_gain import ConcentrationGain
+from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
+from reactorwatch.process.library.cstr.effects.coolant_temperature import CoolantTemperature
+from reactorwatch.process.library.cstr.effects.feed_concentration import FeedConcentration
+from reactorwatch.process.library.cstr.effects.feed_flow import FeedFlow
+from reactorwatch.process.library.cstr.effects.feed_temperature import FeedTemperature
+from reactorwatch.process.library.cstr.effects.heat_loss import HeatLoss
+from reactorwatch.process.library.cstr.effects.heat_transfer import HeatTransfer
+from reactorwatch.process.library.cstr.effects.jacket_lag import JacketLag
+from reactorwatch.process.library.cstr.effects.reaction_heat import ReactionHeat
+from reactorwatch.process.library.cstr.effects.reaction_order import ReactionOrder
+from reactorwatch.process.library.cstr.effects.reaction_rate import ReactionRate
+from reactorwatch.process.library.cstr.effects.sample_timing import SampleTiming
+from reactorwatch.process.library.cstr.effects.side_reaction import SideReaction
+from reactorwatch.process.library.cstr.effects.temperature_bias import TemperatureBias
+from reactorwatch.process.library.cstr.effects.temperature_lag import TemperatureLag
+from reactorwatch.process.library.cstr.effects.valve_lag import ValveLag
+from reactorwatch.process.library.cstr.effects.valve_stiction import ValveStiction
+from reactorwatch.process.library.cstr.effects.volume import Volume
+from reactorwatch.process.library.cstr.effects.wall_heat_capacity import WallHeatCapacity
+
+EFFECTS: tuple[Effect, ...] = (
+    FeedTemperature(),
+    FeedConcentration(),
+    FeedFlow(),
+    ReactionRate(),
+    ActivationEnergy(),
+    ReactionHeat(),
+    SideReaction(),
+    ReactionOrder(),
+    HeatTransfer(),
+    HeatLoss(),
+    CoolantTemperature(),
+    JacketLag(),
+    WallHeatCapacity(),
+    ValveLag(),
+    ValveStiction(),
+    CoolantFlow(),
+    TemperatureBias(),
+    TemperatureLag(),
+    ConcentrationBias(),
+    ConcentrationGain(),
+    ConcentrationDelay(),
+    Bypass(),
+    Volume(),
+    SampleTiming(),
+)
+"""From the feed over the reaction and the cooling to the sensors, then what concerns several of them."""

@@ -1,0 +1,18 @@
+"""The reaction depends on temperature more strongly, or less."""
+
+from reactorwatch.process.effect import ParameterEffect
+
+
+class ActivationEnergy(ParameterEffect):
+    """E/R (1 + m)."""
+
+    name = "activation_energy"
+    label = "wrong activation energy"
+    location = "reaction"
+    unit = "1"
+    larger = "activation energy higher by {} %"
+    smaller = "activation energy lower by {} %"
+    lower = -0.5
+    upper = 0.5
+    typical = 0.002
+    parameter = "E_R"

@@ -1,0 +1,27 @@
+"""The analyser is off by the same everywhere."""
+
+from typing import ClassVar
+
+import casadi as ca
+
+from reactorwatch.process.effect import ReadingEffect
+
+
+class ConcentrationBias(ReadingEffect):
+    """The measured concentration is C + m."""
+
+    name = "concentration_bias"
+    label = "bias of the analyser"
+    location = "concentration_sensor"
+    unit = "mol/l"
+    larger = "analyser shows {} mol/l too much"
+    smaller = "analyser shows {} mol/l too little"
+    lower = -1.0
+    upper = 1.0
+    typical = 0.01
+    output = "C"
+    labels: ClassVar[dict[str, str]] = {"ramp": "drift of the analyser"}
+
+    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """See `ReadingEffect`."""
+        return value + size

@@ -1,0 +1,18 @@
+"""More is fed, or less."""
+
+from reactorwatch.process.effect import ParameterEffect
+
+
+class FeedFlow(ParameterEffect):
+    """q (1 + m). At constant volume as much flows out; with a level of its own the level follows."""
+
+    name = "feed_flow"
+    label = "wrong feed flow"
+    location = "feed"
+    unit = "1"
+    larger = "{} % more feed"
+    smaller = "{} % less feed"
+    lower = -0.99
+    upper = 4.0
+    typical = 0.03
+    parameter = "q"

@@ -1,0 +1,18 @@
+"""The feed is warmer or colder than it should be."""
+
+from reactorwatch.process.effect import ParameterShift
+
+
+class FeedTemperature(ParameterShift):
+    """Tf + m."""
+
+    name = "feed_temperature"
+    label = "wrong feed temperature"
+    location = "feed"
+    unit = "K"
+    larger = "feed warmer by {} K"
+    smaller = "feed colder by {} K"
+    lower = -50.0
+    upper = 50.0
+    typical = 2.0
+    parameter = "Tf"

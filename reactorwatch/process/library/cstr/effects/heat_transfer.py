@@ -1,0 +1,21 @@
+"""Heat passes to the coolant less easily, or more."""
+
+from typing import ClassVar
+
+from reactorwatch.process.effect import ParameterEffect
+
+
+class HeatTransfer(ParameterEffect):
+    """K3 (1 + m): the heat transfer coefficient times the area."""
+
+    name = "heat_transfer"
+    label = "changed heat transfer"
+    location = "coolant"
+    unit = "1"
+    larger = "{} % more heat transfer to the coolant"
+    smaller = "{} % of the heat transfer to the coolant lost"
+    lower = -0.99
+    upper = 4.0
+    typical = -0.3
+    parameter = "K3"
+    labels: ClassVar[dict[str, str]] = {"ramp": "fouling of the jacket", "decay": "fouling of the jacket"}

@@ -1,0 +1,39 @@
+"""The reaction depends on the concentration by another power than the first."""
+
+import casadi as ca
+
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel
+
+REFERENCE_MOL_L = 0.1
+"""Where the rate stays as it was: the concentration at the operating point."""
+
+LEAST_MOL_L = 1e-9
+"""A smaller concentration, or a negative one on the way of a solver, counts as this."""
+
+
+class ReactionOrder(Effect):
+    """The rate, and the heat with it, times (C / 0.1)^m: the order is 1 + m."""
+
+    name = "reaction_order"
+    label = "wrong order of the reaction"
+    location = "reaction"
+    unit = "1"
+    larger = "order of the reaction higher by {}"
+    smaller = "order of the reaction lower by {}"
+    lower = -0.9
+    upper = 2.0
+    typical = 0.05
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`.
+
+        Raises:
+            ValueError: the model has no state C, or no parameter k0 or K1.
+        """
+        C = model.states[model.state_index("C")].symbol
+        factor = (ca.fmax(C, LEAST_MOL_L) / REFERENCE_MOL_L) ** size
+        for name in ("k0", "K1"):
+            symbol = model.parameter(name).symbol
+            model = model.substitute(symbol, symbol * factor)
+        return model

@@ -1,0 +1,27 @@
+"""The thermometer is off."""
+
+from typing import ClassVar
+
+import casadi as ca
+
+from reactorwatch.process.effect import ReadingEffect
+
+
+class TemperatureBias(ReadingEffect):
+    """The measured temperature is T + m."""
+
+    name = "temperature_bias"
+    label = "bias of the temperature sensor"
+    location = "temperature_sensor"
+    unit = "K"
+    larger = "thermometer shows {} K too much"
+    smaller = "thermometer shows {} K too little"
+    lower = -100.0
+    upper = 100.0
+    typical = 2.0
+    output = "T"
+    labels: ClassVar[dict[str, str]] = {"ramp": "drift of the temperature sensor"}
+
+    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """See `ReadingEffect`."""
+        return value + size

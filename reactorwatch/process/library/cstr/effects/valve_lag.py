@@ -1,0 +1,33 @@
+"""The coolant valve is slow."""
+
+import casadi as ca
+
+from reactorwatch.process.effect import Effect, coolant_flow_of
+from reactorwatch.process.effect_states import lagged
+from reactorwatch.process.model import ProcessModel, variable
+
+
+class ValveLag(Effect):
+    """The real coolant flow follows qc with a time constant of m."""
+
+    name = "valve_lag"
+    label = "slow coolant valve"
+    location = "coolant"
+    unit = "min"
+    larger = "coolant flow follows its command with a time constant of {} min"
+    lower = 0.0
+    upper = 10.0
+    typical = 0.1
+    starts = (0.05, 0.5)
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`.
+
+        Raises:
+            ValueError: the model has no input qc.
+        """
+        qc = coolant_flow_of(self, model)
+        name = f"{self.prefix(model)}.flow"
+        state = variable(name, qc.unit, (qc.lower, qc.upper), qc.scale, "flow that the valve lets through")
+        _, flow = lagged(model, state, qc.symbol, size)
+        return lagged(model.substitute(qc.symbol, flow), state, qc.symbol, size)[0]

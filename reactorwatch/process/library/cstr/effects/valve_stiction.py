@@ -1,0 +1,44 @@
+"""The coolant valve sticks."""
+
+from dataclasses import replace
+
+import casadi as ca
+
+from reactorwatch.process.effect import Effect, coolant_flow_of
+from reactorwatch.process.model import ProcessModel, variable
+
+
+class ValveStiction(Effect):
+    """The valve moves only when qc is more than m away from it; then it goes to qc.
+
+    That is decided when a row begins, for between rows qc does not change. The flow that the valve stands at is a state
+    which jumps then and stays in between. A run depends on m in jumps: it is the same for all m between two differences
+    that occur in a record. So its derivative by m is zero, and a fit has to scan m, not climb.
+    """
+
+    name = "valve_stiction"
+    label = "sticking coolant valve"
+    location = "coolant"
+    unit = "l/min"
+    larger = "valve moves only for changes of more than {} l/min"
+    lower = 0.0
+    upper = 100.0
+    typical = 2.0
+    jumps = True
+    starts = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`.
+
+        Raises:
+            ValueError: the model has no input qc.
+        """
+        qc = coolant_flow_of(self, model)
+        name = f"{self.prefix(model)}.flow"
+        state = variable(name, qc.unit, (qc.lower, qc.upper), self.typical, "flow that the valve stands at")
+        free = ca.logic_or(ca.fabs(qc.symbol - state.symbol) > size, size <= 0)
+        moved = ca.if_else(free, qc.symbol, state.symbol)
+        stuck = model.substitute(qc.symbol, state.symbol)
+        # What jumps at the same moment sees where the valve has gone.
+        stuck = replace(stuck, resets=model.substitute(qc.symbol, moved).resets)
+        return stuck.with_state(state, ca.SX(0), at_rest=qc.symbol, reset=moved)

@@ -1,0 +1,33 @@
+"""More is in the reactor than should be, or less."""
+
+import casadi as ca
+
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel
+
+
+class Volume(Effect):
+    """V (1 + m); flows and hA are what they were, so q/V and K2, which holds 1/V as a factor, are divided by 1 + m.
+
+    With a level of its own, it is the set point of the level that is off: the level follows.
+    """
+
+    name = "volume"
+    label = "wrong volume of the contents"
+    location = "mass_balance"
+    unit = "1"
+    larger = "{} % more contents than stated"
+    smaller = "{} % less contents than stated"
+    lower = -0.9
+    upper = 4.0
+    typical = 0.03
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`.
+
+        Raises:
+            ValueError: the model has no parameter K2, or neither V nor V_set.
+        """
+        volume = model.parameter("V_set" if "V_set" in model.parameter_names else "V").symbol
+        cooling = model.parameter("K2").symbol
+        return model.substitute(volume, volume * (1 + size)).substitute(cooling, cooling / (1 + size))

@@ -1,0 +1,45 @@
+"""The wall of the vessel stores heat."""
+
+from dataclasses import replace
+
+import casadi as ca
+
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel, parameter, variable
+
+EXCHANGE_PER_MIN = 2.0
+"""How fast the wall follows the contents, the inverse of a time constant of half a minute: 8 mm of steel (7800 kg/m3,
+500 J/(kg K)) behind a film of 1000 W/(m2 K), as stirred liquids have it."""
+
+
+class WallHeatCapacity(Effect):
+    """A wall with m times the heat capacity of the contents exchanges heat with them.
+
+        dT/dt = ... + m r (Tw - T),    dTw/dt = r (T - Tw)
+
+    r is a parameter of the extended model, `wall_heat_capacity.exchange`: a record with enough in it can tell it too.
+    """
+
+    name = "wall_heat_capacity"
+    label = "heat stored in the wall"
+    location = "energy_balance"
+    unit = "1"
+    larger = "wall stores {} % of the heat that the contents store"
+    lower = 0.0
+    upper = 10.0
+    typical = 0.05
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`.
+
+        Raises:
+            ValueError: the model has no state T.
+        """
+        prefix = self.prefix(model)
+        inside = model.states[model.state_index("T")]
+        bounds = (inside.lower, inside.upper)
+        wall = variable(f"{prefix}.temperature", inside.unit, bounds, inside.scale, "temperature of the wall")
+        exchange = parameter(f"{prefix}.exchange", EXCHANGE_PER_MIN, "1/min", (0.01, 20.0), "how fast the wall follows")
+        rate = exchange.symbol * (inside.symbol - wall.symbol)
+        extended = model.added_to("T", -size * rate).with_state(wall, rate, at_rest=inside.symbol)
+        return replace(extended, parameters=(*model.parameters, exchange))
