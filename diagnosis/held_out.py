@@ -20,7 +20,7 @@ from diagnosis.search import Explained
 from diagnosis.sized import Sized
 from diagnosis.uncertain import beginning_with
 from reactorwatch.arrays import Array
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.innovations import Innovations
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.simulate import Simulator
 

@@ -19,8 +19,8 @@ from diagnosis.run import Run
 from diagnosis.sized import HUBER, Known, Sized, clipped
 from diagnosis.uncertain import last_state, offsets
 from reactorwatch.arrays import Array
-from reactorwatch.process.filter_errors import Ways
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.error_dynamics import Ways
+from reactorwatch.kalman.innovations import Innovations
 
 SETTLED, WELL_SETTLED = 0.05, 0.005
 """In log likelihood: a rough fit ends with a step that gains less, and any fit where none promises the second."""

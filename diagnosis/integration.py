@@ -13,7 +13,7 @@ import numpy as np
 from diagnosis.run import Run
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import RowCode
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.innovations import Innovations
 from reactorwatch.process.model import ProcessModel
 
 LEAST_CORRELATION = 0.15

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from diagnosis.run import Run, doubt_of
 from reactorwatch.arrays import Array
-from reactorwatch.process.doubt import Doubt
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.input_uncertainty import Doubt
 
 
 class Moved(NamedTuple):

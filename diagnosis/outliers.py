@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from diagnosis.run import Run
 from reactorwatch.arrays import Array
-from reactorwatch.process.noise import rough_sensor_sd
+from reactorwatch.kalman.noise_estimation import rough_sensor_sd
 
 FAR = 5.0
 """Standard deviations of the sensor's noise ..."""

@@ -22,8 +22,8 @@ from diagnosis.courses import Constant, Course, Free, Sine
 from diagnosis.run import Run
 from diagnosis.screen import KNOTS, Screen, usable
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.error_dynamics import Ways
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter_errors import Ways
 
 TAKEN_AWAY, SINES_SHARE = 2, 0.3
 """How many causes are taken away in turn to see sines below, and what share of the best one's gain a sine must have."""

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.doubt import Doubt
+from reactorwatch.kalman.input_uncertainty import Doubt
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,8 @@ from diagnosis.run import Run
 from diagnosis.size_inputs import with_size_inputs
 from diagnosis.sized import Sized, clipped, ways_between
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.error_dynamics import FilterErrors, Ways
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter_errors import FilterErrors, Ways
 from reactorwatch.process.model import ProcessModel
 
 KNOTS = 12

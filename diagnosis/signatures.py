@@ -1,7 +1,7 @@
 """What a deviation of any shape in time does to a filter's innovations, linearised; for all causes at once.
 
 Whitened innovations w of a filter that does not know of a deviation have the mean g(m), linear in its course m(t)
-(`reactorwatch.process.filter_errors` has the equations). Four things are asked of that map again and again, and each
+(`reactorwatch.kalman.error_dynamics` has the equations). Four things are asked of that map again and again, and each
 costs one pass over the record:
 
 - `shown`: the signature g of some given courses, forwards; and `products`: their sums of products alone.
@@ -23,7 +23,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import compiled
-from reactorwatch.process.filter_errors import Ways
+from reactorwatch.kalman.error_dynamics import Ways
 
 PART = 256
 """Rows whose signatures are summed up while they are still at hand."""

@@ -10,10 +10,10 @@ import numpy as np
 from diagnosis import clock_shift
 from diagnosis.courses import Signal
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import COMPILED
+from reactorwatch.kalman.error_dynamics import FilterErrors
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import NoiseLevels
-from reactorwatch.process.filter_errors import FilterErrors
-from reactorwatch.process.filter_step import COMPILED
 from reactorwatch.process.model import ProcessModel, variable
 
 

@@ -17,15 +17,15 @@ from diagnosis.wandering import Noise, first_rate_sd, learned, with_wandering
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.kalman.batch_runner import together
+from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
+from reactorwatch.kalman.error_dynamics import FilterErrors, Ways
+from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.noise_estimation import tune_with
+from reactorwatch.kalman.resampling import Filled, filled
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filled import Filled, filled
-from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
-from reactorwatch.process.filter_errors import FilterErrors, Ways
-from reactorwatch.process.filter_record import FilterRecord
-from reactorwatch.process.filter_stretches import together
-from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.noise import tune_with
 
 HUBER = 4.0
 """Standard deviations beyond which an innovation counts no more than in proportion."""

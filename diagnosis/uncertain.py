@@ -18,7 +18,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.innovations import Innovations
 from reactorwatch.process.model import Parameter, ProcessModel, parameter, variable
 
 _OFF, _BEGIN = ".off", ".begin"

@@ -26,8 +26,8 @@ from diagnosis.result import UnknownCourse
 from diagnosis.run import Run
 from diagnosis.search import Explained
 from diagnosis.sized import loss_of
+from reactorwatch.kalman.ekf import LEAST_PROCESS_SD, NoiseLevels
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import LEAST_PROCESS_SD, NoiseLevels
 from reactorwatch.process.model import ProcessModel
 
 MARGIN = 25.0

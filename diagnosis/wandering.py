@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.filter import NoiseLevels
+from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.model import ProcessModel, parameter, variable
 
 LOW, HIGH = (0.375, 0.625), (0.75, 1.0)

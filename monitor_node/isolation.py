@@ -34,11 +34,11 @@ from monitor_node.isolation_hypothesis import Hypothesis
 from monitor_node.isolation_stretch import HUBER
 from monitor_node.isolation_ways import linearisable
 from monitor_node.isolation_window import Row, Window, newest_rows, window_of
+from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.step_budget import StepBudget, StepsSpentError
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP
-from reactorwatch.process.step_budget import StepBudget, StepsSpentError
 
 UNKNOWN, SENSOR, PROCESS = "unknown", "sensor", "process"
 

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from monitor_node.isolation_ways import Linearisation, Ways
 from monitor_node.isolation_window import Window
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.model import ProcessModel
 
 PROFILES = ("step", "ramp")

@@ -21,11 +21,11 @@ from monitor_node.isolation_stretch import Stretch
 from monitor_node.isolation_window import Window
 from monitor_node.stored_state import StoredState
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.step_budget import StepBudget
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP, STEP
-from reactorwatch.process.step_budget import StepBudget
 
 BEHIND = 15.0
 """In log likelihood: what is worse than the best by more is left behind."""

@@ -15,9 +15,9 @@ import numpy as np
 
 from monitor_node.isolation_stretch import HUBER, Loss, Stretch
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.ekf_step import COMPILED
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import Filter, NoiseLevels
-from reactorwatch.process.filter_step import COMPILED
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP, STEP, Profile
 

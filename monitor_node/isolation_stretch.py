@@ -13,10 +13,10 @@ import numpy as np
 
 from monitor_node.isolation_window import Window
 from reactorwatch.arrays import Array
-from reactorwatch.process.filled import filled
-from reactorwatch.process.filter import Filter, FilterState
-from reactorwatch.process.filter_record import FilterRecord
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.resampling import filled
 
 HUBER = 4.0
 LOST = 100.0

@@ -8,10 +8,10 @@ import numpy as np
 
 from monitor_node.isolation_window import Window
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import COMPILED
+from reactorwatch.kalman.error_dynamics import FilterErrors
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import NoiseLevels
-from reactorwatch.process.filter_errors import FilterErrors
-from reactorwatch.process.filter_step import COMPILED
 from reactorwatch.process.model import ProcessModel
 
 

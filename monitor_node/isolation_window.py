@@ -5,8 +5,8 @@ off from the second one on, as the monitor's own does. A value is an outlier, an
 if it stands out, alone or with its neighbour, from those before and after, which agree with each other. So is the
 newest one, if it is far off and the one before was not: nothing confirms it yet.
 
-Where rows are missing and the input behind them is another, it is not known when it changed (see `process.doubt`): no
-cause may be found in what a lost row leaves.
+Where rows are missing and the input behind them is another, it is not known when it changed (see
+`kalman.input_uncertainty`): no cause may be found in what a lost row leaves.
 """
 
 from collections.abc import Sequence
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from monitor_node.sampling import missing_rows
 from reactorwatch.arrays import Array
-from reactorwatch.process.doubt import Doubt
-from reactorwatch.process.filter import LONGEST_GAP_MIN, Filter, FilterState
-from reactorwatch.process.filter_record import LONGEST_ROW_MIN
+from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState
+from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
+from reactorwatch.kalman.input_uncertainty import Doubt
 
 Row: TypeAlias = tuple[float, float, Sequence[float]]
 """Time in minutes, input, outputs; NaN where missing."""

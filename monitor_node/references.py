@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from monitor_node.sampling import missing_rows
 from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
-from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
+from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
+from reactorwatch.kalman.noise_estimation import tune
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.noise import tune
 from reactorwatch.records.record import MINUTE_NS
 
 Array = NDArray[np.float64]

@@ -23,8 +23,8 @@ from monitor_node.stored_state import StoredState, packed, unpacked
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
+from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.effect import SensorEffect
-from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS

@@ -13,7 +13,7 @@ from monitor_node.silence import SilenceState, Spacing
 from monitor_node.spike import SpikeState
 from monitor_node.stuck import StuckState, most_equal
 from monitor_node.watch_state import WatchedState, WatchState
-from reactorwatch.process.filter import FilterState, NoiseLevels, variances
+from reactorwatch.kalman.ekf import FilterState, NoiseLevels, variances
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 

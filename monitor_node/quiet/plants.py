@@ -26,8 +26,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
 from reactorwatch.contract.sample_bytes import SampleColumns, sample_columns
-from reactorwatch.process.filter_record import LONGEST_ROW_MIN
-from reactorwatch.process.filter_step import row_function
+from reactorwatch.kalman.ekf_step import row_function
+from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 

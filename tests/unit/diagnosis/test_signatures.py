@@ -13,8 +13,8 @@ from diagnosis.screen import Screen
 from diagnosis.sized import Sized
 from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.error_dynamics import Ways
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter_errors import Ways
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import run_of

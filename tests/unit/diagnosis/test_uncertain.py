@@ -13,8 +13,8 @@ from diagnosis.sized import Sized
 from diagnosis.uncertain import offsets, stated, with_uncertain
 from diagnosis.wandering import Noise
 from reactorwatch.errors import InputError
+from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.process.filter import Filter
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import record_of, run_of
 

@@ -14,11 +14,11 @@ from diagnosis.sized import Sized
 from diagnosis.unknown import Located, input_answers, located
 from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.noise_estimation import tune
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.noise import tune
 from reactorwatch.process.simulate import Simulator
 
 ROWS, PERIOD_MIN, NOISE = 1500, 0.1, np.array([0.002, 0.3])

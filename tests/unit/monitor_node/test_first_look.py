@@ -18,11 +18,11 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import RowCode
-from reactorwatch.process import filter_errors
-from reactorwatch.process.filter_start import corrected_function
-from reactorwatch.process.filter_step import row_code, row_function, walk_function
+from reactorwatch.kalman import error_dynamics
+from reactorwatch.kalman.ekf_step import row_code, row_function, walk_function
+from reactorwatch.kalman.initial_state import corrected_function
+from reactorwatch.kalman.step_budget import A_SEARCH
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.step_budget import A_SEARCH
 from reactorwatch.runtime.config import BusConfig
 
 from .faulty import SENSORS
@@ -60,7 +60,7 @@ class Work:
     @staticmethod
     def _functions() -> int:
         kept = (row_function, row_code, walk_function, corrected_function)
-        return sum(item.cache_info().misses for item in kept) + len(filter_errors._whitened.signatures)  # type: ignore[attr-defined]
+        return sum(item.cache_info().misses for item in kept) + len(error_dynamics._whitened.signatures)  # type: ignore[attr-defined]
 
     @property
     def made(self) -> int:

@@ -10,8 +10,8 @@ import pytest
 from monitor_node.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, Suspect
 from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_window import Row
+from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import NoiseLevels
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel, variable
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of

@@ -8,8 +8,8 @@ from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_hypothesis import Hypothesis
 from monitor_node.isolation_stretch import Stretch
 from monitor_node.isolation_window import Window, window_of
+from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.profiles import RAMP, STEP, Profile
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of

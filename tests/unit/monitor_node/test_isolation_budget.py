@@ -15,9 +15,9 @@ from monitor_node.reconstruction import START_STEPS, START_STEPS_A_ROW, Reconstr
 from monitor_node.signal_range import ranges_of
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
-from reactorwatch.process.filter import Filter
+from reactorwatch.kalman.ekf import Filter
+from reactorwatch.kalman.step_budget import A_RUN, A_SEARCH, StepBudget, StepsSpentError
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.step_budget import A_RUN, A_SEARCH, StepBudget, StepsSpentError
 
 from .faulty import SENSORS, rows_of
 from .samples import leaking_run, samples

@@ -9,8 +9,8 @@ from monitor_node.isolation_causes import CAUSES
 from monitor_node.isolation_hypothesis import Descent, Hypothesis
 from monitor_node.isolation_stretch import HUBER, LOST, Stretch
 from monitor_node.isolation_window import Window, window_of
+from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import Filter
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.profiles import RAMP, STEP
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of

@@ -15,7 +15,7 @@ from monitor_node.references import ProcessReference, input_reach
 from monitor_node.sampling import missing_rows
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
-from reactorwatch.process.filter import Filter
+from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 

@@ -10,7 +10,7 @@ from monitor_node.isolation_window import Row
 from monitor_node.reconstruction import Reconstruction
 from plant_node.config import NoiseSd
 from reactorwatch.arrays import Array
-from reactorwatch.process.filter import NoiseLevels
+from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.model import ProcessModel

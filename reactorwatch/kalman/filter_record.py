@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.doubt import Doubt
+from reactorwatch.kalman.input_uncertainty import Doubt
 from reactorwatch.process.integrate import LONGEST_STEP_MIN
 
 LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded
@@ -24,7 +24,7 @@ class FilterRecord:
         measured: shape (rows, n_y); NaN where missing.
         gate: standard deviations beyond which a measurement does not correct the state ...
         accept: ... unless this says so, shape (rows, n_y).
-        rows: the arguments `new` of the compiled rows, see `filter_step`; in the first one, what comes from the row
+        rows: the arguments `new` of the compiled rows, see `ekf_step`; in the first one, what comes from the row
             before is not yet there.
         near: whether a row is so soon after the one before that two steps lead to it, shape (rows,); of the first one
             nobody knows yet.

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.filter import Filter, NoiseLevels
-from reactorwatch.process.filter_record import FilterRecord
-from reactorwatch.process.filter_stretches import LEAST_ROWS, together
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.batch_runner import LEAST_ROWS, together
+from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.innovations import Innovations
 from reactorwatch.process.library.cstr.model import cstr
 
 ROWS = 2 * LEAST_ROWS

@@ -17,8 +17,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.kalman.ekf_step import COMPILED, output_function
 from reactorwatch.process.effect_states import reset_function, rest_function
-from reactorwatch.process.filter_step import COMPILED, output_function
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, SteadyStates
 

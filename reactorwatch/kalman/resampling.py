@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.doubt import Doubt
-from reactorwatch.process.filter import LONGEST_GAP_MIN
-from reactorwatch.process.filter_record import LONGEST_ROW_MIN
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.ekf import LONGEST_GAP_MIN
+from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
+from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.input_uncertainty import Doubt
 
 
 class Filled(NamedTuple):

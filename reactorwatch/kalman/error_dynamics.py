@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES, RowCode
 from reactorwatch.codegen.numba_kernel import compiled
-from reactorwatch.process.doubt import Doubt
-from reactorwatch.process.filter import NoiseLevels
-from reactorwatch.process.filter_step import exponential
+from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.ekf_step import exponential
+from reactorwatch.kalman.input_uncertainty import Doubt
 from reactorwatch.process.integrate import LONGEST_STEP_MIN, passed_min, symbolic_step
 from reactorwatch.process.model import ProcessModel
 

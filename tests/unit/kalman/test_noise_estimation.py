@@ -6,9 +6,9 @@ import pytest
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.process.filter import NoiseLevels
+from reactorwatch.kalman.ekf import NoiseLevels
+from reactorwatch.kalman.noise_estimation import tune
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.noise import tune
 
 SMALLEST = (2e-4, 0.05)
 ROWS = 1000

@@ -14,10 +14,10 @@ from scipy.stats import chi2, multivariate_normal
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
+from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
+from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.innovations import Innovation
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.filter import Filter, FilterState, NoiseLevels
-from reactorwatch.process.filter_record import FilterRecord
-from reactorwatch.process.innovations import Innovation
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE, cstr
 from reactorwatch.process.model import Output, ProcessModel, new_clock, variable
 from reactorwatch.process.simulate import Simulator

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.process.doubt import Doubt
+from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.error_dynamics import FilterErrors
+from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.input_uncertainty import Doubt
+from reactorwatch.kalman.noise_estimation import tune_with
+from reactorwatch.kalman.resampling import filled
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.filled import filled
-from reactorwatch.process.filter import Filter, NoiseLevels
-from reactorwatch.process.filter_errors import FilterErrors
-from reactorwatch.process.innovations import Innovations
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.noise import tune_with
 
 SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
 

@@ -8,8 +8,8 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.filter import Filter, NoiseLevels
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator

@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeAlias
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES, RowCode
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.innovations import Innovations
 
 LEAST_ROWS = 1000
 """Of a stretch: for fewer the lanes are not worth what it takes to make their code."""
@@ -23,7 +23,7 @@ class Stretch(NamedTuple):
     Attributes:
         code: that takes them.
         memory: of the filter before the first row.
-        new: of the rows, shape (rows, ...); see `filter_step`, as for all of them.
+        new: of the rows, shape (rows, ...); see `ekf_step`, as for all of them.
         constants: likewise.
         after: what the filter remembers after each row, to be filled.
         told: what it says of each row, to be filled.

@@ -26,7 +26,7 @@ What is out of the ordinary is handled like this:
   that it may have, and is as uncertain as that makes it (see `doubt`).
 - It begins anew as well where the equations leave the bounds of the states, or are no numbers any more. A correction
   that leads out of the bounds is cut off there.
-- It begins at what is measured (see `filter_start`), and says nothing of that row; as long as nothing is, it waits.
+- It begins at what is measured (see `initial_state`), and says nothing of that row; as long as nothing is, it waits.
 - What it has learned of a state that never changes (`ProcessModel.lasting`) outlasts a beginning.
 """
 
@@ -43,14 +43,14 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import RowCode
-from reactorwatch.process.doubt import Doubt
-from reactorwatch.process.filter_record import LONGEST_ROW_MIN, FilterRecord
-from reactorwatch.process.filter_start import Beginning
-from reactorwatch.process.filter_step import row_code, row_function, walk_function
-from reactorwatch.process.filter_stretches import Stretch, Stretches, alone
-from reactorwatch.process.innovations import Innovation, Innovations
+from reactorwatch.kalman.batch_runner import Stretch, Stretches, alone
+from reactorwatch.kalman.ekf_step import row_code, row_function, walk_function
+from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN, FilterRecord
+from reactorwatch.kalman.initial_state import Beginning
+from reactorwatch.kalman.innovations import Innovation, Innovations
+from reactorwatch.kalman.input_uncertainty import Doubt
+from reactorwatch.kalman.step_budget import A_BEGINNING, A_ROW_ALONE, A_RUN, A_SEARCH, A_WALK, StepBudget
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.step_budget import A_BEGINNING, A_ROW_ALONE, A_RUN, A_SEARCH, A_WALK, StepBudget
 
 LONGEST_GAP_MIN = 30.0
 
@@ -89,7 +89,7 @@ class FilterState(msgspec.Struct, frozen=True):
 
 
 def variances(model: ProcessModel, noise: NoiseLevels) -> Array:
-    """Of the sensors and of the process in a minute, as the compiled rows take them, see `filter_step`."""
+    """Of the sensors and of the process in a minute, as the compiled rows take them, see `ekf_step`."""
     least = [LEAST_PROCESS_SD * state.scale for state in model.states]
     return np.asarray(np.square(np.concatenate([noise.measurement_sd, np.maximum(noise.process_sd, least)])))
 
@@ -309,7 +309,7 @@ class Filter:
 
     @cached_property
     def code(self) -> RowCode:
-        """Of its rows, see `filter_step`."""
+        """Of its rows, see `ekf_step`."""
         return row_code(self.model)
 
     @cached_property

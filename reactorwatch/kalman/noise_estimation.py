@@ -30,11 +30,11 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
-from reactorwatch.process.doubt import Doubt
-from reactorwatch.process.filter import Filter, NoiseLevels
-from reactorwatch.process.filter_record import FilterRecord
-from reactorwatch.process.filter_stretches import together
-from reactorwatch.process.innovations import Innovations
+from reactorwatch.kalman.batch_runner import together
+from reactorwatch.kalman.ekf import Filter, NoiseLevels
+from reactorwatch.kalman.filter_record import FilterRecord
+from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.input_uncertainty import Doubt
 from reactorwatch.process.model import ProcessModel
 
 SHARES = (0.3, 0.03, 0.003)

@@ -1,0 +1,1 @@
+"""Extended Kalman filtering of a process model over measured rows."""
