@@ -11,10 +11,10 @@ from time import perf_counter
 
 import numpy as np
 
-from monitor_node.identification.families import LINEAR_FAMILIES, Family
-from monitor_node.identification.neural import Neural
-from monitor_node.identification.selection import select
-from monitor_node.identification.structure import Structure
+from reactorwatch.identification.families import LINEAR_FAMILIES, Family
+from reactorwatch.identification.neural import Neural
+from reactorwatch.identification.selection import select
+from reactorwatch.identification.structure import Structure
 
 
 def main() -> None:

@@ -9,8 +9,8 @@ from time import perf_counter
 import numpy as np
 from padasip.filters import FilterRLS
 
-from monitor_node.identification.rls import RecursiveLeastSquares
-from monitor_node.identification.rls_bank import RecursiveLeastSquaresBank
+from reactorwatch.identification.rls import RecursiveLeastSquares
+from reactorwatch.identification.rls_bank import RecursiveLeastSquaresBank
 
 PARAMETERS = 7
 PLANTS = 10_000

@@ -29,10 +29,10 @@ from monitor_node.charts.shewhart import Shewhart
 from monitor_node.charts.t2 import T2, T2State
 from monitor_node.config import ChartName, MonitorConfig, PriorityName
 from monitor_node.prewhitening import Prewhitening
-from monitor_node.stored_state import StoredState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import ChartPoint
+from reactorwatch.stored_state import StoredState
 
 Array = NDArray[np.float64]
 

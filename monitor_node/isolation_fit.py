@@ -19,13 +19,13 @@ from monitor_node.isolation_bank import Scan
 from monitor_node.isolation_hypothesis import SETTLED, Descent, Hypothesis
 from monitor_node.isolation_stretch import Stretch
 from monitor_node.isolation_window import Window
-from monitor_node.stored_state import StoredState
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.step_budget import StepBudget
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP, STEP
+from reactorwatch.stored_state import StoredState
 
 BEHIND = 15.0
 """In log likelihood: what is worse than the best by more is left behind."""

@@ -14,10 +14,10 @@ from monitor_node.alignment import AlignmentState
 from monitor_node.config import MonitorConfig
 from monitor_node.sample_run import SampleRun
 from monitor_node.seal import DIGEST_BYTES, Seal
-from monitor_node.stored_state import StoredState
 from monitor_node.watch_state import WatchState
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.stored_state import StoredState
 
 MAGIC = b"reactorwatch monitor"
 SEAL = Seal(MAGIC, 2, "state of a monitor")

@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from monitor_node.charts.base import Judgement
 from monitor_node.charts.parameters import ParameterState, ParameterT2
 from monitor_node.drift import learn
-from monitor_node.identification.linear_model import standard_deviations
-from monitor_node.identification.recursion import RlsState
-from monitor_node.identification.regressor import BufferState, RegressorBuffer, Rows, rows_of
-from monitor_node.identification.rls import RecursiveLeastSquares
-from monitor_node.identification.structure import Scaling, Structure
 from monitor_node.sampling import TOLERANCE
-from monitor_node.stored_state import StoredState, packed, unpacked
 from monitor_node.training_record import checks_of
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
+from reactorwatch.identification.linear_model import standard_deviations
+from reactorwatch.identification.recursion import RlsState
+from reactorwatch.identification.regressor import BufferState, RegressorBuffer, Rows, rows_of
+from reactorwatch.identification.rls import RecursiveLeastSquares
+from reactorwatch.identification.structure import Scaling, Structure
+from reactorwatch.stored_state import StoredState, packed, unpacked
 
 Array = NDArray[np.float64]
 

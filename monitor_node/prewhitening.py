@@ -22,7 +22,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.stored_state import StoredState
+from reactorwatch.stored_state import StoredState
 
 Array = NDArray[np.float64]
 

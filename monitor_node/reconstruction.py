@@ -9,10 +9,10 @@ from collections.abc import Iterable, Sequence
 from math import isfinite, nan, sqrt
 
 from monitor_node.isolation_window import MOST_PIECES, Row, newest_rows
-from monitor_node.stored_state import StoredState
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
 from reactorwatch.kalman.step_budget import A_ROW_ALONE, A_WALK, StepBudget, StepsSpentError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.stored_state import StoredState
 
 MARGIN_MIN = 1.0
 """So long before the onset that was found the sensor is left out already."""

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.sampling import missing_rows
-from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
 from reactorwatch.kalman.noise_estimation import tune
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.stored_state import StoredState
 
 Array = NDArray[np.float64]
 

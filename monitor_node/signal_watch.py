@@ -15,9 +15,9 @@ from monitor_node.config import MonitorConfig
 from monitor_node.signal_range import ANY, SignalRange
 from monitor_node.silence import NOTHING, Change, Silence, SilenceState
 from monitor_node.spike import Spike, SpikeState, spike_limit
-from monitor_node.stored_state import StoredState
 from monitor_node.stuck import Stuck, StuckState
 from reactorwatch.contract.codec import Publication
+from reactorwatch.stored_state import StoredState
 
 PLANT = "plant"
 """What the silence of all signals together is of."""

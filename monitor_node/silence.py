@@ -46,8 +46,8 @@ from typing import NamedTuple
 import msgspec
 
 from monitor_node.charts.base import positive
-from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
+from reactorwatch.stored_state import StoredState
 
 LEARN_FROM = 32
 """Spacings that must be known before anything is silent."""

@@ -40,8 +40,8 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
 from monitor_node.charts.base import finite, positive
-from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
+from reactorwatch.stored_state import StoredState
 
 BACK = 0.5
 """Of the limit: within it, a value is back."""

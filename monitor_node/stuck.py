@@ -34,8 +34,8 @@ from math import ceil, inf, log
 from scipy.special import betaincinv
 
 from monitor_node.charts.base import LARGEST_VALUE, Judgement, finite
-from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
+from reactorwatch.stored_state import StoredState
 
 SMALLEST = 5
 """Fewer equal readings in a row than this are never a fault."""

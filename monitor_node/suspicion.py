@@ -19,7 +19,6 @@ from monitor_node.isolation_fit import WayState
 from monitor_node.isolation_window import Row
 from monitor_node.reconstruction import Reconstruction, ReconstructionState
 from monitor_node.references import ProcessReference, places
-from monitor_node.stored_state import StoredState, packed, unpacked
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
@@ -28,6 +27,7 @@ from reactorwatch.process.effect import SensorEffect
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.stored_state import StoredState, packed, unpacked
 
 LOOKS = (10, 30, 100, 300)
 """Rows after the first alarm of an incident at which the causes are compared."""

@@ -24,11 +24,11 @@ from monitor_node.references import ArxReference, ProcessReference, Reference, t
 from monitor_node.resolution import resolution_sd
 from monitor_node.sampling import TOLERANCE
 from monitor_node.signal_range import ranges_of
-from monitor_node.stored_state import StoredState, packed, packed_times, unpacked, unpacked_times
 from monitor_node.undisturbed import Undisturbed, undisturbed
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.stored_state import StoredState, packed, packed_times, unpacked, unpacked_times
 
 Array = NDArray[np.float64]
 

@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.identification.excitation import check_record
-from monitor_node.identification.identify import WORST_MINUS_LOG10_P
-from monitor_node.identification.residual_tests import ResidualTest, independence, whiteness
-from monitor_node.identification.structure import Structure
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.errors import InputError
+from reactorwatch.identification.excitation import check_record
+from reactorwatch.identification.identify import WORST_MINUS_LOG10_P
+from reactorwatch.identification.residual_tests import ResidualTest, independence, whiteness
+from reactorwatch.identification.structure import Structure
 
 Array = NDArray[np.float64]
 

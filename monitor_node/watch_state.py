@@ -6,9 +6,9 @@ from monitor_node.prewhitening import PrewhitenerState
 from monitor_node.references import ArxReferenceState, ProcessReferenceState
 from monitor_node.sampling import SamplingState
 from monitor_node.signal_watch import SignalsState
-from monitor_node.stored_state import StoredState
 from monitor_node.suspicion import SuspicionState
 from monitor_node.training import TrainingState
+from reactorwatch.stored_state import StoredState
 
 
 class WatchedState(StoredState, frozen=True):

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from benchmarks.faults.bank import PERIOD_MIN, TRAINING_MIN
 from benchmarks.faults.runs import OUTPUTS
 from benchmarks.faults.score import Interval
-from monitor_node.identification.batch import fit_arx
-from monitor_node.identification.linear_model import LinearModel
-from monitor_node.identification.output_error import fit_oe
-from monitor_node.identification.structure import Structure
 from plant_node.scenario import SIGNAL
 from reactorwatch.arrays import Array
+from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.output_error import fit_oe
+from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record
 
 ORDER = 3

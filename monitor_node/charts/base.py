@@ -19,8 +19,8 @@ from typing import Any, ClassVar, Generic, NamedTuple, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
+from reactorwatch.stored_state import StoredState
 
 Array = NDArray[np.float64]
 

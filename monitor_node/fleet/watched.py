@@ -12,11 +12,11 @@ from monitor_node import suspicion
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.dues import Dues
-from monitor_node.identification.rls import RecursiveLeastSquares
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.plants import QuietPlants
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.errors import InputError
+from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.process.model import ProcessModel
 
 LOOK_AGAIN_ROWS = 8

@@ -47,7 +47,6 @@ from monitor_node.quiet.lining_up import (
 from monitor_node.quiet.ring import NewestRows, times_ns_of
 from monitor_node.references import ProcessReferenceState
 from monitor_node.sampling import SamplingState
-from monitor_node.stored_state import packed, unpacked
 from monitor_node.suspicion import SuspicionState
 from monitor_node.watch_state import WatchedState, WatchState
 from reactorwatch.contract import keys
@@ -56,6 +55,7 @@ from reactorwatch.contract.sample_bytes import unit_digest
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.stored_state import packed, unpacked
 
 CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)
 """That quiet plants may have, in the order of `rows.judge`."""

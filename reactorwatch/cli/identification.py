@@ -3,13 +3,13 @@
 import msgspec
 import numpy as np
 
-from monitor_node.identification.families import Arx, Family, OutputError
-from monitor_node.identification.identify import Identification
-from monitor_node.identification.identify import identify as identify_model
-from monitor_node.identification.selection import Selection, select
-from monitor_node.identification.structure import ALL_ROWS, REPORT_ROWS
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
+from reactorwatch.identification.families import Arx, Family, OutputError
+from reactorwatch.identification.identify import Identification
+from reactorwatch.identification.identify import identify as identify_model
+from reactorwatch.identification.selection import Selection, select
+from reactorwatch.identification.structure import ALL_ROWS, REPORT_ROWS
 from reactorwatch.records.record import Record
 
 INPUT = "qc"
@@ -53,7 +53,7 @@ def compare(measured: Record, output: str, order: int, delay: int, *, neural: bo
     """
     families: list[Family] = [Arx(), OutputError()]
     if neural:
-        from monitor_node.identification.neural import Neural
+        from reactorwatch.identification.neural import Neural
 
         families.append(Neural())
     if order < 1:

@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor_node.identification.regressor import RegressorBuffer, rows_of
-from monitor_node.identification.structure import RowChoice, Structure
+from reactorwatch.identification.regressor import RegressorBuffer, rows_of
+from reactorwatch.identification.structure import RowChoice, Structure
 
 PERIOD_NS = 100
 

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from monitor_node.identification.recursion import RlsState
-from monitor_node.identification.rls import RecursiveLeastSquares
-from monitor_node.identification.rls_bank import RecursiveLeastSquaresBank
+from reactorwatch.identification.recursion import RlsState
+from reactorwatch.identification.rls import RecursiveLeastSquares
+from reactorwatch.identification.rls_bank import RecursiveLeastSquaresBank
 
 N = 4
 FORGETTING = st.sampled_from([0.5, 0.9, 0.99, 0.9999, 1.0])

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from monitor_node.identification.families import LINEAR_FAMILIES, Family
-from monitor_node.identification.neural import Neural
-from monitor_node.identification.selection import EQUAL_PERCENT, Candidate, Selection, select
 from reactorwatch.cli.study.canvas import BLUE, ORANGE, PURPLE, label, panels
 from reactorwatch.cli.study.figure import Finding, Verdict
 from reactorwatch.cli.study.study import ORDERS, OUTPUTS, Study
+from reactorwatch.identification.families import LINEAR_FAMILIES, Family
+from reactorwatch.identification.neural import Neural
+from reactorwatch.identification.selection import EQUAL_PERCENT, Candidate, Selection, select
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from monitor_node.charts.shewhart import Shewhart, probability_out
-from monitor_node.identification.flow_chart import Conclusion, follow
-from monitor_node.identification.structure import Structure
 from reactorwatch.arrays import Array
 from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, VERMILION, label, panels
 from reactorwatch.cli.study.figure import Finding, verdict
 from reactorwatch.cli.study.study import TRAINING_ROWS, Study
+from reactorwatch.identification.flow_chart import Conclusion, follow
+from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import UNITS, Record
 
 if TYPE_CHECKING:

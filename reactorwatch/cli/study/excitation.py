@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from monitor_node.identification.excitation import persistence
 from plant_node.scenario import RandomSteps, Scenario, Sines, Square
 from reactorwatch.cli.study.canvas import BLUE, GREEN, VERMILION, label, panels
 from reactorwatch.cli.study.figure import Finding, verdict
 from reactorwatch.cli.study.study import ORDERS, Study, levels, row_times
+from reactorwatch.identification.excitation import persistence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

@@ -8,8 +8,6 @@ import numpy as np
 
 from monitor_node import backtest
 from monitor_node.config import MonitorConfig
-from monitor_node.identification.flow_chart import Conclusion, follow
-from monitor_node.identification.structure import Structure
 from plant_node.config import PlantConfig
 from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
@@ -19,6 +17,8 @@ from reactorwatch.cli.study.control_limits import ORDER, watched
 from reactorwatch.cli.study.figure import Finding, Verdict
 from reactorwatch.cli.study.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
 from reactorwatch.contract.codec import encode
+from reactorwatch.identification.flow_chart import Conclusion, follow
+from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record, to_minutes
 from recorder.player import samples_of
 

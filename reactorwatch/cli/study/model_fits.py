@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from monitor_node.identification.linear_model import fit_percent
 from reactorwatch.cli.study.canvas import BLACK, BY_ORDER, label, legend_below, panels
 from reactorwatch.cli.study.figure import Finding, verdict
 from reactorwatch.cli.study.study import NAMES, ORDERS, OUTPUTS, Study, held_out
+from reactorwatch.identification.linear_model import fit_percent
 from reactorwatch.records.record import UNITS
 
 if TYPE_CHECKING:

@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from monitor_node.identification.batch import SINGULAR_CONDITION, fit_arx
-from monitor_node.identification.excitation import (
+from reactorwatch.arrays import Array
+from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION, label, panels
+from reactorwatch.cli.study.figure import Finding, Verdict
+from reactorwatch.cli.study.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, Study
+from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx
+from reactorwatch.identification.excitation import (
     FASTEST_SAMPLES,
     LARGEST_CONDITION,
     SLOWEST_SAMPLES,
     conditioning,
     sampling,
 )
-from monitor_node.identification.regressor import rows_of
-from monitor_node.identification.structure import ALL_ROWS, REPORT_ROWS, RowChoice, Scaling, Structure
-from reactorwatch.arrays import Array
-from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION, label, panels
-from reactorwatch.cli.study.figure import Finding, Verdict
-from reactorwatch.cli.study.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, Study
-from reactorwatch.errors import InputError
+from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.structure import ALL_ROWS, REPORT_ROWS, RowChoice, Scaling, Structure
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:

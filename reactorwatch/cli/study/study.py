@@ -10,13 +10,13 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from monitor_node.identification.families import LINEAR_FAMILIES, Model
-from monitor_node.identification.structure import Structure
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
 from plant_node.scenario import Scenario
 from reactorwatch.arrays import Array
+from reactorwatch.identification.families import LINEAR_FAMILIES, Model
+from reactorwatch.identification.structure import Structure
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator

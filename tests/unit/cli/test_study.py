@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from monitor_node.identification.selection import Candidate, Selection
 from reactorwatch.cli.study import canvas
 from reactorwatch.cli.study.best_model import ThirdOrder
 from reactorwatch.cli.study.catalogue import FIGURES
@@ -17,6 +16,7 @@ from reactorwatch.cli.study.reproduce import reproduce
 from reactorwatch.cli.study.sampling_rate import report_choice
 from reactorwatch.cli.study.study import Study, row_times
 from reactorwatch.errors import InputError
+from reactorwatch.identification.selection import Candidate, Selection
 from reactorwatch.records.record import Record
 
 DOCS = Path(__file__).parents[3] / "docs"

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from monitor_node.identification.batch import fit_arx, least_squares
-from monitor_node.identification.linear_model import LinearModel, fit_percent
-from monitor_node.identification.structure import REPORT_ROWS, Structure
 from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import fit_arx, least_squares
+from reactorwatch.identification.linear_model import LinearModel, fit_percent
+from reactorwatch.identification.structure import REPORT_ROWS, Structure
 from tests.unit.identification.truth import Array, Daisy, oscillating_plant
 
 

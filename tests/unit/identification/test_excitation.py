@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from monitor_node.identification.excitation import (
+from reactorwatch.errors import InputError
+from reactorwatch.identification.excitation import (
     amplitude,
     check_record,
     condition_check,
@@ -13,8 +14,7 @@ from monitor_node.identification.excitation import (
     sampling,
     variation,
 )
-from monitor_node.identification.structure import Structure
-from reactorwatch.errors import InputError
+from reactorwatch.identification.structure import Structure
 from tests.unit.identification.truth import Array, Daisy, NoisyPlant
 
 ROWS = np.arange(3000)

@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from monitor_node.identification.batch import fit_arx
-from monitor_node.identification.identify import Identification, identify
-from monitor_node.identification.linear_model import fit_percent
-from monitor_node.identification.structure import RowChoice, Structure
 from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.identify import Identification, identify
+from reactorwatch.identification.linear_model import fit_percent
+from reactorwatch.identification.structure import RowChoice, Structure
 from tests.unit.identification.truth import Daisy, NoisyPlant
 
 

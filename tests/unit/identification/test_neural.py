@@ -5,12 +5,12 @@ import sys
 import numpy as np
 import pytest
 
-from monitor_node.identification.families import LINEAR_FAMILIES
-from monitor_node.identification.linear_model import fit_percent
-from monitor_node.identification.neural import Neural
-from monitor_node.identification.selection import select
-from monitor_node.identification.structure import Structure
 from reactorwatch.errors import InputError
+from reactorwatch.identification.families import LINEAR_FAMILIES
+from reactorwatch.identification.linear_model import fit_percent
+from reactorwatch.identification.neural import Neural
+from reactorwatch.identification.selection import select
+from reactorwatch.identification.structure import Structure
 from tests.unit.identification.truth import Array, NoisyPlant
 
 SMALL = Neural(neurons=6, seeds=(1,), iterations=100)

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares as scipy_least_squares
 
-from monitor_node.identification.batch import fit_arx
-from monitor_node.identification.instrumental_variable import stabilised
-from monitor_node.identification.linear_model import free_run, plan_run
-from monitor_node.identification.output_error import _triangle, fit_oe, run_with_gradient, stable
-from monitor_node.identification.structure import RowChoice, Structure
 from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.instrumental_variable import stabilised
+from reactorwatch.identification.linear_model import free_run, plan_run
+from reactorwatch.identification.output_error import _triangle, fit_oe, run_with_gradient, stable
+from reactorwatch.identification.structure import RowChoice, Structure
 from tests.unit.identification.truth import Array, Daisy, NoisyPlant, oscillating_plant
 
 

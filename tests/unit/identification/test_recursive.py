@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from monitor_node.identification.batch import fit_arx
-from monitor_node.identification.output_error import fit_oe, stable
-from monitor_node.identification.recursive_arx import RecursiveArx, RecursiveArxState
-from monitor_node.identification.recursive_output_error import RecursiveOutputError, RecursiveOutputErrorState
-from monitor_node.identification.structure import REPORT_ROWS, RowChoice, Scaling, Structure
 from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.output_error import fit_oe, stable
+from reactorwatch.identification.recursive_arx import RecursiveArx, RecursiveArxState
+from reactorwatch.identification.recursive_output_error import RecursiveOutputError, RecursiveOutputErrorState
+from reactorwatch.identification.structure import REPORT_ROWS, RowChoice, Scaling, Structure
 from tests.unit.identification.truth import Daisy, NoisyPlant, oscillating_plant
 
 

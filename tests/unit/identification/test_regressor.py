@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from monitor_node.identification.regressor import BufferState, RegressorBuffer, rows_of, unbroken
-from monitor_node.identification.structure import REPORT_ROWS, RowChoice, Structure
 from reactorwatch.errors import InputError
+from reactorwatch.identification.regressor import BufferState, RegressorBuffer, rows_of, unbroken
+from reactorwatch.identification.structure import REPORT_ROWS, RowChoice, Structure
 
 U = np.arange(10.0, 20.0)
 Y = np.arange(0.0, 10.0)

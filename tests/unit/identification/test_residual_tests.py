@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from monitor_node.identification.residual_tests import independence, minus_log10_p, whiteness
 from reactorwatch.errors import InputError
+from reactorwatch.identification.residual_tests import independence, minus_log10_p, whiteness
 
 
 @pytest.mark.parametrize("statistic", [0.01, 3.0, 900.0, 2e3, 1e7])

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from monitor_node.identification.recursion import RlsState
-from monitor_node.identification.rls import RecursiveLeastSquares
-from monitor_node.identification.rls_bank import RecursiveLeastSquaresBank
+from reactorwatch.identification.recursion import RlsState
+from reactorwatch.identification.rls import RecursiveLeastSquares
+from reactorwatch.identification.rls_bank import RecursiveLeastSquaresBank
 from tests.unit.identification.truth import Array, exact_least_squares
 
 EPSILON = np.finfo(np.float64).eps

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from monitor_node.identification.batch import fit_arx
-from monitor_node.identification.families import LINEAR_FAMILIES, Arx, Model, OutputError
-from monitor_node.identification.flow_chart import follow
-from monitor_node.identification.linear_model import LinearModel, fit_percent
-from monitor_node.identification.selection import bic, select
-from monitor_node.identification.structure import Structure
 from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.families import LINEAR_FAMILIES, Arx, Model, OutputError
+from reactorwatch.identification.flow_chart import follow
+from reactorwatch.identification.linear_model import LinearModel, fit_percent
+from reactorwatch.identification.selection import bic, select
+from reactorwatch.identification.structure import Structure
 from tests.unit.identification.truth import Array, Daisy, NoisyPlant
 
 

@@ -8,8 +8,8 @@ from hypothesis.extra import numpy as hnp
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.identification.linear_model import standard_deviations
 from reactorwatch.contract.messages_pb2 import ModelSnapshot
+from reactorwatch.identification.linear_model import standard_deviations
 from tests.unit.monitor_node.samples import leaking_run, samples
 
 ENTRIES = st.sampled_from([0.0, 1.0, -1.0, 1e-300, 1e150, np.inf, -np.inf, np.nan]) | st.floats(-1e6, 1e6)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from monitor_node.identification.structure import REPORT_ROWS, RowChoice, Scaling, Structure, as_columns
 from reactorwatch.errors import InputError
+from reactorwatch.identification.structure import REPORT_ROWS, RowChoice, Scaling, Structure, as_columns
 
 
 @pytest.mark.parametrize(

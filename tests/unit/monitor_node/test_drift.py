@@ -9,8 +9,8 @@ from scipy import signal
 from monitor_node import drift
 from monitor_node.charts.base import Array
 from monitor_node.charts.parameters import ParameterT2
-from monitor_node.identification.rls import RecursiveLeastSquares
 from reactorwatch.errors import InputError
+from reactorwatch.identification.rls import RecursiveLeastSquares
 
 NAMES = ["a1", "b1", "c"]
 FORGETTING, TRAINING = 0.98, 500

@@ -8,9 +8,9 @@ import numba
 import pytest
 
 from monitor_node.fleet.watched import WatchedPlants
-from monitor_node.identification import information
 from monitor_node.quiet import plants
 from reactorwatch.contract import sample_bytes
+from reactorwatch.identification import information
 
 from .fleets import QUICK, SECOND_NS, fleet, row_by_row, run_of
 

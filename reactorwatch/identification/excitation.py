@@ -20,11 +20,11 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.instrumental_variable import instrumental_variable
-from monitor_node.identification.linear_model import RunPlan, free_run, plan_run
-from monitor_node.identification.regressor import rows_of, unbroken
-from monitor_node.identification.structure import Scaling, Structure, as_columns
 from reactorwatch.errors import InputError
+from reactorwatch.identification.instrumental_variable import instrumental_variable
+from reactorwatch.identification.linear_model import RunPlan, free_run, plan_run
+from reactorwatch.identification.regressor import rows_of, unbroken
+from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 INDEPENDENT = 0.01
 """The weakest direction of the input's lagged copies must have this share of the strongest one's size."""

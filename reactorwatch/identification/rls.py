@@ -40,8 +40,8 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification import information
-from monitor_node.identification.recursion import Recursion, RlsState, refusal
+from reactorwatch.identification import information
+from reactorwatch.identification.recursion import Recursion, RlsState, refusal
 
 
 class Innovation(msgspec.Struct, frozen=True, gc=False):

@@ -5,13 +5,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.batch import LeastSquares, linear_model
-from monitor_node.identification.linear_model import LinearModel
-from monitor_node.identification.recursion import RlsState
-from monitor_node.identification.regressor import BufferState, RegressorBuffer
-from monitor_node.identification.rls import Innovation, RecursiveLeastSquares
-from monitor_node.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure
-from monitor_node.stored_state import StoredState
+from reactorwatch.identification.batch import LeastSquares, linear_model
+from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.recursion import RlsState
+from reactorwatch.identification.regressor import BufferState, RegressorBuffer
+from reactorwatch.identification.rls import Innovation, RecursiveLeastSquares
+from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure
+from reactorwatch.stored_state import StoredState
 
 
 class RecursiveArxState(StoredState, frozen=True):

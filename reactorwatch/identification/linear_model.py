@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.regressor import rows_of, unbroken
-from monitor_node.identification.structure import Structure, as_columns
 from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.identification.regressor import rows_of, unbroken
+from reactorwatch.identification.structure import Structure, as_columns
 
 _AWAY = 1e100  # a free run beyond this has left for good
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.linear_model import LinearModel
-from monitor_node.identification.regressor import Rows, rows_of
-from monitor_node.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 from reactorwatch.errors import InputError
+from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.regressor import Rows, rows_of
+from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 
 SINGULAR_CONDITION = 1e13
 """Beyond this the parameters are rounding."""

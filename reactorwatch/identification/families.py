@@ -6,10 +6,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.batch import fit_arx
-from monitor_node.identification.linear_model import LinearModel
-from monitor_node.identification.output_error import fit_oe
-from monitor_node.identification.structure import Structure
+from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.output_error import fit_oe
+from reactorwatch.identification.structure import Structure
 
 
 class Model(Protocol):

@@ -23,12 +23,12 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike
 
-from monitor_node.identification.batch import fit_arx
-from monitor_node.identification.excitation import Check, check_record, sampling
-from monitor_node.identification.linear_model import LinearModel
-from monitor_node.identification.regressor import rows_of
-from monitor_node.identification.structure import Structure, as_columns
 from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.excitation import Check, check_record, sampling
+from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.structure import Structure, as_columns
 
 OUTSIDE_THREE_SIGMA = 0.0027
 MISMATCH_MINUS_LOG10_P = 6.0

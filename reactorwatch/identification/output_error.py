@@ -23,19 +23,19 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.batch import (
+from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import (
     LeastSquares,
     enough_rows,
     least_squares,
     linear_model,
     refuse_constant,
 )
-from monitor_node.identification.instrumental_variable import instrumental_variable, stabilised
-from monitor_node.identification.linear_model import LinearModel, RunPlan, plan_run
-from monitor_node.identification.regressor import rows_of
-from monitor_node.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
-from reactorwatch.codegen.numba_kernel import compiled
-from reactorwatch.errors import InputError
+from reactorwatch.identification.instrumental_variable import instrumental_variable, stabilised
+from reactorwatch.identification.linear_model import LinearModel, RunPlan, plan_run
+from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 
 _ITERATIONS = 200
 _PRECISION = 1e-12  # a smaller relative gain of a step ends the descent

@@ -5,10 +5,10 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification import information
-from monitor_node.identification.information import TILE_PLANTS
-from monitor_node.identification.recursion import Recursion, RlsState, refusal
-from monitor_node.identification.rls import RecursiveLeastSquares
+from reactorwatch.identification import information
+from reactorwatch.identification.information import TILE_PLANTS
+from reactorwatch.identification.recursion import Recursion, RlsState, refusal
+from reactorwatch.identification.rls import RecursiveLeastSquares
 
 
 class Innovations(NamedTuple):

@@ -8,17 +8,17 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.batch import SINGULAR_CONDITION, fit_arx, refuse_constant
-from monitor_node.identification.excitation import check_record
-from monitor_node.identification.linear_model import LinearModel, fit_percent
-from monitor_node.identification.output_error import fit_oe
-from monitor_node.identification.recursive_arx import model_of
-from monitor_node.identification.recursive_output_error import RecursiveOutputError
-from monitor_node.identification.regressor import rows_of, unbroken
-from monitor_node.identification.residual_tests import independence, whiteness
-from monitor_node.identification.rls import RecursiveLeastSquares
-from monitor_node.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, refuse_constant
+from reactorwatch.identification.excitation import check_record
+from reactorwatch.identification.linear_model import LinearModel, fit_percent
+from reactorwatch.identification.output_error import fit_oe
+from reactorwatch.identification.recursive_arx import model_of
+from reactorwatch.identification.recursive_output_error import RecursiveOutputError
+from reactorwatch.identification.regressor import rows_of, unbroken
+from reactorwatch.identification.residual_tests import independence, whiteness
+from reactorwatch.identification.rls import RecursiveLeastSquares
+from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 
 MODELS = ("arx", "oe")
 WORST_MINUS_LOG10_P = 6.0

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.batch import enough_rows, fit_arx
-from monitor_node.identification.linear_model import LinearModel, fit_percent, plan_run
-from monitor_node.identification.regressor import Rows, rows_of
-from monitor_node.identification.structure import Scaling, Structure, as_columns
 from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import enough_rows, fit_arx
+from reactorwatch.identification.linear_model import LinearModel, fit_percent, plan_run
+from reactorwatch.identification.regressor import Rows, rows_of
+from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 _AWAY = 1e6  # scaled outputs beyond this, a million times their usual spread, have left for good
 

@@ -9,10 +9,10 @@ Young, Automatica 6 (1970) 271). Z = Q S, so Q'X p = Q'y is solved, whose condit
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.batch import least_squares
-from monitor_node.identification.linear_model import RunPlan, free_run
-from monitor_node.identification.regressor import rows_of
-from monitor_node.identification.structure import Structure
+from reactorwatch.identification.batch import least_squares
+from reactorwatch.identification.linear_model import RunPlan, free_run
+from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.structure import Structure
 
 _ITERATIONS = 5
 

@@ -18,9 +18,9 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.regressor import unbroken
-from monitor_node.identification.structure import as_columns
 from reactorwatch.errors import InputError
+from reactorwatch.identification.regressor import unbroken
+from reactorwatch.identification.structure import as_columns
 
 DEFAULT_LAGS = 20
 

@@ -17,10 +17,10 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.families import LINEAR_FAMILIES, Family, Model
-from monitor_node.identification.linear_model import fit_percent
-from monitor_node.identification.structure import Structure, as_columns
 from reactorwatch.errors import InputError
+from reactorwatch.identification.families import LINEAR_FAMILIES, Family, Model
+from reactorwatch.identification.linear_model import fit_percent
+from reactorwatch.identification.structure import Structure, as_columns
 
 Array = NDArray[np.float64]
 

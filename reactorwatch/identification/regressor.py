@@ -12,9 +12,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.structure import ALL_ROWS, RowChoice, Structure, as_columns
-from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
+from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Structure, as_columns
+from reactorwatch.stored_state import StoredState
 
 GAP_TOLERANCE = 0.25
 """An interval that differs from the period by more than this share of it is a gap."""

@@ -5,10 +5,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.identification import information
-from monitor_node.identification.information import LARGEST_VALUE
-from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
+from reactorwatch.identification import information
+from reactorwatch.identification.information import LARGEST_VALUE
+from reactorwatch.stored_state import StoredState
 
 DEFAULT_COVARIANCE_LIMIT = 1e6
 

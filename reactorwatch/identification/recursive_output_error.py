@@ -20,14 +20,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from monitor_node.identification.linear_model import LinearModel
-from monitor_node.identification.output_error import stable
-from monitor_node.identification.recursion import RlsState
-from monitor_node.identification.recursive_arx import model_of, own_unit
-from monitor_node.identification.rls import Innovation, RecursiveLeastSquares
-from monitor_node.identification.structure import Scaling, Structure
-from monitor_node.stored_state import StoredState
 from reactorwatch.errors import InputError
+from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.output_error import stable
+from reactorwatch.identification.recursion import RlsState
+from reactorwatch.identification.recursive_arx import model_of, own_unit
+from reactorwatch.identification.rls import Innovation, RecursiveLeastSquares
+from reactorwatch.identification.structure import Scaling, Structure
+from reactorwatch.stored_state import StoredState
 
 START_FORGETTING = 0.95
 FORGETTING_RISE = 0.99
