@@ -15,13 +15,13 @@ import numpy as np
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.chart_watch import OF_ALL, OF_EACH, ChartWatch
-from monitor_node.charts import run_length
-from monitor_node.charts.base import Bank, SignalChart
-from monitor_node.charts.cusum import Cusum
-from monitor_node.charts.ewma import Ewma
-from monitor_node.charts.shewhart import Shewhart
 from monitor_node.config import ChartName, MonitorConfig
-from monitor_node.prewhitening import Prewhitening
+from reactorwatch.spc import run_length
+from reactorwatch.spc.charts.base import Bank, SignalChart
+from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.prewhitening import Prewhitening
 
 ROWS, PLANTS, REPEATS, RUNS = 20_000, 10_000, 5, 4_000
 PHIS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9)

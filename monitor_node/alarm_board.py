@@ -14,7 +14,6 @@ from google.protobuf.message import DecodeError as ProtobufDecodeError
 from monitor_node.alarm_kpis import Counted, KpiCounter, KpiState
 from monitor_node.alarm_states import Event, State, fits
 from monitor_node.alarms import LAST_NS, AlarmMemory, ChartAlarm, Explanation, SuspectedCause, TimeNs, remembered
-from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig, PriorityName
 from monitor_node.incidents import Incident, Incidents
 from monitor_node.persistence import Persistence
@@ -23,6 +22,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.spc.charts.base import Judgement
 
 KPIS = "monitor"
 """The name in the key of the figures."""

@@ -6,11 +6,11 @@ from typing import Annotated, NamedTuple, TypeAlias
 import msgspec
 
 from monitor_node.alarm_states import Event, State, next_state
-from monitor_node.charts.base import Judgement
 from monitor_node.incidents import Count
 from monitor_node.persistence import Persistence, PersistenceState
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Contribution, Priority, Suspect
+from reactorwatch.spc.charts.base import Judgement
 
 PRIORITIES: Mapping[str, Priority] = {
     "low": Priority.PRIORITY_LOW,

@@ -7,17 +7,17 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node import false_alarm_budget as budget
-from monitor_node.charts.base import SignalChart
-from monitor_node.charts.cusum import Cusum
-from monitor_node.charts.ewma import Ewma
-from monitor_node.charts.mewma import Mewma
-from monitor_node.charts.pca import PcaModel, PcaSpe, PcaT2
-from monitor_node.charts.run_length.mewma import LARGEST_DIMENSION_WITHOUT_SHIFT as LARGEST_DIMENSION
-from monitor_node.charts.shewhart import Shewhart
-from monitor_node.charts.t2 import T2
 from monitor_node.config import MonitorConfig
-from monitor_node.prewhitening import Prewhitening
+from reactorwatch.spc import false_alarm_budget as budget
+from reactorwatch.spc.charts.base import SignalChart
+from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.mewma import Mewma
+from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2
+from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.charts.t2 import T2
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.run_length.mewma import LARGEST_DIMENSION_WITHOUT_SHIFT as LARGEST_DIMENSION
 
 Array = NDArray[np.float64]
 

@@ -20,18 +20,18 @@ from numpy.typing import NDArray
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import ChartAlarm, Explanation, quantity
 from monitor_node.chart_design import ChartDesign, VectorChart, joint_obstacle
-from monitor_node.charts.base import Bank, Judgement, SignalChart, SignalState
-from monitor_node.charts.cusum import Cusum
-from monitor_node.charts.ewma import Ewma
-from monitor_node.charts.mewma import Mewma, MewmaState
-from monitor_node.charts.pca import PcaModel, PcaSpe, PcaT2
-from monitor_node.charts.shewhart import Shewhart
-from monitor_node.charts.t2 import T2, T2State
 from monitor_node.config import ChartName, MonitorConfig, PriorityName
-from monitor_node.prewhitening import Prewhitening
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import ChartPoint
+from reactorwatch.spc.charts.base import Bank, Judgement, SignalChart, SignalState
+from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.mewma import Mewma, MewmaState
+from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2
+from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.charts.t2 import T2, T2State
+from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.stored_state import StoredState
 
 Array = NDArray[np.float64]

@@ -4,8 +4,8 @@ from typing import Literal
 
 import msgspec
 
-from monitor_node.charts.m_of_n import check_rule
 from reactorwatch.contract.keys import checked_plant
+from reactorwatch.spc.m_of_n import check_rule
 
 ChartName = Literal["shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe", "parameters"]
 PriorityName = Literal["low", "medium", "high", "critical"]

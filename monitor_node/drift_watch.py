@@ -10,14 +10,14 @@ from itertools import compress
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import Explanation
-from monitor_node.charts.base import Judgement
-from monitor_node.charts.parameters import ParameterT2
 from monitor_node.config import MonitorConfig
 from monitor_node.predictor import ArxPredictor
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import ChartPoint
 from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import Judgement
+from reactorwatch.spc.charts.parameters import ParameterT2
 
 ROWS = 50
 """From one look to the next. The models remember hundreds of rows, so nothing is missed between."""

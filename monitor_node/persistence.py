@@ -4,12 +4,12 @@ One point beyond 3 sigma comes by chance every 370 samples: at ten samples a min
 with that. So an alarm takes `raise_count` points out among the last `window` (the on-delay of ISA-18.2), and ends
 after `clear_count` points in a row that are back in (its off-delay), where back in may ask for more than not out: a
 dead band, so that a value which stays near its limit makes one alarm and not many. The rate of false alarms that is
-left is `charts.m_of_n.false_alarm_rate`.
+left is `spc.m_of_n.false_alarm_rate`.
 """
 
 from dataclasses import dataclass
 
-from monitor_node.charts.m_of_n import check_rule
+from reactorwatch.spc.m_of_n import check_rule
 
 
 @dataclass

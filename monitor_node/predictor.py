@@ -15,9 +15,6 @@ from math import inf, isfinite, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.charts.base import Judgement
-from monitor_node.charts.parameters import ParameterState, ParameterT2
-from monitor_node.drift import learn
 from monitor_node.sampling import TOLERANCE
 from monitor_node.training_record import checks_of
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
@@ -27,6 +24,9 @@ from reactorwatch.identification.recursion import RlsState
 from reactorwatch.identification.regressor import BufferState, RegressorBuffer, Rows, rows_of
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
+from reactorwatch.spc.charts.base import Judgement
+from reactorwatch.spc.charts.parameters import ParameterState, ParameterT2
+from reactorwatch.spc.parameter_drift import learn
 from reactorwatch.stored_state import StoredState, packed, unpacked
 
 Array = NDArray[np.float64]

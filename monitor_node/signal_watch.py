@@ -10,13 +10,13 @@ from math import isfinite, nan
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import STUCK_SENSOR, ChartAlarm, Explanation, SuspectedCause, quantity
-from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_range import ANY, SignalRange
 from monitor_node.silence import NOTHING, Change, Silence, SilenceState
 from monitor_node.spike import Spike, SpikeState, spike_limit
 from monitor_node.stuck import Stuck, StuckState
 from reactorwatch.contract.codec import Publication
+from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.stored_state import StoredState
 
 PLANT = "plant"

@@ -45,8 +45,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from monitor_node.charts.base import positive
 from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import positive
 from reactorwatch.stored_state import StoredState
 
 LEARN_FROM = 32

@@ -39,8 +39,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
-from monitor_node.charts.base import finite, positive
 from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import finite, positive
 from reactorwatch.stored_state import StoredState
 
 BACK = 0.5

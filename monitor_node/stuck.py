@@ -33,8 +33,8 @@ from math import ceil, inf, log
 
 from scipy.special import betaincinv
 
-from monitor_node.charts.base import LARGEST_VALUE, Judgement, finite
 from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite
 from reactorwatch.stored_state import StoredState
 
 SMALLEST = 5

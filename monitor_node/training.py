@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from monitor_node.config import MonitorConfig
 from monitor_node.predictor import ArxPredictor, fewest_rows
-from monitor_node.prewhitening import Prewhitening, learn
 from monitor_node.references import ArxReference, ProcessReference, Reference, tuned
 from monitor_node.resolution import resolution_sd
 from monitor_node.sampling import TOLERANCE
@@ -28,6 +27,7 @@ from monitor_node.undisturbed import Undisturbed, undisturbed
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.stored_state import StoredState, packed, packed_times, unpacked, unpacked_times
 
 Array = NDArray[np.float64]

@@ -9,16 +9,13 @@ far it has gone from the reference is told as drift.
 from collections.abc import Iterator, Sequence
 from math import isfinite, nan
 
-from monitor_node import false_alarm_budget
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alignment import Row
 from monitor_node.chart_watch import ChartWatch, alarm_names
-from monitor_node.charts.parameters import ParameterT2
 from monitor_node.config import MonitorConfig
 from monitor_node.drift_watch import DriftWatch
 from monitor_node.failures import Failures
 from monitor_node.predictor import ArxPredictor
-from monitor_node.prewhitening import Prewhitener, Prewhitening
 from monitor_node.references import ArxReference, ArxReferenceState, ProcessReference, ProcessReferenceState, Reference
 from monitor_node.sampling import SamplingPeriod
 from monitor_node.signal_range import ranges_of
@@ -33,6 +30,9 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.charts.parameters import ParameterT2
+from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
 
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:

@@ -2,12 +2,12 @@
 
 from monitor_node.chart_watch import ChartsState
 from monitor_node.predictor import PredictorState
-from monitor_node.prewhitening import PrewhitenerState
 from monitor_node.references import ArxReferenceState, ProcessReferenceState
 from monitor_node.sampling import SamplingState
 from monitor_node.signal_watch import SignalsState
 from monitor_node.suspicion import SuspicionState
 from monitor_node.training import TrainingState
+from reactorwatch.spc.prewhitening import PrewhitenerState
 from reactorwatch.stored_state import StoredState
 
 

@@ -16,11 +16,6 @@ from monitor_node.alarm_states import State
 from monitor_node.alarms import AlarmMemory
 from monitor_node.alignment import REMEMBERED, AlignmentState
 from monitor_node.chart_watch import ChartsState, alarm_names
-from monitor_node.charts.base import SignalState
-from monitor_node.charts.cusum import Cusum
-from monitor_node.charts.ewma import Ewma
-from monitor_node.charts.mewma import Mewma, MewmaState
-from monitor_node.charts.shewhart import Shewhart
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.incidents import Incident
@@ -55,6 +50,11 @@ from reactorwatch.contract.sample_bytes import unit_digest
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.spc.charts.base import SignalState
+from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.mewma import Mewma, MewmaState
+from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.stored_state import packed, unpacked
 
 CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)

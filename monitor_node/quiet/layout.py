@@ -5,11 +5,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from monitor_node.charts.cusum import Cusum
-from monitor_node.charts.ewma import Ewma
-from monitor_node.charts.shewhart import Shewhart
-from monitor_node.prewhitening import LARGEST_ORDER
 from monitor_node.stuck import STRETCH
+from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.prewhitening import LARGEST_ORDER
 
 Records: TypeAlias = NDArray[np.void]
 Array: TypeAlias = NDArray[np.float64]

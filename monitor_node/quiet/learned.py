@@ -6,7 +6,6 @@ from typing import TypeAlias
 import msgspec
 import numpy as np
 
-from monitor_node.prewhitening import PrewhitenerState, Prewhitening
 from monitor_node.references import ProcessReferenceState
 from monitor_node.signal_watch import SignalsState
 from monitor_node.silence import SilenceState, Spacing
@@ -16,6 +15,7 @@ from monitor_node.watch_state import WatchedState, WatchState
 from reactorwatch.kalman.ekf import FilterState, NoiseLevels, variances
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.spc.prewhitening import PrewhitenerState, Prewhitening
 
 EqualRuns: TypeAlias = tuple[dict[int, int], float]
 """How often an output read the same so many times in a row, in the training; and the run length of its alarm."""

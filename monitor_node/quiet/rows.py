@@ -18,15 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from monitor_node.charts.base import LARGEST_VALUE, LOWER, OUT, PRESENT, SETTINGS, STATISTIC, UPPER, X
-from monitor_node.charts.cusum import Cusum
-from monitor_node.charts.cusum import _judge as _judge_cusum
-from monitor_node.charts.ewma import Ewma
-from monitor_node.charts.ewma import _judge as _judge_ewma
-from monitor_node.charts.mewma import _move as _move_mewma
-from monitor_node.charts.shewhart import Shewhart
-from monitor_node.charts.shewhart import _judge as _judge_shewhart
-from monitor_node.prewhitening import LARGEST_ORDER
 from monitor_node.quiet.layout import LEVELS, Array, Bytes, Ints, Places, Records
 from monitor_node.quiet.ring import VALUE_BYTES, ZERO
 from monitor_node.quiet.samples import allowed_ns
@@ -35,6 +26,15 @@ from monitor_node.silence import MEMORY
 from monitor_node.stuck import AT_REST, STRETCH
 from reactorwatch.codegen.numba_kernel import call_at, compiled
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.spc.charts.base import LARGEST_VALUE, LOWER, OUT, PRESENT, SETTINGS, STATISTIC, UPPER, X
+from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.cusum import _judge as _judge_cusum
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.ewma import _judge as _judge_ewma
+from reactorwatch.spc.charts.mewma import _move as _move_mewma
+from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.charts.shewhart import _judge as _judge_shewhart
+from reactorwatch.spc.prewhitening import LARGEST_ORDER
 
 ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
 """What a row was; in the second case the figures of the alarms are due, too."""

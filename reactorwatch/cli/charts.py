@@ -34,7 +34,7 @@ def shewhart(
     as_json: Json = False,
 ) -> None:
     """Individual values, with run rules."""
-    from monitor_node.charts import run_length
+    from reactorwatch.spc import run_length
 
     length = run_length.shewhart(shift, limit, _rules(rules), steady_state=steady_state)
     _tell(length, as_json, chart="shewhart", rules=list(_rules(rules)), limit=limit, shift=shift)
@@ -50,7 +50,7 @@ def cusum(
     as_json: Json = False,
 ) -> None:
     """Two-sided cumulative sums."""
-    from monitor_node.charts import run_length
+    from reactorwatch.spc import run_length
 
     length = run_length.cusum(shift, k, h, headstart, one_sided=one_sided, steady_state=steady_state)
     _tell(length, as_json, chart="cusum", k=k, h=h, headstart=headstart, shift=shift)
@@ -65,7 +65,7 @@ def ewma(
     as_json: Json = False,
 ) -> None:
     """Exponentially weighted moving average."""
-    from monitor_node.charts import run_length
+    from reactorwatch.spc import run_length
 
     length = run_length.ewma(shift, weight, limit, exact_limits=exact_limits, steady_state=steady_state)
     _tell(length, as_json, chart="ewma", **{"lambda": weight}, limit=limit, shift=shift)
@@ -80,7 +80,7 @@ def mewma(
     as_json: Json = False,
 ) -> None:
     """Moving average of several signals."""
-    from monitor_node.charts import run_length
+    from reactorwatch.spc import run_length
 
     length = run_length.mewma(shift, dimension, weight, limit, steady_state=steady_state)
     _tell(length, as_json, chart="mewma", dimension=dimension, **{"lambda": weight}, limit=limit, shift=shift)
@@ -94,7 +94,7 @@ def t2(
     as_json: Json = False,
 ) -> None:
     """Hotelling's T2, known covariance; it has no memory, so its steady state is as any other."""
-    from monitor_node.charts import run_length
+    from reactorwatch.spc import run_length
 
     _tell(run_length.t2(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift)
 
@@ -108,7 +108,7 @@ def design(
     as_json: Json = False,
 ) -> None:
     """The chart that detects a shift fastest at a rate of false alarms."""
-    from monitor_node.charts.run_length.design import design as fastest
+    from reactorwatch.spc.run_length.design import design as fastest
 
     found = fastest(chart, arl0, shift, dimension=dimension, rules=_rules(rules))
     if as_json:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-import monitor_node.charts
 import reactorwatch.process.library.cstr.effects
+import reactorwatch.spc.charts
 import recorder.panels
-from monitor_node.charts.catalogue import CHARTS
+from reactorwatch.spc.charts.catalogue import CHARTS
 from recorder.panels.base import Panel
 
 FAMILIES = {
@@ -15,7 +15,7 @@ FAMILIES = {
         reactorwatch.process.library.cstr.effects,
         {type(e).__module__ for e in reactorwatch.process.library.cstr.effects.EFFECTS},
     ),
-    "charts": (monitor_node.charts, {chart.__module__ for chart in CHARTS}),
+    "charts": (reactorwatch.spc.charts, {chart.__module__ for chart in CHARTS}),
     "panels": (recorder.panels, {panel.draw.__module__ for panel in recorder.panels.PANELS}),
 }
 
@@ -24,7 +24,7 @@ FAMILIES = {
 def test_every_file_of_the_folder_is_listed(family: str) -> None:
     package, listed = FAMILIES[family]
     assert package.__file__ is not None
-    files = {path.stem for path in Path(package.__file__).parent.glob("*.py")} - {"__init__", "base"}
+    files = {path.stem for path in Path(package.__file__).parent.glob("*.py")} - {"__init__", "base", "catalogue"}
     assert {name.rpartition(".")[2] for name in listed} == files
 
 

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from monitor_node.charts.shewhart import Shewhart, probability_out
 from reactorwatch.arrays import Array
 from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, VERMILION, label, panels
 from reactorwatch.cli.study.figure import Finding, verdict
@@ -14,6 +13,7 @@ from reactorwatch.cli.study.study import TRAINING_ROWS, Study
 from reactorwatch.identification.flow_chart import Conclusion, follow
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import UNITS, Record
+from reactorwatch.spc.charts.shewhart import Shewhart, probability_out
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,7 +10,7 @@ from benchmarks.faults.bank import BANK, Case
 from benchmarks.faults.oracle import log_likelihood_ratio, oracle_delay_min
 from benchmarks.faults.oracle_suspect import oracle_suspect
 from benchmarks.faults.runs import record_of, truth_of
-from monitor_node.charts import run_length
+from reactorwatch.spc import run_length
 
 ARL0 = 432_000.0
 

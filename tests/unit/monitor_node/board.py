@@ -6,11 +6,11 @@ from google.protobuf.message import Message
 
 from monitor_node.alarm_board import AlarmBoard
 from monitor_node.alarms import ChartAlarm
-from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
 from reactorwatch.records.record import to_time_ns
+from reactorwatch.spc.charts.base import Judgement
 
 M = TypeVar("M", bound=Message)
 

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from monitor_node import backtest
 from monitor_node.alarm_states import Event, State
 from monitor_node.alarms import SuspectedCause
-from monitor_node.charts.base import Judgement
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
@@ -17,6 +16,7 @@ from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, AlarmState
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
+from reactorwatch.spc.charts.base import Judgement
 from recorder.player import samples_of
 
 from .board import AT_ONCE, Desk

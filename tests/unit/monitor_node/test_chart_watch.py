@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from monitor_node.chart_watch import OF_ALL, OF_EACH
-from monitor_node.charts.cusum import CEILING, Cusum
 from monitor_node.config import ChartName, MonitorConfig
+from reactorwatch.spc.charts.cusum import CEILING, Cusum
 
 from .watching import sound_run, watched
 

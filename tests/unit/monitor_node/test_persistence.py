@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from monitor_node.charts.m_of_n import false_alarm_rate
-from monitor_node.charts.shewhart import probability_out
 from monitor_node.persistence import Persistence
+from reactorwatch.spc.charts.shewhart import probability_out
+from reactorwatch.spc.m_of_n import false_alarm_rate
 
 
 def changes(rule: Persistence, points: str) -> list[tuple[int, bool]]:

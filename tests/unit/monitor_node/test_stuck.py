@@ -7,9 +7,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal, stats
 
-from monitor_node.charts.base import Judgement
 from monitor_node.stuck import SMALLEST, Stuck, StuckState, most_equal, upper_bound
 from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import Judgement
 
 Array = NDArray[np.float64]
 ARL0 = 432_000.0  # 30 days of 6 s

@@ -1,0 +1,1 @@
+"""Statistical process control: charts, their run lengths, and what keeps a promise of false alarms."""

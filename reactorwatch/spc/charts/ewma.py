@@ -1,0 +1,98 @@
+"""The exponentially weighted moving average: sees small changes soon, and shows where the mean is now.
+
+Roberts (1959), Control chart tests based on geometric moving averages, Technometrics 1(3); Lucas & Saccucci (1990),
+Exponentially weighted moving average control schemes, Technometrics 32(1). With lambda the weight of the newest value
+
+    z <- (1 - lambda) z + lambda x,      out: |z - mean| > L sigma sqrt(lambda / (2 - lambda)).
+
+Starting at the mean, the variance of the t-th z is smaller than in the long run by the factor 1 - (1 - lambda)^(2t).
+With `exact_limits` the limits follow it and so are tight at the start; otherwise they are those of the long run from
+the first value on.
+"""
+
+from math import sqrt
+
+import numpy as np
+
+from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import (
+    CENTRE,
+    LOWER,
+    OUT,
+    PRESENT,
+    SETTINGS,
+    STATISTIC,
+    UPPER,
+    Array,
+    SignalChart,
+    X,
+    finite,
+    positive,
+)
+
+_MEMORIES = 2
+_MEAN, _WEIGHT, _LIMIT, _START = range(SETTINGS, SETTINGS + 4)
+# The memory: the average, and (1 - lambda)^(2t), which is 0 from the start for fixed limits.
+_AVERAGE, _MISSING, _END = range(_START + _MEMORIES, _START + _MEMORIES + 3)
+
+
+@compiled
+def _judge(columns: Array) -> None:
+    for p in range(columns.shape[1]):
+        present = columns[PRESENT, p] > 0.0
+        mean, weight = columns[_MEAN, p], columns[_WEIGHT, p]
+        rest = 1.0 - weight
+        average = rest * columns[_AVERAGE, p] + weight * columns[X, p]
+        missing = rest * rest * columns[_MISSING, p]
+        limit = columns[_LIMIT, p] * np.sqrt(1.0 - missing)
+        columns[_AVERAGE, p] = average if present else columns[_AVERAGE, p]
+        columns[_MISSING, p] = missing if present else columns[_MISSING, p]
+        columns[STATISTIC, p] = average
+        columns[CENTRE, p] = mean
+        columns[LOWER, p] = mean - limit
+        columns[UPPER, p] = mean + limit
+        columns[OUT, p] = 1.0 if abs(average - mean) > limit else 0.0
+
+
+class Ewma(SignalChart):
+    """The exponentially weighted moving average against mean +- L of its own standard deviations.
+
+    >>> chart = Ewma(mean=0.0, sigma=1.0, weight=0.5, limit=2.0)
+    >>> [chart.update(x).out for x in (2.0, 2.0)]
+    [False, True]
+
+    Args:
+        mean: of the values when all is well.
+        sigma: their standard deviation.
+        weight: lambda, of the newest value, in (0, 1]; small for small changes.
+        limit: L, in standard deviations of the average in the long run.
+        exact_limits: whether the limits grow with the average's standard deviation from the start.
+
+    Raises:
+        InputError: sigma or limit is not a positive number, or weight not in (0, 1].
+    """
+
+    name = "ewma"
+    memories = _MEMORIES
+    numbers = _END - SETTINGS
+    kernel = staticmethod(_judge)
+
+    def __init__(
+        self, mean: float, sigma: float, weight: float = 0.2, limit: float = 3.0, *, exact_limits: bool = False
+    ) -> None:
+        positive("sigma", sigma)
+        check(weight, limit)
+        half_width = limit * sigma * sqrt(weight / (2.0 - weight))
+        super().__init__([finite(mean), weight, half_width], [mean, 1.0 if exact_limits else 0.0])
+
+
+def check(weight: float, limit: float) -> None:
+    """Whether the parameters make a chart.
+
+    Raises:
+        InputError: they don't; the text names which and why.
+    """
+    if not 0.0 < weight <= 1.0:
+        raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
+    positive("limit", limit)

@@ -1,0 +1,116 @@
+"""The multivariate exponentially weighted moving average: sees small changes of several signals at once.
+
+Lowry, Woodall, Champ & Rigdon (1992), A multivariate exponentially weighted moving average control chart,
+Technometrics 34(1). With d = x - mean, S the covariance of x and lambda the weight of the newest vector
+
+    z <- (1 - lambda) z + lambda d,      out: z' Sz^-1 z > limit,      Sz = lambda / (2 - lambda) S,
+
+where Sz is the covariance of z in the long run. z is kept in coordinates in which S is the unit matrix.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, positive, vector
+from reactorwatch.spc.charts.t2 import Whitening
+
+
+@compiled
+def _move(average: Array, x: Array, mean: Array, matrix: Array, weight: float) -> float:
+    """Take x into the average, in white coordinates; returns its squared length, -1 if x cannot be taken."""
+    for value in x:
+        if not abs(value) < LARGEST_VALUE:
+            return -1.0
+    squares = 0.0
+    for i in range(average.size):
+        white = 0.0
+        for j in range(i + 1):  # the matrix is lower triangular
+            white += matrix[i, j] * (x[j] - mean[j])
+        average[i] = (1.0 - weight) * average[i] + weight * white
+        squares += average[i] * average[i]
+    return squares
+
+
+class MewmaState(ChartState, frozen=True):
+    """All that a MEWMA chart is and remembers: the arguments of `Mewma`, and the average in white coordinates."""
+
+    mean: list[float]
+    covariance: list[list[float]]
+    weight: float
+    limit: float
+    average: list[float]
+
+
+class Mewma:
+    """The moving average of vectors, its distance from the mean measured by its covariance.
+
+    >>> chart = Mewma([0.0, 0.0], [[1.0, 0.0], [0.0, 1.0]], weight=0.1, limit=8.64)
+    >>> [chart.update([2.0, 0.0]).out for _ in range(4)]
+    [False, False, False, True]
+
+    Args:
+        mean: of the vectors when all is well, shape (p,).
+        covariance: of the vectors, shape (p, p).
+        weight: lambda, of the newest vector, in (0, 1]; small for small changes.
+        limit: H, of z' Sz^-1 z.
+
+    Raises:
+        InputError: an argument out of its range, or covariance not a symmetric positive definite matrix of that size.
+    """
+
+    name = "mewma"
+
+    def __init__(self, mean: ArrayLike, covariance: ArrayLike, weight: float, limit: float) -> None:
+        if not 0.0 < weight <= 1.0:
+            raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
+        self.whitening = Whitening(mean, covariance)
+        self.weight = float(weight)
+        self.limit = positive("limit", limit)
+        self._average: Array = np.zeros(self.whitening.mean.size)
+
+    @classmethod
+    def from_state(cls, state: MewmaState) -> "Mewma":
+        """The chart that goes on, bit for bit, where `state` was taken.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        chart = cls(state.mean, state.covariance, state.weight, state.limit)
+        average = np.array(state.average, dtype=np.float64)
+        if average.shape != chart._average.shape or not np.all(np.isfinite(average)):
+            raise ValueError(f"average must be {chart._average.size} finite numbers, got {state.average}")
+        chart._average = average
+        return chart
+
+    @property
+    def state(self) -> MewmaState:
+        """A copy of all that it is and remembers."""
+        mean, covariance = self.whitening.mean.tolist(), self.whitening.covariance.tolist()
+        return MewmaState(mean, covariance, self.weight, self.limit, self._average.tolist())
+
+    def update(self, x: ArrayLike) -> Judgement:
+        """See `Chart`; x has shape (p,)."""
+        values = np.asarray(x, dtype=np.float64)
+        if values.shape != self._average.shape:
+            raise ValueError(f"a sample must have shape {self._average.shape}, got {values.shape}")
+        whitening = self.whitening
+        squares = _move(self._average, values, whitening.mean, whitening.matrix, self.weight)
+        if squares < 0.0:
+            vector(x, self._average.size)  # says which value it is
+        statistic = squares * (2.0 - self.weight) / self.weight
+        return Judgement(statistic, float(self._average.size), 0.0, self.limit, statistic > self.limit)
+
+    def contributions(self) -> Array:
+        """Each signal's part of the statistic, shape (p,); their sum is the statistic, one may be negative.
+
+        The partial decomposition, as for `T2.contributions`, of the average instead of the newest vector.
+        """
+        matrix = self.whitening.matrix
+        off = np.linalg.solve(matrix, self._average)
+        return np.asarray(off * (matrix.T @ self._average) * (2.0 - self.weight) / self.weight)
+
+    def restart(self) -> None:
+        """Forget the vectors seen."""
+        self._average = np.zeros(self._average.size)

@@ -1,0 +1,197 @@
+"""Charts of many signals that are driven by few: T2 of what the signals have in common, SPE of what is left over.
+
+Jackson & Mudholkar (1979), Control procedures for residuals associated with principal component analysis,
+Technometrics 21(3). Signals, each scaled by its mean and standard deviation in the training, are x. The eigenvectors of
+their correlation matrix with the `a` largest eigenvalues l are the loadings P, and
+
+    T2 = sum of t_i^2 / l_i with t = P' x,             unusually large, but related as always;
+    SPE = |x - P t|^2,                                 related otherwise than before: a sensor, or a new cause.
+
+Limits for a probability alpha of a false alarm per sample. T2, with n training rows (Jackson 1959; mean and
+covariance are estimated, the sample is a new one):
+
+    a (n^2 - 1) / (n (n - a)) F(a, n - a; 1 - alpha).
+
+SPE, with th_i = sum of l_j^i over the components left out, h = 1 - 2 th_1 th_3 / (3 th_2^2) and c the normal quantile:
+
+    Jackson & Mudholkar   th_1 (1 + c sqrt(2 th_2 h^2) / th_1 + th_2 h (h - 1) / th_1^2)^(1/h)
+    Box (1954)            g chi2(f; 1 - alpha) with g = th_2 / th_1, f = th_1^2 / th_2.
+
+Both match moments of a sum of chi-squares. Box's is exact where the eigenvalues left out are equal.
+"""
+
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import Array, ChartState, Judgement, vector
+
+SpeLimit = Literal["jackson_mudholkar", "box"]
+
+
+class PcaModel(ChartState, frozen=True):
+    """What a training matrix says of related signals; it is the whole state of the two charts.
+
+    Attributes:
+        mean: of each signal, length p.
+        scale: standard deviation of each signal, length p.
+        loadings: p rows of a numbers, orthonormal columns.
+        variances: all p eigenvalues of the correlation matrix, falling.
+        rows: of the training, n.
+        t2_limit: of T2.
+        spe_limit: of SPE.
+    """
+
+    mean: list[float]
+    scale: list[float]
+    loadings: list[list[float]]
+    variances: list[float]
+    rows: int
+    t2_limit: float
+    spe_limit: float
+
+    @classmethod
+    def fit(
+        cls,
+        training: ArrayLike,
+        components: int,
+        false_alarm: float = 0.0027,
+        spe_limit: SpeLimit = "jackson_mudholkar",
+    ) -> Self:
+        """The model of a training matrix.
+
+        Args:
+            training: shape (n, p), rows of a time when all was well.
+            components: a, how many the signals have in common, in [1, p - 1].
+            false_alarm: alpha, the probability of a false alarm per sample, of each of the two charts.
+            spe_limit: whose limit.
+
+        Raises:
+            InputError: an argument out of its range, or a signal that does not vary.
+        """
+        from scipy import stats
+
+        matrix = np.asarray(training, dtype=np.float64)
+        if matrix.ndim != 2 or not np.all(np.isfinite(matrix)):
+            raise InputError(f"training must be a matrix of finite numbers, got shape {matrix.shape}")
+        n, p = matrix.shape
+        if not 1 <= components <= p - 1:
+            raise InputError(f"components must be in [1, {p - 1}] for {p} signals, got {components}")
+        if n <= p:
+            raise InputError(f"training must have more rows than its {p} signals, got {n}")
+        if not 0.0 < false_alarm < 1.0:
+            raise InputError(f"false_alarm must be in (0, 1), got {false_alarm}")
+        if spe_limit not in ("jackson_mudholkar", "box"):
+            raise InputError(f"spe_limit must be jackson_mudholkar or box, got {spe_limit!r}")
+        mean, scale = matrix.mean(axis=0), matrix.std(axis=0, ddof=1)
+        still = np.flatnonzero(scale <= 1e-12 * np.abs(mean))
+        if still.size:
+            raise InputError(f"training must vary in every signal, number {still[0]} does not; leave it out")
+        _, singular, directions = np.linalg.svd((matrix - mean) / scale, full_matrices=False)
+        variances = singular**2 / (n - 1)
+        a = components
+        if variances[a] < 1e-12:
+            raise InputError(f"components must leave some variance over, {components} of {p} signals leave none")
+        t2 = a * (n * n - 1) / (n * (n - a)) * float(stats.f.isf(false_alarm, a, n - a))
+        limit_of_spe = _box_limit if spe_limit == "box" else _jackson_mudholkar_limit
+        left_out = limit_of_spe(variances[a:], false_alarm)
+        return cls(mean.tolist(), scale.tolist(), directions[:a].T.tolist(), variances.tolist(), n, t2, left_out)
+
+
+class _PcaChart:
+    """What the two charts share: a model, and no memory."""
+
+    def __init__(self, model: PcaModel) -> None:
+        self.state = model
+        self._mean, self._scale = np.array(model.mean), np.array(model.scale)
+        self._loadings = np.array(model.loadings)
+        p, a = len(model.mean), len(model.variances)
+        if self._loadings.shape[:1] != (p,) or self._scale.shape != (p,) or a != p or not np.all(self._scale > 0):
+            raise ValueError(f"state must hold loadings, scales and variances of its {p} signals")
+
+    @classmethod
+    def from_state(cls, state: PcaModel) -> Self:
+        """The chart of that model.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        return cls(state)
+
+    def restart(self) -> None:
+        """Nothing: there is no memory."""
+
+    def _scaled(self, x: ArrayLike) -> Array:
+        return np.asarray((vector(x, self._mean.size) - self._mean) / self._scale)
+
+
+class PcaT2(_PcaChart):
+    """T2 of the components that the signals have in common.
+
+    Args:
+        model: from `PcaModel.fit`.
+
+    Raises:
+        ValueError: the model's parts don't fit together.
+    """
+
+    name = "pca_t2"
+
+    def __init__(self, model: PcaModel) -> None:
+        super().__init__(model)
+        a = self._loadings.shape[1]
+        self._white: Array = self._loadings / np.sqrt(np.array(model.variances[:a]))
+
+    def update(self, x: ArrayLike) -> Judgement:
+        """See `Chart`; x has shape (p,)."""
+        scores = self._scaled(x) @ self._white
+        statistic = float(scores @ scores)
+        return Judgement(statistic, float(scores.size), 0.0, self.state.t2_limit, statistic > self.state.t2_limit)
+
+    def contributions(self, x: ArrayLike) -> Array:
+        """Each signal's part of T2, shape (p,): x_j (P l^-1 P' x)_j. Their sum is T2; one may be negative."""
+        scaled = self._scaled(x)
+        return np.asarray(scaled * (self._white @ (scaled @ self._white)))
+
+
+class PcaSpe(_PcaChart):
+    """The squared prediction error (also called Q): what the common components do not explain.
+
+    Args:
+        model: from `PcaModel.fit`.
+
+    Raises:
+        ValueError: the model's parts don't fit together.
+    """
+
+    name = "pca_spe"
+
+    def update(self, x: ArrayLike) -> Judgement:
+        """See `Chart`; x has shape (p,)."""
+        statistic = float(self.contributions(x).sum())
+        centre = sum(self.state.variances[self._loadings.shape[1] :])
+        return Judgement(statistic, centre, 0.0, self.state.spe_limit, statistic > self.state.spe_limit)
+
+    def contributions(self, x: ArrayLike) -> Array:
+        """Each signal's part of SPE, shape (p,): its squared residual. Their sum is SPE."""
+        scaled = self._scaled(x)
+        return np.asarray((scaled - self._loadings @ (scaled @ self._loadings)) ** 2)
+
+
+def _jackson_mudholkar_limit(left_out: Array, alpha: float) -> float:
+    from scipy import stats
+
+    th1, th2, th3 = (float(np.sum(left_out**i)) for i in (1, 2, 3))
+    h = 1.0 - 2.0 * th1 * th3 / (3.0 * th2 * th2)
+    c = float(stats.norm.isf(alpha)) * (1.0 if h > 0.0 else -1.0)
+    inner = c * np.sqrt(2.0 * th2 * h * h) / th1 + 1.0 + th2 * h * (h - 1.0) / th1**2
+    return float(th1 * inner ** (1.0 / h))
+
+
+def _box_limit(left_out: Array, alpha: float) -> float:
+    from scipy import stats
+
+    th1, th2 = float(np.sum(left_out)), float(np.sum(left_out**2))
+    return th2 / th1 * float(stats.chi2.isf(alpha, th1 * th1 / th2))

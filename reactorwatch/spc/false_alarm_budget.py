@@ -1,0 +1,191 @@
+"""One number, how often a false alarm may come, shared over everything that can raise an alarm.
+
+A plant is watched by many charts, and each adds its false alarms: at k charts of a plain 3-sigma limit they come k
+times as often. Here the number is promised for the plant, in alarms per 30 days, and every chart gets the same share of
+it. Whatever the charts have in common, the expected number of alarms is the sum of theirs, so the promise is not a
+bound but an expectation. (Alarms that come together are one incident: of these there are fewer.)
+
+Limits for a share come from the run lengths in `spc.run_length`, which hold when mean and standard deviation are
+known. They are learned from n rows, and a limit that ignores it is too tight: Jones, Champ & Rigdon (2001), The
+performance of exponentially weighted moving average charts with estimated parameters, Technometrics 43, find
+a run length of 200 fall to 145. An average of weight lambda has the variance lambda / (2 - lambda); the mean that was
+learned adds 1 / n to it, and the standard deviation that was learned makes a normal number into one of Student's, with
+the degrees of freedom nu that belong to the variance 1 / (2 nu) of its relative error. So the limit L becomes
+
+    sqrt(1 + (2 - lambda) / (lambda n)) t_nu^-1(Phi(L)),
+
+the one that a new average crosses as rarely as L is crossed when all is known. That is Student's prediction interval
+(Hahn 1970, Additional factors for calculating prediction intervals, J. Amer. Statist. Assoc. 65); several signals:
+`estimated_t2`. It holds on average over trainings: one plant may have been lucky with its training, another
+not.
+"""
+
+from collections.abc import Callable
+from math import ceil, comb, exp, floor, log, log10, sqrt
+
+import numpy as np
+from scipy import special
+
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import Array
+from reactorwatch.spc.estimated_t2 import estimated_t2_quantile
+from reactorwatch.spc.m_of_n import false_alarm_rate
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.run_length.design import LONGEST_DESIGN, SHORTEST, cusum_limit, ewma_limit, mewma_limit
+
+DAYS = 30
+DAYS_MIN = DAYS * 24 * 60.0
+
+USUAL_PER_30_DAYS = 1.0
+"""False alarms of a plant that are promised where the settings ask for no number."""
+
+
+def promise_per_30_days(asked: float | None, alarms: int, period_min: float) -> float:
+    """The false alarms of a plant in 30 days that are promised.
+
+    Args:
+        asked: by the settings; None: `USUAL_PER_30_DAYS`, or the nearest number that charts can keep.
+        alarms: number of alarms that share them.
+        period_min: of the rows.
+
+    Raises:
+        InputError: charts cannot keep what is asked for.
+    """
+    rows = DAYS_MIN / period_min * alarms
+    fewest, most = rows / LONGEST_DESIGN, rows / (10 * SHORTEST)
+    if asked is None:
+        return min(max(USUAL_PER_30_DAYS, fewest), most)
+    if not fewest <= asked <= most:
+        bounds = f"[{_two_digits(fewest, ceil)}, {_two_digits(most, floor)}]"
+        raise InputError(
+            f"false_alarms_per_30_days must be in {bounds} for {alarms} alarms and rows every {period_min:g} min, got "
+            f"{asked:g}; set it within that range, or leave it out for the nearest number to 1 that can be kept"
+        )
+    return asked
+
+
+def _two_digits(value: float, rounded: Callable[[float], int]) -> str:
+    """A bound in two digits, which is itself within the bounds."""
+    unit = 10.0 ** (floor(log10(value)) - 1)
+    return f"{rounded(value / unit) * unit:.2g}"
+
+
+def share_arl0(per_30_days: float, alarms: int, period_min: float) -> float:
+    """The run length that each of a plant's alarms is to have without a fault, in rows.
+
+    Args:
+        per_30_days: false alarms of the plant that are promised, see `promise_per_30_days`.
+        alarms: number of alarms that share them.
+        period_min: of the rows.
+    """
+    return min(max(DAYS_MIN / period_min * alarms / per_30_days, 10 * SHORTEST), LONGEST_DESIGN)
+
+
+def point_probability(arl0: float, raise_count: int, window: int) -> float:
+    """How often a single point may be out if an alarm takes `raise_count` of them among `window`.
+
+    Args:
+        arl0: run length to the alarm without a fault.
+        raise_count: see `m_of_n`.
+        window: see `m_of_n`.
+    """
+    from scipy import optimize  # only here: to import it is a tenth of a start
+
+    def off(log_p: float) -> float:
+        return false_alarm_rate(raise_count, window, exp(log_p)) * arl0 - 1.0
+
+    # A point completes at most so many patterns, each as rare as its points together.
+    lowest = -log(arl0 * comb(window - 1, raise_count - 1)) / raise_count
+    return exp(float(optimize.brentq(off, lowest - 0.1, -0.01)))
+
+
+def shewhart_width(p: float, learned: Prewhitening) -> float:
+    """The width L that a point is beyond with the probability p.
+
+    Args:
+        p: of a single point.
+        learned: the training.
+    """
+    return _wider(float(-special.ndtri(0.5 * p)), 1.0, learned)
+
+
+def ewma_width(arl0: float, weight: float, learned: Prewhitening) -> float:
+    """The width L of an EWMA of weight lambda.
+
+    Args:
+        arl0: its run length without a fault.
+        weight: lambda.
+        learned: the training.
+    """
+    return _wider(ewma_limit(arl0, weight), weight, learned)
+
+
+def cusum_height(arl0: float, k: float, learned: Prewhitening) -> float:
+    """The limit h of a two-sided CUSUM with the allowance k, in standard deviations.
+
+    An error of the mean does not add to a CUSUM as it does to an average, so here the rate of false alarms is averaged
+    over the errors that the training may have made. How it changes with them is told by Siegmund's approximation (1985,
+    Sequential Analysis, sec. 2.6), which costs nothing and is good where run lengths are long.
+
+    Args:
+        arl0: its run length without a fault.
+        k: the allowance.
+        learned: the training.
+    """
+    from scipy import optimize  # only here: to import it is a tenth of a start
+
+    places, weights = np.polynomial.hermite_e.hermegauss(15)
+    shift, log_scale = np.meshgrid(places / sqrt(learned.rows), places * sqrt(_scale_variance(learned, 0.0)))
+    share = np.outer(weights, weights) / weights.sum() ** 2
+    scale = np.exp(log_scale)
+    known = cusum_limit(arl0, k)
+
+    def off(h: float) -> float:
+        return log(float(np.sum(share * _cusum_rate(shift / scale, k / scale, h / scale))) / wanted)
+
+    wanted = float(_cusum_rate(np.zeros(1), np.full(1, k), np.full(1, known))[0])
+    beyond = 10.0 * known + 10.0
+    while off(beyond) > 0.0:  # after a training of few rows; the rate falls with 1 / h, so this comes to an end
+        beyond *= 10.0
+    return float(optimize.brentq(off, known, beyond, xtol=1e-6 * known))
+
+
+def joint_limit(arl0: float, weight: float, learned: list[Prewhitening], rows: float) -> float:
+    """The limit of a MEWMA's, or with the weight 1 of a T2's, statistic.
+
+    Args:
+        arl0: its run length without a fault.
+        weight: lambda.
+        learned: the training of each signal.
+        rows: from which the correlations of the signals were estimated.
+    """
+    dimension = len(learned)
+    known = mewma_limit(arl0, dimension, weight)
+    freedoms = np.array([_freedom(item, weight) for item in learned])
+    limit = estimated_t2_quantile(float(special.chdtrc(dimension, known)), freedoms, rows)
+    return limit * (1.0 + (2.0 - weight) / (weight * min(item.rows for item in learned)))
+
+
+def _cusum_rate(shift: Array, k: Array, h: Array) -> Array:
+    """How often a two-sided CUSUM signals, a row, after Siegmund."""
+    rate = np.zeros(shift.shape)
+    for side in (1.0, -1.0):
+        off = side * shift - k
+        off = np.where(np.abs(off) < 1e-6, 1e-6, off)
+        exponent = np.minimum(-2.0 * off * (h + 1.166), 700.0)
+        rate += 2.0 * off * off / (np.exp(exponent) - exponent - 1.0)
+    return rate
+
+
+def _wider(limit: float, weight: float, learned: Prewhitening) -> float:
+    student = -float(special.stdtrit(_freedom(learned, weight), float(special.ndtr(-limit))))
+    return sqrt(1.0 + (2.0 - weight) / (weight * learned.rows)) * student
+
+
+def _freedom(learned: Prewhitening, weight: float) -> float:
+    return max(0.5 / _scale_variance(learned, weight), 5.0)
+
+
+def _scale_variance(learned: Prewhitening, weight: float) -> float:
+    """Of the relative error of the standard deviation, as a chart whose newest value weighs `weight` feels it."""
+    return learned.sd_variance + (1.0 - weight) ** 2 * learned.passed_variance

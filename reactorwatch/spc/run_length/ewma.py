@@ -1,0 +1,82 @@
+"""Run length of the two-sided EWMA, by its integral equation.
+
+Crowder (1987), A simple method for studying run-length distributions of EWMA charts, Technometrics 29(4).
+
+In units of sigma from the mean, with the limit H = L sqrt(lambda / (2 - lambda)) and the average at u
+
+    L(u) = 1 + 1/lambda integral from -H to H of L(y) phi((y - (1 - lambda) u) / lambda - shift) dy.
+
+With exact limits H depends on the number of samples t; L_t follows from L_(t+1) by the same integral, backwards from
+where the limit has settled.
+"""
+
+from math import ceil, log, sqrt
+
+import numpy as np
+
+from reactorwatch.spc.charts import ewma as chart
+from reactorwatch.spc.charts.base import Array
+from reactorwatch.spc.run_length.chain import nodes, run_lengths, settled
+from reactorwatch.spc.run_length.limits import checked_shift, told, within
+
+SMALLEST_WEIGHT = 1e-3
+LARGEST_LIMIT = 10.0
+
+
+def ewma(
+    shift: float,
+    weight: float = 0.2,
+    limit: float = 3.0,
+    *,
+    exact_limits: bool = False,
+    steady_state: bool = False,
+) -> float:
+    """The average run length.
+
+    >>> round(ewma(1.0, weight=0.25, limit=3.0), 6)
+    11.154267
+
+    Args:
+        shift: of the mean, in sigma.
+        weight: lambda, in [0.001, 1].
+        limit: L, in standard deviations of the average.
+        exact_limits: whether the limits grow with the average's standard deviation from the start.
+        steady_state: whether the chart has long run when the shift comes.
+
+    Raises:
+        InputError: an argument out of its range.
+    """
+    chart.check(weight, limit)
+    within("weight (lambda)", weight, SMALLEST_WEIGHT, 1.0)
+    within("limit", limit, 1e-3, LARGEST_LIMIT)
+    size = checked_shift(shift)
+    bound = limit * sqrt(weight / (2.0 - weight))
+    count = 40 + ceil(6.0 * bound / weight)
+    places, weights = nodes(-bound, bound, count)
+    lengths = run_lengths(_kernel(places, places, size, weight) * weights)
+    told(float(lengths[count // 2]))
+    if steady_state:
+        return float(settled(_kernel(places, places, 0.0, weight) * weights) @ lengths)
+    if exact_limits:
+        return _with_exact_limits(size, weight, bound, count, places, lengths)
+    return float(1.0 + _kernel(np.zeros(1), places, size, weight)[0] * weights @ lengths)
+
+
+def _kernel(start: Array, end: Array, shift: float, weight: float) -> Array:
+    """Density of the next average at `end`, from each `start`, shape (starts, ends)."""
+    off = (end[None, :] - (1.0 - weight) * start[:, None]) / weight - shift
+    return np.asarray(np.exp(-0.5 * off * off) / (np.sqrt(2.0 * np.pi) * weight))
+
+
+def _with_exact_limits(shift: float, weight: float, bound: float, count: int, places: Array, lengths: Array) -> float:
+    """Backwards from the sample at which the limit is within 1e-9 of its final value."""
+    if weight == 1.0:
+        return float(lengths[0])
+    unit, unit_weights = nodes(-1.0, 1.0, count)
+    weights = bound * unit_weights
+    for t in range(ceil(log(1e-9) / (2.0 * log(1.0 - weight))), 0, -1):
+        bound_before = bound * sqrt(1.0 - (1.0 - weight) ** (2 * t))
+        before = bound_before * unit
+        lengths = 1.0 + (_kernel(before, places, shift, weight) * weights) @ lengths
+        places, weights = before, bound_before * unit_weights
+    return float(1.0 + (_kernel(np.zeros(1), places, shift, weight) * weights)[0] @ lengths)

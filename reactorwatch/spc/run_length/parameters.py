@@ -1,0 +1,104 @@
+"""The limit of the chart on parameters, when their covariance and the reference are learned from a finite training.
+
+If covariance and reference were known, the difference u of the parameters, made white, would be a MEWMA of weight w
+with the rate of false alarms rate(h) = 1 / ARL at the limit h. Neither is known.
+
+*The covariance* comes from a training with nu degrees of freedom. The statistic of a normal vector v is then
+|v|^2 / G with G independent of |v|, chi-square with nu - p + 1 degrees of freedom over nu (that is Hotelling's F;
+Mardia, Kent & Bibby, Multivariate Analysis, 1979, section 3.5).
+
+*The reference* is off by a d that does not change any more, of r times the variance of u: what is charted is u - d,
+with 1 + r times the variance. One reference is lucky and another is not; what can be promised is the rate of false
+alarms averaged over the references. A rare alarm of an average whose weight is small comes when u is carried out over
+the boundary of the region within the limit. As u falls back towards 0 at the speed w u, in balance as many cross the
+boundary outwards for the first time as would drift inwards there (the flux that gives Kramers' escape rate), and by
+Gauss's theorem that is, with all that is random in u, d and G averaged over,
+
+    w E[(|u|^2 - p) 1(out)].
+
+Given v = (u - d) / sqrt(1 + r), the mean of |u|^2 - p is (|v|^2 - p) / (1 + r). So the average rate of false alarms at
+the limit L of |v|^2 / G is that of the known chart, at the limits L G, over 1 + r:
+
+    E_G[rate(L G)] / (1 + r).
+
+It says how often the statistic leaves where it usually is. A reference so unlucky that the statistic is usually
+out gives one false alarm that stays.
+"""
+
+from functools import lru_cache
+from math import log
+
+import numpy as np
+from scipy import special
+
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import Array
+from reactorwatch.spc.run_length.design import LONGEST_DESIGN, SHORTEST
+from reactorwatch.spc.run_length.limits import within
+from reactorwatch.spc.run_length.mewma import LARGEST_LIMIT, mewma
+
+_FIRST_HEIGHT, _HEIGHT_RATIO = 0.5, 1.25
+_LARGEST_LEARNED_LIMIT = 1e6
+
+
+def parameter_limit(arl0: float, dimension: int, weight: float, freedom: float, reference_share: float) -> float:
+    """The limit of the statistic.
+
+    Args:
+        arl0: rows to a false alarm, averaged as above.
+        dimension: number of directions that are charted, p.
+        weight: w, of the newest row in the model that adapts.
+        freedom: nu, of the covariance that was learned; at least p.
+        reference_share: r, the variance of the reference over that of the model that adapts.
+
+    Raises:
+        InputError: an argument out of its range, or a training so short that no limit gives that run length.
+    """
+    from scipy import optimize  # only here: to import it is a tenth of a start
+
+    within("arl0", arl0, SHORTEST * (1.0 + reference_share), LONGEST_DESIGN)
+    rates = _rates(dimension, weight)
+    half = 0.5 * (freedom - dimension + 1.0)
+    # All but 1e-20 of the distribution of half of nu G; even steps of the log of it, so that small ones are there too.
+    log_half = np.linspace(log(special.gammaincinv(half, 1e-20)), log(special.gammainccinv(half, 1e-20)), 2001)
+    share = np.exp(half * (log_half - log(half)) - np.exp(log_half) + half)
+    share /= share.sum()
+    log_g = log_half - log(0.5 * freedom)
+
+    def off(log_limit: float) -> float:
+        return log(float(share @ np.exp(rates(log_limit + log_g)))) + log(arl0 / (1.0 + reference_share))
+
+    largest = log(_LARGEST_LEARNED_LIMIT)
+    if off(largest) > 0.0:
+        raise InputError(f"arl0 must be lower, or the training longer: it has {freedom:g} degrees of freedom")
+    return float(np.exp(optimize.brentq(off, log(_FIRST_HEIGHT), largest, xtol=1e-6)))
+
+
+class _Rates:
+    """Log of the rate of false alarms of a known chart, by the log of its limit."""
+
+    def __init__(self, dimension: int, weight: float) -> None:
+        from scipy import interpolate  # only here: to import it is a tenth of a start
+
+        heights, rates = [], []
+        height = _FIRST_HEIGHT
+        while height < LARGEST_LIMIT:
+            try:
+                rates.append(-log(mewma(0.0, dimension, weight, height)))
+            except InputError:  # beyond the longest run length that can be told
+                break
+            heights.append(log(height))
+            height *= _HEIGHT_RATIO
+        self._last = heights[-1]
+        self._inside = interpolate.CubicSpline(heights, rates)
+        self._slope = float(self._inside(self._last, 1))
+
+    def __call__(self, log_height: Array) -> Array:
+        """Below the first height the chart signals as often as there, which is more often than anyone asks for."""
+        inside = self._inside(np.clip(log_height, log(_FIRST_HEIGHT), self._last))
+        return np.asarray(inside + self._slope * np.maximum(log_height - self._last, 0.0))
+
+
+@lru_cache(maxsize=16)
+def _rates(dimension: int, weight: float) -> _Rates:
+    return _Rates(dimension, weight)

@@ -1,0 +1,84 @@
+"""For each chart of the catalogue: one to try, what to feed it, and the run length it should have."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.spc import run_length
+from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.mewma import Mewma
+from reactorwatch.spc.charts.parameters import ParameterT2
+from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2
+from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.charts.t2 import T2
+
+Array = NDArray[np.float64]
+
+MEAN, SIGMA = 438.5, 0.3
+MEANS = np.array([438.5, 0.1, 103.4])
+COVARIANCE = np.array([[0.09, 0.001, 0.0], [0.001, 0.0001, 0.002], [0.0, 0.002, 1.0]])
+ROOT = np.linalg.cholesky(COVARIANCE)
+SHIFT = 1.0
+
+
+@dataclass(frozen=True)
+class Member:
+    """One chart of the catalogue.
+
+    Attributes:
+        new: a chart.
+        sample: shape (rows, ...) of shifted samples.
+        run_length: the mean number of samples to the signal.
+    """
+
+    new: Callable[[], Any]
+    sample: Callable[[np.random.Generator, int], Array]
+    run_length: float
+
+
+def value(rng: np.random.Generator, rows: int) -> Array:
+    return MEAN + SIGMA * (rng.standard_normal(rows) - SHIFT)
+
+
+def vector(rng: np.random.Generator, rows: int) -> Array:
+    white = rng.standard_normal((rows, 3))
+    white[:, 0] += SHIFT
+    return MEANS + white @ ROOT.T
+
+
+def difference(rng: np.random.Generator, rows: int) -> Array:
+    return np.asarray(vector(rng, rows) - MEANS)
+
+
+def related(rng: np.random.Generator, rows: int) -> Array:
+    """Six signals driven by two, with noise of its own in each: the eigenvalues left out are equal."""
+    driving = np.array([[1.0, 1.0, 1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0, 1.0, 1.0]])
+    return np.asarray(rng.standard_normal((rows, 2)) @ driving + 0.5 * rng.standard_normal((rows, 6)))
+
+
+MODEL = PcaModel.fit(related(np.random.default_rng(1), 20_000), components=2, false_alarm=0.05)
+
+MEMBERS: dict[type, Member] = {
+    Shewhart: Member(
+        lambda: Shewhart(MEAN, SIGMA, rules=(1, 2, 3, 4)), value, run_length.shewhart(SHIFT, rules=(1, 2, 3, 4))
+    ),
+    Cusum: Member(lambda: Cusum(MEAN, SIGMA, 0.5, 4.0, 2.0), value, run_length.cusum(SHIFT, 0.5, 4.0, 2.0)),
+    Ewma: Member(
+        lambda: Ewma(MEAN, SIGMA, 0.1, 2.8, exact_limits=True),
+        value,
+        run_length.ewma(SHIFT, 0.1, 2.8, exact_limits=True),
+    ),
+    T2: Member(lambda: T2(MEANS, COVARIANCE, 10.0), vector, run_length.t2(SHIFT, 3, 10.0)),
+    Mewma: Member(lambda: Mewma(MEANS, COVARIANCE, 0.2, 11.0), vector, run_length.mewma(SHIFT, 3, 0.2, 11.0)),
+    ParameterT2: Member(
+        lambda: ParameterT2(["a1", "b1", "c"], np.linalg.inv(ROOT), 10.0, np.eye(3)[1:]),
+        difference,
+        run_length.t2(SHIFT, 3, 10.0),
+    ),
+    PcaT2: Member(lambda: PcaT2(MODEL), related, 20.0),
+    PcaSpe: Member(lambda: PcaSpe(MODEL), related, 20.0),
+}

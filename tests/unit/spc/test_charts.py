@@ -1,0 +1,167 @@
+"""What holds for every chart of the catalogue."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import Bank, SignalChart
+from reactorwatch.spc.charts.catalogue import CHARTS
+from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.shewhart import Shewhart
+from tests.unit.spc.members import MEMBERS, Member, value
+
+SIGNAL_CHARTS = [chart for chart in CHARTS if issubclass(chart, SignalChart)]
+
+
+@pytest.fixture(params=CHARTS, ids=lambda chart: chart.name)
+def member(request: pytest.FixtureRequest) -> Member:
+    assert request.param in MEMBERS, "a new chart needs a member to be checked by"
+    return MEMBERS[request.param]
+
+
+def restored(chart: Any) -> Any:
+    """The chart from its state's bytes."""
+    return type(chart).from_state(type(chart.state).from_bytes(chart.state.to_bytes()))
+
+
+def test_stopped_and_gone_on_is_never_stopped(member: Member) -> None:
+    """Stored after any of 40 samples, the chart goes on bit for bit."""
+    samples = member.sample(np.random.default_rng(1), 40)
+    steady, stopped = member.new(), member.new()
+    for x in samples:
+        stopped = restored(stopped)
+        assert stopped.update(x) == steady.update(x)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
+def test_what_is_no_number_is_refused_and_leaves_no_trace(member: Member, bad: float) -> None:
+    samples = member.sample(np.random.default_rng(2), 5)
+    chart, undisturbed = member.new(), member.new()
+    for x in samples[:4]:
+        assert chart.update(x) == undisturbed.update(x)
+    spoilt = np.array(samples[4])
+    spoilt.flat[0] = bad
+    before = chart.state
+    with pytest.raises(ValueError, match="a chart takes finite values"):
+        chart.update(spoilt if spoilt.ndim else float(spoilt))
+    assert chart.state == before
+    assert chart.update(samples[4]) == undisturbed.update(samples[4])
+
+
+def test_memory_is_bounded(member: Member) -> None:
+    """After 3,000 samples the state takes no more bytes than after 10, but for how long its numbers are written."""
+    chart = member.new()
+    sizes = []
+    for x in member.sample(np.random.default_rng(3), 3000):
+        chart.update(x)
+        sizes.append(len(chart.state.to_bytes()))
+    assert max(sizes[10:]) <= max(sizes[:10]) + 9
+
+
+def test_restarted_is_as_new(member: Member) -> None:
+    samples = member.sample(np.random.default_rng(4), 20)
+    chart, fresh = member.new(), member.new()
+    for x in samples[:10]:
+        chart.update(x)
+    chart.restart()
+    assert chart.state == fresh.state
+    assert [chart.update(x) for x in samples[10:]] == [fresh.update(x) for x in samples[10:]]
+
+
+def test_it_runs_as_long_as_computed(member: Member) -> None:
+    """The mean of simulated run lengths is within 4 standard errors of the computed one."""
+    chart, rng = member.new(), np.random.default_rng(5)
+    lengths = []
+    for _ in range(600):
+        chart.restart()
+        length = 0
+        while True:
+            samples = member.sample(rng, 25)
+            out = next((i for i, x in enumerate(samples) if chart.update(x).out), None)
+            length += 25 if out is None else out + 1
+            if out is not None:
+                break
+        lengths.append(length)
+    error = np.std(lengths) / np.sqrt(len(lengths))
+    assert abs(np.mean(lengths) - member.run_length) < 4 * error
+
+
+def test_out_means_beyond_a_limit(member: Member) -> None:
+    """Every judgement of a chart without run rules is as its own numbers say."""
+    chart = member.new()
+    for x in member.sample(np.random.default_rng(6), 100):
+        said = chart.update(x)
+        beyond = not said.lower_limit <= said.statistic <= said.upper_limit
+        assert said.lower_limit <= said.centre <= said.upper_limit
+        assert said.out == beyond or (isinstance(chart, Shewhart) and said.out)
+
+
+@pytest.mark.parametrize("kind", SIGNAL_CHARTS, ids=lambda chart: chart.name)
+def test_a_bank_gives_the_bits_of_the_single_chart(kind: type[SignalChart]) -> None:
+    """131 plants, some absent at times, the bank stored and restored on the way: all as each plant alone."""
+    rng = np.random.default_rng(7)
+    singles: list[SignalChart] = [MEMBERS[kind].new() for _ in range(131)]
+    bank = Bank(singles)
+    for _ in range(60):
+        x, present = value(rng, 131), rng.random(131) < 0.8
+        said = bank.update(np.where(present, x, np.nan), present)
+        for plant, chart in enumerate(singles):
+            if present[plant]:
+                assert tuple(column[plant] for column in said) == chart.update(x[plant])
+            else:
+                assert np.isnan(said.statistic[plant])
+                assert not said.out[plant]
+        bank = Bank.from_state(kind, type(bank.state).from_bytes(bank.state.to_bytes()))
+    assert all(bank.chart(plant).state == chart.state for plant, chart in enumerate(singles))
+
+
+def test_a_bank_refuses_a_row_as_a_whole() -> None:
+    bank = Bank([Ewma(0.0, 1.0) for _ in range(3)])
+    before = bank.state
+    with pytest.raises(ValueError, match="plant 1: a chart takes finite values"):
+        bank.update([1.0, np.nan, 1.0])
+    with pytest.raises(ValueError, match=r"values must have shape \(3,\), got \(2,\)"):
+        bank.update([1.0, 1.0])
+    assert bank.state == before
+
+
+def test_a_bank_restarts_the_plants_it_is_told() -> None:
+    bank = Bank([Ewma(0.0, 1.0) for _ in range(3)])
+    bank.update([1.0, 2.0, 3.0])
+    bank.restart(np.array([False, True, False]))
+    assert bank.chart(1).state == Ewma(0.0, 1.0).state
+    assert bank.chart(2).state != Ewma(0.0, 1.0).state
+
+
+def test_a_state_of_another_chart_is_refused() -> None:
+    with pytest.raises(ValueError, match="state must be of the chart shewhart, got ewma"):
+        Shewhart.from_state(Ewma(0.0, 1.0).state)
+
+
+@pytest.mark.parametrize(
+    ("new", "message"),
+    [
+        (lambda: Shewhart(0.0, 0.0), "sigma must be a positive number, got 0.0"),
+        (lambda: Shewhart(0.0, 1.0, rules=(1, 5)), r"rules must be some of 1, 2, 3, 4, got \(1, 5\)"),
+        (lambda: Ewma(0.0, 1.0, weight=1.5), r"weight \(lambda\) must be in \(0, 1\], got 1.5"),
+        (lambda: Bank([]), "charts must be one or more of one kind"),
+    ],
+)
+def test_settings_out_of_range_are_named(new: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        new()
+
+
+def test_rules_count_only_points_that_complete_a_pattern() -> None:
+    """Two of three beyond 2 sigma: out at the second of them, not at a point that follows near the mean."""
+    chart = Shewhart(0.0, 1.0, rules=(2,))
+    assert [chart.update(x).out for x in (2.1, -2.1, 0.0, 2.1, 0.0, 2.1, 0.0)] == [False] * 5 + [True, False]
+
+
+def test_rule_3_wants_four_of_five_on_one_side_and_rule_4_eight_in_a_row() -> None:
+    chart = Shewhart(0.0, 1.0, rules=(3, 4))
+    assert [chart.update(x).out for x in (1.5, 1.5, 1.5, -0.1, 1.5)] == [False] * 4 + [True]
+    chart.restart()
+    assert [chart.update(0.1).out for _ in range(9)] == [False] * 7 + [True, True]

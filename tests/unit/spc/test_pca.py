@@ -1,0 +1,103 @@
+"""PCA charts: their limits, and what they blame."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2, SpeLimit
+from reactorwatch.spc.charts.t2 import T2
+from tests.unit.spc.members import COVARIANCE, MEANS, MODEL, related
+
+
+@pytest.mark.parametrize("spe_limit", ["jackson_mudholkar", "box"])
+def test_the_limit_of_spe_is_that_of_its_distribution(spe_limit: SpeLimit) -> None:
+    """Equal eigenvalues left out: SPE is their value times chi-square, Box's limit its quantile, the other near."""
+    model = PcaModel.fit(related(np.random.default_rng(1), 20_000), 2, 0.01, spe_limit)
+    left_out = np.array(model.variances[2:])
+    exact = left_out.mean() * stats.chi2.isf(0.01, 4)
+    assert model.spe_limit == pytest.approx(exact, rel=0.01 if spe_limit == "box" else 0.02)
+
+
+def test_the_limits_of_spe_hold_for_unlike_eigenvalues() -> None:
+    """Signals with noise of unlike size: 1 % of fresh samples are out, to 4 standard errors and 0.1 %."""
+    rng = np.random.default_rng(2)
+    sizes = np.array([0.3, 0.5, 0.7, 0.4, 0.6, 0.8])
+
+    def sample(rows: int) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+        return np.asarray(rng.standard_normal((rows, 1)) + sizes * rng.standard_normal((rows, 6)))
+
+    training, fresh = sample(50_000), sample(20_000)
+    for rule in ("jackson_mudholkar", "box"):
+        chart = PcaSpe(PcaModel.fit(training, 1, 0.01, rule))
+        share = np.mean([chart.update(x).out for x in fresh])
+        assert abs(share - 0.01) < 4 * np.sqrt(0.01 * 0.99 / 20_000) + 0.001
+
+
+def test_the_limit_of_t2_allows_for_a_short_training() -> None:
+    """Trained on 12 rows only, a fresh sample is out with the probability promised: 4,000 trainings."""
+    rng = np.random.default_rng(3)
+    mixing = np.array([[1.0, 0.2], [0.2, 1.0], [0.01, 0.01]])
+    outs = 0
+    for _ in range(4000):
+        rows = rng.standard_normal((13, 2)) @ mixing.T + 1e-6 * rng.standard_normal((13, 3))
+        outs += PcaT2(PcaModel.fit(rows[:12], 2, 0.05)).update(rows[12]).out
+    assert abs(outs / 4000 - 0.05) < 4 * np.sqrt(0.05 * 0.95 / 4000)
+
+
+@pytest.mark.parametrize("kind", [PcaT2, PcaSpe])
+def test_contributions_add_up_to_the_statistic(kind: type[PcaT2] | type[PcaSpe]) -> None:
+    chart = kind(MODEL)
+    for x in related(np.random.default_rng(4), 20):
+        assert chart.contributions(x).sum() == pytest.approx(chart.update(x).statistic, rel=1e-12)
+
+
+def test_contributions_of_t2_add_up() -> None:
+    chart = T2(MEANS, COVARIANCE, 10.0)
+    x = MEANS + np.array([0.3, -0.02, 1.0])
+    assert chart.contributions(x).sum() == pytest.approx(chart.update(x).statistic, rel=1e-12)
+
+
+def test_a_sensor_that_leaves_the_others_is_blamed() -> None:
+    """One signal 3 standard deviations off what the others say: SPE is out and that signal has most of it."""
+    for sensor in range(6):
+        x = np.zeros(6)
+        x[sensor] = 3.0
+        assert PcaSpe(MODEL).update(x).out
+        assert np.argmax(PcaSpe(MODEL).contributions(x)) == sensor
+
+
+def test_a_large_common_move_is_for_t2_alone() -> None:
+    x = np.array([4.0, 4.0, 4.0, 0.0, 0.0, 0.0])
+    assert PcaT2(MODEL).update(x).out
+    assert not PcaSpe(MODEL).update(x).out
+
+
+@pytest.mark.parametrize(
+    ("training", "components", "message"),
+    [
+        (np.ones((10, 3)), 1, "training must vary in every signal, number 0 does not"),
+        (np.eye(3), 1, "training must have more rows than its 3 signals, got 3"),
+        (np.random.default_rng(1).standard_normal((9, 3)), 3, r"components must be in \[1, 2\] for 3 signals, got 3"),
+        (np.full((9, 3), np.nan), 1, "training must be a matrix of finite numbers"),
+        (
+            np.outer(np.arange(9.0), np.ones(3)),
+            1,
+            "components must leave some variance over, 1 of 3 signals leave none",
+        ),
+    ],
+)
+def test_a_training_that_makes_no_model_is_refused(
+    training: np.ndarray[tuple[int, ...], np.dtype[np.float64]], components: int, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        PcaModel.fit(training, components)
+
+
+def test_a_covariance_that_is_none_is_refused() -> None:
+    with pytest.raises(InputError, match="covariance must be positive definite"):
+        T2([0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]], 10.0)
+    with pytest.raises(InputError, match="covariance must be symmetric"):
+        T2([0.0, 0.0], [[1.0, 0.1], [0.2, 1.0]], 10.0)
+    with pytest.raises(InputError, match=r"covariance must have shape \(2, 2\)"):
+        T2([0.0, 0.0], [[1.0]], 10.0)
