@@ -23,7 +23,7 @@ from rich.progress import Progress
 
 from benchmarks.hidden.classes import CLASSES, StudyClass, class_named, drawn
 from benchmarks.hidden.tables import confusion_table, failures, main_table
-from diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.runtime.jobs import Failed, workers
 from tests.hidden_effect.draw import draw

@@ -28,10 +28,10 @@ from rich.table import Table
 from scipy.signal import savgol_filter
 
 from benchmarks.hidden.classes import class_named, drawn
-from diagnosis.diagnose import diagnose
-from diagnosis.held_out import held_out_rows
-from diagnosis.record_checks import run_of
-from diagnosis.run import Run
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.holdout import held_out_rows
+from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel

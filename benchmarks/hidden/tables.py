@@ -5,7 +5,7 @@ from math import isfinite, isnan
 
 from benchmarks.hidden.classes import CLASSES
 from benchmarks.hidden.score import Score, confusion
-from diagnosis.result import UNKNOWN
+from reactorwatch.diagnosis.result import UNKNOWN
 from tests.hidden_effect.judge import Judged
 
 Cell = Callable[[Score], str]

@@ -22,7 +22,6 @@ def add_to(app: typer.Typer) -> None:
 
 def compile_kernels() -> None:
     """Compile the numerical kernels once, so that no first start has to: half a minute on a new machine."""
-    from diagnosis.diagnose import diagnose
     from monitor_node import backtest
     from monitor_node.config import MonitorConfig
     from monitor_node.fleet.watched import WatchedPlants
@@ -30,6 +29,7 @@ def compile_kernels() -> None:
     from plant_node.record import simulate_record
     from reactorwatch.cli.progress import task
     from reactorwatch.contract.codec import encode
+    from reactorwatch.diagnosis.diagnose import diagnose
     from reactorwatch.process.library.cstr.model import cstr
     from recorder.player import samples_of
 

@@ -179,8 +179,8 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folde
 
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
     """Diagnose the recording, draw it, read from it what happened, and write that down."""
-    from diagnosis.report.words import verdict
     from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, Asked, case_of, diagnosed, write_report
+    from reactorwatch.diagnosis.report.words import verdict
     from reactorwatch.process import effects_of
     from recorder.dashboard.file import write_rrd
     from recorder.run_reader import stretches

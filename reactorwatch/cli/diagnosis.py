@@ -8,13 +8,13 @@ from typing import TypeAlias
 import msgspec
 import numpy as np
 
-from diagnosis.diagnose import diagnose
-from diagnosis.record_checks import run_of
-from diagnosis.report.machine import with_differences
-from diagnosis.result import Diagnosis, Experiment
-from diagnosis.uncertain import stated
 from reactorwatch.cli.options import existing_recording
 from reactorwatch.cli.sources import process_model, record, signals_of
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.parameter_priors import stated
+from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.report.machine import with_differences
+from reactorwatch.diagnosis.result import Diagnosis, Experiment
 from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import replacing
@@ -119,8 +119,8 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
         InputError: the folder cannot be made or written to.
     """
     # Imported where a report is wanted: Rerun and Jinja take longer to import than most records to diagnose.
-    from diagnosis.report.page import as_page
     from reactorwatch.cli.diagnosis_drawing import write_drawing
+    from reactorwatch.diagnosis.report.page import as_page
 
     assert case.folder is not None
     folder = case.folder

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from diagnosis.report.pictures import interval
-from diagnosis.result import SD_95, Curves, Diagnosis
+from reactorwatch.diagnosis.report.pictures import interval
+from reactorwatch.diagnosis.result import SD_95, Curves, Diagnosis
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record, to_time_ns
 from recorder.dashboard.file import DIAGNOSIS, write_views

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import msgspec
 
-from diagnosis.limits import checked_limits
-from diagnosis.practice import checked_tolerance
-from diagnosis.report.machine import as_object
-from diagnosis.report.plain import as_text
-from diagnosis.result import Cause, Diagnosis
-from diagnosis.uncertain import stated
 from reactorwatch.cli.batch import SUMMARY, Answer, Kind, Row, as_table
 from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, REPORT, Asked, Case, case_of, diagnosed, write_report
+from reactorwatch.diagnosis.experiment.constraints import checked_limits
+from reactorwatch.diagnosis.parameter_priors import stated
+from reactorwatch.diagnosis.practical_significance import checked_tolerance
+from reactorwatch.diagnosis.report.machine import as_object
+from reactorwatch.diagnosis.report.plain import as_text
+from reactorwatch.diagnosis.result import Cause, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.library.cstr.model import cstr

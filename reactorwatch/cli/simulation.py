@@ -6,9 +6,9 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from diagnosis.impossible_values import check_values
-from diagnosis.units import find_wrong_unit
 from plant_node.initial_state import carried_over
+from reactorwatch.diagnosis.impossible_values import check_values
+from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.fault import parse_fault

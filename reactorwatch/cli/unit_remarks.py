@@ -4,11 +4,11 @@ from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 
-from diagnosis.units import find_wrong_unit
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import to_minutes
 

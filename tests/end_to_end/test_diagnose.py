@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from diagnosis.diagnose import diagnose
-from diagnosis.result import Diagnosis
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.result import Diagnosis
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv, write_csv

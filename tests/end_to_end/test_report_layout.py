@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from diagnosis.report.page import as_page
+from reactorwatch.diagnosis.report.page import as_page
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.cases import CASES

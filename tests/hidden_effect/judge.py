@@ -5,7 +5,7 @@ from math import inf, nan
 
 import numpy as np
 
-from diagnosis.result import Cause, Diagnosis
+from reactorwatch.diagnosis.result import Cause, Diagnosis
 from tests.hidden_effect.courses import HiddenCourse
 from tests.hidden_effect.draw import Hidden
 

@@ -11,8 +11,8 @@ from math import sqrt
 import pytest
 from scipy.stats import binom
 
-from diagnosis.diagnose import diagnose
-from diagnosis.result import NOMINAL, Diagnosis
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.result import NOMINAL, Diagnosis
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import named

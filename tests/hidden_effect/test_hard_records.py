@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from diagnosis.diagnose import diagnose
-from diagnosis.result import NOMINAL, Diagnosis
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.result import NOMINAL, Diagnosis
 from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import Hidden, draw

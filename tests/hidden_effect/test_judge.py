@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from diagnosis.result import Alternative, Cause, Curves, Diagnosis, Estimate, Gain, HeldOut
+from reactorwatch.diagnosis.result import Alternative, Cause, Curves, Diagnosis, Estimate, Gain, HeldOut
 from reactorwatch.records.record import Record
 from tests.hidden_effect.catalogue import CATALOGUE, OUTSIDE
 from tests.hidden_effect.courses import HiddenCourse

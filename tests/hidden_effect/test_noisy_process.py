@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import chi2
 
-from diagnosis.courses import Constant
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.record_checks import run_of
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.record_checks import run_of
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import HiddenEffect, named

@@ -3,8 +3,8 @@
 from dataclasses import replace
 from functools import cache
 
-from diagnosis.diagnose import diagnose
-from diagnosis.result import UNKNOWN
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.result import UNKNOWN
 from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import OUTSIDE
 from tests.hidden_effect.draw import draw

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from diagnosis.courses import Step
-from diagnosis.run import Run
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.profiles import Step
+from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr

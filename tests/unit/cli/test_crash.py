@@ -224,7 +224,7 @@ def test_a_recording_of_a_plant_with_an_impossible_name_is_watched_under_no_name
 @pytest.mark.parametrize(
     "fails",
     [
-        "diagnosis.report.page.as_page",
+        "reactorwatch.diagnosis.report.page.as_page",
         "reactorwatch.cli.diagnosis.with_differences",
         "reactorwatch.cli.diagnosis.write_extended_model",
         "reactorwatch.cli.diagnosis_drawing.write_drawing",

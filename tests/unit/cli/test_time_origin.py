@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from diagnosis.diagnose import diagnose
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
@@ -17,6 +16,7 @@ from reactorwatch.cli.options import span_ns
 from reactorwatch.cli.recordings import cut
 from reactorwatch.cli.simulation import free_run
 from reactorwatch.cli.sources import process_model, record, tape
+from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import write_csv

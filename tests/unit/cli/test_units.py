@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from diagnosis.units import find_wrong_unit
 from monitor_node.config import MonitorConfig
 from reactorwatch.cli import backtest_jobs
 from reactorwatch.cli.main import app
+from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import write_csv

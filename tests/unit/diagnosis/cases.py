@@ -5,8 +5,9 @@ from math import nan
 
 import numpy as np
 
-from diagnosis.difference import difference
-from diagnosis.result import (
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.difference import difference
+from reactorwatch.diagnosis.result import (
     Adjusted,
     Alternative,
     Apart,
@@ -19,7 +20,6 @@ from diagnosis.result import (
     Gain,
     HeldOut,
 )
-from reactorwatch.arrays import Array
 
 ROWS = 2000
 

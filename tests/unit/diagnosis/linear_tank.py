@@ -5,13 +5,13 @@ from math import exp
 import casadi as ca
 import numpy as np
 
-from diagnosis.courses import Constant
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.run import Run
-from diagnosis.search import Explained
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.search import Explained
 from reactorwatch.process.effect import Effect, ParameterEffect, ParameterShift
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
 

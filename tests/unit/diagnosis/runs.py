@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from diagnosis.run import Run
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.diagnosis.run import Run
 from reactorwatch.records.record import Record
 
 

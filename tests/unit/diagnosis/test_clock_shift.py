@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from diagnosis.between_moves import walked
-from diagnosis.clock_shift import felt
-from diagnosis.courses import Course, Decay, Ramp, Step
-from diagnosis.hypothesis import MOST_STEPS, Hypothesis
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
+from reactorwatch.diagnosis.fitting.input_timing import felt
+from reactorwatch.diagnosis.fitting.onset_refinement import walked
+from reactorwatch.diagnosis.fitting.profiles import Course, Decay, Ramp, Step
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import run_of

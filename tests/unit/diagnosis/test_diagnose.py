@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from diagnosis.diagnose import diagnose
-from diagnosis.record_checks import run_of
-from diagnosis.result import NAMED, NOMINAL, UNKNOWN
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.result import NAMED, NOMINAL, UNKNOWN
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from diagnosis.difference import BINS, TIME, Difference, difference
-from diagnosis.report.words import difference_said
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.difference import BINS, TIME, Difference, difference
+from reactorwatch.diagnosis.report.words import difference_said
 
 ROWS, NOISE = 8000, 0.3
 T_MIN: Array = np.linspace(0.0, 800.0, ROWS)

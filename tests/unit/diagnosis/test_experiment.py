@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from diagnosis.courses import Constant
-from diagnosis.experiment import FEWEST, PATTERN_ROWS, proposed
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.input_sequence import HOLDS_ROWS, QUIET_ROWS, Ends, families
-from diagnosis.limits import checked_limits, limits_of
-from diagnosis.result import Experiment
-from diagnosis.rivals import Rivals
-from diagnosis.run import Run
-from diagnosis.search import Explained
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.diagnosis.experiment.alternatives import Rivals
+from reactorwatch.diagnosis.experiment.constraints import checked_limits, limits_of
+from reactorwatch.diagnosis.experiment.design import FEWEST, PATTERN_ROWS, proposed
+from reactorwatch.diagnosis.experiment.input_sequence import HOLDS_ROWS, QUIET_ROWS, Ends, families
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.result import Experiment
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.search import Explained
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr

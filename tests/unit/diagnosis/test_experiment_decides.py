@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from diagnosis.diagnose import diagnose
-from diagnosis.result import NAMED
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.result import NAMED
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record
 

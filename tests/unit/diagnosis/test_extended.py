@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from diagnosis.courses import Course, Decay, Free, Ramp, Sine, Step
-from diagnosis.extended import extended_model
-from diagnosis.result import Cause, Estimate
+from reactorwatch.diagnosis.extended import extended_model
+from reactorwatch.diagnosis.fitting.profiles import Course, Decay, Free, Ramp, Sine, Step
+from reactorwatch.diagnosis.result import Cause, Estimate
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr

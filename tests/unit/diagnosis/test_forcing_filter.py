@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from diagnosis.forcing_filter import Linear, smoothed, whitened
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.unknown_input.smoother import Linear, smoothed, whitened
 
 ROWS, N_X, N_Y = 7, 2, 2
 VARIANCE = 0.7

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from diagnosis.courses import Step
-from diagnosis.held_out import gained, held_out_rows
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.run import Run
-from diagnosis.search import Explained
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Step
+from reactorwatch.diagnosis.holdout import gained, held_out_rows
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.search import Explained
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import run_of

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from diagnosis.record_checks import run_of
 from reactorwatch.cli.diagnosis import Asked, case_of
 from reactorwatch.cli.simulation import free_run
+from reactorwatch.diagnosis.record_checks import run_of
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.cstr.model import cstr

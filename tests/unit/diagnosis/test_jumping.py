@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from diagnosis import jumping
-from diagnosis.courses import Constant, Step
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
+from reactorwatch.diagnosis.fitting import grid_search
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Constant, Step
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 
@@ -22,8 +22,8 @@ def test_an_onset_that_no_slope_leads_to_is_found(size: float, onset_min: float)
     run = run_of(f"valve_stiction:step:{size}@{onset_min}min", rows=3000)
     hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
     truth = hypothesis.at(run, (np.array([size, onset_min]),))
-    roughly = jumping.roughly(run, hypothesis, hypothesis.at(run, (np.array([6.3, 40.0]),)))
-    found = jumping.finely(run, hypothesis, roughly)
+    roughly = grid_search.roughly(run, hypothesis, hypothesis.at(run, (np.array([6.3, 40.0]),)))
+    found = grid_search.finely(run, hypothesis, roughly)
     assert found.loss <= truth.loss + 1e-6
     # When it began to stick shows only in where it stands from the next move on that it does not follow.
     after = slice(int(10.0 * onset_min) + 100, None)
@@ -34,7 +34,7 @@ def test_a_size_is_found_between_the_two_moves_that_it_lies_between() -> None:
     run = run_of("valve_stiction:constant:4.0", rows=1500)
     hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Constant(run.time_min),))
     truth = hypothesis.at(run, (np.array([4.0]),))
-    found = jumping.fitted(run, hypothesis, (np.array([1.5]),))
+    found = grid_search.fitted(run, hypothesis, (np.array([1.5]),))
     assert found.loss <= truth.loss + 1e-6
     assert found.theta[0][0] == pytest.approx(4.0, abs=0.5)
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from diagnosis.courses import Free
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.knots import best_resolved, fine
-from diagnosis.search import Explained, Search
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.knot_selection import best_resolved, fine
+from reactorwatch.diagnosis.fitting.profiles import Free
+from reactorwatch.diagnosis.search.search import Explained, Search
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import run_of

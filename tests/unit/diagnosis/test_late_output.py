@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from diagnosis.courses import Constant
-from diagnosis.late_output import moved
-from diagnosis.run import Run
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.measurement_delay import moved
+from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import run_of

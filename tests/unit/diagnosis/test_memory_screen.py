@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from diagnosis.courses import Course, Decay, Ramp, Step
-from diagnosis.memory_screen import MemoryScreen
-from diagnosis.run import Run
-from diagnosis.screen import DECAYS
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.profiles import Course, Decay, Ramp, Step
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.dynamic_effects_screen import MemoryScreen
+from reactorwatch.diagnosis.search.screen import DECAYS
 from reactorwatch.process.library.cstr.effects import EFFECTS
 
 TIME_MIN: Array = np.arange(0.0, 100.0, 0.1)

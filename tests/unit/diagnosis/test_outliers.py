@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from diagnosis.outliers import gross_outliers, outliers, without
-from diagnosis.run import Run
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.outliers import gross_outliers, outliers, without
+from reactorwatch.diagnosis.run import Run
 
 ROWS = 5000
 

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from diagnosis.diagnose import diagnose
-from diagnosis.report.machine import as_object
-from diagnosis.report.page import as_page
-from diagnosis.report.plain import as_text
-from diagnosis.result import NAMED, NOMINAL, UNKNOWN
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.report.machine import as_object
+from reactorwatch.diagnosis.report.page import as_page
+from reactorwatch.diagnosis.report.plain import as_text
+from reactorwatch.diagnosis.result import NAMED, NOMINAL, UNKNOWN
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from diagnosis.bounded_fit import within
-from diagnosis.diagnose import diagnose
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.pair_screen import PairScreen
-from diagnosis.result import NAMED
-from diagnosis.screen import Screen
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.fitting.bounded_least_squares import within
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.result import NAMED
+from reactorwatch.diagnosis.search.pair_screen import PairScreen
+from reactorwatch.diagnosis.search.screen import Screen
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.diagnosis.runs import record_of, run_of

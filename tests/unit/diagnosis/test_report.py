@@ -10,11 +10,11 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from diagnosis.report import mathml
-from diagnosis.report.equations import balances
-from diagnosis.report.page import as_page
-from diagnosis.report.svg import COLUMNS, decimated
-from diagnosis.result import UnknownCourse
+from reactorwatch.diagnosis.report import mathml
+from reactorwatch.diagnosis.report.equations import balances
+from reactorwatch.diagnosis.report.page import as_page
+from reactorwatch.diagnosis.report.svg import COLUMNS, decimated
+from reactorwatch.diagnosis.result import UnknownCourse
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr

@@ -5,13 +5,13 @@ from math import exp
 import numpy as np
 import pytest
 
-from diagnosis.courses import Constant, Free, Ramp, Sine
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.rival import Rival, going_on, probability
-from diagnosis.run import Run
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.experiment.alternative import Rival, going_on, probability
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Constant, Free, Ramp, Sine
+from reactorwatch.diagnosis.run import Run
 from tests.unit.diagnosis.linear_tank import NOISE, NOISE_SD, PERIOD_MIN, RATE, Gain, Shift, explained, follows, tank
 from tests.unit.diagnosis.linear_tank import record as tank_record
 

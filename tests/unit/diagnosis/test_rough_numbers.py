@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from diagnosis.courses import Step
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.record_checks import run_of as of_record
-from diagnosis.result import Estimate
-from diagnosis.rough_numbers import WITHIN_ROW, settled
-from diagnosis.search import Search
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Step
+from reactorwatch.diagnosis.profile_likelihood import WITHIN_ROW, settled
+from reactorwatch.diagnosis.record_checks import run_of as of_record
+from reactorwatch.diagnosis.result import Estimate
+from reactorwatch.diagnosis.search.search import Search
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import named

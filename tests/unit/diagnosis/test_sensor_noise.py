@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from diagnosis.diagnose import diagnose
-from diagnosis.result import UNKNOWN
-from diagnosis.sensor_noise import sensor_noise
-from diagnosis.wandering import Noise, Wandering
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.fitting.colored_noise import Noise, Wandering
+from reactorwatch.diagnosis.result import UNKNOWN
+from reactorwatch.diagnosis.sensor_noise import sensor_noise
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr

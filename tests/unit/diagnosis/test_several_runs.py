@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from diagnosis.diagnose import diagnose
-from diagnosis.held_out import OBSERVED_ROWS, held_out_rows
-from diagnosis.record_checks import run_of
-from diagnosis.report.machine import as_object
-from diagnosis.report.plain import as_text
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.holdout import OBSERVED_ROWS, held_out_rows
+from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.report.machine import as_object
+from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from diagnosis import signatures
-from diagnosis.courses import Constant, Course, Decay, Free, Ramp, Sine, Step
-from diagnosis.hypothesis import Fit, Hypothesis
-from diagnosis.run import Run
-from diagnosis.screen import Screen
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting import signatures
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import Constant, Course, Decay, Free, Ramp, Sine, Step
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.screen import Screen
 from reactorwatch.kalman.error_dynamics import Ways
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS

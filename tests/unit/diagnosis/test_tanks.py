@@ -9,10 +9,10 @@ import json
 import numpy as np
 import pytest
 
-from diagnosis.diagnose import diagnose
-from diagnosis.report.page import as_page
-from diagnosis.report.words import verdict
-from diagnosis.result import NAMED, NOMINAL, Diagnosis
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.report.page import as_page
+from reactorwatch.diagnosis.report.words import verdict
+from reactorwatch.diagnosis.result import NAMED, NOMINAL, Diagnosis
 from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cascaded_tanks.model import tanks

@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from diagnosis.diagnose import diagnose
-from diagnosis.result import NAMED, NOMINAL
-from diagnosis.run import Run
-from diagnosis.sized import Sized
-from diagnosis.uncertain import offsets, stated, with_uncertain
-from diagnosis.wandering import Noise
+from reactorwatch.diagnosis.diagnose import diagnose
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.parameter_priors import offsets, stated, with_uncertain
+from reactorwatch.diagnosis.result import NAMED, NOMINAL
+from reactorwatch.diagnosis.run import Run
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.extended_model import parse_extended_model

@@ -7,13 +7,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from diagnosis.forcing import Forcing
-from diagnosis.hypothesis import Hypothesis
-from diagnosis.run import Run
-from diagnosis.sized import Sized
-from diagnosis.unknown import Located, input_answers, located
-from diagnosis.wandering import Noise
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.unknown_input.forcing import Forcing
+from reactorwatch.diagnosis.unknown_input.localise import Located, input_answers, located
 from reactorwatch.kalman.noise_estimation import tune
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from diagnosis.run import Run
-from diagnosis.sized import Sized
-from diagnosis.wandering import Noise, suspected
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.colored_noise import Noise, suspected
+from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.simulate import Simulator
 

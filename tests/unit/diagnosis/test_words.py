@@ -6,10 +6,10 @@ import re
 import msgspec
 import pytest
 
-from diagnosis.report.machine import as_object, with_differences
-from diagnosis.report.plain import as_text
-from diagnosis.report.words import size_said, verdict, with_interval
-from diagnosis.result import Cause, Diagnosis, Estimate
+from reactorwatch.diagnosis.report.machine import as_object, with_differences
+from reactorwatch.diagnosis.report.plain import as_text
+from reactorwatch.diagnosis.report.words import size_said, verdict, with_interval
+from reactorwatch.diagnosis.result import Cause, Diagnosis, Estimate
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
 from reactorwatch.process.library.cstr.effects import EFFECTS

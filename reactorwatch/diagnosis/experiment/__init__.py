@@ -1,0 +1,1 @@
+"""Design of an experiment that separates explanations."""

@@ -1,0 +1,43 @@
+"""From the causes that were found to the model that has them in it, in the form of its file."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from reactorwatch.diagnosis.result import Cause
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.extended_model import extended_model_of
+from reactorwatch.process.fault import FaultSpecification
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import FREE_NAME, PROFILES, free_profile
+
+WITHIN = 1.0 - 1e-12
+"""Of a knot at an effect's bounds: it is written as a share of the size, and their product is rounded."""
+
+
+def extended_model(
+    model: ProcessModel, effects: Sequence[Effect], causes: Sequence[Cause], zero_ns: int = 0
+) -> dict[str, Any]:
+    """The model with the causes in it, as in its file (`reactorwatch.process.extended_model`).
+
+    Args:
+        model: the simulation; the effects that it has already stay.
+        effects: the catalogue.
+        causes: that were found.
+        zero_ns: what the record's minutes count from; 0: not known.
+    """
+    named = {effect.name: effect for effect in effects}
+    before = extended_model_of(model, effects, zero_ns=zero_ns)
+    found = [_specification(named[cause.cause], cause) for cause in causes]
+    return replace(before, effects=(*before.effects, *found)).to_object()
+
+
+def _specification(effect: Effect, cause: Cause) -> FaultSpecification:
+    values = {name: estimate.value for name, estimate in cause.parameters.items()}
+    size = values["size"] = min(max(values["size"], effect.lower), effect.upper)
+    if cause.profile != FREE_NAME:
+        return FaultSpecification(effect, next(item for item in PROFILES if item.name == cause.profile), values)
+    shares = {name: share for name, share in values.items() if name.startswith("value_")}
+    for name, share in shares.items():
+        values[name] = share if effect.lower <= size * share <= effect.upper else WITHIN * share
+    return FaultSpecification(effect, free_profile(len(shares)), values)

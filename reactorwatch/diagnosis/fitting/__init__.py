@@ -1,0 +1,1 @@
+"""Fits of one explanation to a record: its sizes, times and noise."""

@@ -1,0 +1,113 @@
+"""From a record to a run of a model, and what a record must have so that anything can be said of it."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.impossible_values import check_values
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.errors import InputError
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import Record
+
+FEWEST_ROWS = 200
+FEWEST_VALUES = 100
+"""Of an output: with less nothing can be told from noise."""
+
+LEAST_MOVE = 1e-3
+"""Of an input, in its scales: less is no excitation."""
+
+FEW_ROWS = 10
+"""Of them missing, the plant is followed through; behind more, a filter begins anew."""
+
+_OFF_GRID, _REGULAR = 0.05, 0.95
+"""Rows are on a grid if steps are whole periods, give or take so much of one, in so many of them."""
+
+
+def run_of(record: Record, model: ProcessModel) -> Run:
+    """What of the record the model speaks of.
+
+    Missing inputs are taken to be as they were. Of a record of several runs, the times are `continuous_min`.
+
+    Raises:
+        InputError: too few rows; a signal that is missing, constant or in another unit; a value that it cannot have.
+    """
+    name = record.name
+    if record.rows < FEWEST_ROWS:
+        raise InputError(f"{name}: a diagnosis needs at least {FEWEST_ROWS} rows, got {record.rows}; record for longer")
+    missing = [item for item in (*model.input_names, *model.output_names) if item not in record.columns]
+    if missing:
+        raise InputError(
+            f"{name}: needs the columns {', '.join((*model.input_names, *model.output_names))}, "
+            f"{', '.join(missing)} is not there"
+        )
+    outputs = []
+    for output in model.outputs:
+        values = record.columns[output.name]
+        known = values[np.isfinite(values)]
+        if known.size < FEWEST_VALUES:
+            raise InputError(
+                f"{name}: {output.name} needs at least {FEWEST_VALUES} values, got {known.size}; "
+                "is the column the right one, and is the sensor recorded?"
+            )
+        if np.ptp(known) == 0.0:
+            raise InputError(
+                f"{name}: {output.name} must vary, it is {known[0]:g} {output.unit} in every row; "
+                "the sensor is stuck, or the column is not what it seems"
+            )
+        outputs.append(values)
+    inputs = []
+    for item in model.inputs:
+        values = np.concatenate([_held(part.columns[item.name]) for part in record.each_run()])
+        if not np.all(np.isfinite(values)):
+            of_run = "the first row" if record.runs is None else "the first row of each run"
+            raise InputError(
+                f"{name}: {item.name} must be there in {of_run}; leave out the rows before its first value"
+            )
+        inputs.append(values)
+    wrong = find_wrong_unit(model, record.columns, record.continuous_min)
+    if wrong is not None and not wrong.of_times:
+        raise InputError(f"{name}: {wrong.text}")
+    check_values(record, model)
+    if all(np.ptp(values) <= LEAST_MOVE * item.scale for values, item in zip(inputs, model.inputs, strict=True)):
+        raise InputError(
+            f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} all the time; "
+            "nothing can be told apart without excitation: record a stretch with steps in it"
+        )
+    if wrong is not None:
+        raise InputError(f"{name}: {wrong.text}")
+    there: NDArray[np.bool_] = np.column_stack([np.isfinite(record.columns[item.name]) for item in model.inputs])
+    u = np.column_stack(inputs)
+    time_min, starts = record.continuous_min, record.run_starts[1:]
+    breaks, few = _breaks(time_min, u, there)
+    return Run(time_min, u, np.column_stack(outputs), tuple(sorted({*breaks, *starts})), few, starts)
+
+
+def _breaks(
+    time_min: Array, inputs: Array, known: NDArray[np.bool_]
+) -> tuple[tuple[int, ...], NDArray[np.intp] | None]:
+    """Rows whose inputs differ from those of the row before, with rows missing between them or the inputs in it.
+
+    Nobody knows when they changed. Where rows are irregular by nature none is taken to be missing.
+
+    Returns:
+        Those before which too much is missing, and how many are before the others (see `Run.missing`).
+    """
+    step = np.diff(time_min)
+    period = float(np.median(step))
+    counts = step / period
+    regular = np.mean(np.abs(counts - np.round(counts)) < _OFF_GRID) > _REGULAR
+    changed = np.any(np.diff(inputs, axis=0) != 0.0, axis=1)
+    missing = np.round(counts).astype(np.intp) - 1
+    short = changed & regular & (missing > 0) & (missing <= FEW_ROWS) & np.all(known[:-1], axis=1)
+    long = changed & ((counts > 1.5) & regular | ~np.all(known[:-1], axis=1)) & ~short
+    few = np.append(0, np.where(short, missing, 0))
+    return tuple((np.flatnonzero(long) + 1).tolist()), few if np.any(short) else None
+
+
+def _held(values: Array) -> Array:
+    """With what is missing as it was before."""
+    places = np.where(np.isfinite(values), np.arange(values.size), -1)
+    places = np.maximum.accumulate(places)
+    return np.where(places >= 0, values[np.maximum(places, 0)], np.nan)

@@ -1,0 +1,130 @@
+"""A diagnosis as an object for JSON; what is no finite number is null."""
+
+from math import isfinite
+from typing import Any
+
+from reactorwatch.diagnosis.difference import Difference
+from reactorwatch.diagnosis.result import Cause, Diagnosis, Estimate, Experiment, HeldOut
+
+
+def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None = None) -> dict[str, Any]:
+    """The object that `diagnose --json` prints.
+
+    Args:
+        diagnosis: of the file.
+        file: as it was named.
+        seconds: that the diagnosis took.
+        zero: clock time that the minutes count from; None: not known.
+    """
+    experiment = diagnosis.experiment
+    return {
+        "file": file,
+        "zero": zero,
+        "samples": diagnosis.samples,
+        "runs": diagnosis.runs,
+        "span_min": _number(diagnosis.span_min),
+        "seconds": _number(round(seconds, 3)),
+        "verdict": diagnosis.verdict,
+        "causes": [_cause(cause, diagnosis.runs) for cause in diagnosis.causes],
+        "alternatives": [
+            {
+                "causes": [_cause(cause, diagnosis.runs) for cause in item.explanation],
+                "delta_bic": _number(item.delta_bic),
+            }
+            for item in diagnosis.alternatives
+        ],
+        "location": diagnosis.location or None,
+        "significant": bool(diagnosis.significant),
+        "practical": bool(diagnosis.practical),
+        "gain": {
+            "delta_bic": _number(diagnosis.gain.delta_bic),
+            "held_out": {name: _held_out(item) for name, item in diagnosis.gain.held_out.items()},
+        },
+        "adequacy": {name: {"minus_log10_p": _number(value)} for name, value in diagnosis.adequacy.items()},
+        "experiment": None if experiment is None else _experiment(experiment),
+        "extended_model": diagnosis.extended_model,
+        **({"parameters": _parameters(diagnosis)} if diagnosis.parameters else {}),
+    }
+
+
+def _cause(cause: Cause, runs: int) -> dict[str, Any]:
+    return {
+        "cause": cause.cause,
+        "profile": cause.profile,
+        "label": cause.label,
+        "location": cause.location,
+        **({"run": cause.run} if runs > 1 else {}),
+        "parameters": {name: _estimate(item) for name, item in cause.parameters.items()},
+    }
+
+
+def _parameters(diagnosis: Diagnosis) -> dict[str, Any]:
+    """Those that were stated to be uncertain."""
+    return {
+        name: {"nominal": _number(item.nominal), "stated_sd": _number(item.stated_sd), **_estimate(item.estimate)}
+        for name, item in diagnosis.parameters.items()
+    }
+
+
+def with_differences(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None = None) -> dict[str, Any]:
+    """The same, and where the simulation differs from the record: what report.json holds."""
+    differences = {name: _difference(item) for name, item in diagnosis.differences.items()}
+    return as_object(diagnosis, file, seconds, zero) | {"differences": differences}
+
+
+def _experiment(experiment: Experiment) -> dict[str, Any]:
+    return {
+        "why": experiment.why,
+        "input": [[_number(minute), _number(value)] for minute, value in experiment.input],
+        "separates": list(experiment.separates),
+        "signal": experiment.signal,
+        "span_min": _number(experiment.span_min),
+        "expected_delta_bic": _number(experiment.expected_delta_bic),
+        "probability": _number(experiment.probability),
+        "limits": {name: list(ends) for name, ends in experiment.limits.items()},
+        "expected": [
+            {
+                "between": list(item.between),
+                "delta_bic": _number(item.expected_delta_bic),
+                "probability": _number(item.probability),
+            }
+            for item in experiment.apart
+        ],
+        "predicted": {
+            rival: {name: list(ends) for name, ends in ranges.items()} for rival, ranges in experiment.predicted.items()
+        },
+    }
+
+
+def _estimate(estimate: Estimate) -> dict[str, Any]:
+    return {"value": _number(estimate.value), "sd": _number(estimate.sd), "unit": estimate.unit}
+
+
+def _difference(item: Difference) -> dict[str, Any]:
+    return {
+        "rmse": _number(item.rmse),
+        "noise_sd": _number(item.noise_sd),
+        "noise_share": _number(item.noise_share),
+        "one_step": _number(item.one_step),
+        "unit": item.unit,
+        "along": {
+            axis: [
+                {"from": part.lower, "to": part.upper, "mean": part.mean, "rmse": part.rmse, "rows": part.rows}
+                for part in ranges
+            ]
+            for axis, ranges in item.along.items()
+        },
+    }
+
+
+def _held_out(item: HeldOut) -> dict[str, Any]:
+    return {
+        "rmse_before": _number(item.rmse_before),
+        "rmse_after": _number(item.rmse_after),
+        "noise_sd": _number(item.noise_sd),
+        "unit": item.unit,
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if isfinite(value) else None

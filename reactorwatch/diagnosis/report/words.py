@@ -1,0 +1,221 @@
+"""What a diagnosis says, in words."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import floor, isfinite, log10
+
+import numpy as np
+
+from reactorwatch.diagnosis.difference import TIME, Difference
+from reactorwatch.diagnosis.result import (
+    AMBIGUOUS,
+    NAMED,
+    NOMINAL,
+    SD_95,
+    Adjusted,
+    Cause,
+    Curves,
+    Diagnosis,
+    Estimate,
+    HeldOut,
+)
+from reactorwatch.process.effect import Effect
+
+MOSTLY_NOISE, WORSE = 0.9, 1.2
+"""Of the mean square error: nothing worth locating is left. Times the error of all rows: a range is told as worse."""
+
+PLACES = {
+    "mass_balance": "in the mass balance",
+    "energy_balance": "in the energy balance",
+    "reaction": "in the reaction",
+    "feed": "in the feed",
+    "coolant": "on the side of the coolant",
+    "temperature_sensor": "in the measurement of the temperature",
+    "concentration_sensor": "in the measurement of the concentration",
+    "timing": "in the times of the record",
+}
+"""Of causes, by their location, where it takes more words than the name of the location."""
+
+
+def verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
+    """The answer, in a sentence or two."""
+    off = [name for name, item in diagnosis.parameters.items() if item.off]
+    if diagnosis.verdict == NOMINAL and off:
+        return (
+            f"The simulation is right within what was stated of its parameters: {' and '.join(off)} "
+            f"{'is' if len(off) == 1 else 'are'} a little off, and what the record shows beyond that is noise."
+        )
+    if diagnosis.verdict == NOMINAL:
+        return "The simulation is right: what the record shows beyond it is noise."
+    if diagnosis.verdict == AMBIGUOUS:
+        explanations = [diagnosis.causes, *(item.explanation for item in diagnosis.alternatives)]
+        names = [" with ".join(f"{item.label} ({when(item)})" for item in causes) for causes in explanations]
+        return (
+            f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {in_practice(diagnosis)}"
+        )
+    if diagnosis.verdict == NAMED:
+        causes = [f"{cause.label}, {when(cause, diagnosis.curves)}" for cause in diagnosis.causes]
+        return f"The simulation is wrong: {'; and '.join(causes)}. {in_practice(diagnosis)}"
+    return (
+        f"The simulation is wrong, and no known cause explains it; it acts {place(diagnosis)}. {in_practice(diagnosis)}"
+    )
+
+
+def in_practice(diagnosis: Diagnosis) -> str:
+    """Whether it matters."""
+    return "It matters in practice." if diagnosis.practical else "In practice the difference is too small to matter."
+
+
+def place(diagnosis: Diagnosis) -> str:
+    """Where it acts."""
+    if not diagnosis.location:
+        return "where this record does not tell"
+    return place_of(diagnosis.location)
+
+
+def place_of(location: str) -> str:
+    """Where that is.
+
+    >>> place_of("upper_tank")
+    'in the upper tank'
+    """
+    return PLACES.get(location, f"in the {location.replace('_', ' ')}")
+
+
+def when(cause: Cause, curves: Curves | None = None) -> str:
+    """Since when, or how it goes in time."""
+    if cause.profile == "constant":
+        return "all the time"
+    if cause.profile == "sine":
+        return f"swinging with a period of {with_interval(cause.parameters['period'])}"
+    if cause.profile == "free":
+        largest = "" if curves is None else f", largest at {_largest_min(cause, curves):.4g} min"
+        return f"changing over the record{largest}"
+    since = f"since {with_interval(cause.parameters['onset'])}"
+    if cause.run > 1:
+        since += f" of run {cause.run}"
+    if cause.profile == "ramp":
+        return f"growing {since}"
+    return f"settling {since}" if cause.profile == "decay" else since
+
+
+def size_said(cause: Cause, effects: Sequence[Effect]) -> str:
+    """Size of a cause in its unit and meaning with its 95 % interval, and the part of the profile it belongs to.
+
+    Args:
+        cause: of an explanation.
+        effects: the catalogue, where it has its meaning.
+    """
+    of_what = {"ramp": " at the end", "decay": " in the end", "sine": " to either side", "free": " at its largest"}
+    return _describe_size(cause, effects) + of_what.get(cause.profile, "")
+
+
+def describe_explanation(causes: Sequence[Cause], effects: Sequence[Effect]) -> str:
+    """Causes that explain a record together, each with its size and since when."""
+    return " with ".join(
+        f"{item.label} ({item.cause}, {item.profile}): {size_said(item, effects)}, {when(item)}" for item in causes
+    )
+
+
+def _describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
+    size = cause.parameters["size"]
+    effect = next((item for item in effects if item.name == cause.cause), None)
+    if effect is None or not effect.larger:
+        return with_interval(size)
+    share = "{} %" in effect.larger
+    amount = replace(size, value=100.0 * size.value, sd=100.0 * size.sd, unit="%") if share else size
+    if cause.profile == "sine":  # whose sign says nothing
+        return with_interval(amount)
+    text = effect.larger
+    if amount.value < 0.0 and effect.smaller:
+        text, amount = effect.smaller, replace(amount, value=-amount.value)
+    value, half = round_estimate(amount)
+    unit = "" if amount.unit == "1" else f" {amount.unit}"
+    return text.format(value) + (f" (± {half}{unit})" if half else "")
+
+
+def causes_said(causes: Sequence[tuple[str, str]], effects: Sequence[Effect]) -> str:
+    """Causes that explain a record together, as people call them.
+
+    Args:
+        causes: (cause, profile) of each.
+        effects: the catalogue.
+    """
+    named = {effect.name: effect for effect in effects}
+    labels = []
+    for cause, profile in causes:
+        effect = named.get(cause)
+        label = cause if effect is None else effect.labels.get(profile, effect.label)
+        labels.append(f"{label} ({cause}, {profile})")
+    return " with ".join(labels)
+
+
+def with_interval(estimate: Estimate) -> str:
+    """A number and half the width of its 95 % interval, with its unit.
+
+    >>> with_interval(Estimate(-0.0499634, 8.5e-5, "1"))
+    '-0.04996 ± 0.00017'
+    >>> with_interval(Estimate(299.9, 0.0, "min"))
+    '299.9 min'
+    """
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    value, half = round_estimate(estimate)
+    return f"{value} ± {half}{unit}" if half else f"{value}{unit}"
+
+
+def round_estimate(estimate: Estimate) -> tuple[str, str]:
+    """A number and half the width of its 95 % interval with as many decimals; the latter empty if it is not known.
+
+    The interval has one digit, or two if it begins with a 1.
+
+    >>> round_estimate(Estimate(14.998, 0.0127, "%"))
+    ('15.00', '0.02')
+    """
+    half = SD_95 * estimate.sd
+    if not (isfinite(half) and half > 0.0):
+        return f"{estimate.value:.5g}", ""
+    first = floor(log10(half))
+    decimals = -first + (half < 2.0 * 10.0**first)
+    if decimals < 0:
+        return f"{round(estimate.value, decimals):.0f}", f"{round(half, decimals):.0f}"
+    return f"{estimate.value:.{decimals}f}", f"{half:.{decimals}f}"
+
+
+def adjusted_said(item: Adjusted) -> str:
+    """An uncertain parameter as the record has it, beside what was stated."""
+    stated = Estimate(item.nominal, item.stated_sd, item.estimate.unit)
+    return f"{with_interval(item.estimate)}; stated: {with_interval(stated)}"
+
+
+def error_said(value: float, unit: str) -> str:
+    """A root mean square error; a free run that came to an end has none."""
+    return f"{value:.3g} {unit}" if isfinite(value) else "none, it ran away"
+
+
+def error_left(name: str, item: HeldOut, *, improved: bool) -> str:
+    """The error of the free run on rows that the fit did not see, in one line."""
+    before = f", before {error_said(item.rmse_before, item.unit)}" if improved else ""
+    return f"{name} off by {error_said(item.rmse_after, item.unit)}{before}; noise {item.noise_sd:.3g} {item.unit}"
+
+
+def difference_said(name: str, item: Difference) -> str:
+    """By how much the simulation errs, where most, and how much of it is noise, in a sentence."""
+    if not isfinite(item.rmse):
+        return f"{name}: the simulation ran away from the record."
+    said = f"{name}: the simulation errs by {item.rmse:.3g} {item.unit}, {_percent(item.noise_share)} of it noise"
+    if item.noise_share > MOSTLY_NOISE:
+        return f"{said}."
+    places = [
+        f"{'from' if axis == TIME else f'at {axis}'} {part.lower:.4g} to {part.upper:.4g} {unit} ({part.rmse:.3g})"
+        for axis, unit in item.units.items()
+        if (part := item.worst(axis)) is not None and part.rmse > WORSE * item.rmse
+    ]
+    return f"{said}; most {', '.join(places)}." if places else f"{said}; everywhere alike."
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
+
+
+def _largest_min(cause: Cause, curves: Curves) -> float:
+    return float(curves.time_min[int(np.argmax(np.abs(curves.deviation[cause.cause])))])

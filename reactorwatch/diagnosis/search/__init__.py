@@ -1,0 +1,1 @@
+"""Search for the explanation that fits a record best."""

@@ -1,0 +1,1 @@
+"""Localisation of a deviation that no known effect explains."""
