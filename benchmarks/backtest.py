@@ -9,8 +9,8 @@ charts' limits and compiles the filters.
 import time
 from collections.abc import Callable, Iterable
 
-from monitor_node import backtest
 from monitor_node.config import MonitorConfig
+from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, decode, encode

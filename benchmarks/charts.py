@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from monitor_node.alarm_board import AlarmBoard
-from monitor_node.chart_watch import OF_ALL, OF_EACH, ChartWatch
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.chart_stage import OF_ALL, OF_EACH, ChartWatch
 from monitor_node.config import ChartName, MonitorConfig
 from reactorwatch.spc import run_length
 from reactorwatch.spc.charts.base import Bank, SignalChart

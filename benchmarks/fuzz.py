@@ -21,11 +21,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from monitor_node.baseline.signal_range import ranges_of
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.monitor import FleetMonitor
-from monitor_node.fleet.shards import WHOLE, Crew
-from monitor_node.signal_range import ranges_of
+from monitor_node.fleet.sharding import WHOLE, Crew
 from plant_node.config import PlantConfig
 from plant_node.node import PlantNode
 from plant_node.record import plant_from, simulate_record

@@ -18,11 +18,11 @@ from collections.abc import Iterable
 from statistics import median
 from typing import NamedTuple
 
+from monitor_node.baseline.signal_range import ranges_of
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation, Suspect
-from monitor_node.signal_range import ranges_of
-from monitor_node.suspicion import preparation
+from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation, Suspect
+from monitor_node.isolation.stage import preparation
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode

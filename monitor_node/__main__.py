@@ -12,14 +12,14 @@ from pathlib import Path
 
 import structlog
 
-from monitor_node import suspicion
-from monitor_node.alarm_commands import COMMANDS
-from monitor_node.alarm_file import AlarmFile
+from monitor_node.alarms.commands import COMMANDS
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.health import NODE
+from monitor_node.isolation import stage
 from monitor_node.other_monitors import OtherMonitors, log_report
-from monitor_node.state_file import StateFile
+from monitor_node.storage.alarm_file import AlarmFile
+from monitor_node.storage.state_file import StateFile
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
@@ -199,7 +199,7 @@ def run(
         InputError: settings that the bus cannot use, or a damaged file of alarm states.
     """
     node = MonitorNode(config, time.time_ns())
-    node.preparation = suspicion.preparation(config, node.model)
+    node.preparation = stage.preparation(config, node.model)
     with served(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:

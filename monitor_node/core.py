@@ -11,20 +11,20 @@ anything says the same, value for value.
 from collections.abc import Iterable
 from typing import Any
 
-from monitor_node.alarm_board import AlarmBoard
-from monitor_node.alarm_commands import obey
-from monitor_node.alignment import Aligner, Row
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.commands import obey
+from monitor_node.baseline.training import NO_VALUE
 from monitor_node.config import MonitorConfig
 from monitor_node.failures import Failures
 from monitor_node.health import NODE, health_of
-from monitor_node.monitor_state import MonitorState, opened, sealed, settings_of
-from monitor_node.receipt import HEARD_AGAIN_NS, STALL_NS, Receipt
-from monitor_node.refusals import Refusals
-from monitor_node.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, unusable
-from monitor_node.sample_run import Held, SampleRun
-from monitor_node.told_again import ToldAgain
-from monitor_node.training import NO_VALUE
-from monitor_node.watch import PlantWatch
+from monitor_node.ingest.alignment import Aligner, Row
+from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, Receipt
+from monitor_node.ingest.rejects import Refusals
+from monitor_node.ingest.replay_filter import ToldAgain
+from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, unusable
+from monitor_node.ingest.sequence_check import Held, SampleRun
+from monitor_node.pipeline import PlantWatch
+from monitor_node.state.monitor_state import MonitorState, opened, sealed, settings_of
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
@@ -221,7 +221,7 @@ class Monitor:
         """Go on from what `to_bytes` returned, of a monitor with the same settings.
 
         Samples that were heard before may come again, until `caught_up`: they are counted as duplicated, and passed
-        over (see `told_again`).
+        over (see `replay_filter`).
 
         Raises:
             InputError: the bytes are not that; everything is as before.

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from monitor_node.alignment import Counts
+from monitor_node.ingest.alignment import Counts
 from reactorwatch import __version__
 from reactorwatch.contract.messages_pb2 import Health
 

@@ -1,7 +1,7 @@
 """Other monitors of the same plants, found by their liveliness tokens.
 
 Two monitors of one plant raise every alarm twice, and both answer commands. Monitors that divide plants among
-themselves are one group: the crew of a fleet (see `fleet.shards`). A monitor of one plant is a group of its own. Each
+themselves are one group: the crew of a fleet (see `fleet.sharding`). A monitor of one plant is a group of its own. Each
 group is reported once, with the first plant that it watches as well, and once more when its last monitor has gone.
 
 >>> ours, fleet = keys.monitor_token("a", "01"), keys.fleet_token("0f", "1", "1", keys.fleet_member("02", "reactor/*"))

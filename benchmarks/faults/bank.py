@@ -1,6 +1,6 @@
 """Which faults, how large, when: the cases of the bank.
 
-Every cause that the monitor compares (see `monitor_node.isolation_causes`) sets in as a step, and three of them as a
+Every cause that the monitor compares (see `isolation.isolation.causes`) sets in as a step, and three of them as a
 ramp too, each in three sizes: small is about the smallest that the oracle (see `oracle`) finds within an hour, medium
 eight times as much, and large ten times that: as gross as the report's method needs. Large faults that cool the reactor
 put it out: that is noted, not avoided.

@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.faults.bank import BANK, Case
 from benchmarks.faults.runs import NOISE_SD, Truth, measured_of, profile_changes, simulator_of
-from monitor_node.isolation_causes import CAUSES
+from monitor_node.isolation.causes import CAUSES
 from plant_node.scenario import SIGNAL
 from reactorwatch.arrays import Array
 from reactorwatch.process.effect import Effect

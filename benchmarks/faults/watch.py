@@ -6,8 +6,8 @@ from math import inf
 
 from benchmarks.faults.bank import TRAINING_MIN, TWINS
 from benchmarks.faults.score import Interval
-from monitor_node import backtest
 from monitor_node.config import MonitorConfig
+from monitor_node.replay import backtest
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.records.record import Record, to_minutes

@@ -25,7 +25,7 @@ import msgspec
 from benchmarks.soak.memory import GROWTH_MB, Taken, find_growth_mb, most_in_thirds
 from benchmarks.soak.plan import PERIOD_MIN, Plan
 from benchmarks.soak.site import WATCH
-from monitor_node import backtest
+from monitor_node.replay import backtest
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Alarm, Health

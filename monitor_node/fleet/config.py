@@ -2,7 +2,7 @@
 
 import msgspec
 
-from monitor_node.fleet import shards
+from monitor_node.fleet import sharding
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 
@@ -28,6 +28,6 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.plants is not None:
             keys.checked_plants(self.plants)
         try:
-            shards.parsed(self.shard)
+            sharding.parsed(self.shard)
         except InputError as error:
             raise ValueError(str(error)) from error

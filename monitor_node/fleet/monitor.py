@@ -18,16 +18,16 @@ Nothing here reads a clock or does I/O.
 
 from collections.abc import Callable, Iterable, Iterator
 
-from monitor_node.arrivals import Arrivals, Past, cut
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.alarms import AlarmsBefore, alarm_of
-from monitor_node.fleet.dues import NEVER_NS
-from monitor_node.fleet.recent import Recent
-from monitor_node.fleet.shards import Crew
-from monitor_node.fleet.strangers import PROVEN_MESSAGES, PROVEN_ROWS, Strangers
-from monitor_node.fleet.watched import State, WatchedPlants
-from monitor_node.recorded_lives import SILENCE
+from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, Strangers
+from monitor_node.fleet.deadline_queue import NEVER_NS
+from monitor_node.fleet.handed_over_alarms import AlarmsBefore, alarm_of
+from monitor_node.fleet.recently_adopted import Recent
+from monitor_node.fleet.sharding import Crew
+from monitor_node.fleet.watched_plants import State, WatchedPlants
+from monitor_node.ingest.pending import Arrivals, Past, cut
+from monitor_node.replay.recorded_sessions import SILENCE
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
@@ -264,7 +264,7 @@ class FleetMonitor:
         Args:
             plant: its name.
             now_ns: now.
-            vouched: whether it is certain that there is such a plant; if not, see `strangers`.
+            vouched: whether it is certain that there is such a plant; if not, see `admission`.
         """
         if plant in self._met:
             if vouched:

@@ -6,24 +6,24 @@ from pathlib import Path
 
 import structlog
 
-from monitor_node.alarm_commands import COMMANDS
-from monitor_node.alarm_kpis import are_of_nothing
+from monitor_node.alarms.commands import COMMANDS
+from monitor_node.alarms.kpis import are_of_nothing
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet import shards
-from monitor_node.fleet.absence import Absence
+from monitor_node.fleet import sharding
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import FleetMonitor
-from monitor_node.fleet.pasts import Pasts
-from monitor_node.fleet.shards import Crew
-from monitor_node.fleet.states import FleetStates
-from monitor_node.fleet.watched import WatchedPlants
+from monitor_node.fleet.partition import Absence
+from monitor_node.fleet.sharding import Crew
+from monitor_node.fleet.watched_plants import WatchedPlants
 from monitor_node.health import NODE
-from monitor_node.kept_aside import DAMAGED, OTHER_SETTINGS
-from monitor_node.monitor_state import OtherSettingsError
+from monitor_node.ingest.rejects import Refusals
 from monitor_node.other_monitors import OtherMonitors, log_report
-from monitor_node.refusals import Refusals
-from monitor_node.seal import ForeignFileError
+from monitor_node.state.monitor_state import OtherSettingsError
+from monitor_node.state.seal import ForeignFileError
+from monitor_node.storage.fleet_states import FleetStates
+from monitor_node.storage.kept_aside import DAMAGED, OTHER_SETTINGS
+from monitor_node.storage.state_recovery import Pasts
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, CommandReply
@@ -102,7 +102,7 @@ class FleetNode(FleetMonitor):
         self._rate, self._commands_refused = CommandRate(), Refusals()
         # The older of two with the same shard is in charge: names sort by the time of the start.
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
-        self.crew = Crew(self.expression, shards.parsed(fleet.shard), name)
+        self.crew = Crew(self.expression, sharding.parsed(fleet.shard), name)
         self._others = OtherMonitors(self.crew.token, lambda: self.plants)
         model = model_on_the_bus(config.model)
         super().__init__(

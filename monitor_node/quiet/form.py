@@ -10,16 +10,18 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from monitor_node.alarm_board import AlarmBoard, BoardState
-from monitor_node.alarm_kpis import KpiState
-from monitor_node.alarm_states import State
-from monitor_node.alarms import AlarmMemory
-from monitor_node.alignment import REMEMBERED, AlignmentState
-from monitor_node.chart_watch import ChartsState, alarm_names
+from monitor_node.alarms.alarms import AlarmMemory
+from monitor_node.alarms.annunciator import AlarmBoard, BoardState
+from monitor_node.alarms.incidents import Incident
+from monitor_node.alarms.kpis import KpiState
+from monitor_node.alarms.states import State
+from monitor_node.baseline.references import ProcessReferenceState
+from monitor_node.chart_stage import ChartsState, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.incidents import Incident
-from monitor_node.monitor_state import MonitorState
+from monitor_node.ingest.alignment import REMEMBERED, AlignmentState
+from monitor_node.ingest.sampling import SamplingState
+from monitor_node.isolation.stage import SuspicionState
 from monitor_node.quiet.layout import Records, record_type
 from monitor_node.quiet.learned import (
     EqualRuns,
@@ -40,10 +42,8 @@ from monitor_node.quiet.lining_up import (
     write_runs,
 )
 from monitor_node.quiet.ring import NewestRows, times_ns_of
-from monitor_node.references import ProcessReferenceState
-from monitor_node.sampling import SamplingState
-from monitor_node.suspicion import SuspicionState
-from monitor_node.watch_state import WatchedState, WatchState
+from monitor_node.state.monitor_state import MonitorState
+from monitor_node.state.pipeline_state import WatchedState, WatchState
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import AlarmKpis
 from reactorwatch.contract.sample_bytes import unit_digest

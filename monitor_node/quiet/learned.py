@@ -6,12 +6,12 @@ from typing import TypeAlias
 import msgspec
 import numpy as np
 
-from monitor_node.references import ProcessReferenceState
-from monitor_node.signal_watch import SignalsState
-from monitor_node.silence import SilenceState, Spacing
-from monitor_node.spike import SpikeState
-from monitor_node.stuck import StuckState, most_equal
-from monitor_node.watch_state import WatchedState, WatchState
+from monitor_node.baseline.references import ProcessReferenceState
+from monitor_node.signal_checks.spike import SpikeState
+from monitor_node.signal_checks.stage import SignalsState
+from monitor_node.signal_checks.stuck import StuckState, most_equal
+from monitor_node.signal_checks.timeout import SilenceState, Spacing
+from monitor_node.state.pipeline_state import WatchedState, WatchState
 from reactorwatch.kalman.ekf import FilterState, NoiseLevels, variances
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from monitor_node.alignment import AlignmentState, Counts, Waiting
-from monitor_node.alignment import Sequence as Numbering
-from monitor_node.sample_run import MEMORY as FULL_RUN
-from monitor_node.sample_run import SampleRun
+from monitor_node.ingest.alignment import AlignmentState, Counts, Waiting
+from monitor_node.ingest.alignment import Sequence as Numbering
+from monitor_node.ingest.sequence_check import MEMORY as FULL_RUN
+from monitor_node.ingest.sequence_check import SampleRun
 
 COUNTS = ("rows", "incomplete_rows", "late", "duplicated", "out_of_order", "lost", "restarts")
 

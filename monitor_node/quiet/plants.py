@@ -6,21 +6,21 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.alignment import Counts, Row
+from monitor_node.baseline.references import GATE, ProcessReference
+from monitor_node.baseline.signal_range import ranges_of
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.health import NODE, health_of
-from monitor_node.monitor_state import sealed, settings_of
+from monitor_node.ingest.alignment import Counts, Row
+from monitor_node.ingest.receive_stats import STALL_NS, Receipt
+from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.lining_up import COUNTS
 from monitor_node.quiet.ring import kept_spacings, kept_values
 from monitor_node.quiet.rows import NEW_MINUTE, judge
 from monitor_node.quiet.samples import silent_from, take_samples
 from monitor_node.quiet.slots import NEVER_NS, Slots
-from monitor_node.receipt import STALL_NS, Receipt
-from monitor_node.references import GATE, ProcessReference
-from monitor_node.sample_limits import LARGEST_SAMPLE, USABLE
-from monitor_node.signal_range import ranges_of
+from monitor_node.state.monitor_state import sealed, settings_of
 from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of

@@ -18,12 +18,12 @@ from typing import Any
 
 import numpy as np
 
+from monitor_node.ingest.sampling import WHOLE
 from monitor_node.quiet.layout import LEVELS, Array, Bytes, Ints, Places, Records
 from monitor_node.quiet.ring import VALUE_BYTES, ZERO
 from monitor_node.quiet.samples import allowed_ns
-from monitor_node.sampling import WHOLE
-from monitor_node.silence import MEMORY
-from monitor_node.stuck import AT_REST, STRETCH
+from monitor_node.signal_checks.stuck import AT_REST, STRETCH
+from monitor_node.signal_checks.timeout import MEMORY
 from reactorwatch.codegen.numba_kernel import call_at, compiled
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import LARGEST_VALUE, LOWER, OUT, PRESENT, SETTINGS, STATISTIC, UPPER, X

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS
+from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_VALUE
+from monitor_node.ingest.sequence_check import ALIKE, TOLERANCE
+from monitor_node.ingest.sequence_check import DEVIATIONS as RUN_DEVIATIONS
+from monitor_node.ingest.sequence_check import MEMORY as RUN_MEMORY
 from monitor_node.quiet.layout import Array, Ints, Places, Records
-from monitor_node.receipt import HEARD_AGAIN_NS
-from monitor_node.sample_limits import LARGEST_NUMBER, LARGEST_VALUE
-from monitor_node.sample_run import ALIKE, TOLERANCE
-from monitor_node.sample_run import DEVIATIONS as RUN_DEVIATIONS
-from monitor_node.sample_run import MEMORY as RUN_MEMORY
-from monitor_node.silence import BURST, DEVIATIONS, LEARN_FROM, MEMORY
+from monitor_node.signal_checks.timeout import BURST, DEVIATIONS, LEARN_FROM, MEMORY
 from reactorwatch.codegen.numba_kernel import compiled
 
 # Under names of this module: compiled code keeps them as they are now.

@@ -7,8 +7,8 @@ from typing import Any
 
 import msgspec
 
-from monitor_node.backtest import run
 from monitor_node.config import MonitorConfig
+from monitor_node.replay.backtest import run
 from reactorwatch.cli.batch import Answer, Kind, Row, as_table
 from reactorwatch.cli.options import existing_recording
 from reactorwatch.cli.reports import backtest_object, backtest_text

@@ -22,9 +22,9 @@ def add_to(app: typer.Typer) -> None:
 
 def compile_kernels() -> None:
     """Compile the numerical kernels once, so that no first start has to: half a minute on a new machine."""
-    from monitor_node import backtest
     from monitor_node.config import MonitorConfig
-    from monitor_node.fleet.watched import WatchedPlants
+    from monitor_node.fleet.watched_plants import WatchedPlants
+    from monitor_node.replay import backtest
     from plant_node.config import PlantConfig
     from plant_node.record import simulate_record
     from reactorwatch.cli.progress import task

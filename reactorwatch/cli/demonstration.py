@@ -10,8 +10,8 @@ import threading
 import time
 from pathlib import Path
 
-from monitor_node import backtest
 from monitor_node.config import MonitorConfig
+from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from reactorwatch.cli.joining import VIEWER, heard_by, joining, open_router, write_node_settings
 from reactorwatch.cli.printing import say, say_text

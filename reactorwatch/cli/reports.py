@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from monitor_node.backtest import Backtest
+from monitor_node.replay.backtest import Backtest
 from reactorwatch.contract.messages_pb2 import Alarm, Priority
 from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.records.record import to_minutes

@@ -12,7 +12,7 @@ import msgspec
 import structlog
 
 from monitor_node.config import MonitorConfig
-from monitor_node.watch import check_promise
+from monitor_node.pipeline import check_promise
 from plant_node.config import PlantConfig
 from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.joining import VIEWER, Joining, heard_by, joining, open_router, write_node_settings

@@ -6,9 +6,9 @@ from typing import Any
 
 import msgspec
 
-from monitor_node.comparison import Difference
 from monitor_node.config import MonitorConfig
-from monitor_node.verification import COMPARED, Verification, verify
+from monitor_node.replay.message_diff import Difference
+from monitor_node.replay.verification import COMPARED, Verification, verify
 from reactorwatch import __version__
 from reactorwatch.cli.printing import say_text
 from reactorwatch.cli.progress import task

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 from google.protobuf.message import Message
 
 from benchmarks.link_cuts import Router, connected
-from monitor_node import backtest
 from monitor_node.config import MonitorConfig
+from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from reactorwatch.cli.processes import MODULES, Processes, write_settings
 from reactorwatch.cli.sources import messages

@@ -103,7 +103,7 @@ def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun) -> None:
     """It has a clock of its own, and publishes for half of the run, a sample after each of the first plant's.
 
     Two free processes would not do: the second counts as a restart of the first while a busy machine holds that up for
-    eight samples (`sample_run`).
+    eight samples (`sequence_check`).
     """
     second, numbers = connected(run.config), defaultdict[str, Iterator[int]](itertools.count)
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from monitor_node.verification import verify
+from monitor_node.replay.verification import verify
 from reactorwatch.cli.sources import messages
 
 from .live_run import PLANT, LiveRun

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.link_cuts import Heard, Proxy, Router, connected
-from monitor_node.alarm_commands import COMMANDS
+from monitor_node.alarms.commands import COMMANDS
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from plant_node.__main__ import serve_plant

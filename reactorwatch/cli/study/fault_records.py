@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from monitor_node.alarms.on_off_delay import Persistence
 from monitor_node.config import MonitorConfig
-from monitor_node.persistence import Persistence
 from plant_node.presets import ONSET_MIN, PRESETS
 from reactorwatch.arrays import Array
 from reactorwatch.cli.study.canvas import GREEN, ORANGE, label, panels

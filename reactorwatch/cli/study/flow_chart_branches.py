@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from monitor_node import backtest
 from monitor_node.config import MonitorConfig
+from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.presets import PRESETS
 from plant_node.record import simulate_record

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.faults.bank import AFTER_MIN, BANK, GRADES, ONSET_MIN, TWINS, Case, Fault, cases
 from benchmarks.faults.runs import NOISE_SD, fault_free, record_of, truth_of
-from monitor_node.isolation_causes import CAUSES
+from monitor_node.isolation.causes import CAUSES
 from plant_node.initial_state import start_state
 from reactorwatch.arrays import Array
 from reactorwatch.process.fault import parse_fault

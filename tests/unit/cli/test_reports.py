@@ -5,8 +5,8 @@ from typing import Literal
 
 import pytest
 
-from monitor_node.backtest import Backtest, run
 from monitor_node.config import MonitorConfig
+from monitor_node.replay.backtest import Backtest, run
 from reactorwatch.cli.reports import backtest_object, backtest_text
 from tests.unit.monitor_node.samples import leaking_run, samples
 

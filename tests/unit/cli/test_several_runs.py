@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monitor_node.backtest import run as watch
 from monitor_node.config import MonitorConfig
+from monitor_node.replay.backtest import run as watch
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import HeldRecord

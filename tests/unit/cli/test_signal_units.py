@@ -8,9 +8,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from monitor_node.alarms import quantity
-from monitor_node.backtest import Backtest, run
+from monitor_node.alarms.alarms import quantity
 from monitor_node.config import MonitorConfig
+from monitor_node.replay.backtest import Backtest, run
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli import identification

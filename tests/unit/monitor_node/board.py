@@ -4,8 +4,8 @@ from typing import TypeVar
 
 from google.protobuf.message import Message
 
-from monitor_node.alarm_board import AlarmBoard
-from monitor_node.alarms import ChartAlarm
+from monitor_node.alarms.alarms import ChartAlarm
+from monitor_node.alarms.annunciator import AlarmBoard
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis

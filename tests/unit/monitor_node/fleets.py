@@ -7,7 +7,7 @@ import msgspec
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.monitor import FleetMonitor
-from monitor_node.fleet.shards import WHOLE, Crew, Shard
+from monitor_node.fleet.sharding import WHOLE, Crew, Shard
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Health

@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor_node import backtest
-from monitor_node.alarm_states import Event, State
-from monitor_node.alarms import SuspectedCause
+from monitor_node.alarms.alarms import SuspectedCause
+from monitor_node.alarms.states import Event, State
 from monitor_node.config import MonitorConfig
+from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode

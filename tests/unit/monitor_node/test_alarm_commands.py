@@ -6,7 +6,7 @@ import pytest
 from google.protobuf.message import Message
 
 from monitor_node.__main__ import MonitorNode
-from monitor_node.alarm_commands import COMMANDS
+from monitor_node.alarms.commands import COMMANDS
 from monitor_node.config import MonitorConfig
 from plant_node.node import COMMANDS as PLANT_COMMANDS
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode_message

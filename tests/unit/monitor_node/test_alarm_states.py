@@ -6,8 +6,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor_node.alarm_states import OUT_OF_SIGHT, TABLE, ByCondition, Event, Refused, State, diagram, fits, next_state
-from monitor_node.alarms import STATES
+from monitor_node.alarms.alarms import STATES
+from monitor_node.alarms.states import (
+    OUT_OF_SIGHT,
+    TABLE,
+    ByCondition,
+    Event,
+    Refused,
+    State,
+    diagram,
+    fits,
+    next_state,
+)
 from reactorwatch.contract.messages_pb2 import AlarmState
 from reactorwatch.errors import InputError
 
@@ -78,7 +88,7 @@ def test_no_sequence_of_events_leaves_the_table_or_loses_the_condition(events: l
 
 def test_the_diagram_of_the_docs_is_drawn_from_the_table() -> None:
     assert f"```mermaid\n{diagram()}\n```" in DOCUMENT.read_text(encoding="utf-8"), (
-        "docs/alarms.md: put what monitor_node.alarm_states.diagram() returns between the lines of its mermaid block"
+        "docs/alarms.md: put what monitor_node.alarms.states.diagram() returns between the lines of its mermaid block"
     )
 
 

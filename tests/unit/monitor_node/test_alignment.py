@@ -5,7 +5,7 @@ import random
 
 import pytest
 
-from monitor_node.alignment import Aligner, Row
+from monitor_node.ingest.alignment import Aligner, Row
 
 SIGNALS = ("qc", "C", "T")
 PERIOD = 100

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from monitor_node.chart_watch import OF_ALL, OF_EACH
+from monitor_node.chart_stage import OF_ALL, OF_EACH
 from monitor_node.config import ChartName, MonitorConfig
 from reactorwatch.spc.charts.cusum import CEILING, Cusum
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from monitor_node.baseline.outlier_blocks import undisturbed
+from monitor_node.baseline.resolution import resolution
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.resolution import resolution
-from monitor_node.undisturbed import undisturbed
 
 from .samples import Rows
 from .test_many_outputs import config_of, plant, raised, watch

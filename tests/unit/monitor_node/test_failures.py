@@ -5,18 +5,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from monitor_node.alarm_board import AlarmBoard
-from monitor_node.chart_watch import ChartWatch
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.chart_stage import ChartWatch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.failures import Failures
-from monitor_node.isolation import Isolation
-from monitor_node.isolation_bank import Scan
-from monitor_node.isolation_fit import _begun
-from monitor_node.isolation_window import Window
+from monitor_node.isolation.fit import _begun
+from monitor_node.isolation.glr_scan import Scan
+from monitor_node.isolation.isolation import Isolation
+from monitor_node.isolation.window import Window
+from monitor_node.pipeline import PlantWatch
 from monitor_node.quiet.form import QuietForm
-from monitor_node.signal_watch import SignalWatch
-from monitor_node.watch import PlantWatch
+from monitor_node.signal_checks.stage import SignalWatch
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError

@@ -7,13 +7,13 @@ from typing import Any
 import pytest
 
 from monitor_node import __main__ as monitor_main
-from monitor_node import suspicion
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet import node as fleet_node
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
-from monitor_node.isolation_window import MOST_PIECES, newest_rows
+from monitor_node.isolation import stage
+from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
+from monitor_node.isolation.window import MOST_PIECES, newest_rows
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.codegen.array_function import ArrayFunction
@@ -104,7 +104,7 @@ def test_looks_of_a_monitor_that_is_prepared_compile_nothing(work: Work, monkeyp
     monkeypatch.setattr(Isolation, "suspects", noted)
     monitor = Monitor(CONFIG, 0, points=False, model=replace(cstr()))
     work.forget()
-    assert sum(1 for _ in suspicion.preparation(CONFIG, monitor.model)) > 10
+    assert sum(1 for _ in stage.preparation(CONFIG, monitor.model)) > 10
     assert work.made > 40
     for message in samples(*leaking_run(-0.2, 18.0, 23.0, seed=3)):
         monitor.on_message(message, 0)
@@ -114,7 +114,7 @@ def test_looks_of_a_monitor_that_is_prepared_compile_nothing(work: Work, monkeyp
 
 @pytest.mark.parametrize("config", [MonitorConfig(isolation=False), MonitorConfig(reference="arx")])
 def test_a_monitor_that_looks_for_no_causes_prepares_nothing(config: MonitorConfig) -> None:
-    assert list(suspicion.preparation(config, Monitor(config, 0).model)) == []
+    assert list(stage.preparation(config, Monitor(config, 0).model)) == []
 
 
 def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,10 +123,10 @@ def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pyt
     def fail(_: object) -> None:
         raise RuntimeError("made on purpose")
 
-    monkeypatch.setattr("monitor_node.isolation_hypothesis.Hypothesis.prepare", fail)
-    assert len(list(suspicion.preparation(CONFIG, cstr()))) == 2
-    monkeypatch.setattr("monitor_node.isolation.Bank", fail)
-    assert list(suspicion.preparation(CONFIG, cstr())) == []
+    monkeypatch.setattr("monitor_node.isolation.hypothesis.Hypothesis.prepare", fail)
+    assert len(list(stage.preparation(CONFIG, cstr()))) == 2
+    monkeypatch.setattr("monitor_node.isolation.isolation.Bank", fail)
+    assert list(stage.preparation(CONFIG, cstr())) == []
     monitor = Monitor(CONFIG, 0, points=False)
     for message in samples(*leaking_run(-0.2, 18.0, 20.0, seed=3)):
         monitor.on_message(message, 0)
@@ -154,7 +154,7 @@ def test_a_monitor_prepares_part_by_part_once_it_listens_and_then_no_more(monkey
         def close(self) -> None:
             """Nothing is open."""
 
-    monkeypatch.setattr(suspicion, "preparation", preparation)
+    monkeypatch.setattr(stage, "preparation", preparation)
     monkeypatch.setattr(monitor_main, "serve", serve)
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_: Closed())
     monitor_main.run(MonitorConfig(), BusConfig())
@@ -168,7 +168,7 @@ def test_a_fleet_prepares_before_it_joins_the_bus(monkeypatch: pytest.MonkeyPatc
         done.append("prepared")
         yield
 
-    monkeypatch.setattr(suspicion, "preparation", preparation)
+    monkeypatch.setattr(stage, "preparation", preparation)
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_, **__: done.append("connected"))
     fleet_node.run(CONFIG, FleetConfig(plants="reactor/*"), BusConfig())
     assert done == ["prepared", "connected"]

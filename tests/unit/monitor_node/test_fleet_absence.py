@@ -4,8 +4,8 @@ import tracemalloc
 
 import pytest
 
-from monitor_node.arrivals import Past
-from monitor_node.fleet.shards import Shard, home
+from monitor_node.fleet.sharding import Shard, home
+from monitor_node.ingest.pending import Past
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 

@@ -9,11 +9,11 @@ import pytest
 
 from monitor_node.core import Monitor
 from monitor_node.fleet import node as fleet_node
-from monitor_node.fleet import pasts
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import LOOK_EVERY_NS, FleetNode
-from monitor_node.fleet.shards import Crew, Shard, home
-from monitor_node.fleet.states import FleetStates
+from monitor_node.fleet.sharding import Crew, Shard, home
+from monitor_node.storage import state_recovery
+from monitor_node.storage.fleet_states import FleetStates
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
@@ -58,7 +58,7 @@ class Bench:
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Bench]:
     """One of two monitors, both of whose shards it has, or a single one."""
     for name in ("SETTLE_S", "RETURN_S", "LOOK_AGAIN_S"):
-        monkeypatch.setattr(pasts, name, 0.0)
+        monkeypatch.setattr(state_recovery, name, 0.0)
     bench = Bench(tmp_path, getattr(request, "param", "1/2"))
     for _ in range(101):  # the other was never seen
         bench.tick()

@@ -2,7 +2,7 @@
 
 import pytest
 
-from monitor_node.fleet.shards import Crew, Shard, home, keeper, parsed
+from monitor_node.fleet.sharding import Crew, Shard, home, keeper, parsed
 from reactorwatch.errors import InputError
 
 NAMES = [f"plant_{number}" for number in range(3000)]

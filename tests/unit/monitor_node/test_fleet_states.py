@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from monitor_node.fleet.states import FleetStates
+from monitor_node.storage.fleet_states import FleetStates
 from reactorwatch.errors import InputError
 
 

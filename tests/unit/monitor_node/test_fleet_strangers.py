@@ -2,8 +2,8 @@
 
 import pytest
 
-from monitor_node.arrivals import Past
-from monitor_node.fleet.shards import Shard, home
+from monitor_node.fleet.sharding import Shard, home
+from monitor_node.ingest.pending import Past
 from reactorwatch.contract.codec import Encoded
 
 from .fleets import SECOND_NS, fleet, noting, run_of, shard_token

@@ -7,9 +7,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from monitor_node.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, Suspect
-from monitor_node.isolation_causes import CAUSES
-from monitor_node.isolation_window import Row
+from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, Suspect
+from monitor_node.isolation.window import Row
 from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.model import cstr

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from monitor_node.isolation_bank import Bank, Scan, spread_onsets
-from monitor_node.isolation_causes import CAUSES
-from monitor_node.isolation_hypothesis import Hypothesis
-from monitor_node.isolation_stretch import Stretch
-from monitor_node.isolation_window import Window, window_of
+from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.glr_scan import Bank, Scan, spread_onsets
+from monitor_node.isolation.hypothesis import Hypothesis
+from monitor_node.isolation.segment import Stretch
+from monitor_node.isolation.window import Window, window_of
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.model import cstr

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor_node.alarm_board import STOPPED
+from monitor_node.alarms.annunciator import STOPPED
+from monitor_node.baseline.signal_range import ranges_of
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, UNKNOWN, Isolation
-from monitor_node.reconstruction import START_STEPS, START_STEPS_A_ROW, Reconstruction
-from monitor_node.signal_range import ranges_of
+from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, UNKNOWN, Isolation
+from monitor_node.isolation.reconstruction import START_STEPS, START_STEPS_A_ROW, Reconstruction
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.kalman.ekf import Filter

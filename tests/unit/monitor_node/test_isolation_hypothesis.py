@@ -5,10 +5,10 @@ from math import inf, sqrt
 import numpy as np
 import pytest
 
-from monitor_node.isolation_causes import CAUSES
-from monitor_node.isolation_hypothesis import Descent, Hypothesis
-from monitor_node.isolation_stretch import HUBER, LOST, Stretch
-from monitor_node.isolation_window import Window, window_of
+from monitor_node.isolation.causes import CAUSES
+from monitor_node.isolation.hypothesis import Descent, Hypothesis
+from monitor_node.isolation.segment import HUBER, LOST, Stretch
+from monitor_node.isolation.window import Window, window_of
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.model import cstr

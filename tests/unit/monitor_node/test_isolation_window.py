@@ -5,7 +5,7 @@ from math import nan
 import numpy as np
 import pytest
 
-from monitor_node.isolation_window import BURN_IN_ROWS, Row, Window, window_of
+from monitor_node.isolation.window import BURN_IN_ROWS, Row, Window, window_of
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.library.cstr.model import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of

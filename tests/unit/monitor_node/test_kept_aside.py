@@ -11,13 +11,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from monitor_node.__main__ import MonitorNode
-from monitor_node.alarm_file import SEAL
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet import pasts
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.node import LOOK_EVERY_NS, FleetNode
-from monitor_node.fleet.states import FleetStates
-from monitor_node.kept_aside import find_kept_aside, keep_aside
+from monitor_node.storage import state_recovery
+from monitor_node.storage.alarm_file import SEAL
+from monitor_node.storage.fleet_states import FleetStates
+from monitor_node.storage.kept_aside import find_kept_aside, keep_aside
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
 from reactorwatch.errors import InputError
@@ -303,7 +303,7 @@ def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: li
 
 @pytest.fixture(autouse=True)
 def _no_settling(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pasts, "SETTLE_S", 0.0)
+    monkeypatch.setattr(state_recovery, "SETTLE_S", 0.0)
 
 
 def fleet_of(folder: Path, order: int, rows: list[Encoded]) -> FleetNode:

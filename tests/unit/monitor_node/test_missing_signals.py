@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from monitor_node import backtest
-from monitor_node.backtest import Backtest
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.replay import backtest
+from monitor_node.replay.backtest import Backtest
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.records.record import MINUTE_NS

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from google.protobuf.message import Message
 
-from monitor_node import backtest
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
+from monitor_node.replay import backtest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import (

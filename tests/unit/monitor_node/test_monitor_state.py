@@ -9,7 +9,7 @@ import pytest
 
 from monitor_node.config import ChartName, MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.monitor_state import MAGIC, SEAL, OtherSettingsError
+from monitor_node.state.monitor_state import MAGIC, SEAL, OtherSettingsError
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, Health, ShelveAlarm

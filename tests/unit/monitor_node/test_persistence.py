@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor_node.persistence import Persistence
+from monitor_node.alarms.on_off_delay import Persistence
 from reactorwatch.spc.charts.shewhart import probability_out
 from reactorwatch.spc.m_of_n import false_alarm_rate
 

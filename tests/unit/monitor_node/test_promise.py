@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from monitor_node import backtest
 from monitor_node.config import MonitorConfig
+from monitor_node.replay import backtest
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.simulate import Simulator
 

@@ -7,10 +7,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from monitor_node.alarm_board import BoardState
+from monitor_node.alarms.annunciator import BoardState
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.monitor_state import MonitorState
+from monitor_node.state.monitor_state import MonitorState
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Health, Quality, Sample
 

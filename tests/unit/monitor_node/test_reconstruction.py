@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from monitor_node.isolation_window import Row
-from monitor_node.reconstruction import Reconstruction
+from monitor_node.isolation.reconstruction import Reconstruction
+from monitor_node.isolation.window import Row
 from plant_node.config import NoiseSd
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import NoiseLevels

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from monitor_node.sample_run import CONFIRMED, Held, SampleRun
+from monitor_node.ingest.sequence_check import CONFIRMED, Held, SampleRun
 
 PERIOD = 6_000_000_000
 REORDER_ROWS = 8

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from monitor_node.baseline.references import ArxReference, ProcessReference
+from monitor_node.baseline.signal_range import ANY, ranges_of
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.references import ArxReference, ProcessReference
-from monitor_node.signal_range import ANY, ranges_of
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.process.library.cascaded_tanks.model import tanks

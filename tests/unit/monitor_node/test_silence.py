@@ -5,7 +5,7 @@ from math import nan
 import numpy as np
 import pytest
 
-from monitor_node.silence import NOTHING, Change, Silence, SilenceState
+from monitor_node.signal_checks.timeout import NOTHING, Change, Silence, SilenceState
 from reactorwatch.errors import InputError
 
 PERIOD = 6_000_000_000  # ns of the plant's time

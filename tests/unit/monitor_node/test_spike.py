@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from monitor_node.spike import Spike, SpikeState, false_spike_rate, spike_limit
+from monitor_node.signal_checks.spike import Spike, SpikeState, false_spike_rate, spike_limit
 from reactorwatch.errors import InputError
 
 LIMIT = 6.0

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal, stats
 
-from monitor_node.stuck import SMALLEST, Stuck, StuckState, most_equal, upper_bound
+from monitor_node.signal_checks.stuck import SMALLEST, Stuck, StuckState, most_equal, upper_bound
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Judgement
 

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from monitor_node.alignment import Aligner
-from monitor_node.backtest import Backtest, run
 from monitor_node.config import MonitorConfig
+from monitor_node.ingest.alignment import Aligner
+from monitor_node.replay.backtest import Backtest, run
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import MINUTE_NS, Record
 from recorder.player import samples_of

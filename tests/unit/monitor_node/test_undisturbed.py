@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from monitor_node.undisturbed import undisturbed
+from monitor_node.baseline.outlier_blocks import undisturbed
 
 
 def noise(seed: int, phi: float = 0.0, rows: int = 1000) -> np.ndarray:

@@ -2,8 +2,8 @@
 
 import pytest
 
-from monitor_node.backtest import run
 from monitor_node.config import MonitorConfig
+from monitor_node.replay.backtest import run
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode

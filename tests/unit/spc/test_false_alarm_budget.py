@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from monitor_node.persistence import Persistence
+from monitor_node.alarms.on_off_delay import Persistence
 from reactorwatch.errors import InputError
 from reactorwatch.spc import false_alarm_budget as budget
 from reactorwatch.spc.charts.base import Bank, SignalChart

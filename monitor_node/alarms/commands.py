@@ -1,0 +1,56 @@
+"""What people may ask of the alarms, by the queryables `reactor/{plant}/command/{name}`."""
+
+from collections.abc import Mapping
+
+from google.protobuf.message import Message
+
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.states import Event
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.commands import command_in, signed
+from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms, ShelveAlarm
+
+EVENTS: Mapping[str, Event] = {
+    event.replace(" ", "_"): event
+    for event in (
+        Event.ACKNOWLEDGE,
+        Event.UNSHELVE,
+        Event.SUPPRESS,
+        Event.UNSUPPRESS,
+        Event.TAKE_OUT_OF_SERVICE,
+        Event.RETURN_TO_SERVICE,
+    )
+}
+COMMANDS: Mapping[str, type[Message]] = {
+    **dict.fromkeys(EVENTS, AlarmCommand),
+    "shelve": ShelveAlarm,
+    "comment": AlarmCommand,
+    "list_alarms": ListAlarms,
+}
+"""The commands and what they carry."""
+
+
+def obey(board: AlarmBoard, question: Encoded) -> tuple[CommandReply, list[Publication]]:
+    """Do what is asked.
+
+    Returns:
+        The answer, with the alarms that were asked about, and what is to be published.
+
+    Raises:
+        InputError: it cannot be done; nothing has changed.
+        DecodeError: the payload is not what the command carries; nothing has changed.
+    """
+    name, command = command_in(question, COMMANDS)
+    if isinstance(command, ListAlarms):
+        alarms = board.all_alarms()
+        return CommandReply(accepted=True, text=f"{len(alarms)} alarms", alarms=alarms), []
+    assert isinstance(command, AlarmCommand | ShelveAlarm), "the catalogue holds no others"
+    by, comment = signed(command.by, command.comment)
+    if isinstance(command, ShelveAlarm):
+        said = board.shelve(command.alarm, command.minutes, by, comment)
+    elif name == "comment":
+        said = board.comment(command.alarm, by, comment)
+    else:
+        said = board.act(command.alarm, EVENTS[name], by, comment)
+    alarm = board.alarm(command.alarm)
+    return CommandReply(accepted=True, text=f"alarm {command.alarm}: {name} by {by}", alarms=[alarm]), said

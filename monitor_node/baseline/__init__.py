@@ -1,0 +1,1 @@
+"""The training: what is learned of a plant before it is watched."""

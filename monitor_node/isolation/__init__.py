@@ -1,0 +1,1 @@
+"""Isolation of the likely cause after an alarm."""

@@ -1,0 +1,491 @@
+"""The watch over a plant, row by row: it learns what is normal, then judges what comes.
+
+A row goes this way: the identified models predict it and learn from it; while the plant is in training it is kept, and
+afterwards the reference predicts it, its residuals are prewhitened, and the charts judge what remains. The reference is
+frozen: a model that goes on adapting would learn a fault and call it normal. It goes on adapting beside it, and how
+far it has gone from the reference is told as drift.
+"""
+
+from collections.abc import Iterator, Sequence
+from math import isfinite, nan
+
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.baseline.predictor import ArxPredictor
+from monitor_node.baseline.references import (
+    ArxReference,
+    ArxReferenceState,
+    ProcessReference,
+    ProcessReferenceState,
+    Reference,
+)
+from monitor_node.baseline.signal_range import ranges_of
+from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Trained, Training
+from monitor_node.chart_stage import ChartWatch, alarm_names
+from monitor_node.config import MonitorConfig
+from monitor_node.drift_stage import DriftWatch
+from monitor_node.failures import Failures
+from monitor_node.ingest.alignment import Row
+from monitor_node.ingest.sampling import SamplingPeriod
+from monitor_node.isolation.stage import Suspicion, has_causes
+from monitor_node.signal_checks.stage import SignalWatch
+from monitor_node.state.pipeline_state import WatchedState, WatchState
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Check, Estimate, ModelSnapshot, Parameter
+from reactorwatch.errors import InputError
+from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.charts.parameters import ParameterT2
+from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
+
+
+def check_promise(config: MonitorConfig, period_min: float) -> None:
+    """Check that the false alarms that the settings promise can be kept where every output is watched.
+
+    Args:
+        config: how the plant is watched.
+        period_min: of the rows.
+
+    Raises:
+        InputError: charts cannot keep the promise.
+    """
+    outputs = len(config.outputs)
+    of_drift = outputs if ParameterT2.name in config.charts else 0
+    alarms = len(alarm_names(config)) + SignalWatch.CHANCE_ALARMS * outputs + of_drift
+    false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
+
+
+class PlantWatch:
+    """Watches one plant.
+
+    Args:
+        config: of the monitor.
+        board: the alarms of the plant.
+        points: whether estimates, charts' points and models are to be published.
+        model: as for `Monitor`.
+        failures: where errors of the search for causes are counted; None: in an object of its own.
+
+    Raises:
+        InputError: the settings ask for the process model of a plant that it is not of.
+
+    Attributes:
+        model: that the plant may be watched by; None: there is none.
+        notes: what people are to be told, oldest first; whoever tells them empties it.
+        rows_watched: rows that were judged.
+        left_out: signals that are not watched, each with the reason; known when the training ends.
+        signals: the watch over the signals themselves.
+    """
+
+    def __init__(
+        self,
+        config: MonitorConfig,
+        board: AlarmBoard,
+        *,
+        points: bool = True,
+        model: ProcessModel | None = None,
+        failures: Failures | None = None,
+    ) -> None:
+        self._config = config
+        self._failures = Failures() if failures is None else failures
+        self._board = board
+        self._points = points
+        self.model = _model(config, model)
+        self._is_process = self._is_said_to_be_process = model is not None or config.reference == "process"
+        self._sampling = SamplingPeriod()
+        self._charts = ChartWatch(config, board)
+        self.signals = SignalWatch(config, board, ranges_of(self.model, (config.input, *config.outputs)))
+        self._drift = DriftWatch(config, board, told=points)
+        self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
+        self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
+        self._refusals = 0
+        self._checks: list[Check] = []
+        self._reference: Reference | None = None
+        self._whiteners: list[Prewhitener] = []
+        self._whitened_sds: list[float] = []
+        self._suspicion: Suspicion | None = None
+        self._arl0 = 0.0
+        self._withheld = (False,) * len(config.outputs)
+        self._evaluated = [True] * len(config.outputs)
+        self._begin_training(None)
+        self._promise_checked = False
+        self.notes: list[str] = []
+        self.rows_watched = 0
+        self.left_out: dict[str, str] = {}
+
+    # --- what survives a restart -----------------------------------------------------------------------------
+
+    @property
+    def state(self) -> WatchState:
+        """A copy of all that is remembered, but for the alarms; between two rows."""
+        return WatchState(
+            self._sampling.copied(),
+            self.signals.state,
+            [predictor.state for predictor in self._predictors],
+            self._refusals,
+            self._began_ns,
+            self._training.state,
+            None if self._reference is None else self._watched(self._reference),
+        )
+
+    def _watched(self, reference: Reference) -> WatchedState:
+        return WatchedState(
+            reference.state,
+            [(check.name, check.result) for check in self._checks],
+            dict(self.left_out),
+            [whitener.state for whitener in self._whiteners],
+            self._charts.state,
+            None if self._suspicion is None else self._suspicion.state,
+            self._arl0,
+            list(self._withheld),
+            self.rows_watched,
+            self._drift.until_next,
+        )
+
+    def restore(self, state: WatchState, now_ns: int) -> None:
+        """Go on, bit for bit, where a watch with the same settings was when `state` was taken; after the board.
+
+        Args:
+            state: of the other watch.
+            now_ns: when the plant is listened to again.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+        self._sampling.state = state.sampling
+        self.signals.restore(state.signals, now_ns)
+        for predictor, of_predictor in zip(self._predictors, state.predictors, strict=True):
+            predictor.restore(of_predictor)
+        self._refusals, self._began_ns = state.refusals, state.began_ns
+        self._training.restore(state.training)
+        watched = state.watched
+        if watched is None:
+            return
+        self._drift.until_next = watched.until_drift
+        self._checks = [Check(name=name, result=result) for name, result in watched.checks]
+        learned = [item.learned for item in watched.whiteners]
+        outputs = len(self._config.outputs)
+        if not len(learned) == len(watched.withheld) == outputs:
+            raise ValueError(f"the state must be of {outputs} outputs, got {len(learned)}")
+        self._leave_out(watched.left_out)
+        self._judge_by(self._reference_of(watched.reference), learned, watched.arl0)
+        self._whiteners = [Prewhitener.from_state(item) for item in watched.whiteners]
+        self._charts.restore(watched.charts, self._evaluated)
+        if (watched.suspicion is None) != (self._suspicion is None):
+            raise ValueError("the state must tell of the search for causes as it is set")
+        if self._suspicion is not None and watched.suspicion is not None:
+            self._suspicion.restore(watched.suspicion)
+        self._withheld, self.rows_watched = tuple(watched.withheld), watched.rows_watched
+
+    def _reference_of(self, state: ProcessReferenceState | ArxReferenceState) -> Reference:
+        if isinstance(state, ArxReferenceState):
+            return ArxReference.from_state(state)
+        if self.model is None:
+            raise ValueError("the state must be of a plant without a process model")
+        return ProcessReference.from_state(state, self.model, self._config.outputs)
+
+    @property
+    def watching(self) -> bool:
+        """Whether rows are judged."""
+        return self._reference is not None
+
+    @property
+    def reference(self) -> str:
+        """The kind of reference that judges rows: `equations` or `arx`; empty before there is one."""
+        return "" if self._reference is None else self._reference.kind
+
+    @property
+    def noise_levels(self) -> dict[str, dict[str, float]] | None:
+        """The noise levels that the equations judge by, see `ProcessReference`; None where they do not judge."""
+        return self._reference.noise_levels if isinstance(self._reference, ProcessReference) else None
+
+    def trained_share(self, last_ns: int | None) -> float:
+        """The share of the training that is done, 0 to 1, after a row."""
+        if self.watching:
+            return 1.0
+        if self._began_ns is None or last_ns is None:
+            return 0.0
+        return min(max((last_ns - self._began_ns) / MINUTE_NS / self._config.training_min, 0.0), 1.0)
+
+    @property
+    def refused_trainings(self) -> int:
+        """Number of trainings that were not fit to learn from."""
+        return self._refusals
+
+    @property
+    def expected_false_alarms(self) -> float:
+        """Alarms that chance alone would have raised by now, on average."""
+        return self.rows_watched * self._chance_alarms / self._arl0 if self._arl0 else 0.0
+
+    def update(self, row: Row, units: list[str], publications: list[Publication]) -> None:
+        """Take a row in.
+
+        Args:
+            row: input first, then the outputs.
+            units: of the outputs.
+            publications: what is to be published is added here.
+        """
+        time_ns = row.time_ns
+        follows = self._sampling.follows(time_ns) and not row.restarted
+        publications.extend(self.signals.hear(time_ns, row.values))
+        measured = self.signals.measured(time_ns, row.values, publications) if self._is_process else row.values
+        input_value, *values = measured
+        if self._reference is None:
+            self._train(time_ns, input_value, values, units, publications, follows=follows)
+        else:
+            if row.restarted:
+                self.signals.begin_anew()
+            self._judge(time_ns, input_value, values, units, publications, follows=follows)
+
+    def snapshots(self, time_ns: int) -> list[Publication]:
+        """The models of each output as they are now: the one that adapts, the one held since the training, the judge.
+
+        Where the equations judge, the held one is compared with the one that adapts, and judges nothing.
+        """
+        told: list[Publication] = []
+        if not self._points:
+            return told
+        reference = self._reference
+        for key, output, predictor in zip(self._model_keys, self._config.outputs, self._predictors, strict=True):
+            adaptive, held = predictor.adaptive(), predictor.reference()
+            equations = _judge_of(reference, output) if isinstance(reference, ProcessReference) else None
+            if held is not None:
+                held.held, held.reference = True, isinstance(reference, ArxReference)
+            for snapshot in (held, equations):
+                if snapshot is not None:
+                    snapshot.checks.extend(self._checks)
+            for snapshot in (adaptive, held, equations):
+                if snapshot is not None:
+                    snapshot.time_ns = time_ns
+                    told.append(Publication(key, snapshot))
+        return told
+
+    # --- training --------------------------------------------------------------------------------------------
+
+    def _begin_training(self, time_ns: int | None) -> None:
+        config = self._config
+        self._began_ns = time_ns
+        self._predictors: list[ArxPredictor] = [
+            ArxPredictor(config.order, config.delay, config.forgetting, described=self._points) for _ in config.outputs
+        ]
+        self._training: Training = Training(config, self.model, self._predictors)
+
+    def _train(
+        self,
+        time_ns: int,
+        input_value: float,
+        values: list[float],
+        units: list[str],
+        publications: list[Publication],
+        *,
+        follows: bool,
+    ) -> None:
+        config = self._config
+        if not self._promise_checked and self._sampling.state.period_ns is not None:
+            check_promise(config, self._sampling.period_ns / MINUTE_NS)
+            self._promise_checked = True
+        if self._began_ns is None or time_ns < self._began_ns:
+            self._began_ns = time_ns
+        trained_min = (time_ns - self._began_ns) / MINUTE_NS
+        if trained_min >= config.training_min and self._training.is_enough(self.signals.silent[1:]):
+            trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
+            if trained.refused:
+                self._refusals += 1
+                self.notes.append(f"the training begins anew: {trained.refused}")
+                self._begin_training(time_ns)
+            else:
+                self._start(trained)
+                self._judge(time_ns, input_value, values, units, publications, follows=follows)
+                publications.extend(self.snapshots(time_ns))
+                return
+        self._training.add(time_ns, input_value, values)
+        if not self._points:
+            for predictor, value in zip(self._predictors, values, strict=True):
+                predictor.put_by(time_ns, input_value, value, follows=follows)
+        else:
+            predictions = [
+                predictor.update(time_ns, input_value, value, follows=follows)
+                for predictor, value in zip(self._predictors, values, strict=True)
+            ]
+            for key, prediction, value, unit in zip(self._estimate_keys, predictions, values, units, strict=True):
+                residual = value - prediction
+                if isfinite(residual):
+                    publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
+
+    def _leave_out(self, left_out: dict[str, str]) -> None:
+        """Watch all signals but these."""
+        self.left_out = dict(left_out)
+        self._evaluated = [name not in left_out for name in self._config.outputs]
+
+    @property
+    def _chance_alarms(self) -> int:
+        """Number of alarms that chance can raise."""
+        of_signals = SignalWatch.CHANCE_ALARMS * sum(self._evaluated)
+        return self._charts.chance_alarms + of_signals + self._drift.chance_alarms(self._evaluated)
+
+    def _start(self, trained: Trained) -> None:
+        self._leave_out(trained.left_out)
+        unmade = self._charts.choose(self._evaluated, trained.e)
+        trained.checks.extend(
+            Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
+        )
+        asked, period_min = self._config.false_alarms_per_30_days, self._sampling.period_ns / MINUTE_NS
+        promised = false_alarm_budget.promise_per_30_days(asked, self._chance_alarms, period_min)
+        if asked is None and promised != false_alarm_budget.USUAL_PER_30_DAYS:
+            text = (
+                f"{promised:.3g} false alarms in 30 days are promised instead of "
+                f"{false_alarm_budget.USUAL_PER_30_DAYS:g}: that is the nearest that the charts can keep for "
+                f"{self._chance_alarms} alarms and rows every {period_min:.3g} min"
+            )
+            trained.checks.append(Check(name="promise", result=text))
+        arl0 = false_alarm_budget.share_arl0(promised, self._chance_alarms, period_min)
+        self._checks = trained.checks
+        self._judge_by(trained.reference, trained.learned, arl0)
+        self._whiteners = [Prewhitener(item) for item in trained.learned]
+        self._charts.start(trained.learned, trained.e, self._arl0)
+        self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
+        self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
+        notes = [check.result for check in trained.checks if check.result != "ok"]
+        self.notes += [f"training: {note}" for note in notes]
+
+    def _judge_by(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
+        """From now on rows are judged by this reference."""
+        self._reference, self._arl0 = reference, arl0
+        self._is_process = self._is_said_to_be_process or isinstance(reference, ProcessReference)
+        self._whitened_sds = [item.sd for item in learned]
+        self._suspicion = self._new_suspicion(reference)
+
+    def _new_suspicion(self, reference: Reference) -> Suspicion | None:
+        if not (isinstance(reference, ProcessReference) and has_causes(self._config, reference.model)):
+            return None
+        return Suspicion(self._config, self._board, reference)
+
+    def _search_causes(
+        self, time_ns: int, input_value: float, values: list[float], units: list[str], stuck: list[bool]
+    ) -> list[Publication]:
+        """Look for the causes of alarms; an error there costs what the search remembers, and no alarm."""
+        assert self._suspicion is not None
+        try:
+            return self._suspicion.update(time_ns, input_value, values, units, stuck)
+        except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+            self._failures.add("isolation", error, "the search for the cause of this alarm starts again")
+            assert self._reference is not None
+            self._suspicion = self._new_suspicion(self._reference)
+            return []
+
+    # --- watching --------------------------------------------------------------------------------------------
+
+    def _judge(
+        self,
+        time_ns: int,
+        input_value: float,
+        values: list[float],
+        units: list[str],
+        publications: list[Publication],
+        *,
+        follows: bool,
+    ) -> None:
+        reference = self._reference
+        assert reference is not None
+        if self.left_out:
+            self._note_late_signals(input_value, values)
+            input_value = 0.0 if self._config.input in self.left_out else input_value  # as in the training
+            values = [value if evaluated else nan for value, evaluated in zip(values, self._evaluated, strict=True)]
+        publications.extend(self.signals.look(time_ns, values, units))
+        stuck = self.signals.stuck
+        if True in stuck:
+            values = [nan if still else value for value, still in zip(values, stuck, strict=True)]
+        if isinstance(reference, ArxReference):
+            reference.predictions = [
+                predictor.update(time_ns, input_value, value, follows=follows)
+                for predictor, value in zip(self._predictors, values, strict=True)
+            ]
+        elif self._drift.wanted:
+            for predictor, value in zip(self._predictors, values, strict=True):
+                predictor.put_by(time_ns, input_value, value, follows=follows)
+        if self._sampling.gap:  # nobody knows what the input did in it
+            reference.restart()
+            self.signals.restart()
+            for whitener in self._whiteners:
+                whitener.restart()
+        missing = self._sampling.missing
+        predictions, sds = reference.update(time_ns, input_value, values, self._withheld, missing)
+        scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
+        if self._points:
+            publications.extend(self._estimates(time_ns, values, predictions, sds, scales, units))
+        e = [
+            whitener.update((value - prediction) / sd)
+            for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
+        ]
+        self.rows_watched += 1
+        withheld, told = self.signals.withheld(time_ns, e, scales, units)
+        self._withheld = withheld
+        publications.extend(told)
+        if True in withheld:
+            for whitener, outlier in zip(self._whiteners, withheld, strict=True):
+                if outlier:
+                    whitener.withhold()
+        self._charts.update(time_ns, e, withheld, scales, units, publications, points=self._points)
+        publications.extend(self._drift.update(time_ns, self._predictors))
+        if self._suspicion is not None:
+            publications.extend(self._search_causes(time_ns, input_value, values, units, stuck))
+
+    def _note_late_signals(self, input_value: float, values: list[float]) -> None:
+        """Say once of each signal that was left out for want of values that it comes now."""
+        for name, value in zip((self._config.input, *self._config.outputs), (input_value, *values), strict=True):
+            if self.left_out.get(name) == NO_VALUE and isfinite(value):
+                self.left_out[name] = "its first value came after the training"
+                self.notes.append(
+                    f"{name} comes now, and is not watched: start the monitor without its state to learn it"
+                )
+
+    def _estimates(
+        self,
+        time_ns: int,
+        values: list[float],
+        predictions: Sequence[float],
+        sds: Sequence[float],
+        scales: list[float],
+        units: list[str],
+    ) -> Iterator[Publication]:
+        """What was expected of a row, before it is taken into the residuals' past."""
+        for index, whitener in enumerate(self._whiteners):
+            prediction, residual = predictions[index], values[index] - predictions[index]
+            if isfinite(residual):
+                usual, reach = prediction + sds[index] * whitener.expected(), scales[index] * self._charts.widths[index]
+                estimate = _estimate(time_ns, prediction, residual, units[index])
+                estimate.residual_sd = scales[index]
+                estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach
+                yield Publication(self._estimate_keys[index], estimate)
+
+
+def _judge_of(reference: ProcessReference, output: str) -> ModelSnapshot:
+    """The filter of the equations as what judges an output: its noise levels."""
+    levels = reference.noise_levels
+    sensor = Parameter(name="sensor_sd", value=levels["sensors"][output])
+    states = [Parameter(name=f"{name}_sd", value=value) for name, value in levels["states"].items()]
+    return ModelSnapshot(structure=reference.kind, parameters=[sensor, *states], reference=True, held=True)
+
+
+def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
+    """The process model that the plant may be watched by."""
+    if config.reference == "arx":
+        return None
+    given, model = model is not None, model or cstr()
+    fits = (config.input,) == model.input_names and set(config.outputs) <= set(model.output_names)
+    if fits:
+        return model
+    if config.reference == "auto" and not given:
+        return None
+    raise InputError(
+        f"reference 'process' needs the signals of {model.name}, input {', '.join(model.input_names)} and outputs of "
+        f"{', '.join(model.output_names)}, got {config.input} and {', '.join(config.outputs)}; "
+        'set reference = "arx"'
+    )
+
+
+def _estimate(time_ns: int, prediction: float, residual: float, unit: str) -> Estimate:
+    return Estimate(
+        time_ns=time_ns, prediction=prediction, residual=residual, lower_limit=nan, upper_limit=nan, unit=unit
+    )

@@ -1,0 +1,1 @@
+"""Records and recordings through the monitor again: back-test and verification."""

@@ -1,0 +1,122 @@
+"""The monitor's core over a recording, as fast as it goes: what it would have said, or did say."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from monitor_node.alarms.states import Event
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from reactorwatch.contract import keys
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.runtime.model_file import model_on_the_bus
+
+RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
+
+
+@dataclass
+class Backtest:
+    """What came of it.
+
+    Attributes:
+        input: name of the input.
+        outputs: names of the outputs.
+        rows: of samples.
+        first_ns: time of the first row; 0 without rows.
+        last_ns: time of the last row.
+        span_ns: that the rows span, summed over the runs of the plant.
+        runs: of the plant: one more than it was restarted, or its clock set back.
+        watching_since_ns: time of the first row that was judged; None if the record is shorter than the training.
+        expected_false_alarms: see `Monitor.expected_false_alarms`.
+        alarm_messages: every change of an alarm, in order.
+        refused: counts by reason.
+        notes: what people are to be told of the training.
+        left_out: signals that are not watched, each with the reason.
+        refused_trainings: number of trainings that were not fit to learn from.
+        reference: what rows were judged by, `equations` or `arx`; None if none was.
+        noise_levels: standard deviations that the equations judged by: of each sensor in its unit (`sensors`), of each
+            state in its unit per square root of a minute (`states`); None where they did not judge.
+    """
+
+    input: str
+    outputs: tuple[str, ...]
+    rows: int
+    first_ns: int
+    last_ns: int
+    span_ns: int
+    runs: int
+    watching_since_ns: int | None
+    expected_false_alarms: float
+    alarm_messages: list[Alarm]
+    refused: dict[str, int]
+    notes: list[str]
+    left_out: dict[str, str]
+    refused_trainings: int
+    reference: str | None = None
+    noise_levels: dict[str, dict[str, float]] | None = None
+
+    @property
+    def raised(self) -> list[tuple[Alarm, int | None]]:
+        """Each alarm as raised, with the suspects known last, and when it was cleared (None: it still stands)."""
+        found: list[tuple[Alarm, int | None]] = []
+        last: dict[str, int] = {}
+        for message in self.alarm_messages:
+            if message.event == RAISED:
+                last[message.alarm] = len(found)
+                alarm = Alarm()
+                alarm.CopyFrom(message)
+                found.append((alarm, None))
+            elif message.alarm in last:
+                alarm, cleared_ns = found[last[message.alarm]]
+                if message.raised_ns == alarm.raised_ns and message.suspects:
+                    del alarm.suspects[:]
+                    alarm.suspects.extend(message.suspects)
+                if cleared_ns is None and (message.cleared_ns or message.event == CLEARED):
+                    cleared_ns = message.cleared_ns
+                found[last[message.alarm]] = (alarm, cleared_ns)
+        return found
+
+
+def run(messages: Iterable[Encoded], config: MonitorConfig, zero_ns: int = 0) -> Backtest:
+    """Run the monitor over messages in the order they were received; those that are no samples are passed over.
+
+    Args:
+        messages: of any plant; only samples of `config.plant` are looked at.
+        config: of the monitor.
+        zero_ns: the time that the minutes of the model count from, where its file does not say.
+
+    Raises:
+        InputError: settings that do not fit together, or a model's file that cannot be used.
+    """
+    prefix = keys.key(config.plant, keys.SAMPLE, "")
+    monitor = Monitor(config, start_ns=0, points=False, model=model_on_the_bus(config.model, zero_ns))
+    alarms: list[Alarm] = []
+    first_ns: int | None = None
+
+    def keep(publications: list[Publication]) -> None:
+        alarms.extend(item.message for item in publications if isinstance(item.message, Alarm))
+
+    for message in messages:
+        if message.key.startswith(prefix) and (publications := monitor.on_message(message, message.received_ns)):
+            keep(publications)
+        if first_ns is None:
+            first_ns = monitor.first_ns
+    keep(monitor.finish())
+    return Backtest(
+        input=config.input,
+        outputs=config.outputs,
+        rows=monitor.rows,
+        first_ns=(monitor.first_ns or 0) if first_ns is None else first_ns,
+        last_ns=monitor.last_ns or 0,
+        span_ns=monitor.span_ns,
+        runs=1 + monitor.restarts,
+        watching_since_ns=monitor.watching_since_ns,
+        expected_false_alarms=monitor.expected_false_alarms,
+        alarm_messages=alarms,
+        refused=dict(monitor.refusals.by_reason),
+        notes=monitor.notes,
+        left_out=monitor.left_out,
+        refused_trainings=monitor.refused_trainings,
+        reference=monitor.reference or None,
+        noise_levels=monitor.noise_levels,
+    )

@@ -1,0 +1,1 @@
+"""Checks of single signals: no data, stuck values, spikes."""

@@ -1,0 +1,1 @@
+"""The monitor's state as one structure, and its seal."""

@@ -1,0 +1,1 @@
+"""Files of stored states and alarms."""

@@ -1,0 +1,107 @@
+"""The file that the state of the alarms is kept in, so that it survives a restart of the monitor."""
+
+import os
+from pathlib import Path
+
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.core import Monitor
+from monitor_node.state.seal import ForeignFileError, Seal
+from monitor_node.storage.kept_aside import DAMAGED, keep_aside, read_regular
+from reactorwatch.errors import InputError
+from reactorwatch.records.atomic import is_full, replacing
+
+SEAL = Seal(b"reactorwatch alarms", 1, "alarm state")
+
+_CURE = "move it away to begin with all alarms normal, or name another file"
+
+
+class AlarmFile:
+    """Keeps the state of the alarms in a file: whole or not at all, and on the disk when `store` returns.
+
+    The file is read when this is made and changed by `load` at the earliest, so that one that is refused ends the start
+    before anything else is renamed.
+
+    Args:
+        path: the file.
+        monitor: of the plant.
+
+    Raises:
+        InputError: the file cannot be read, is no alarm state, or is that of another plant; it is left as it is.
+    """
+
+    def __init__(self, path: Path, monitor: Monitor) -> None:
+        self._path, self._monitor = path, monitor
+        self._stored: tuple[AlarmBoard, int] | None = None
+        self._body: bytes | None = None
+        self._damage: InputError | None = None
+        try:
+            self._read()
+        except InputError as error:
+            raise InputError(f"alarm_state_file {path}: {error}; {_CURE}") from error
+        except OSError as error:
+            raise InputError(f"alarm_state_file {path}: cannot be read: {error.strerror}") from error
+
+    def _read(self) -> None:
+        data = read_regular(self._path)
+        if data is None:
+            return
+        try:
+            self._body = SEAL.open(data)
+        except ForeignFileError:
+            if data[0] >> 4 != 8:  # a MessagePack map: version 0.1 wrote it without a seal
+                raise
+            self._body = data
+        except InputError as error:
+            self._damage = error
+            return
+        AlarmBoard(self._monitor.config).from_bytes(self._body)
+
+    def load(self, *, is_newest: bool) -> str | None:
+        """Restore the alarms from the file; one that does not exist is begun.
+
+        Args:
+            is_newest: whether the monitor knows its alarms from nowhere else, or from an older state.
+
+        Returns:
+            A line for the log; None: there is nothing to report.
+
+        Raises:
+            InputError: the file is damaged and the alarms are known from nowhere else, or it will never be written.
+                That the disk is full just now ends nothing.
+        """
+        line = None
+        if self._damage is not None:
+            if is_newest:
+                raise InputError(f"alarm_state_file {self._path}: {self._damage}; {_CURE}") from self._damage
+            try:
+                aside = keep_aside(self._path, DAMAGED)
+            except OSError as error:
+                raise InputError(f"alarm_state_file {self._path}: cannot be renamed: {error.strerror}") from error
+            cure = f"it is kept as {aside.name}, and the alarms are those of state_file"
+            line = f"alarm_state_file {self._path}: {self._damage}; {cure}"
+        elif self._body is not None and is_newest:
+            self._monitor.restore_alarms(self._body)
+        try:
+            self.store()
+        except InputError as error:
+            if not is_full(error):
+                raise
+        return line
+
+    def store(self) -> None:
+        """Write what has changed, if anything has.
+
+        Raises:
+            InputError: the file cannot be written; what was there is still there.
+        """
+        board = self._monitor.alarms
+        if self._stored == (board, board.changes):
+            return
+        try:
+            with replacing(self._path) as temporary, temporary.open("wb") as file:
+                file.write(SEAL.close(board.to_bytes()))
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise InputError(f"alarm_state_file {self._path}: cannot be written: {error.strerror}") from error
+        self._stored = board, board.changes

@@ -1,0 +1,115 @@
+"""The file that all a monitor remembers is kept in, so that it goes on where it was after a restart.
+
+It is written beside its place and renamed into it, so a kill at any moment leaves the one before or this one, whole. A
+state that cannot be used is kept aside, and used again when it fits (see `kept_aside`). A file that is no state is
+refused and left alone.
+"""
+
+import os
+from pathlib import Path
+
+from monitor_node.core import Monitor
+from monitor_node.state.monitor_state import OtherSettingsError
+from monitor_node.state.seal import ForeignFileError
+from monitor_node.storage.kept_aside import DAMAGED, OTHER_SETTINGS, find_kept_aside, keep_aside, put_back, read_regular
+from reactorwatch.errors import InputError
+from reactorwatch.records.atomic import is_full, replacing
+
+
+class StateFile:
+    """Keeps what a monitor remembers: whole or not at all, and on the disk when `store` returns.
+
+    Args:
+        path: the file.
+        monitor: its memory.
+        every_s: how often it is stored.
+
+    Attributes:
+        was_aside: whether the monitor was restored from a file that had been kept aside.
+    """
+
+    def __init__(self, path: Path, monitor: Monitor, every_s: float) -> None:
+        self.was_aside = False
+        self._path, self._monitor, self._every_ns = path, monitor, int(every_s * 1e9)
+        self._alarms_stored: int | None = None
+        self._heard_stored: int | None = None
+        self._due_ns: int | None = None
+
+    def load(self) -> str:
+        """Restore the monitor from the file, or from one kept aside that fits; returns a line for the log.
+
+        Raises:
+            InputError: the file cannot be read, is no state, or will never be written: its folder is not there, for
+                instance. That the disk is full just now ends nothing.
+        """
+        try:
+            line = self._restore(read_regular(self._path))
+        except ForeignFileError as error:
+            raise InputError(f"state_file {self._path}: {error}; it is left as it is: name another file") from error
+        except InputError as error:
+            raise InputError(f"state_file {self._path}: {error}") from error
+        except OSError as error:
+            raise InputError(f"state_file {self._path}: cannot be read or renamed: {error.strerror}") from error
+        told = f"state_file {self._path}: {line}"
+        try:
+            self._write()
+        except InputError as error:
+            if not is_full(error):
+                raise
+            told = f"{told}; {error}"
+        return told
+
+    def due_ns(self) -> int | None:
+        """When to store what was heard; None: there is nothing to store."""
+        return None if self._monitor.received == self._heard_stored else self._due_ns
+
+    def is_due(self, now_ns: int) -> bool:
+        """Whether to store: an alarm has changed, or it is time and something was heard since."""
+        if self._due_ns is None or now_ns < self._due_ns - self._every_ns:  # the first time, or the clock was set back
+            self._due_ns = now_ns + self._every_ns
+        if self._monitor.alarms.changes == self._alarms_stored and now_ns < self._due_ns:
+            return False
+        self._due_ns = now_ns + self._every_ns
+        return self._monitor.alarms.changes != self._alarms_stored or self._monitor.received != self._heard_stored
+
+    def store(self) -> None:
+        """Write all that is remembered now.
+
+        Raises:
+            InputError: the file cannot be written; what was there is still there. It is due again in its time.
+        """
+        self._alarms_stored, self._heard_stored = self._monitor.alarms.changes, None
+        self._write()
+        self._heard_stored = self._monitor.received
+
+    def _write(self) -> None:
+        try:
+            with replacing(self._path) as temporary, temporary.open("wb") as file:
+                file.write(self._monitor.to_bytes())
+                file.flush()
+                os.fsync(file.fileno())
+        except InputError:
+            self._monitor.not_stored += 1
+            raise
+        except OSError as error:
+            self._monitor.not_stored += 1
+            raise InputError(f"state_file {self._path}: cannot be written: {error.strerror}") from error
+
+    def _restore(self, data: bytes | None) -> str:
+        found = "there is none yet"
+        if data is not None:
+            try:
+                self._monitor.from_bytes(data)
+            except ForeignFileError:
+                raise
+            except InputError as error:
+                ending = OTHER_SETTINGS if isinstance(error, OtherSettingsError) else DAMAGED
+                found = f"{error}; it is kept as {keep_aside(self._path, ending).name}"
+            else:
+                return "the monitor goes on from it"
+        asides = find_kept_aside(self._path.parent).get(self._path.name, [])
+        fitting = put_back(self._path, asides, self._monitor.from_bytes)
+        self.was_aside = fitting is not None
+        if fitting is not None:
+            return f"{found}; {fitting.name} fits and is in use again"
+        return f"{found}{';' if data is None else ', and'} the monitor learns anew"
