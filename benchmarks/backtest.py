@@ -14,7 +14,7 @@ from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, decode, encode
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 ROWS, SHORT = 50_000, 7500
 REPEATS = 3

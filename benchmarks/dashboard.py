@@ -24,8 +24,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
 from reactorwatch.records.record import UNITS
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter, read_messages
+from recorder.message import Entry
+from recorder.tools.mcap_file import RecordingWriter, read_messages
 
 SAMPLES = 1_000_000
 HOUR = 600  # rows
@@ -84,8 +84,8 @@ def read_bare(path: Path) -> None:
 
 def draw(path: Path) -> None:
     """What `dashboard` does."""
+    from recorder.columns.run_reader import stretches
     from recorder.dashboard.file import write_rrd
-    from recorder.run_reader import stretches
 
     write_rrd(stretches(read_messages(path)), path.with_suffix(".rrd"))
 

@@ -38,7 +38,7 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.runtime.config import SECTIONS, BusConfig, read_settings, section
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 COUNT, COMMANDS, SETTINGS, STATES, VALUES = 200_000, 20_000, 20_000, 5_000, 10_000
 PAIR = ("bad", "sound")

@@ -32,7 +32,7 @@ from reactorwatch.runtime.loopback import free_endpoint, free_port
 from reactorwatch.runtime.serve import StopSignal
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
-from recorder.mcap_file import read_messages, recordings_in
+from recorder.tools.mcap_file import read_messages, recordings_in
 
 CUTS_S = (1.0, 5.0, 30.0)
 Manner = Literal["closed", "stalled"]

@@ -29,7 +29,7 @@ from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.library.cstr.model import cstr
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 RUNS = 300
 CONFIG = MonitorConfig(training_min=20.0)

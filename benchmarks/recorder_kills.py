@@ -29,7 +29,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.runtime.serve import StopSignal
-from recorder.mcap_file import read_messages, recordings_in
+from recorder.tools.mcap_file import read_messages, recordings_in
 
 KILLS = 50
 RATE_PER_S = 5_000

@@ -34,10 +34,10 @@ from reactorwatch.runtime.serve import StopSignal
 from recorder.__main__ import begin, files_for
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
-from recorder.entry import Entry
-from recorder.filing import Fsync
-from recorder.mcap_file import RecordingWriter, read_messages, read_metadata, read_record
-from recorder.part_file import PartFile
+from recorder.message import Entry
+from recorder.policy.rotation import Fsync
+from recorder.storage.part_file import PartFile
+from recorder.tools.mcap_file import RecordingWriter, read_messages, read_metadata, read_record
 
 RATE_PER_S = 20_000
 SECONDS = 5

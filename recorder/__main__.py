@@ -17,19 +17,19 @@ from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.entry import main
 from reactorwatch.runtime.metrics import Metrics, served
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
-from recorder.ages import BootClock, read_boot_clock
-from recorder.black_box import BlackBox
 from recorder.config import RecorderConfig
 from recorder.core import NODE, Recorder
 from recorder.files import RecordingFiles
-from recorder.filing import Filing
-from recorder.head import Head
 from recorder.node import Decisions, RecorderNode
-from recorder.own_alarms import COMMANDS, PRIORITIES
-from recorder.part_file import PartFile
-from recorder.retention import DAY_NS, Limits
-from recorder.room import Room
-from recorder.series import Series
+from recorder.policy.black_box import BlackBox
+from recorder.policy.latched import Head
+from recorder.policy.own_alarms import COMMANDS, PRIORITIES
+from recorder.policy.retention import DAY_NS, Limits
+from recorder.policy.room import Room
+from recorder.policy.rotation import Filing
+from recorder.policy.series import Series
+from recorder.storage.ages import BootClock, read_boot_clock
+from recorder.storage.part_file import PartFile
 
 HISTORY_MARGIN_NS = 10_000_000_000
 """Between a message's publication, by which the bus knows how old it is, and its receipt, by which a file does."""

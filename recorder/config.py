@@ -5,8 +5,8 @@ import math
 import msgspec
 
 from reactorwatch.contract import keys
-from recorder.filing import Fsync
-from recorder.room import MOST_KEYS
+from recorder.policy.room import MOST_KEYS
+from recorder.policy.rotation import Fsync
 
 LONGEST_FLUSH_S = 1.0
 FEWEST_KEYS = 100

@@ -18,10 +18,10 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.in_order import Gap
-from recorder.entry import Entry
-from recorder.own_alarms import DISK_ALARM, KEYS_ALARM, OwnAlarms
-from recorder.room import Channel
-from recorder.sequences import SequenceCheck
+from recorder.columns.sequences import SequenceCheck
+from recorder.message import Entry
+from recorder.policy.own_alarms import DISK_ALARM, KEYS_ALARM, OwnAlarms
+from recorder.policy.room import Channel
 
 log = structlog.get_logger()
 

@@ -20,20 +20,20 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
-from recorder.ages import Ages, BootClock, read_boot_clock
-from recorder.black_box import BlackBox, Stretch
-from recorder.black_box_files import BlackBoxFiles
-from recorder.chores import Chores
 from recorder.core import Kept, fingerprint
-from recorder.cut import cut, received_between
-from recorder.entry import Entry
-from recorder.gaps import GAP, to_metadata
-from recorder.mcap_scan import Scan, Stored, Wanted
-from recorder.mcap_writer import NUMBER, RecordingWriter, check_free, part_of
-from recorder.part_file import PART, PartFile
-from recorder.remains import damaged, make_whole, remains_of
-from recorder.retention import Finished, Limits, to_delete
-from recorder.series import Series
+from recorder.message import Entry
+from recorder.policy.black_box import BlackBox, Stretch
+from recorder.policy.retention import Finished, Limits, to_delete
+from recorder.policy.series import Series
+from recorder.storage.ages import Ages, BootClock, read_boot_clock
+from recorder.storage.background import Chores
+from recorder.storage.black_box_files import BlackBoxFiles
+from recorder.storage.gaps import GAP, to_metadata
+from recorder.storage.mcap_scan import Scan, Stored, Wanted
+from recorder.storage.mcap_writer import NUMBER, RecordingWriter, check_free, part_of
+from recorder.storage.orphans import damaged, make_whole, remains_of
+from recorder.storage.part_file import PART, PartFile
+from recorder.tools.cut import cut, received_between
 
 log = structlog.get_logger()
 

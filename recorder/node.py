@@ -7,13 +7,13 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
-from recorder.black_box import BlackBox, Stretch
 from recorder.core import Kept, Recorder
 from recorder.files import RecordingFiles
-from recorder.filing import Filing
-from recorder.head import Head
-from recorder.mcap_writer import WriteError
-from recorder.room import Room
+from recorder.policy.black_box import BlackBox, Stretch
+from recorder.policy.latched import Head
+from recorder.policy.room import Room
+from recorder.policy.rotation import Filing
+from recorder.storage.mcap_writer import WriteError
 
 RETRY_NS = 2_000_000_000
 """Between two looks for room on a full disk."""

@@ -11,7 +11,7 @@ from monitor_node.replay import backtest
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.records.record import Record, to_minutes
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 LIKELY = 0.1
 """Suspects of at least this probability are among those that an operator would look at."""

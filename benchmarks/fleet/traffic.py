@@ -18,7 +18,7 @@ from reactorwatch.runtime.access import NOBODY
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.serve import StopSignal
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 SIGNALS = 3
 LEARNED_ROWS = 900

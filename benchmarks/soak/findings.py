@@ -30,7 +30,7 @@ from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Alarm, Health
 from reactorwatch.records.record import MINUTE_NS
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 SIGNALS = 3
 SOON_ROWS = 20

@@ -31,7 +31,7 @@ def compile_kernels() -> None:
     from reactorwatch.contract.codec import encode
     from reactorwatch.diagnosis.diagnose import diagnose
     from reactorwatch.process.library.cstr.model import cstr
-    from recorder.player import samples_of
+    from recorder.tools.player import samples_of
 
     record = simulate_record(PlantConfig(seed=1, faults=(FAULT,)), ROWS)
     with task("compiling"):

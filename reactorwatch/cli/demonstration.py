@@ -182,8 +182,8 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, Asked, case_of, diagnosed, write_report
     from reactorwatch.diagnosis.report.words import verdict
     from reactorwatch.process import effects_of
+    from recorder.columns.run_reader import stretches
     from recorder.dashboard.file import write_rrd
-    from recorder.run_reader import stretches
 
     drawing = recording.with_suffix(".rrd")
     with task("checking"):

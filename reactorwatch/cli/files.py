@@ -13,7 +13,7 @@ from reactorwatch.records.output import checked_folder
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record
-    from recorder.run import Run
+    from recorder.columns.run import Run
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
 
@@ -44,9 +44,9 @@ def dashboard(
     from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.sources import tape
+    from recorder.columns.run_reader import stretches
     from recorder.dashboard.file import write_rrd
     from recorder.dashboard.picture import picture_names, render_tabs
-    from recorder.run_reader import stretches
 
     drawn = diagnosis / DRAWING if diagnosis is not None else None
     out = output_file(out, ".rrd", (file, drawn), force=force)
@@ -91,7 +91,7 @@ def import_csv(
 ) -> None:
     """Turn a record (.csv) into a recording (.mcap)."""
     from reactorwatch.cli.progress import task
-    from recorder.convert import import_csv as convert
+    from recorder.tools.convert import import_csv as convert
 
     out = output_file(out, ".mcap", (file,), force=force)
     with task(f"importing {file.name}"):
@@ -107,7 +107,7 @@ def export_csv(
 ) -> None:
     """Turn a recording (.mcap) into a record (.csv)."""
     from reactorwatch.cli.progress import task
-    from recorder.convert import export_csv as convert
+    from recorder.tools.convert import export_csv as convert
 
     out = output_file(out, ".csv", (file,), force=force)
     with task(f"exporting {file.name}"):

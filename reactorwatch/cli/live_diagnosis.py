@@ -27,8 +27,8 @@ from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.entry import main
 from reactorwatch.runtime.serve import serve, stop_on_signals
-from recorder.entry import Entry
-from recorder.mcap_writer import RecordingWriter
+from recorder.message import Entry
+from recorder.storage.mcap_writer import RecordingWriter
 
 log = structlog.get_logger()
 

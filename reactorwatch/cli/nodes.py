@@ -226,7 +226,7 @@ def replay(
         raise typer.Exit(run(existing_recording(file), config, name, as_json=as_json))
     from reactorwatch.records.record import MINUTE_NS
     from reactorwatch.runtime.config import section
-    from recorder.replay import ReplayConfig, run_replay
+    from recorder.tools.replay import ReplayConfig, run_replay
 
     if column and file.suffix.lower() != ".csv":
         raise InputError(f"--column is for the columns of a .csv file, got {file}")

@@ -7,9 +7,9 @@ from typing import Any
 from reactorwatch.contract.messages_pb2 import Priority
 from reactorwatch.records.record import clock_time, to_minutes
 from reactorwatch.terminal import printable_lines
-from recorder.look import Look
-from recorder.mcap_file import has_clock
-from recorder.recover import Saved
+from recorder.storage.recover import Saved
+from recorder.tools.inspect import Look
+from recorder.tools.mcap_file import has_clock
 
 MOST_LINES = 20
 """Gaps that people are told of one by one."""

@@ -32,8 +32,8 @@ def recover(
 
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import saved_object, saved_text
-    from recorder.part_file import is_held
-    from recorder.recover import recover as save
+    from recorder.storage.part_file import is_held
+    from recorder.storage.recover import recover as save
 
     if is_held(existing(file)):
         raise InputError(f"{file}: is still being written; stop its recorder first")
@@ -52,7 +52,7 @@ def info(
 
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import info_object, info_text
-    from recorder.look import look_over
+    from recorder.tools.inspect import look_over
 
     with task(f"reading {file.name}"):
         seen = look_over(existing_recording(file))
@@ -72,10 +72,10 @@ def cut(
 ) -> None:
     """Copy a stretch of plant time out of a recording."""
     from reactorwatch.cli.progress import task
-    from recorder.cut import cut as copy
-    from recorder.cut import sampled_between
-    from recorder.look import zero_ns_of
-    from recorder.mcap_file import ZERO_NS, read_metadata, recordings_in
+    from recorder.tools.cut import cut as copy
+    from recorder.tools.cut import sampled_between
+    from recorder.tools.inspect import zero_ns_of
+    from recorder.tools.mcap_file import ZERO_NS, read_metadata, recordings_in
 
     from_ns = span_ns(begin, "--from") if begin is not None else -(2**63)
     to_ns = span_ns(end, "--to") if end is not None else 2**63
@@ -98,8 +98,8 @@ def merge(
 ) -> None:
     """Put several recordings into one, in order of receipt."""
     from reactorwatch.cli.progress import task
-    from recorder.cut import merge as join
-    from recorder.mcap_file import read_metadata, recordings_in
+    from recorder.tools.cut import merge as join
+    from recorder.tools.mcap_file import read_metadata, recordings_in
 
     out = output_file(out, ".mcap", files, force=force)
     with task(f"merging into {out.name}"):

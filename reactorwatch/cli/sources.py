@@ -44,7 +44,7 @@ def record(
 
         measured = read_csv(path, columns, required)
         return measured if units is None else replace(measured, units=units)
-    from recorder.mcap_file import read_record
+    from recorder.tools.mcap_file import read_record
 
     return read_record(path, plant)
 
@@ -83,12 +83,12 @@ def tape(
         InputError: as `record`.
     """
     if kind(path) == "csv":
-        from recorder.player import samples_of
+        from recorder.tools.player import samples_of
 
         measured = record(path, plant, columns, units=units)
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
         return Tape((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
-    from recorder.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from
+    from recorder.tools.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from
 
     read = (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
     metadata = read_metadata(path)
@@ -113,8 +113,8 @@ def stands_for(folder: Path) -> list[Path]:
     Raises:
         InputError: there is neither in it.
     """
-    from recorder.mcap_file import read_metadata
-    from recorder.mcap_writer import NUMBER
+    from recorder.storage.mcap_writer import NUMBER
+    from recorder.tools.mcap_file import read_metadata
 
     of_a_piece = {NUMBER, "cut", "merged"}
     records, recordings = (files_of(folder, suffix) for suffix in (".csv", ".mcap"))
@@ -167,7 +167,7 @@ def plant_of(path: Path, plant: str | None) -> str:
     """
     if kind(path) == "csv":
         return plant or DEFAULT_PLANT
-    from recorder.mcap_file import one_plant_in
+    from recorder.tools.mcap_file import one_plant_in
 
     found = one_plant_in(path, plant)
     try:

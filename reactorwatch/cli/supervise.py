@@ -28,7 +28,7 @@ from reactorwatch.runtime.model_file import read_extended_model
 from reactorwatch.runtime.serve import stop_on_signals
 from recorder.__main__ import file_for
 from recorder.config import RecorderConfig
-from recorder.series import ENDING
+from recorder.policy.series import ENDING
 
 log = structlog.get_logger()
 

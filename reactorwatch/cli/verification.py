@@ -18,8 +18,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.record import clock_time, to_minutes
 from reactorwatch.runtime.config import parse_toml, read_settings, section
 from reactorwatch.terminal import printable_lines
-from recorder.look import gaps_in, zero_ns_of
-from recorder.mcap_file import has_clock, one_plant_in, read_messages, read_metadata
+from recorder.tools.inspect import gaps_in, zero_ns_of
+from recorder.tools.mcap_file import has_clock, one_plant_in, read_messages, read_metadata
 
 SETTINGS = "settings"
 """What our metadata of a recording calls the settings of the nodes that ran."""

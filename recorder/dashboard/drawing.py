@@ -6,6 +6,7 @@ from typing import assert_never
 import numpy as np
 import rerun as rr
 
+from recorder.columns.run import Run
 from recorder.dashboard.layout import Layout, origin
 from recorder.dashboard.plane import draw_plane
 from recorder.dashboard.stream import Stream, path_of
@@ -21,7 +22,6 @@ from recorder.panels.base import (
     TimePlot,
     View,
 )
-from recorder.run import Run
 
 
 class Drawing:

@@ -11,12 +11,12 @@ from pathlib import Path
 import rerun as rr
 
 from reactorwatch.records.atomic import replacing
+from recorder.columns.run import Run
 from recorder.dashboard.drawing import Drawing
 from recorder.dashboard.reading import read_time_plots
 from recorder.dashboard.stream import APPLICATION
 from recorder.panels import PANELS
 from recorder.panels.base import Panel, View
-from recorder.run import Run
 
 _PIPE_BYTES = 65_536
 

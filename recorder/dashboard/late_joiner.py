@@ -16,7 +16,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encode, encode_message
 from reactorwatch.runtime.bus import Bus
-from recorder.run_reader import LISTED, SUSPECTED
+from recorder.columns.run_reader import LISTED, SUSPECTED
 
 ANSWER_WITHIN_S = 5.0
 AGAIN_S = 1.0

@@ -28,12 +28,12 @@ from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_port
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+from recorder.columns.run_reader import STRETCH, RunReader
 from recorder.dashboard.drawing import Drawing
 from recorder.dashboard.late_joiner import Past, PastQuery, ask_for_past, zero_of
 from recorder.dashboard.stream import APPLICATION
 from recorder.dashboard.viewer import viewer
 from recorder.panels import PANELS
-from recorder.run_reader import STRETCH, RunReader
 
 _ALARM = encoding_of(Alarm)
 

@@ -3,6 +3,8 @@
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.records.record import to_minutes
+from recorder.columns.run import AlarmChange, FaultChange, Run
+from recorder.columns.run_reader import LISTED, SUSPECTED
 from recorder.panels.base import (
     ALARM,
     FAULT,
@@ -19,8 +21,6 @@ from recorder.panels.base import (
     StateLines,
     View,
 )
-from recorder.run import AlarmChange, FaultChange, Run
-from recorder.run_reader import LISTED, SUSPECTED
 
 _WORDS: dict[int, str] = {
     messages.ALARM_STATE_NORMAL: "normal",

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.run import Run
+from recorder.columns.run import Run
 
 
 class Colour(NamedTuple):

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from recorder.columns.run import Charted, Estimated, Run
 from recorder.panels.base import ALARM, LIMIT, RESIDUAL, Panel, Series, TimePlot
-from recorder.run import Charted, Estimated, Run
 
 ROOM = 25.0
 """So many times as far from its centre as its limit a statistic may go and set the scale; beyond that the limits, which

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
+from recorder.columns.run import Report, Run
 from recorder.panels.base import (
     ALARM,
     FAULT,
@@ -18,7 +19,6 @@ from recorder.panels.base import (
     TimePlot,
     View,
 )
-from recorder.run import Report, Run
 
 _PHASES = {
     "waiting": FAULT,

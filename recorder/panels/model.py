@@ -8,8 +8,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from recorder.columns.run import ADAPTS, EQUATIONS, HELD, JUDGES, Run, Snapshot
 from recorder.panels.base import LIMIT, MEASURED, PREDICTED, SEVERAL, Colour, Panel, Series, TimePlot
-from recorder.run import ADAPTS, EQUATIONS, HELD, JUDGES, Run, Snapshot
 
 _KINDS = {"a": "of its own past", "b": "of the input", "c": "offset"}
 _HELD = {JUDGES: "judged by", HELD: "held since the training"}

@@ -1,6 +1,7 @@
 """Each signal as measured, as predicted, and its limits; beside it what was raised, and where the process went."""
 
-from recorder.known_process import is_input, titled
+from recorder.columns.process_annotations import is_input, titled
+from recorder.columns.run import Run
 from recorder.panels.base import (
     INPUT,
     LIMIT,
@@ -13,7 +14,6 @@ from recorder.panels.base import (
     TimePlot,
     View,
 )
-from recorder.run import Run
 
 
 def draw(run: Run) -> tuple[View, ...]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.process.steady_state import SteadyState
-from recorder.known_process import operating_branch, process_of, rests
+from recorder.columns.process_annotations import operating_branch, process_of, rests
+from recorder.columns.run import Run, Times, Values
 from recorder.panels.base import (
     ALARM,
     FAULT,
@@ -24,7 +25,6 @@ from recorder.panels.base import (
     PlanePath,
     PlanePlot,
 )
-from recorder.run import Run, Times, Values
 
 MOST_POINTS = 4000
 """Of the path in a stretch; of more rows those are drawn that are farthest out."""

@@ -18,7 +18,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.serve import StopSignal
 from recorder.dashboard.picture import count_coloured
-from recorder.mcap_file import read_messages
+from recorder.tools.mcap_file import read_messages
 
 from .conftest import PATIENCE_S, Command, Start, WaitAlive
 

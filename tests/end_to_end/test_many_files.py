@@ -18,7 +18,7 @@ import pytest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.records.csv_file import write_csv
-from recorder.convert import import_csv
+from recorder.tools.convert import import_csv
 from tests.cluster import dask_cluster
 
 from .conftest import PATIENCE_S, REACTORWATCH, Command

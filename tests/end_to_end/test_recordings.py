@@ -8,7 +8,7 @@ import pytest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.records.csv_file import read_csv, write_csv
-from recorder.mcap_file import RecordingWriter
+from recorder.tools.mcap_file import RecordingWriter
 
 from .conftest import Command
 

@@ -17,7 +17,7 @@ from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.loopback import free_port
 from reactorwatch.runtime.serve import StopSignal
 from reactorwatch.runtime.site import make_site
-from recorder.mcap_file import read_messages
+from recorder.tools.mcap_file import read_messages
 
 from .conftest import PATIENCE_S, Command, Start
 

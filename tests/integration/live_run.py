@@ -22,7 +22,7 @@ from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
 from recorder.config import RecorderConfig
-from recorder.mcap_file import read_messages
+from recorder.tools.mcap_file import read_messages
 
 WITHIN_S = 120.0
 PLANT = "cstr"

@@ -30,8 +30,8 @@ from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
-from recorder.look import look_over
-from recorder.mcap_file import recordings_in
+from recorder.tools.inspect import look_over
+from recorder.tools.mcap_file import recordings_in
 
 KEPT = 60_000
 """On a key: what is published in a minute, more than any cut lasts, also where processes are slow to start."""

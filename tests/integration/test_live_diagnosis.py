@@ -17,7 +17,7 @@ from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-from recorder.replay import samples_of
+from recorder.tools.replay import samples_of
 
 ZERO_NS = 1_780_000_000 * 10**9
 

@@ -21,9 +21,9 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.serve import StopSignal
 from recorder.__main__ import record
 from recorder.config import RecorderConfig, ReplayConfig
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter, read_messages
-from recorder.replay import replay
+from recorder.message import Entry
+from recorder.tools.mcap_file import RecordingWriter, read_messages
+from recorder.tools.replay import replay
 from tests.running import WITHIN_S, running
 from tests.unit.recorder import golden
 

@@ -14,11 +14,11 @@ from reactorwatch.contract.codec import decode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
-from recorder.cut import cut, sampled_between
-from recorder.entry import Entry
-from recorder.gaps import GAP, to_metadata
-from recorder.mcap_file import RecordingWriter, read_messages, read_metadata, recordings_in
-from recorder.recover import recover
+from recorder.message import Entry
+from recorder.storage.gaps import GAP, to_metadata
+from recorder.storage.recover import recover
+from recorder.tools.cut import cut, sampled_between
+from recorder.tools.mcap_file import RecordingWriter, read_messages, read_metadata, recordings_in
 
 from .watched_hour import ROWS, START_NS, record_hour
 

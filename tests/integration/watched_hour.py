@@ -18,7 +18,7 @@ from reactorwatch.cli.processes import settings_text
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import AlarmCommand, ShelveAlarm
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 from tests.unit.recorder.recording import SECOND, Fed, recorder
 
 ROWS = 600

@@ -22,8 +22,8 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import ALARM_STATE_UNACKNOWLEDGED, QUALITY_GOOD, Alarm, Sample
 from reactorwatch.runtime import logs
 from reactorwatch.terminal import printable, printable_lines
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter
+from recorder.message import Entry
+from recorder.tools.mcap_file import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
 HOSTILE = "\x1b[2J\x1b]0;title\x07 a\r\nb\tc\x7f\x9b31m\u202eevil\u2066\u200b\u2028\u2029\ufeff\U000e0041"

@@ -20,7 +20,7 @@ from reactorwatch.contract.codec import encode
 from reactorwatch.identification.flow_chart import Conclusion, follow
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record, to_minutes
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

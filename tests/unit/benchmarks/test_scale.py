@@ -10,7 +10,7 @@ from benchmarks.fleet.traffic import LEARNED_ROWS
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, encode
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 ROWS = 200
 

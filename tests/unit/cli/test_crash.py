@@ -24,8 +24,8 @@ from reactorwatch.records.csv_file import write_csv
 from reactorwatch.runtime import crash
 from reactorwatch.runtime.config import read_settings
 from recorder.config import RecorderConfig
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter
+from recorder.message import Entry
+from recorder.tools.mcap_file import RecordingWriter
 from tests.unit.diagnosis.cases import CASES
 
 Shown = pytest.CaptureFixture[str]
@@ -81,7 +81,7 @@ def test_an_unexpected_error_is_one_line_with_the_path_of_a_report(
     folder: Path, typed: str, monkeypatch: Patch, capsys: Shown
 ) -> None:
     for name in (
-        "recorder.look.look_over",
+        "recorder.tools.inspect.look_over",
         "reactorwatch.cli.linear_models.describe",
         "reactorwatch.spc.run_length.design.design",
     ):
@@ -103,7 +103,7 @@ def test_where_no_report_can_be_written_the_line_names_the_place(
     folder: Path, monkeypatch: Patch, capsys: Shown
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(folder / "nowhere"))
-    monkeypatch.setattr("recorder.look.look_over", crashing)
+    monkeypatch.setattr("recorder.tools.inspect.look_over", crashing)
     assert run(["info", "plant0.mcap"], monkeypatch) == crash.EXIT_CODE
     said = capsys.readouterr().err
     assert said.count("\n") == 1
@@ -249,7 +249,7 @@ def test_an_input_error_is_not_a_crash(folder: Path, monkeypatch: Patch, capsys:
     def refuse(*_: object) -> None:
         raise InputError("no such reactor")
 
-    monkeypatch.setattr("recorder.look.look_over", refuse)
+    monkeypatch.setattr("recorder.tools.inspect.look_over", refuse)
     assert run(["info", "plant0.mcap"], monkeypatch) == 2
     assert capsys.readouterr().err == "reactorwatch: no such reactor\n"
     assert not list((folder / "reports").iterdir())

@@ -6,8 +6,8 @@ import pytest
 
 from reactorwatch.cli.batch import as_table, files_named
 from reactorwatch.errors import InputError
-from recorder.mcap_file import RecordingWriter
-from recorder.mcap_writer import NUMBER
+from recorder.storage.mcap_writer import NUMBER
+from recorder.tools.mcap_file import RecordingWriter
 
 
 def recording(path: Path, **metadata: str) -> Path:

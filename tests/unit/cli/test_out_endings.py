@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from reactorwatch.cli.main import app, main
 from reactorwatch.errors import InputError
 from reactorwatch.records.output import check_folder_name
-from recorder.convert import import_csv
+from recorder.tools.convert import import_csv
 
 NO_ROUTER = "--endpoint tcp/127.0.0.1:1"
 FILES = {

@@ -18,8 +18,8 @@ from reactorwatch.cli.study.page import FOLDER
 from reactorwatch.cli.study.reproduce import PAGE
 from reactorwatch.records import output
 from recorder.dashboard.picture import picture_names
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter
+from recorder.message import Entry
+from recorder.tools.mcap_file import RecordingWriter
 from tests.unit.recorder import golden
 
 NO_ROUTER = "--endpoint tcp/127.0.0.1:1"

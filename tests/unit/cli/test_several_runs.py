@@ -19,7 +19,7 @@ from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.record import Record, join_runs
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 ROWS, FIRST = 1600, 1100
 

@@ -21,12 +21,12 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import UNITS, Record
 from reactorwatch.runtime.model_file import write_extended_model
-from recorder.convert import import_csv
-from recorder.known_process import process_of, titled
-from recorder.mcap_file import read_messages, read_record
+from recorder.columns.process_annotations import process_of, titled
+from recorder.columns.run_reader import read_run
 from recorder.panels.overview import draw
-from recorder.player import samples_of
-from recorder.run_reader import read_run
+from recorder.tools.convert import import_csv
+from recorder.tools.mcap_file import read_messages, read_record
+from recorder.tools.player import samples_of
 
 HEADER = "ts,flow,TI-1 [degC],TI-2"
 COLUMNS = {"time_min": "ts", "qc": "flow", "C": "TI-1 [degC]", "T": "TI-2"}

@@ -22,10 +22,10 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import write_csv
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
-from recorder.convert import import_csv
-from recorder.look import look_over
-from recorder.mcap_file import read_record
-from recorder.run_reader import read_run
+from recorder.columns.run_reader import read_run
+from recorder.tools.convert import import_csv
+from recorder.tools.inspect import look_over
+from recorder.tools.mcap_file import read_record
 
 ROWS, ONSET_MIN = 600, 40.0
 ORIGINS = [-ONSET_MIN, -59.9, -1.0, -5000.0, 250.0]

@@ -9,8 +9,8 @@ from reactorwatch.cli.batch import files_named
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_BAD, QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter, recordings_in
+from recorder.message import Entry
+from recorder.tools.mcap_file import RecordingWriter, recordings_in
 from tests.unit.cli.test_crash import run
 
 NO_ROUTER = "--endpoint tcp/127.0.0.1:1"

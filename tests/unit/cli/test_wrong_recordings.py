@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.cli.main import main
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter
+from recorder.message import Entry
+from recorder.tools.mcap_file import RecordingWriter
 from tests.unit.recorder import golden
 
 NO_ROUTER = "--endpoint tcp/127.0.0.1:1"

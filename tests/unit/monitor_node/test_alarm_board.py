@@ -17,7 +17,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, AlarmState
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.spc.charts.base import Judgement
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 from .board import AT_ONCE, Desk
 

@@ -11,7 +11,7 @@ from monitor_node.ingest.alignment import Aligner
 from monitor_node.replay.backtest import Backtest, run
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import MINUTE_NS, Record
-from recorder.player import samples_of
+from recorder.tools.player import samples_of
 
 from .samples import leaking_run
 

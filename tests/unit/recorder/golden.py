@@ -14,7 +14,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
 from reactorwatch.records.record import UNITS, to_time_ns
-from recorder.entry import Entry
+from recorder.message import Entry
 
 PLANT = "cstr"
 ZERO_NS = 1_700_000_000_000_000_000

@@ -7,12 +7,12 @@ from pathlib import Path
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Health
 from recorder.__main__ import begin, files_for
-from recorder.ages import BootClock
 from recorder.config import RecorderConfig
 from recorder.files import RecordingFiles
-from recorder.mcap_writer import part_of
 from recorder.node import RecorderNode
-from recorder.part_file import PartFile
+from recorder.storage.ages import BootClock
+from recorder.storage.mcap_writer import part_of
+from recorder.storage.part_file import PartFile
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND

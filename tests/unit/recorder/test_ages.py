@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.ages import Ages, read_boot_clock
-from recorder.retention import DAY_NS
+from recorder.policy.retention import DAY_NS
+from recorder.storage.ages import Ages, read_boot_clock
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, Confirmed, Fed, recorder
 from tests.unit.recorder.test_files import samples

@@ -3,7 +3,7 @@
 import itertools
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.black_box import LONGEST, BlackBox, Stretch
+from recorder.policy.black_box import LONGEST, BlackBox, Stretch
 
 N = 600
 

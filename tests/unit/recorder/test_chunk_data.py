@@ -13,12 +13,12 @@ from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, Footer, Header, Mc
 from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
-from recorder.chunk_data import LARGEST_MB
-from recorder.cut import cut, merge, received_between
-from recorder.look import look_over
-from recorder.mcap_file import read_messages
-from recorder.mcap_scan import FOREVER_NS
-from recorder.recover import recover
+from recorder.storage.chunk_data import LARGEST_MB
+from recorder.storage.mcap_scan import FOREVER_NS
+from recorder.storage.recover import recover
+from recorder.tools.cut import cut, merge, received_between
+from recorder.tools.inspect import look_over
+from recorder.tools.mcap_file import read_messages
 
 BOMB_BYTES = 40_000_000
 KEY = "reactor/cstr/sample/T"
@@ -144,7 +144,7 @@ def test_every_reader_refuses_it_in_one_line_and_takes_no_more_memory_than_is_al
 
 @pytest.mark.parametrize("packing", PACKED)
 def test_a_chunk_within_the_limit_is_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packing: str) -> None:
-    monkeypatch.setattr("recorder.chunk_data.PIECE_BYTES", 100)
+    monkeypatch.setattr("recorder.storage.chunk_data.PIECE_BYTES", 100)
     data = DESCRIBED + b"".join(map(message, range(1, 200)))
     for indexed in (True, False):
         path = tmp_path / f"{indexed}.mcap"

@@ -12,9 +12,9 @@ from reactorwatch.cli.recording_reports import info_object
 from reactorwatch.errors import InputError
 from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.record import Record, join_runs
-from recorder.convert import export_csv, import_csv
-from recorder.look import look_over
-from recorder.mcap_file import read_messages, read_metadata, read_record
+from recorder.tools.convert import export_csv, import_csv
+from recorder.tools.inspect import look_over
+from recorder.tools.mcap_file import read_messages, read_metadata, read_record
 from tests.unit.records.test_csv_file import A_VALUE, assert_same
 
 

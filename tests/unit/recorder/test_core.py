@@ -6,7 +6,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Encoded, Publication, encode, encode_message, encoding_of
 from recorder.core import Recorder
-from recorder.entry import Entry
+from recorder.message import Entry
 
 KEY = "reactor/cstr/sample/T"
 GOOD = messages.QUALITY_GOOD

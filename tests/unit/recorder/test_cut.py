@@ -10,9 +10,9 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
-from recorder.cut import cut, merge, received_between, sampled_between
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
+from recorder.message import Entry
+from recorder.tools.cut import cut, merge, received_between, sampled_between
+from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
 from tests.unit.recorder import golden
 
 MINUTE = 60_000_000_000

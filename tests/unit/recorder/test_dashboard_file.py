@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from reactorwatch.errors import InputError
+from recorder.columns.run import Measured, Run
+from recorder.columns.run_reader import read_run, stretches
 from recorder.dashboard.file import write_rrd, write_views
 from recorder.dashboard.reading import read_time_plots
 from recorder.dashboard.stream import BATCH_ROWS, RUN_TIME, SAMPLE_TIME
@@ -30,8 +32,6 @@ from recorder.panels.base import (
     TimePlot,
     View,
 )
-from recorder.run import Measured, Run
-from recorder.run_reader import read_run, stretches
 from tests.unit.recorder import golden
 
 V = TypeVar("V", bound=View)

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from reactorwatch.contract.codec import Encoded
+from recorder.columns.run import Run
+from recorder.columns.run_reader import read_run
 from recorder.dashboard.drawing import Drawing
 from recorder.dashboard.live import DRAW_EVERY_NS, LiveDashboard
 from recorder.dashboard.stream import SAMPLE_TIME
-from recorder.run import Run
-from recorder.run_reader import read_run
 from tests.unit.recorder import golden
 
 MESSAGES = [Encoded(entry.key, entry.payload, entry.encoding) for entry in golden.entries()]

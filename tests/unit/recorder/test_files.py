@@ -12,10 +12,17 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode
 from reactorwatch.errors import InputError
-from recorder.chores import Chores
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record, recordings_in
-from recorder.mcap_scan import Scan
+from recorder.message import Entry
+from recorder.storage.background import Chores
+from recorder.storage.mcap_scan import Scan
+from recorder.tools.mcap_file import (
+    RecordingWriter,
+    plants_in,
+    read_messages,
+    read_metadata,
+    read_record,
+    recordings_in,
+)
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import MINUTE, SECOND, Fed, recorder
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.filing import SECOND_NS, Filing, Fsync
+from recorder.policy.rotation import SECOND_NS, Filing, Fsync
 
 HALF = SECOND_NS // 2
 START = 1_000 * SECOND_NS

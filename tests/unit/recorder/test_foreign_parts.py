@@ -8,9 +8,9 @@ from mcap.writer import CompressionType, Writer
 
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
-from recorder.cut import cut, merge, received_between
-from recorder.mcap_scan import FOREVER_NS
-from recorder.recover import recover
+from recorder.storage.mcap_scan import FOREVER_NS
+from recorder.storage.recover import recover
+from recorder.tools.cut import cut, merge, received_between
 
 MINUTE_NS = 60 * 10**9
 CALIBRATION = {"sensor": "T", "offset": "0.2"}

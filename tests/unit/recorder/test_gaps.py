@@ -10,10 +10,10 @@ from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.runtime.in_order import Gap
 from recorder.__main__ import files_for
 from recorder.config import RecorderConfig
-from recorder.cut import cut, merge, received_between
-from recorder.gaps import from_metadata, to_metadata
-from recorder.look import look_over
-from recorder.recover import recover
+from recorder.storage.gaps import from_metadata, to_metadata
+from recorder.storage.recover import recover
+from recorder.tools.cut import cut, merge, received_between
+from recorder.tools.inspect import look_over
 
 from .recording import SECOND, Fed, recorder
 

@@ -3,8 +3,8 @@
 from google.protobuf.message import Message
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.entry import Entry
-from recorder.head import Head
+from recorder.message import Entry
+from recorder.policy.latched import Head
 
 
 def remembered(*told: tuple[str, Message], most: int = 100) -> Head:

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
+from recorder.message import Entry
+from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
 from tests.unit.recorder import golden
 
 ENTRIES = [entry for entry in golden.entries() if "/sample/" in entry.key][:60]

@@ -15,8 +15,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.errors import InputError
-from recorder.entry import Entry
-from recorder.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
+from recorder.message import Entry
+from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
 from tests.unit.recorder import golden
 
 

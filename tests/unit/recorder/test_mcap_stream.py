@@ -10,8 +10,8 @@ from mcap.reader import make_reader
 from mcap.records import Channel, McapRecord, Schema
 from mcap.writer import Writer
 
-from recorder import mcap_stream
-from recorder.mcap_stream import McapStream
+from recorder.storage import mcap_stream
+from recorder.storage.mcap_stream import McapStream
 
 SIGNALS = ("qc", "C", "T")
 BEGAN = 1_700_000_000_000_000_000

@@ -14,10 +14,10 @@ from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.serve import StopSignal, serve
 from recorder.__main__ import begin, files_for
 from recorder.config import RecorderConfig
-from recorder.entry import Entry
 from recorder.files import RecordingFiles
-from recorder.mcap_file import read_messages
+from recorder.message import Entry
 from recorder.node import RecorderNode
+from recorder.tools.mcap_file import read_messages
 from tests.running import WITHIN_S, running
 from tests.unit.recorder import golden
 

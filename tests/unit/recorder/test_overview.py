@@ -7,10 +7,10 @@ from reactorwatch.cli.recording_reports import info_object
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
-from recorder.entry import Entry
-from recorder.look import Look, look_over, zero_ns_of
-from recorder.mcap_file import RecordingWriter
-from recorder.overview import Gap, overview
+from recorder.message import Entry
+from recorder.tools.inspect import Look, look_over, zero_ns_of
+from recorder.tools.mcap_file import RecordingWriter
+from recorder.tools.overview import Gap, overview
 from tests.unit.recorder import golden
 
 SECOND = 1_000_000_000

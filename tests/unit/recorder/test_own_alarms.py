@@ -7,7 +7,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, ListAlarms
-from recorder.own_alarms import DISK_ALARM, PRIORITIES, OwnAlarms
+from recorder.policy.own_alarms import DISK_ALARM, PRIORITIES, OwnAlarms
 
 NORMAL, RAISED = messages.ALARM_STATE_NORMAL, messages.ALARM_STATE_UNACKNOWLEDGED
 SEEN, GONE = messages.ALARM_STATE_ACKNOWLEDGED, messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED

@@ -10,10 +10,10 @@ import pytest
 
 import recorder.panels
 from reactorwatch.contract import messages_pb2 as messages
+from recorder.columns.run import ADAPTS, EQUATIONS, HELD, JUDGES, Charted, Reconstructed, Report, Run, Snapshot
+from recorder.columns.run_reader import read_run, stretches
 from recorder.panels import PANELS, alarms, charts, health, model, overview
 from recorder.panels.base import ALARM, Again, EventLog, Panel, PlanePlot, StateLines, TimePlot, View
-from recorder.run import ADAPTS, EQUATIONS, HELD, JUDGES, Charted, Reconstructed, Report, Run, Snapshot
-from recorder.run_reader import read_run, stretches
 from tests.unit.recorder import golden
 
 V = TypeVar("V", bound=View)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from reactorwatch.records.record import UNITS
+from recorder.columns.run import Measured, Run, Seen
+from recorder.columns.run_reader import read_run, stretches
 from recorder.panels import phase_plane
 from recorder.panels.base import STABLE, UNSTABLE, PlanePlot
-from recorder.run import Measured, Run, Seen
-from recorder.run_reader import read_run, stretches
 from tests.unit.recorder import golden
 
 # at qc = 103.41 l/min: C in mol/l, T in K, and whether it is stable (docs/plant.md; solved by hand from the equations)

@@ -10,8 +10,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.records.record import Record
-from recorder.entry import Entry
-from recorder.player import BATCH, EVERYTHING, NEVER_NS, Player, between, playable, samples_of
+from recorder.message import Entry
+from recorder.tools.player import BATCH, EVERYTHING, NEVER_NS, Player, between, playable, samples_of
 from tests.unit.recorder import golden
 
 SECOND = 10**9

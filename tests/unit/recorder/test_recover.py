@@ -14,12 +14,12 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from reactorwatch.errors import InputError
-from recorder.entry import Entry
-from recorder.mcap_chunks import metadata_records
-from recorder.mcap_file import read_messages, read_metadata
-from recorder.mcap_scan import Scan, Stored
-from recorder.mcap_writer import RecordingWriter
-from recorder.recover import Saved, recover
+from recorder.message import Entry
+from recorder.storage.mcap_chunks import metadata_records
+from recorder.storage.mcap_scan import Scan, Stored
+from recorder.storage.mcap_writer import RecordingWriter
+from recorder.storage.recover import Saved, recover
+from recorder.tools.mcap_file import read_messages, read_metadata
 from tests.unit.recorder import golden
 
 ENTRIES = list(golden.entries())[:90]

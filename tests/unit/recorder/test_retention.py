@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.retention import Finished, Limits, to_delete
+from recorder.policy.retention import Finished, Limits, to_delete
 
 FILES = [Finished(Path(f"{name}.mcap"), 100, at) for name, at in (("c", 30), ("a", 10), ("b", 20))]
 

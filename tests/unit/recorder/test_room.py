@@ -8,12 +8,12 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from recorder import room as room_module
-from recorder.entry import Entry
-from recorder.mcap_file import read_messages, recordings_in
-from recorder.mcap_writer import RecordingWriter, WriteError
-from recorder.own_alarms import KEYS_ALARM
-from recorder.room import MOST_OTHERS, Channel, Room
+from recorder.message import Entry
+from recorder.policy import room as room_module
+from recorder.policy.own_alarms import KEYS_ALARM
+from recorder.policy.room import MOST_OTHERS, Channel, Room
+from recorder.storage.mcap_writer import RecordingWriter, WriteError
+from recorder.tools.mcap_file import read_messages, recordings_in
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, Fed, recorder
 
@@ -123,7 +123,7 @@ def test_messages_repeated_at_the_start_of_a_file_count_too() -> None:
 def test_a_channel_beyond_those_that_the_format_can_number_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recorder.mcap_writer.MOST_CHANNELS", 3)
+    monkeypatch.setattr("recorder.storage.mcap_writer.MOST_CHANNELS", 3)
     first = Entry("", b"", "?", 0, 0)
     with RecordingWriter(tmp_path / "run.mcap", {}) as writer:
         for number in range(3):

@@ -6,9 +6,9 @@ import pytest
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.errors import InputError
-from recorder.entry import Entry
-from recorder.run import ADAPTS, EQUATIONS, HELD, JUDGES, Earlier, Run
-from recorder.run_reader import read_run, stretches
+from recorder.columns.run import ADAPTS, EQUATIONS, HELD, JUDGES, Earlier, Run
+from recorder.columns.run_reader import read_run, stretches
+from recorder.message import Entry
 from tests.unit.recorder import golden
 
 

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
-from recorder.run_splitter import ContinuousTime, RunSplitter
+from recorder.columns.run_splitter import ContinuousTime, RunSplitter
 
 PERIOD = 6_000_000_000
 SIGNALS = ("qc", "C", "T")

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.sequences import MOST_GAPS, SequenceCheck
+from recorder.columns.sequences import MOST_GAPS, SequenceCheck
 
 
 def counted(sequences: list[int]) -> tuple[int, int, int]:

@@ -8,12 +8,12 @@ import pytest
 from reactorwatch.cli.recording_reports import info_object, info_text
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import Record
-from recorder.convert import export_csv
-from recorder.entry import Entry
-from recorder.look import look_over, zero_ns_of
-from recorder.mcap_file import RecordingWriter, read_messages, read_record
-from recorder.player import Player, playable, samples_of
-from recorder.run_reader import read_run
+from recorder.columns.run_reader import read_run
+from recorder.message import Entry
+from recorder.tools.convert import export_csv
+from recorder.tools.inspect import look_over, zero_ns_of
+from recorder.tools.mcap_file import RecordingWriter, read_messages, read_record
+from recorder.tools.player import Player, playable, samples_of
 
 SECOND = 1_000_000_000
 START_NS = 1_772_352_000 * SECOND

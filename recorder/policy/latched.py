@@ -8,8 +8,8 @@ time of the file's beginning as that of receipt.
 from google.protobuf.message import Message
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.entry import Entry
-from recorder.room import MOST_KEYS
+from recorder.message import Entry
+from recorder.policy.room import MOST_KEYS
 
 
 class Head:

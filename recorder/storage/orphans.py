@@ -5,10 +5,10 @@ from pathlib import Path
 import structlog
 
 from reactorwatch.errors import InputError
-from recorder.mcap_scan import Scan
-from recorder.part_file import PART, is_held, left_behind
-from recorder.recover import origin, recover
-from recorder.series import Series
+from recorder.policy.series import Series
+from recorder.storage.mcap_scan import Scan
+from recorder.storage.part_file import PART, is_held, left_behind
+from recorder.storage.recover import origin, recover
 
 log = structlog.get_logger()
 

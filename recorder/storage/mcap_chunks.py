@@ -29,8 +29,8 @@ from mcap.writer import MCAP0_MAGIC
 from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
 from reactorwatch.records.reading import reading
-from recorder.chunk_data import chunk_data
-from recorder.entry import Entry
+from recorder.message import Entry
+from recorder.storage.chunk_data import chunk_data
 
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the summary offsets, CRC
 RECORD = struct.Struct("<BQ")  # opcode, length

@@ -8,10 +8,10 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from reactorwatch.errors import InputError
-from recorder.black_box import Stretch
-from recorder.mcap_chunks import read_summary, span_ns
-from recorder.part_file import PART, is_held
-from recorder.series import ENDING, Series
+from recorder.policy.black_box import Stretch
+from recorder.policy.series import ENDING, Series
+from recorder.storage.mcap_chunks import read_summary, span_ns
+from recorder.storage.part_file import PART, is_held
 
 BLACK_BOX = "black-box"
 """The folder, beside the recordings, of the stretches that are kept for good."""

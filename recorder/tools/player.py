@@ -17,8 +17,8 @@ from reactorwatch.contract.commands import command_in
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, to_time_ns
-from recorder.entry import Entry
-from recorder.run_splitter import ContinuousTime
+from recorder.columns.run_splitter import ContinuousTime
+from recorder.message import Entry
 
 BATCH = 256
 """Messages that go out before the loop looks for a stop again."""

@@ -8,7 +8,7 @@ sample that belongs there.
 from typing import Any, NamedTuple
 
 from reactorwatch.contract.messages_pb2 import Sample
-from recorder.sequences import Place, SequenceCheck
+from recorder.columns.sequences import Place, SequenceCheck
 
 
 class RunSpan(NamedTuple):

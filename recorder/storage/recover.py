@@ -14,8 +14,8 @@ from pathlib import Path
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.output import refuse_source
-from recorder.mcap_scan import Damage, Scan, profile_of
-from recorder.mcap_writer import METADATA, RecordingWriter, own_metadata
+from recorder.storage.mcap_scan import Damage, Scan, profile_of
+from recorder.storage.mcap_writer import METADATA, RecordingWriter, own_metadata
 
 RECOVERED = "recovered"
 """In our metadata of a recovered file: what could not be read."""

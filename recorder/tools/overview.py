@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, decode
-from recorder.entry import Entry
-from recorder.run_splitter import RunSpan, RunSplitter
+from recorder.columns.run_splitter import RunSpan, RunSplitter
+from recorder.message import Entry
 
 MOST_GAPS = 1000
 """Gaps that are named; more are counted only."""

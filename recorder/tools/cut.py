@@ -18,13 +18,13 @@ from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.output import refuse_source
-from recorder.entry import Entry
-from recorder.gaps import GAP, from_metadata
-from recorder.head import Head
-from recorder.mcap_chunks import damaged, read_summary, span_ns
-from recorder.mcap_scan import FOREVER_NS, Scan, Stored, Wanted, profile_of
-from recorder.mcap_writer import METADATA, RecordingWriter
-from recorder.turns import in_turn
+from recorder.message import Entry
+from recorder.policy.latched import Head
+from recorder.storage.gaps import GAP, from_metadata
+from recorder.storage.mcap_chunks import damaged, read_summary, span_ns
+from recorder.storage.mcap_scan import FOREVER_NS, Scan, Stored, Wanted, profile_of
+from recorder.storage.mcap_writer import METADATA, RecordingWriter
+from recorder.tools.overlap import in_turn
 
 STANDING = frozenset({keys.MODEL, keys.ALARM, keys.FAULT})
 """Kinds of messages whose last one tells how things stand."""

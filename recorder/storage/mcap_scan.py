@@ -22,9 +22,9 @@ from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.reading import reading
-from recorder.chunk_data import chunk_data
-from recorder.entry import Entry
-from recorder.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, channel_of, read_summary
+from recorder.message import Entry
+from recorder.storage.chunk_data import chunk_data
+from recorder.storage.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, channel_of, read_summary
 
 FOREVER_NS = 2**64 - 1
 
@@ -54,7 +54,7 @@ class Stored(NamedTuple):
 
     @property
     def repeated(self) -> bool:
-        """See `recorder.entry.Entry`."""
+        """See `recorder.message.Entry`."""
         return REPEATED in self.channel.metadata
 
     @property

@@ -19,9 +19,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.errors import InputError
-from recorder.entry import Entry
-from recorder.measurement import measured
-from recorder.run import (
+from recorder.columns.measurement import measured
+from recorder.columns.run import (
     ADAPTS,
     EQUATIONS,
     HELD,
@@ -38,7 +37,8 @@ from recorder.run import (
     Seen,
     Snapshot,
 )
-from recorder.run_splitter import ContinuousTime
+from recorder.columns.run_splitter import ContinuousTime
+from recorder.message import Entry
 
 STRETCH = 100_000
 """Messages; drawn they take some 20 MB for a moment."""

@@ -11,10 +11,10 @@ from reactorwatch.records.atomic import replacing
 from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.output import refuse_source
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, to_time_ns
-from recorder.entry import Entry
-from recorder.mcap_file import CLOCK, NO_CLOCK, ZERO_NS, RecordingWriter, read_record
-from recorder.player import samples_of
-from recorder.run_splitter import ContinuousTime
+from recorder.columns.run_splitter import ContinuousTime
+from recorder.message import Entry
+from recorder.tools.mcap_file import CLOCK, NO_CLOCK, ZERO_NS, RecordingWriter, read_record
+from recorder.tools.player import samples_of
 
 
 def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | None = None, zero_ns: int = 0) -> Record:

@@ -28,12 +28,12 @@ from reactorwatch.contract.codec import DecodeError, decode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.reading import files_of
 from reactorwatch.records.record import MINUTE_NS, UNITS, Record, join_runs
-from recorder.entry import Entry
-from recorder.mcap_chunks import entries, is_in_order, metadata_records, read_summary, sorted_entries, span_ns
-from recorder.mcap_writer import RecordingWriter, own_metadata
-from recorder.measurement import measured
-from recorder.run_splitter import RunSplitter
-from recorder.turns import in_turn
+from recorder.columns.measurement import measured
+from recorder.columns.run_splitter import RunSplitter
+from recorder.message import Entry
+from recorder.storage.mcap_chunks import entries, is_in_order, metadata_records, read_summary, sorted_entries, span_ns
+from recorder.storage.mcap_writer import RecordingWriter, own_metadata
+from recorder.tools.overlap import in_turn
 
 __all__ = ["RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
 

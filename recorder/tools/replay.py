@@ -16,9 +16,9 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.config import ReplayConfig
-from recorder.look import zero_ns_of
-from recorder.mcap_file import plants_in, read_messages
-from recorder.player import COMMANDS, EVERYTHING, NEVER_NS, SAMPLES, Player, between, playable, samples_of
+from recorder.tools.inspect import zero_ns_of
+from recorder.tools.mcap_file import plants_in, read_messages
+from recorder.tools.player import COMMANDS, EVERYTHING, NEVER_NS, SAMPLES, Player, between, playable, samples_of
 
 __all__ = ["Player", "ReplayConfig", "replay", "run_replay", "samples_of"]
 

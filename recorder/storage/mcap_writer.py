@@ -16,12 +16,12 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import encoding_of, message_type
 from reactorwatch.contract.sample_bytes import sample_number
 from reactorwatch.errors import InputError
-from recorder.entry import Entry
-from recorder.mcap_chunks import REPEATED
-from recorder.mcap_scan import Stored
-from recorder.mcap_stream import McapStream
-from recorder.part_file import PART, PartFile, is_held
-from recorder.room import MOST_CHANNELS
+from recorder.message import Entry
+from recorder.policy.room import MOST_CHANNELS
+from recorder.storage.mcap_chunks import REPEATED
+from recorder.storage.mcap_scan import Stored
+from recorder.storage.mcap_stream import McapStream
+from recorder.storage.part_file import PART, PartFile, is_held
 
 METADATA = "reactorwatch"
 MOST_MESSAGES = 2**32 - 1

@@ -12,13 +12,13 @@ from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.in_order import Gap
-from recorder.gaps import GAP, from_metadata
-from recorder.mcap_chunks import metadata_records
-from recorder.mcap_file import read_messages, read_metadata, recordings_in, zero_from
-from recorder.mcap_scan import Scan
-from recorder.mcap_writer import own_metadata
-from recorder.overview import Overview, overview
-from recorder.run_splitter import RunSplitter
+from recorder.columns.run_splitter import RunSplitter
+from recorder.storage.gaps import GAP, from_metadata
+from recorder.storage.mcap_chunks import metadata_records
+from recorder.storage.mcap_scan import Scan
+from recorder.storage.mcap_writer import own_metadata
+from recorder.tools.mcap_file import read_messages, read_metadata, recordings_in, zero_from
+from recorder.tools.overview import Overview, overview
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""A recording's messages as columns of numbers, for drawing."""

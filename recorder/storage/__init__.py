@@ -1,0 +1,1 @@
+"""Recordings on disk: MCAP files, their parts, their repair."""

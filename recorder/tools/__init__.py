@@ -1,0 +1,1 @@
+"""Work on whole recordings: inspect, cut, merge, convert, play back."""
