@@ -25,7 +25,7 @@ from benchmarks.hidden.classes import CLASSES, StudyClass, class_named, drawn
 from benchmarks.hidden.tables import confusion_table, failures, main_table
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.runtime.jobs import Failed, workers
+from reactorwatch.runtime.parallel.jobs import Failed, workers
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.judge import Judged, failed, judge
 

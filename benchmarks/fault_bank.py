@@ -31,7 +31,7 @@ from benchmarks.faults.report_method import METHODS, calibrated_width
 from benchmarks.faults.score import rows_to_false_alarm
 from benchmarks.faults.study import Widths, fault_free_statistics, run_case, run_fault_free
 from benchmarks.faults.tables import as_json, print_fault_free, print_summary, print_table
-from reactorwatch.runtime.jobs import Failed, Workers, in_order, workers
+from reactorwatch.runtime.parallel.jobs import Failed, Workers, in_order, workers
 
 SEEDS, FAULT_FREE_RUNS, CALIBRATION_RUNS = 20, 200, 400
 QUICK_SEEDS, QUICK_FAULT_FREE_RUNS, QUICK_CALIBRATION_RUNS = 2, 6, 60

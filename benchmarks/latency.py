@@ -25,9 +25,9 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Quality, Sampl
 from reactorwatch.records.record import UNITS, to_time_ns
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
-from reactorwatch.runtime.serve import StopSignal
 
 RATE = 100.0  # rows a second
 TRAINING_ROWS, WATCHED_ROWS, EVERY = 400, 2000, 10
@@ -36,7 +36,7 @@ import sys, threading
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.logs import configure
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 bus = connect(BusConfig(endpoint=sys.argv[1]), "echo", StopSignal())
 bus.subscribe("reactor/cstr/sample/T", lambda message: bus.publish(message._replace(key="echo/T")))
 bus.announce("reactor/cstr/alive/echo")

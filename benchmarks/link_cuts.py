@@ -28,8 +28,8 @@ from reactorwatch.contract.messages_pb2 import Health, Sample
 from reactorwatch.runtime import logs
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint, free_port
-from reactorwatch.runtime.serve import StopSignal
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
 from recorder.tools.mcap_file import read_messages, recordings_in

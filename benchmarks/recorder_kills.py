@@ -27,8 +27,8 @@ from reactorwatch.contract.codec import Encoded, Publication, decode, encode
 from reactorwatch.runtime import logs
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
-from reactorwatch.runtime.serve import StopSignal
 from recorder.tools.mcap_file import read_messages, recordings_in
 
 KILLS = 50

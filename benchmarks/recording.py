@@ -29,8 +29,8 @@ from reactorwatch.records.record import Record
 from reactorwatch.runtime import logs
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
-from reactorwatch.runtime.serve import StopSignal
 from recorder.__main__ import begin, files_for
 from recorder.config import RecorderConfig
 from recorder.core import Recorder

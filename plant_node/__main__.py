@@ -16,10 +16,10 @@ from reactorwatch.records.record import Record
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
-from reactorwatch.runtime.entry import main
+from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.metrics import Metrics, served
-from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.node_main import main
 
 log = structlog.get_logger()
 

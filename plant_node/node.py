@@ -42,7 +42,7 @@ SAY_AGAIN_NS = 60_000_000_000
 
 
 class PlantNode:
-    """See `reactorwatch.runtime.serve.Node`.
+    """See `reactorwatch.runtime.event_loop.Node`.
 
     Args:
         plant: the simulated plant, at its first row.

@@ -14,9 +14,9 @@ from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
-from reactorwatch.runtime.entry import main
+from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
 from reactorwatch.runtime.metrics import Metrics, served
-from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.node_main import main
 from recorder.config import RecorderConfig
 from recorder.core import NODE, Recorder
 from recorder.files import RecordingFiles

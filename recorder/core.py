@@ -17,7 +17,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import CommandReply
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.columns.sequences import SequenceCheck
 from recorder.message import Entry
 from recorder.policy.own_alarms import DISK_ALARM, KEYS_ALARM, OwnAlarms

@@ -19,7 +19,7 @@ import structlog
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.core import Kept, fingerprint
 from recorder.message import Entry
 from recorder.policy.black_box import BlackBox, Stretch

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.core import Kept, Recorder
 from recorder.files import RecordingFiles
 from recorder.policy.black_box import BlackBox, Stretch
@@ -30,7 +30,7 @@ class Decisions:
 
 
 class RecorderNode:
-    """Writes what it receives; see `reactorwatch.runtime.serve.Node`.
+    """Writes what it receives; see `reactorwatch.runtime.event_loop.Node`.
 
     Its reports of health go out on the bus and come back as everything else does, so they are not written here. The
     last one alone is, because nobody listens any more when it would come back.

@@ -5,7 +5,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 
 WITHIN_S = 60.0
 

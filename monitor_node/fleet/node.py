@@ -30,11 +30,11 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
-from reactorwatch.runtime.command_rate import CommandRate, sender_of
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
+from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
 from reactorwatch.runtime.metrics import FleetMetrics, served
 from reactorwatch.runtime.model_file import model_on_the_bus
-from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.security.command_rate import CommandRate, sender_of
 
 log = structlog.get_logger()
 

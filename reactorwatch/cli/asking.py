@@ -49,7 +49,7 @@ def ask(
     from reactorwatch.contract.codec import Encoded, decode, encode_message
     from reactorwatch.contract.messages_pb2 import CommandReply
     from reactorwatch.runtime.bus_zenoh import connect
-    from reactorwatch.runtime.serve import StopSignal
+    from reactorwatch.runtime.event_loop import StopSignal
 
     tables, bus_config = begin(config, endpoint)
     try:

@@ -23,7 +23,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import filling
 from reactorwatch.records.reading import files_of
-from reactorwatch.runtime.jobs import Failed, in_order, workers
+from reactorwatch.runtime.parallel.jobs import Failed, in_order, workers
 from reactorwatch.terminal import printable
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"

@@ -29,9 +29,9 @@ from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import section
+from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
-from reactorwatch.runtime.serve import StopSignal, stop_on_signals
 from reactorwatch.terminal import printable_lines
 from recorder.config import RecorderConfig
 

@@ -22,10 +22,10 @@ from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
-from reactorwatch.runtime.access import Role, kinds_of, role_of
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
-from reactorwatch.runtime.certificates import common_name_of, read_certificate, read_key
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.security.acl import Role, kinds_of, role_of
+from reactorwatch.runtime.security.certificates import common_name_of, read_certificate, read_key
 
 RENEW_DAYS = 30
 LARGEST_OFFSET_S = 1.0

@@ -17,7 +17,7 @@ from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import ZenohBus, log_refusals, router, router_from_file
 from reactorwatch.runtime.config import BusConfig, read_settings, section
-from reactorwatch.runtime.site import ROUTER, ROUTER_SETTINGS, SETTINGS
+from reactorwatch.runtime.security.provisioning import ROUTER, ROUTER_SETTINGS, SETTINGS
 from recorder.config import RecorderConfig
 
 VIEWER = "viewer"

@@ -25,8 +25,8 @@ from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.entry import main
-from reactorwatch.runtime.serve import serve, stop_on_signals
+from reactorwatch.runtime.event_loop import serve, stop_on_signals
+from reactorwatch.runtime.node_main import main
 from recorder.message import Entry
 from recorder.storage.mcap_writer import RecordingWriter
 

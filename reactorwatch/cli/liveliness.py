@@ -4,8 +4,8 @@ import threading
 
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.liveliness import wait_alive
-from reactorwatch.runtime.serve import StopSignal
 
 
 def comes_alive(config: BusConfig, plant: str, node: str, timeout_s: float) -> bool:

@@ -56,7 +56,7 @@ def certify(
     """
     from datetime import UTC, datetime
 
-    from reactorwatch.runtime.site import AUTHORITY, ROUTER, ROUTER_SETTINGS, make_site
+    from reactorwatch.runtime.security.provisioning import AUTHORITY, ROUTER, ROUTER_SETTINGS, make_site
 
     now, revoked = datetime.now(UTC), tuple(revoke or ())
     for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, now, renew_days=renew, revoke=revoked):
@@ -93,8 +93,8 @@ def router(
     from reactorwatch.runtime.bus_zenoh import log_refusals, router_from_file
     from reactorwatch.runtime.bus_zenoh import router as plain_router
     from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
+    from reactorwatch.runtime.event_loop import stop_on_signals
     from reactorwatch.runtime.logs import configure
-    from reactorwatch.runtime.serve import stop_on_signals
 
     if file is not None and (config is not None or endpoint is not None):
         raise InputError(f"{file}: says where this router listens; leave out --config and --endpoint")

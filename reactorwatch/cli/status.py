@@ -16,7 +16,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, 
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.serve import stop_on_signals
+from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.terminal import printable_lines
 
 if TYPE_CHECKING:

@@ -23,9 +23,9 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.output import check_folder_name
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
+from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.model_file import read_extended_model
-from reactorwatch.runtime.serve import stop_on_signals
 from recorder.__main__ import file_for
 from recorder.config import RecorderConfig
 from recorder.policy.series import ENDING

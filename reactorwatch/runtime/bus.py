@@ -16,7 +16,7 @@ from google.protobuf.message import Message
 
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.keys import matches
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 
 MOST_GATHERED = 2000
 """Messages that are handed over together."""

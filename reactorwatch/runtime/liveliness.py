@@ -7,7 +7,7 @@ import structlog
 
 from reactorwatch.contract import keys
 from reactorwatch.runtime.bus import Bus
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 
 log = structlog.get_logger()
 

@@ -26,8 +26,8 @@ from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
 from reactorwatch.runtime.loopback import free_port
-from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.columns.run_reader import STRETCH, RunReader
 from recorder.dashboard.drawing import Drawing
 from recorder.dashboard.late_joiner import Past, PastQuery, ask_for_past, zero_of
@@ -111,7 +111,7 @@ def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], N
 
 
 class LiveDashboard:
-    """Draws what it hears; see `reactorwatch.runtime.serve.Node`.
+    """Draws what it hears; see `reactorwatch.runtime.event_loop.Node`.
 
     Args:
         recording: the stream, connected to a viewer.

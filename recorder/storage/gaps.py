@@ -1,12 +1,13 @@
 """What never came, as a recording tells it: a metadata record for each gap. Pure.
 
-The bus numbers what a node publishes of one kind (`reactorwatch.runtime.in_order`). What was lost on the way and could
-not be recovered is among these numbers, so it is known how much is missing, of what, and from where to where.
+The bus numbers what a node publishes of one kind (`reactorwatch.runtime.delivery.reorder_buffer`). What was lost on the
+way and could not be recovered is among these numbers, so it is known how much is missing, of what, and from where to
+where.
 """
 
 from datetime import UTC, datetime
 
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 
 GAP = "reactorwatch.gap"
 """The name of these records."""

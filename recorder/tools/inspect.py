@@ -11,7 +11,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.columns.run_splitter import RunSplitter
 from recorder.storage.gaps import GAP, from_metadata
 from recorder.storage.mcap_chunks import metadata_records

@@ -127,7 +127,7 @@ def _paced(tape: Iterable[Publication]) -> Iterator[_Due]:
 
 
 class Player:
-    """Hands out publications when they are due; see `reactorwatch.runtime.serve.Node`.
+    """Hands out publications when they are due; see `reactorwatch.runtime.event_loop.Node`.
 
     Args:
         open_tape: gives what is to be played, from its beginning each time it is called.

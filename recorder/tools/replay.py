@@ -13,8 +13,8 @@ from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
-from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
 from recorder.config import ReplayConfig
 from recorder.tools.inspect import zero_ns_of
 from recorder.tools.mcap_file import plants_in, read_messages

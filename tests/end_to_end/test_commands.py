@@ -16,7 +16,7 @@ from reactorwatch.contract.messages_pb2 import CommandReply, InjectFault, SetInp
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 from recorder.dashboard.picture import count_coloured
 from recorder.tools.mcap_file import read_messages
 

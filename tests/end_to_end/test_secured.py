@@ -14,9 +14,9 @@ from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health, Sample
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig, read_settings, section
+from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_port
-from reactorwatch.runtime.serve import StopSignal
-from reactorwatch.runtime.site import make_site
+from reactorwatch.runtime.security.provisioning import make_site
 from recorder.tools.mcap_file import read_messages
 
 from .conftest import PATIENCE_S, Command, Start

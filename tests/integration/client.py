@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 
 
 @contextmanager

@@ -10,9 +10,9 @@ import msgspec
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router_from_file
 from reactorwatch.runtime.config import BusConfig, read_settings, section
+from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_port
-from reactorwatch.runtime.serve import StopSignal
-from reactorwatch.runtime.site import make_site
+from reactorwatch.runtime.security.provisioning import make_site
 
 PLANTS = ("cstr", "other")
 WITHIN_S = 60.0

@@ -30,7 +30,7 @@ import sys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 bus = connect(BusConfig(endpoint=sys.argv[1]), "plant", StopSignal())
 bus.announce("reactor/x/alive/plant")
 print("ready", flush=True)
@@ -45,7 +45,7 @@ LISTENER = """
 import sys, threading
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 bus = connect(BusConfig(endpoint=sys.argv[1]), "listener", StopSignal())
 heard = []
 def on_messages(messages):

@@ -16,8 +16,8 @@ from reactorwatch.contract.codec import Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import CommandReply, Fault, Health, InjectFault, Sample, SetInput
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
-from reactorwatch.runtime.serve import StopSignal
 
 WITHIN_S = 60.0
 

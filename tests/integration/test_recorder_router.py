@@ -18,7 +18,7 @@ from reactorwatch.contract.codec import Encoded, Publication, decode, encode, en
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 from recorder.__main__ import record
 from recorder.config import RecorderConfig, ReplayConfig
 from recorder.message import Entry

@@ -13,7 +13,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import decode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Sample
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.message import Entry
 from recorder.storage.gaps import GAP, to_metadata
 from recorder.storage.recover import recover

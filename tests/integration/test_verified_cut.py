@@ -21,8 +21,8 @@ from reactorwatch.cli.verification import run
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal, serve
 from reactorwatch.runtime.loopback import free_endpoint
-from reactorwatch.runtime.serve import StopSignal, serve
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
 from tests.running import WITHIN_S, running

@@ -15,7 +15,7 @@ from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import filling, make_folder
 from reactorwatch.records.output import checked_folder
 from reactorwatch.records.record import Record
-from reactorwatch.runtime.jobs import Failed
+from reactorwatch.runtime.parallel.jobs import Failed
 from reactorwatch.terminal import printable_lines
 
 PAGE = "study.md"

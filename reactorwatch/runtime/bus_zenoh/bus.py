@@ -16,7 +16,6 @@ from google.protobuf.message import Message
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode_message
-from reactorwatch.runtime.access import MEMORY, NOBODY
 from reactorwatch.runtime.bus import MOST_GATHERED, Request
 from reactorwatch.runtime.bus_zenoh.messages import (
     LONGEST_ENCODING,
@@ -30,9 +29,10 @@ from reactorwatch.runtime.bus_zenoh.messages import (
     spelled,
 )
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.delivery import Delivery, Numbered
-from reactorwatch.runtime.in_order import Gap, InOrder
-from reactorwatch.runtime.streams import STREAM_PARTS, keys_of, stream_of
+from reactorwatch.runtime.delivery.delivery import Delivery, Numbered
+from reactorwatch.runtime.delivery.reorder_buffer import Gap, InOrder
+from reactorwatch.runtime.delivery.streams import STREAM_PARTS, keys_of, stream_of
+from reactorwatch.runtime.security.acl import MEMORY, NOBODY
 
 log = structlog.get_logger()
 

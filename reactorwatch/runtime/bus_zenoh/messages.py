@@ -6,8 +6,8 @@ import struct
 import zenoh
 
 from reactorwatch.contract.codec import LARGEST_PAYLOAD, Encoded
-from reactorwatch.runtime.delivery import Numbered
-from reactorwatch.runtime.streams import STREAM_PARTS
+from reactorwatch.runtime.delivery.delivery import Numbered
+from reactorwatch.runtime.delivery.streams import STREAM_PARTS
 
 LONGEST_ENCODING = 1000
 LONGEST_KEY = 1000

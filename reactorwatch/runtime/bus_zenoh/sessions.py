@@ -14,9 +14,9 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh.bus import ZenohBus
 from reactorwatch.runtime.bus_zenoh.messages import first_line
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.heap import return_large_blocks
-from reactorwatch.runtime.identity import ROUTER_FILES, TLS, client_settings
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.security.identity import ROUTER_FILES, TLS, client_settings
 
 log = structlog.get_logger()
 

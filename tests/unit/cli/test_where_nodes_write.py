@@ -10,7 +10,7 @@ from reactorwatch.cli import supervise
 from reactorwatch.cli.main import main
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import BusConfig, section
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
 

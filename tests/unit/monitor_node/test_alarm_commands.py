@@ -23,7 +23,7 @@ from reactorwatch.contract.messages_pb2 import (
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
-from reactorwatch.runtime.command_rate import ONE_NAME
+from reactorwatch.runtime.security.command_rate import ONE_NAME
 
 from .samples import PLANT, leaking_run, samples
 

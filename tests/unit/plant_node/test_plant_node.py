@@ -23,7 +23,7 @@ from reactorwatch.contract.messages_pb2 import (
     SetInput,
 )
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-from reactorwatch.runtime.serve import StopSignal
+from reactorwatch.runtime.event_loop import StopSignal
 from tests.running import WITHIN_S, running
 
 START_NS = 1_700_000_000_000_000_000

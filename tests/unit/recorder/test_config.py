@@ -9,7 +9,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import section
-from reactorwatch.runtime.entry import main
+from reactorwatch.runtime.node_main import main
 from recorder.__main__ import file_for, run
 from recorder.config import RecorderConfig, ReplayConfig
 

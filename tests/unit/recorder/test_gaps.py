@@ -7,7 +7,7 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.__main__ import files_for
 from recorder.config import RecorderConfig
 from recorder.storage.gaps import from_metadata, to_metadata

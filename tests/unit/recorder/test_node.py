@@ -11,7 +11,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, decode, encode
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-from reactorwatch.runtime.serve import StopSignal, serve
+from reactorwatch.runtime.event_loop import StopSignal, serve
 from recorder.__main__ import begin, files_for
 from recorder.config import RecorderConfig
 from recorder.files import RecordingFiles

@@ -17,9 +17,9 @@ from reactorwatch.contract.messages_pb2 import (
     SetInput,
     ShelveAlarm,
 )
-from reactorwatch.runtime.audit import audit
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-from reactorwatch.runtime.serve import StopSignal, serve
+from reactorwatch.runtime.event_loop import StopSignal, serve
+from reactorwatch.runtime.security.audit import audit
 from tests.running import WITHIN_S, running
 
 

@@ -13,10 +13,17 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from cryptography.x509.verification import PolicyBuilder, Store, VerificationError
 
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.access import ROLES, access_control
-from reactorwatch.runtime.certificates import Identity, authority, common_name_of, issue, read_certificate, read_key
 from reactorwatch.runtime.config import BusConfig, read_settings, section
-from reactorwatch.runtime.site import make_site
+from reactorwatch.runtime.security.acl import ROLES, access_control
+from reactorwatch.runtime.security.certificates import (
+    Identity,
+    authority,
+    common_name_of,
+    issue,
+    read_certificate,
+    read_key,
+)
+from reactorwatch.runtime.security.provisioning import make_site
 
 NOW = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 DAY = datetime.timedelta(days=1)

@@ -4,7 +4,7 @@ import pytest
 
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, ListAlarms
-from reactorwatch.runtime.command_rate import ALL, MOST_NAMES, ONE_NAME, CommandRate, sender_of
+from reactorwatch.runtime.security.command_rate import ALL, MOST_NAMES, ONE_NAME, CommandRate, sender_of
 
 SECOND = 1_000_000_000
 

@@ -7,9 +7,9 @@ from queue import SimpleQueue
 import pytest
 
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.runtime import in_order
-from reactorwatch.runtime.delivery import Delivery, Numbered
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery import reorder_buffer
+from reactorwatch.runtime.delivery.delivery import Delivery, Numbered
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from tests.running import WITHIN_S
 
 SECOND = 10**9
@@ -37,7 +37,7 @@ def taken(heard: "SimpleQueue[Encoded | Gap]") -> list[str]:
 
 
 def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(in_order, "PATIENCE_NS", 1_000_000)
+    monkeypatch.setattr(reorder_buffer, "PATIENCE_NS", 1_000_000)
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     delivery = Delivery(each(heard), heard.put)
     delivery.begin()
@@ -52,7 +52,7 @@ def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.Monke
 
 
 def test_what_is_missing_is_asked_for_before_it_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(in_order, "PATIENCE_NS", 1_000_000)
+    monkeypatch.setattr(reorder_buffer, "PATIENCE_NS", 1_000_000)
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     asked: list[tuple[str, float]] = []
 

@@ -5,8 +5,8 @@ from collections.abc import Iterable
 
 import pytest
 
-from reactorwatch.runtime import in_order, numbered_stream
-from reactorwatch.runtime.in_order import (
+from reactorwatch.runtime.delivery import reorder_buffer, stream_state
+from reactorwatch.runtime.delivery.reorder_buffer import (
     GATHER_NS,
     LOOK_AGAIN_NS,
     PATIENCE_NS,
@@ -283,14 +283,14 @@ def test_a_late_listener_gathers_as_long_as_older_ones_come_and_not_as_long_as_n
 
 
 def test_no_more_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numbered_stream, "MOST_HELD", 100)
+    monkeypatch.setattr(stream_state, "MOST_HELD", 100)
     order = InOrder[int]()
     fed(order, [0])
     assert fed(order, list(range(2, 103))) == [Gap(STREAM, 1, 1, 1, 1, 0), *range(2, 103)]
 
 
 def test_no_more_bytes_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numbered_stream, "MOST_HELD_BYTES", 1000)
+    monkeypatch.setattr(stream_state, "MOST_HELD_BYTES", 1000)
     order = InOrder[int](size=lambda _: 100)
     fed(order, [0])
     assert fed(order, list(range(2, 13))) == [Gap(STREAM, 1, 1, 1, 1, 0), *range(2, 13)]
@@ -299,7 +299,7 @@ def test_no_more_bytes_wait_than_memory_has_room_for(monkeypatch: pytest.MonkeyP
 
 def test_while_what_was_before_is_told_no_more_waits_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """What did not find room is told as missing."""
-    monkeypatch.setattr(numbered_stream, "MOST_HELD", 10)
+    monkeypatch.setattr(stream_state, "MOST_HELD", 10)
     order = InOrder[int](gathering=True)
     assert fed(order, range(100)) == []
     told = [*order.gathered(0), *fed(order, [100, 101])]
@@ -311,7 +311,7 @@ def test_while_what_was_before_is_told_no_more_waits_than_there_is_room_for(monk
 def test_publishers_without_number_are_forgotten_and_the_one_that_goes_on_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(in_order, "MOST_STREAMS", 100)
+    monkeypatch.setattr(reorder_buffer, "MOST_STREAMS", 100)
     order = InOrder[int]()
     for number in range(1000):
         assert fed(order, [number], now_ns=number) == [number]
@@ -321,14 +321,14 @@ def test_publishers_without_number_are_forgotten_and_the_one_that_goes_on_is_not
 
 
 def test_keys_without_number_are_not_all_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numbered_stream, "MOST_KEYS", 10)
+    monkeypatch.setattr(stream_state, "MOST_KEYS", 10)
     order = InOrder[int]()
     assert [item for number in range(100) for item in fed(order, [number], key=f"x{number}")] == list(range(100))
     assert len(order._streams[1, STREAM].keys) == 10
 
 
 def test_the_fast_way_is_for_keys_that_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(numbered_stream, "MOST_KEYS", 10)
+    monkeypatch.setattr(stream_state, "MOST_KEYS", 10)
     order = InOrder[int]()
     fed(order, [0], key="x0")
     for number in range(1, 100):
@@ -372,7 +372,7 @@ def test_a_flood_of_made_up_publishers_pushes_out_its_own_and_not_those_that_are
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """More of them in a minute than there is room for: the plant's own alarms may be silent for longer than they."""
-    monkeypatch.setattr(in_order, "MOST_STREAMS", 100)
+    monkeypatch.setattr(reorder_buffer, "MOST_STREAMS", 100)
     order = InOrder[int]()
     assert fed(order, [0, 1]) == [0, 1]
     for number in range(1000):
@@ -398,7 +398,7 @@ def test_publishers_that_were_told_of_or_heard_from_their_beginning_are_not_forg
 
 
 def test_the_one_that_goes_on_by_the_fast_way_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(in_order, "MOST_STREAMS", 100)
+    monkeypatch.setattr(reorder_buffer, "MOST_STREAMS", 100)
     order = InOrder[int]()
     assert fed(order, [0]) == [0]
     for number in range(1, 1000):

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.jobs import RETRIES, Failed, Here, Workers, in_order, workers
-from reactorwatch.runtime.local_workers import THREADS, LocalWorkers, cores
+from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, Here, Workers, in_order, workers
+from reactorwatch.runtime.parallel.process_pool import THREADS, LocalWorkers, cores
 from tests.cluster import dask_cluster
 from tests.unit.runtime.work import deadly, linear_algebra_threads, picky, square, unspeakable
 
@@ -153,13 +153,13 @@ def test_without_dask_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_workers_with_another_version_or_none_are_told(
     cluster: str, theirs: str | None, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("reactorwatch.runtime.dask_workers._asks_for_version", lambda: lambda: theirs)
+    monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers._asks_for_version", lambda: lambda: theirs)
     with pytest.raises(InputError, match=said):
         list(workers(None, cluster).outcomes(square, range(2)))
 
 
 def test_a_cluster_without_workers_is_told_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("reactorwatch.runtime.dask_workers.WORKERS_WITHIN_S", 0.2)
+    monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers.WORKERS_WITHIN_S", 0.2)
     with dask_cluster(0) as address:
         said = f"has no workers; start some with: dask worker {address} --nthreads 1"
         with pytest.raises(InputError, match=said):
@@ -168,6 +168,6 @@ def test_a_cluster_without_workers_is_told_with_the_cure(monkeypatch: pytest.Mon
 
 def test_a_scheduler_that_is_not_there_is_told_by_its_address(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
-    monkeypatch.setattr("reactorwatch.runtime.dask_workers.CONNECT_WITHIN_S", 0.2)
+    monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers.CONNECT_WITHIN_S", 0.2)
     with pytest.raises(InputError, match=r"^--scheduler tcp://127\.0\.0\.1:1: cannot be reached: "):
         list(workers(None, "tcp://127.0.0.1:1").outcomes(square, range(2)))

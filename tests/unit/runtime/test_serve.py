@@ -11,7 +11,7 @@ import pytest
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply, Health
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-from reactorwatch.runtime.serve import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
 from tests.running import WITHIN_S, running
 
 FAR = 10**19
@@ -96,7 +96,7 @@ def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(
     bound: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The inbox stays within its bound, of messages or of bytes, and nothing is lost."""
-    monkeypatch.setattr(f"reactorwatch.runtime.serve.{bound}", most)
+    monkeypatch.setattr(f"reactorwatch.runtime.event_loop.{bound}", most)
     exchange, count = Exchange(), 5000
     handled, ahead = [0], [0]
 
@@ -157,7 +157,7 @@ def test_lingering_hears_what_comes_within_it() -> None:
 
 
 def test_a_node_that_is_finished_holds_nobody_up_who_still_publishes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("reactorwatch.runtime.serve.LARGEST_INBOX", 10)
+    monkeypatch.setattr("reactorwatch.runtime.event_loop.LARGEST_INBOX", 10)
     exchange = Exchange()
     node, speaker = Echo(messages=5), MemoryBus(exchange)
     serving = listening(node, exchange)
@@ -275,7 +275,7 @@ class Gathering(MemoryBus):
 def test_messages_that_come_together_are_bounded_likewise(
     bound: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(f"reactorwatch.runtime.serve.{bound}", most)
+    monkeypatch.setattr(f"reactorwatch.runtime.event_loop.{bound}", most)
     count, handled, ahead = 5000, [0], [0]
     bus, stop, ready = Gathering(Exchange()), StopSignal(), threading.Event()
 

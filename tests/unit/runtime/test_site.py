@@ -11,10 +11,10 @@ from cryptography import x509
 from cryptography.x509.verification import PolicyBuilder, Store
 
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.access import ROLES, access_control, role_of
-from reactorwatch.runtime.certificates import common_name_of, read_certificate, read_key
 from reactorwatch.runtime.config import BusConfig, read_settings, section
-from reactorwatch.runtime.site import LONGEST_PLANT, make_site
+from reactorwatch.runtime.security.acl import ROLES, access_control, role_of
+from reactorwatch.runtime.security.certificates import common_name_of, read_certificate, read_key
+from reactorwatch.runtime.security.provisioning import LONGEST_PLANT, make_site
 
 NOW = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 DAY = datetime.timedelta(days=1)

@@ -8,10 +8,10 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.keys import matches
-from reactorwatch.runtime.access import ROLES, access_control
-from reactorwatch.runtime.delivery import Delivery, Numbered
-from reactorwatch.runtime.in_order import Gap
-from reactorwatch.runtime.streams import MOST_CACHED, keys_of, role_of_key, stream_of
+from reactorwatch.runtime.delivery.delivery import Delivery, Numbered
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.delivery.streams import MOST_CACHED, keys_of, role_of_key, stream_of
+from reactorwatch.runtime.security.acl import ROLES, access_control
 
 ROOT = "reactor/cstr"
 KINDS = (

@@ -7,8 +7,8 @@ from itertools import islice
 from typing import NamedTuple
 
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.runtime.in_order import Gap, InOrder
-from reactorwatch.runtime.streams import stream_of
+from reactorwatch.runtime.delivery.reorder_buffer import Gap, InOrder
+from reactorwatch.runtime.delivery.streams import stream_of
 
 MOST_ASKED_FOR = 100
 """Streams whose publishers are asked again at once: of more than that something is missing when a network broke down,

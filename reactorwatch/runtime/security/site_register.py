@@ -7,7 +7,7 @@ import msgspec
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
-from reactorwatch.runtime.access import SERIAL_BYTES, common_name
+from reactorwatch.runtime.security.acl import SERIAL_BYTES, common_name
 
 
 class Register(msgspec.Struct, forbid_unknown_fields=True):

@@ -17,10 +17,10 @@ from typing import NamedTuple, Protocol, TypeAlias
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import CommandReply
-from reactorwatch.runtime.audit import audit
 from reactorwatch.runtime.bus import Bus, Request
 from reactorwatch.runtime.clock import SteadyClock
-from reactorwatch.runtime.in_order import Gap
+from reactorwatch.runtime.delivery.reorder_buffer import Gap
+from reactorwatch.runtime.security.audit import audit
 
 LONGEST_WAIT_S = 3600.0
 LONGEST_LINGER = 10  # times linger_s: a bus that never falls silent does not keep a node from ending

@@ -29,7 +29,7 @@ from itertools import accumulate
 from operator import itemgetter
 from typing import Generic, NamedTuple
 
-from reactorwatch.runtime.numbered_stream import Item, Stream, Waiting
+from reactorwatch.runtime.delivery.stream_state import Item, Stream, Waiting
 
 PATIENCE_NS = 5_000_000_000
 RECOVERY_NS = 15_000_000_000

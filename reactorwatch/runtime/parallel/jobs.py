@@ -2,7 +2,7 @@
 
 A job is the argument of a plain function; both are sent to wherever the work is done, so both can be pickled and the
 function is found by its name. Who does the work is a `Workers`: this process (`Here`), processes on this machine
-(`local_workers`), or a Dask cluster (`dask_workers`). All of them keep three promises:
+(`process_pool`), or a Dask cluster (`dask_workers`). All of them keep three promises:
 
 - a job that fails is an answer, `Failed`, and no other job knows of it;
 - a worker that dies costs a retry of the job that it was at. A job that does so again and again is a `Failed`, too;
@@ -109,10 +109,10 @@ def workers(processes: int | None = None, scheduler: str | None = None) -> Worke
     if scheduler is not None:
         if processes is not None:
             raise InputError("--jobs is for this machine, and --scheduler for a cluster; give one of them")
-        from reactorwatch.runtime.dask_workers import DaskWorkers
+        from reactorwatch.runtime.parallel.dask_workers import DaskWorkers
 
         return DaskWorkers(scheduler)
-    from reactorwatch.runtime.local_workers import LocalWorkers, cores
+    from reactorwatch.runtime.parallel.process_pool import LocalWorkers, cores
 
     if processes is None:
         processes = cores()

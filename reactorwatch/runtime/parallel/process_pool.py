@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar, cast
 
-from reactorwatch.runtime.jobs import RETRIES, Failed, attempt, died, fault
+from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, attempt, died, fault
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """What the libraries of linear algebra read as they are loaded."""

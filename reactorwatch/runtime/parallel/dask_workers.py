@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from reactorwatch import __version__
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.jobs import Failed, attempt, died, fault, one_line
+from reactorwatch.runtime.parallel.jobs import Failed, attempt, died, fault, one_line
 
 CONNECT_WITHIN_S = 10.0
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start

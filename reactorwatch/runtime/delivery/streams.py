@@ -10,7 +10,7 @@ all of one kind of one plant that one role may publish.
 from functools import lru_cache
 
 from reactorwatch.contract import keys
-from reactorwatch.runtime.access import ROLES, Role
+from reactorwatch.runtime.security.acl import ROLES, Role
 
 STREAM_PARTS = 3
 """Parts of a key that a stream has in common: root, plant and kind."""

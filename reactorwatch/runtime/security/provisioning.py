@@ -22,9 +22,16 @@ from cryptography.hazmat.primitives import serialization
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
-from reactorwatch.runtime.access import ROLES, SERIAL_BYTES, access_control, common_name
-from reactorwatch.runtime.certificates import Identity, authority, common_name_of, issue, read_certificate, read_key
-from reactorwatch.runtime.site_register import Register, read_register
+from reactorwatch.runtime.security.acl import ROLES, SERIAL_BYTES, access_control, common_name
+from reactorwatch.runtime.security.certificates import (
+    Identity,
+    authority,
+    common_name_of,
+    issue,
+    read_certificate,
+    read_key,
+)
+from reactorwatch.runtime.security.site_register import Register, read_register
 
 AUTHORITY, ROUTER = "authority", "router"
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"

@@ -1,0 +1,1 @@
+"""Delivery of messages in the order of their publication, without gaps."""

@@ -1,0 +1,1 @@
+"""Access rules, certificates, provisioning of a site, limits and audit of commands."""
