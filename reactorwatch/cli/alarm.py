@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.asking import PATIENCE_S, NoAnswerError, ask
+from reactorwatch.cli.command_client import PATIENCE_S, NoAnswerError, ask
 from reactorwatch.cli.options import LONGEST_WAIT_S, Endpoint, Json, Plant, Settings, sendable
 from reactorwatch.cli.printing import say
 from reactorwatch.contract.keys import ACKNOWLEDGE_RECORDER, LIST_RECORDER_ALARMS, RECORDING

@@ -11,8 +11,8 @@ from monitor_node.config import MonitorConfig
 from monitor_node.replay.backtest import run
 from reactorwatch.cli.batch import Answer, Kind, Row, as_table
 from reactorwatch.cli.options import existing_recording
+from reactorwatch.cli.read_record import plant_of, tape
 from reactorwatch.cli.reports import backtest_object, backtest_text
-from reactorwatch.cli.sources import plant_of, tape
 from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr

@@ -18,7 +18,7 @@ import typer
 from reactorwatch.cli.printing import say as print_lines
 from reactorwatch.cli.printing import say_text
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.cli.sources import stands_for
+from reactorwatch.cli.read_record import stands_for
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import filling

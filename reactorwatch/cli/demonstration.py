@@ -13,11 +13,11 @@ from pathlib import Path
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
-from reactorwatch.cli.joining import VIEWER, heard_by, joining, open_router, write_node_settings
+from reactorwatch.cli.bus_settings import VIEWER, heard_by, joining, open_router, write_node_settings
 from reactorwatch.cli.printing import say, say_text
 from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.cli.sources import messages
+from reactorwatch.cli.read_record import messages
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample

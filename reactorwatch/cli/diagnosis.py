@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from reactorwatch.cli.options import existing_recording
-from reactorwatch.cli.sources import process_model, record, signals_of
+from reactorwatch.cli.read_record import process_model, record, signals_of
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.parameter_priors import stated
 from reactorwatch.diagnosis.record_checks import run_of

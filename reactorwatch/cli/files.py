@@ -43,7 +43,7 @@ def dashboard(
     """Draw a recording into a Rerun file, without a screen."""
     from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.sources import tape
+    from reactorwatch.cli.read_record import tape
     from recorder.columns.run_reader import stretches
     from recorder.dashboard.file import write_rrd
     from recorder.dashboard.picture import picture_names, render_tabs

@@ -41,7 +41,7 @@ def identify(
     from reactorwatch.cli import identification
     from reactorwatch.cli.batch import write_remark
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.sources import record
+    from reactorwatch.cli.read_record import record
     from reactorwatch.cli.unit_remarks import unit_remark
     from reactorwatch.process.library.cstr.model import cstr
 
@@ -86,9 +86,9 @@ def reproduce(
     force: Force = False,
 ) -> None:
     """Make every figure of the original report anew (reactorwatch[pictures])."""
-    from reactorwatch.cli.sources import record
-    from reactorwatch.cli.study.reproduce import check_out
-    from reactorwatch.cli.study.reproduce import reproduce as reproduce_figures
+    from benchmarks.study_figures.reproduce import check_out
+    from benchmarks.study_figures.reproduce import reproduce as reproduce_figures
+    from reactorwatch.cli.read_record import record
 
     check_out(out, only, (file,), force=force)
     measured = record(existing_recording(file), plant, columns(column)) if file else None

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.asking import PATIENCE_S, ask
+from reactorwatch.cli.command_client import PATIENCE_S, ask
 from reactorwatch.cli.options import LONGEST_WAIT_S, Endpoint, Plant, Settings, pace
 from reactorwatch.cli.printing import say
 from reactorwatch.terminal import printable

@@ -126,7 +126,7 @@ def doctor(
     import msgspec
 
     from reactorwatch.cli.doctor import examine
-    from reactorwatch.cli.onlooker import begin_beside_recorder
+    from reactorwatch.cli.observer import begin_beside_recorder
 
     bus, recorder = begin_beside_recorder(config, endpoint, name)
     out = Path(recorder.out)
@@ -157,7 +157,7 @@ def status(
     as_json: Json = False,
 ) -> None:
     """Show plants, nodes, rates and alarms as they are now, until stopped."""
-    from reactorwatch.cli.onlooker import begin_beside_recorder
+    from reactorwatch.cli.observer import begin_beside_recorder
     from reactorwatch.cli.status import run
 
     bus, recorder = begin_beside_recorder(config, endpoint, name)

@@ -50,8 +50,8 @@ def simulate(
     They start from its first row and run freely, driven by its inputs.
     """
     from reactorwatch.cli.progress import task
+    from reactorwatch.cli.read_record import process_model, record, signals_of
     from reactorwatch.cli.simulation import free_run, report
-    from reactorwatch.cli.sources import process_model, record, signals_of
     from reactorwatch.records.csv_file import write_csv
 
     out = output_file(out, ".csv", (file, model), force=force)
@@ -88,7 +88,7 @@ def backtest(
     from monitor_node.config import MonitorConfig
     from reactorwatch.cli.backtest_jobs import WATCHING, jobs_of
     from reactorwatch.cli.batch import SUMMARY, files_named, say
-    from reactorwatch.cli.sources import DEFAULT_PLANT
+    from reactorwatch.cli.read_record import DEFAULT_PLANT
     from reactorwatch.records.output import checked_folder
     from reactorwatch.runtime.config import read_settings, section
 

@@ -11,11 +11,11 @@ from typing import Any
 import msgspec
 import structlog
 
+from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
 from monitor_node.pipeline import check_promise
 from plant_node.config import PlantConfig
-from reactorwatch.cli.after_alarm import DiagnosisConfig
-from reactorwatch.cli.joining import VIEWER, Joining, heard_by, joining, open_router, write_node_settings
+from reactorwatch.cli.bus_settings import VIEWER, Joining, heard_by, joining, open_router, write_node_settings
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.diagnosis.practical_significance import checked_tolerance
 from reactorwatch.errors import InputError

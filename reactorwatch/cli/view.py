@@ -37,7 +37,7 @@ def view(
     """
     import logging
 
-    from reactorwatch.cli.onlooker import begin_beside_recorder
+    from reactorwatch.cli.observer import begin_beside_recorder
     from recorder.dashboard.live import Shown, show
 
     bus, recorder = begin_beside_recorder(config, endpoint, name, logging.INFO)

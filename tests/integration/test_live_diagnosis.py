@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 import structlog
 
+from diagnosis_node.node import Command, Diagnoses
+from diagnosis_node.trigger import AfterAlarm, DiagnosisConfig
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli.after_alarm import AfterAlarm, DiagnosisConfig
-from reactorwatch.cli.live_diagnosis import Command, Diagnoses
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.process.extended_model import parse_extended_model

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from monitor_node.replay.verification import verify
-from reactorwatch.cli.sources import messages
+from reactorwatch.cli.read_record import messages
 
 from .live_run import PLANT, LiveRun
 

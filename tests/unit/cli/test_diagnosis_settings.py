@@ -5,8 +5,8 @@ from typing import Any
 
 import pytest
 
+from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
-from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.supervise import diagnosis_settings
 from reactorwatch.errors import InputError
 

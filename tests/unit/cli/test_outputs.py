@@ -11,11 +11,11 @@ from typing import NamedTuple, get_args, get_type_hints
 import pytest
 import typer
 
+from benchmarks.study_figures.page import FOLDER
+from benchmarks.study_figures.reproduce import PAGE
 from reactorwatch.cli.batch import SUMMARY
 from reactorwatch.cli.diagnosis import REPORT
 from reactorwatch.cli.main import app, main
-from reactorwatch.cli.study.page import FOLDER
-from reactorwatch.cli.study.reproduce import PAGE
 from reactorwatch.records import output
 from recorder.dashboard.picture import picture_names
 from recorder.message import Entry

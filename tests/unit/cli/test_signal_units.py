@@ -15,7 +15,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli import identification
 from reactorwatch.cli.backtest_jobs import _units
-from reactorwatch.cli.sources import tape
+from reactorwatch.cli.read_record import tape
 from reactorwatch.process import MODELS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv

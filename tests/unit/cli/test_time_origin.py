@@ -13,9 +13,9 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli.backtest_jobs import answer, jobs_of
 from reactorwatch.cli.options import span_ns
+from reactorwatch.cli.read_record import process_model, record, tape
 from reactorwatch.cli.recordings import cut
 from reactorwatch.cli.simulation import free_run
-from reactorwatch.cli.sources import process_model, record, tape
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.model import cstr

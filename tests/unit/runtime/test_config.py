@@ -5,9 +5,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
-from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import SECTIONS, BusConfig, read_settings, section

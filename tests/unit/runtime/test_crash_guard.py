@@ -20,7 +20,7 @@ MODULES = sorted(
     for path in (ROOT / package).rglob("*.py")
     if 'if __name__ == "__main__":' in path.read_text(encoding="utf-8")
 )
-ARGUMENTS = {"reactorwatch": ["record"], "reactorwatch.cli.live_diagnosis": ["settings.toml"]}
+ARGUMENTS = {"reactorwatch": ["record"], "diagnosis_node.node": ["settings.toml"]}
 ERRORS: dict[str, tuple[BaseException, int, str | None]] = {
     "a fault of ours": (
         RuntimeError("the wrong\nreactor\x1b[31m"),
@@ -34,7 +34,7 @@ ERRORS: dict[str, tuple[BaseException, int, str | None]] = {
 
 
 def test_the_modules_are_those_that_the_documents_name() -> None:
-    assert MODULES == ["monitor_node", "plant_node", "reactorwatch", "reactorwatch.cli.live_diagnosis", "recorder"]
+    assert MODULES == ["monitor_node", "plant_node", "reactorwatch", "diagnosis_node.node", "recorder"]
 
 
 @pytest.mark.parametrize("error", ERRORS)

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from plant_node.config import PlantConfig
-from reactorwatch.cli.after_alarm import DiagnosisConfig
 from reactorwatch.cli.supervise import diagnosis_settings
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, section

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from reactorwatch.cli.study import canvas
-from reactorwatch.cli.study.best_model import ThirdOrder
-from reactorwatch.cli.study.catalogue import FIGURES
-from reactorwatch.cli.study.figure import Figure, Finding, Verdict
-from reactorwatch.cli.study.reproduce import reproduce
-from reactorwatch.cli.study.sampling_rate import report_choice
-from reactorwatch.cli.study.study import Study, row_times
+from benchmarks.study_figures import canvas
+from benchmarks.study_figures.best_model import ThirdOrder
+from benchmarks.study_figures.catalogue import FIGURES
+from benchmarks.study_figures.figure import Figure, Finding, Verdict
+from benchmarks.study_figures.reproduce import reproduce
+from benchmarks.study_figures.sampling_rate import report_choice
+from benchmarks.study_figures.study import Study, row_times
 from reactorwatch.errors import InputError
 from reactorwatch.identification.selection import Candidate, Selection
 from reactorwatch.records.record import Record
@@ -224,7 +224,7 @@ def test_bad_options_end_with_code_2_and_one_line(
 
 
 def test_a_figure_that_fails_leaves_no_page_and_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from reactorwatch.cli.study import reproduce as module
+    from benchmarks.study_figures import reproduce as module
 
     def fails(_study: Study, _drawing: object) -> Finding:
         raise InputError("a record that cannot be used")

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from reactorwatch.cli.study.canvas import BLACK, BY_ORDER, label, legend_below, panels
-from reactorwatch.cli.study.figure import Finding, verdict
-from reactorwatch.cli.study.study import NAMES, ORDERS, OUTPUTS, Study, held_out
+from benchmarks.study_figures.canvas import BLACK, BY_ORDER, label, legend_below, panels
+from benchmarks.study_figures.figure import Finding, verdict
+from benchmarks.study_figures.study import NAMES, ORDERS, OUTPUTS, Study, held_out
 from reactorwatch.identification.linear_model import fit_percent
 from reactorwatch.records.record import UNITS
 

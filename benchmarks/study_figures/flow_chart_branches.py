@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.study_figures.canvas import GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, panels
+from benchmarks.study_figures.control_limits import ORDER, watched
+from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
-from reactorwatch.cli.study.canvas import GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, panels
-from reactorwatch.cli.study.control_limits import ORDER, watched
-from reactorwatch.cli.study.figure import Finding, Verdict
-from reactorwatch.cli.study.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
 from reactorwatch.contract.codec import encode
 from reactorwatch.identification.flow_chart import Conclusion, follow
 from reactorwatch.identification.structure import Structure

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, VERMILION, label, panels
+from benchmarks.study_figures.figure import Finding, verdict
+from benchmarks.study_figures.study import TRAINING_ROWS, Study
 from reactorwatch.arrays import Array
-from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, VERMILION, label, panels
-from reactorwatch.cli.study.figure import Finding, verdict
-from reactorwatch.cli.study.study import TRAINING_ROWS, Study
 from reactorwatch.identification.flow_chart import Conclusion, follow
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import UNITS, Record

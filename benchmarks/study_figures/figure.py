@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing
 
-    from reactorwatch.cli.study.study import Study
+    from benchmarks.study_figures.study import Study
 
 
 class Verdict(Enum):

@@ -44,7 +44,7 @@ def ask(
     """
     import threading
 
-    from reactorwatch.cli.onlooker import begin
+    from reactorwatch.cli.observer import begin
     from reactorwatch.contract import keys
     from reactorwatch.contract.codec import Encoded, decode, encode_message
     from reactorwatch.contract.messages_pb2 import CommandReply

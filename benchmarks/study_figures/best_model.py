@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reactorwatch.cli.study.canvas import BLUE, ORANGE, PURPLE, label, panels
-from reactorwatch.cli.study.figure import Finding, Verdict
-from reactorwatch.cli.study.study import ORDERS, OUTPUTS, Study
+from benchmarks.study_figures.canvas import BLUE, ORANGE, PURPLE, label, panels
+from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.study import ORDERS, OUTPUTS, Study
 from reactorwatch.identification.families import LINEAR_FAMILIES, Family
 from reactorwatch.identification.neural import Neural
 from reactorwatch.identification.selection import EQUAL_PERCENT, Candidate, Selection, select

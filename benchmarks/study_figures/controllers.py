@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import brentq
 
+from benchmarks.study_figures.canvas import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, label, legend_below, panels
+from benchmarks.study_figures.figure import Finding
+from benchmarks.study_figures.study import NAMES, Study
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.controllers import GAIN, TemperatureControl
 from plant_node.record import simulate_record
-from reactorwatch.cli.study.canvas import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, label, legend_below, panels
-from reactorwatch.cli.study.figure import Finding
-from reactorwatch.cli.study.study import NAMES, Study
 from reactorwatch.process.level_control import GAIN as LEVEL_GAIN
 from reactorwatch.process.level_control import with_level_control
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE

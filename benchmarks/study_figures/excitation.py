@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from benchmarks.study_figures.canvas import BLUE, GREEN, VERMILION, label, panels
+from benchmarks.study_figures.figure import Finding, verdict
+from benchmarks.study_figures.study import ORDERS, Study, levels, row_times
 from plant_node.scenario import RandomSteps, Scenario, Sines, Square
-from reactorwatch.cli.study.canvas import BLUE, GREEN, VERMILION, label, panels
-from reactorwatch.cli.study.figure import Finding, verdict
-from reactorwatch.cli.study.study import ORDERS, Study, levels, row_times
 from reactorwatch.identification.excitation import persistence
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, ORANGE, label, legend_below, panels
-from reactorwatch.cli.study.figure import Finding, verdict
-from reactorwatch.cli.study.study import NAMES, Study, row_times
+from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, ORANGE, label, legend_below, panels
+from benchmarks.study_figures.figure import Finding, verdict
+from benchmarks.study_figures.study import NAMES, Study, row_times
 from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW
 
 if TYPE_CHECKING:

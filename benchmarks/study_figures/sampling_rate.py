@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION, label, panels
+from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, Study
 from reactorwatch.arrays import Array
-from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION, label, panels
-from reactorwatch.cli.study.figure import Finding, Verdict
-from reactorwatch.cli.study.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, Study
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx
 from reactorwatch.identification.excitation import (

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from benchmarks.study_figures.canvas import GREEN, ORANGE, label, panels
+from benchmarks.study_figures.control_limits import draw_residuals, out_of, watched
+from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.study import TRAINING_ROWS, Study
 from monitor_node.alarms.on_off_delay import Persistence
 from monitor_node.config import MonitorConfig
 from plant_node.presets import ONSET_MIN, PRESETS
 from reactorwatch.arrays import Array
-from reactorwatch.cli.study.canvas import GREEN, ORANGE, label, panels
-from reactorwatch.cli.study.control_limits import draw_residuals, out_of, watched
-from reactorwatch.cli.study.figure import Finding, Verdict
-from reactorwatch.cli.study.study import TRAINING_ROWS, Study
 from reactorwatch.records.record import UNITS
 
 if TYPE_CHECKING:

@@ -4,12 +4,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.study_figures.canvas import paper, require_matplotlib
+from benchmarks.study_figures.catalogue import FIGURES
+from benchmarks.study_figures.figure import Figure, Finding
+from benchmarks.study_figures.page import FOLDER, page
+from benchmarks.study_figures.study import Study
 from reactorwatch.cli.batch import results
-from reactorwatch.cli.study.canvas import paper, require_matplotlib
-from reactorwatch.cli.study.catalogue import FIGURES
-from reactorwatch.cli.study.figure import Figure, Finding
-from reactorwatch.cli.study.page import FOLDER, page
-from reactorwatch.cli.study.study import Study
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import filling, make_folder

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.cli.study.canvas import BLUE, ORANGE, VERMILION, label, legend_below, panels
-from reactorwatch.cli.study.figure import Finding, verdict
-from reactorwatch.cli.study.study import NAMES, Study
+from benchmarks.study_figures.canvas import BLUE, ORANGE, VERMILION, label, legend_below, panels
+from benchmarks.study_figures.figure import Finding, verdict
+from benchmarks.study_figures.study import NAMES, Study
 from reactorwatch.process.step_response import compare_step
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ What the report says there is as far as the description of that work tells; wher
 does the claim.
 """
 
-from reactorwatch.cli.study import (
+from benchmarks.study_figures import (
     best_model,
     control_limits,
     controllers,
@@ -18,7 +18,7 @@ from reactorwatch.cli.study import (
     steady_state_curve,
     step_responses,
 )
-from reactorwatch.cli.study.figure import Figure
+from benchmarks.study_figures.figure import Figure
 
 FIGURES: tuple[Figure, ...] = (
     Figure(

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from reactorwatch.cli.study.catalogue import FIGURES
-from reactorwatch.cli.study.figure import Figure, Finding
+from benchmarks.study_figures.catalogue import FIGURES
+from benchmarks.study_figures.figure import Figure, Finding
 
 FOLDER = "study"
 """Of the pictures, beside the page."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from reactorwatch.cli.after_alarm import SILENT_NS, AfterAlarm, Asked, DiagnosisConfig
+from diagnosis_node.trigger import SILENT_NS, AfterAlarm, Asked, DiagnosisConfig
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Sample

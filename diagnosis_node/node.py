@@ -1,6 +1,6 @@
 """Diagnoses beside a live monitor: after an alarm the recent samples are written down and diagnosed.
 
-    python -m reactorwatch.cli.live_diagnosis settings.toml
+    python -m diagnosis_node.node settings.toml
 
 It hears the same bus as the monitor, is a process of its own, and leaves the work to another one: whatever a diagnosis
 takes or breaks, plant and monitor do not notice. Each gets a folder, named after the plant and the time of the alarm,
@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 import structlog
 
-from reactorwatch.cli.after_alarm import AfterAlarm, Asked, DiagnosisConfig
+from diagnosis_node.trigger import AfterAlarm, Asked, DiagnosisConfig
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
@@ -188,7 +188,7 @@ def _last_line(text: str) -> str:
 if __name__ == "__main__":
     sys.exit(
         main(
-            "reactorwatch.cli.live_diagnosis",
+            "diagnosis_node.node",
             "diagnosis",
             DiagnosisConfig,
             lambda config, bus_config, _metrics: run(config, bus_config),

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import brentq
 
-from reactorwatch.cli.study.canvas import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, label, legend_below, panels
-from reactorwatch.cli.study.figure import Finding, Verdict
-from reactorwatch.cli.study.study import NAMES, Study, edge
+from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, ORANGE, SKY, VERMILION, label, legend_below, panels
+from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.study import NAMES, Study, edge
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Drawing

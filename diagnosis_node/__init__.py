@@ -1,0 +1,1 @@
+"""The node that diagnoses a plant's record after an alarm."""
