@@ -1,7 +1,5 @@
 """Diagnoses beside a live monitor: after an alarm the recent samples are written down and diagnosed.
 
-    python -m diagnosis_node.node settings.toml
-
 It hears the same bus as the monitor, is a process of its own, and leaves the work to another one: whatever a diagnosis
 takes or breaks, plant and monitor do not notice. Each gets a folder, named after the plant and the time of the alarm,
 with the samples as a recording and the report of `reactorwatch diagnose` on it, so that it can be done again by hand.
@@ -26,7 +24,6 @@ from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import serve, stop_on_signals
-from reactorwatch.runtime.node_main import main
 from recorder.message import Entry
 from recorder.storage.mcap_writer import RecordingWriter
 
@@ -183,14 +180,3 @@ def _summary(found: dict[str, Any]) -> dict[str, str]:
 
 def _last_line(text: str) -> str:
     return (text.strip().splitlines() or ["no reason was given"])[-1]
-
-
-if __name__ == "__main__":
-    sys.exit(
-        main(
-            "diagnosis_node.node",
-            "diagnosis",
-            DiagnosisConfig,
-            lambda config, bus_config, _metrics: run(config, bus_config),
-        )
-    )

@@ -85,10 +85,19 @@ def reproduce(
     scheduler: Scheduler = None,
     force: Force = False,
 ) -> None:
-    """Make every figure of the original report anew (reactorwatch[pictures])."""
-    from benchmarks.study_figures.reproduce import check_out
-    from benchmarks.study_figures.reproduce import reproduce as reproduce_figures
+    """Draw every figure of the original report (source tree, reactorwatch[pictures])."""
     from reactorwatch.cli.read_record import record
+
+    try:
+        from benchmarks.study_figures.reproduce import check_out
+        from benchmarks.study_figures.reproduce import reproduce as reproduce_figures
+    except ModuleNotFoundError as error:
+        if not (error.name or "").startswith("benchmarks"):
+            raise
+        raise InputError(
+            "reproduce: the figures of the report are in the source tree, not in the installed package; "
+            "run `make setup` in a clone of the project and use its .venv/bin/reactorwatch"
+        ) from error
 
     check_out(out, only, (file,), force=force)
     measured = record(existing_recording(file), plant, columns(column)) if file else None

@@ -22,7 +22,7 @@ log = structlog.get_logger()
 MODULES = {
     "plant": "plant_node",
     "monitor": "monitor_node",
-    "diagnosis": "diagnosis_node.node",
+    "diagnosis": "diagnosis_node",
     "recorder": "recorder",
 }
 STOP_WITHIN_S = 60.0

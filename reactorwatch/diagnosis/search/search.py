@@ -314,7 +314,7 @@ class Search:
     def fit(
         self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True
     ) -> Explained:
-        """A hypothesis, fitted from a start; see there and, if sizes that act in jumps are looked for, `grid_search`."""
+        """Fit a hypothesis from a start, by `grid_search` where its sizes act in jumps and `scan` is set."""
         best = (
             grid_search.fitted(self.run, hypothesis, start, steps) if scan else hypothesis.fit(self.run, start, steps)
         )

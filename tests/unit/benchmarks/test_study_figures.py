@@ -15,6 +15,7 @@ from benchmarks.study_figures.figure import Figure, Finding, Verdict
 from benchmarks.study_figures.reproduce import reproduce
 from benchmarks.study_figures.sampling_rate import report_choice
 from benchmarks.study_figures.study import Study, row_times
+from reactorwatch.cli import models
 from reactorwatch.errors import InputError
 from reactorwatch.identification.selection import Candidate, Selection
 from reactorwatch.records.record import Record
@@ -233,3 +234,14 @@ def test_a_figure_that_fails_leaves_no_page_and_no_picture(tmp_path: Path, monke
     with pytest.raises(InputError, match="cannot be used"):
         reproduce(tmp_path, 1)
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_an_installed_package_without_the_source_tree_names_the_cure(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name in [name for name in sys.modules if name.split(".")[0] == "benchmarks"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "benchmarks", None)  # what Python takes for "not there"
+    with pytest.raises(InputError, match=r"in the source tree.*make setup"):
+        models.reproduce(tmp_path / "out")
+    assert not (tmp_path / "out").exists()

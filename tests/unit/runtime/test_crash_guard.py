@@ -13,14 +13,14 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.crash import EXIT_CODE, complain
 
 ROOT = Path(__file__).parents[3]
-PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis")
+PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis_node")
 MODULES = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__main__")
     for package in PACKAGES
     for path in (ROOT / package).rglob("*.py")
     if 'if __name__ == "__main__":' in path.read_text(encoding="utf-8")
 )
-ARGUMENTS = {"reactorwatch": ["record"], "diagnosis_node.node": ["settings.toml"]}
+ARGUMENTS = {"reactorwatch": ["record"], "diagnosis_node": ["settings.toml"]}
 ERRORS: dict[str, tuple[BaseException, int, str | None]] = {
     "a fault of ours": (
         RuntimeError("the wrong\nreactor\x1b[31m"),
@@ -34,7 +34,7 @@ ERRORS: dict[str, tuple[BaseException, int, str | None]] = {
 
 
 def test_the_modules_are_those_that_the_documents_name() -> None:
-    assert MODULES == ["monitor_node", "plant_node", "reactorwatch", "diagnosis_node.node", "recorder"]
+    assert MODULES == ["diagnosis_node", "monitor_node", "plant_node", "reactorwatch", "recorder"]
 
 
 @pytest.mark.parametrize("error", ERRORS)
