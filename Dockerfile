@@ -16,7 +16,7 @@ COPY reactorwatch ./reactorwatch
 COPY plant_node ./plant_node
 COPY monitor_node ./monitor_node
 COPY recorder ./recorder
-COPY diagnosis ./diagnosis
+COPY diagnosis_node ./diagnosis_node
 RUN pip install --no-cache-dir --no-deps --no-build-isolation .
 
 USER reactorwatch

@@ -61,3 +61,10 @@ def test_the_image_installs_what_is_locked_and_nothing_else() -> None:
     assert len(installs) == 2
     assert re.search(r"^ARG PYTHON_IMAGE=python:\d+\.\d+\.\d+-", text, re.MULTILINE)
     assert "USER reactorwatch" in text
+
+
+def test_the_image_holds_every_package_of_the_wheel() -> None:
+    wheel = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]["targets"]
+    text = (ROOT / "Dockerfile").read_text(encoding="utf-8")
+    copied = re.findall(r"^COPY (\w+) \./\1$", text, re.MULTILINE)
+    assert sorted(copied) == sorted(wheel["wheel"]["packages"])
