@@ -1,0 +1,129 @@
+"""Size and shape of the code: product lines, rooms and floors of each package, moves between files for one sample.
+
+    python benchmarks/house.py
+
+A room is a file or folder at the top level of a package; its floor is the longest chain of rooms below it. A move is a
+call or a return that leads from one file of the project to another. The sample is the last of a row of a watched plant:
+once of an ordinary row, once of the row that raises the first alarm of a leak (isolation off).
+"""
+
+import subprocess
+import sys
+from graphlib import TopologicalSorter
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import grimp
+import numpy as np
+
+from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.contract.codec import Encoded, encode
+from reactorwatch.contract.messages_pb2 import Alarm
+from recorder.tools.player import samples_of
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis_node")
+SHAPED = ("reactorwatch", "reactorwatch.runtime", "reactorwatch.diagnosis", "monitor_node", "recorder")
+GENERATED = "_pb2.py"
+TRAINING_MIN, ONSET_MIN, SPAN_MIN = 20.0, 30.0, 60.0
+SIGNALS = 3
+
+
+def product_lines() -> dict[str, int]:
+    """Lines of Python in each package, without generated code; those that git knows of."""
+    listed = subprocess.run(["git", "ls-files", "*.py"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    lines = dict.fromkeys(PACKAGES, 0)
+    for name in listed.split():
+        package = name.partition("/")[0]
+        if package in lines and not name.endswith(GENERATED):
+            lines[package] += len((ROOT / name).read_text(encoding="utf-8").splitlines())
+    return lines
+
+
+def floors(graph: grimp.ImportGraph, package: str) -> tuple[int, int]:
+    """Numbers of rooms and of floors of a package.
+
+    Raises:
+        graphlib.CycleError: rooms import each other in a circle.
+    """
+    depth = package.count(".") + 2
+
+    def room(module: str) -> str:
+        return ".".join(module.split(".")[:depth])
+
+    below: dict[str, set[str]] = {}
+    for module in graph.modules:
+        if module.startswith(f"{package}."):
+            imported = {
+                room(name) for name in graph.find_modules_directly_imported_by(module) if name.startswith(package)
+            }
+            below.setdefault(room(module), set()).update(imported - {room(module), package})
+    floor: dict[str, int] = {}
+    for name in TopologicalSorter(below).static_order():
+        floor[name] = 1 + max((floor[other] for other in below.get(name, ())), default=0)
+    return len(floor), max(floor.values())
+
+
+class Walk:
+    """Count of moves between the files of the project while a function runs; a context."""
+
+    def __init__(self) -> None:
+        self.moves = 0
+        self._file = ""
+
+    def __enter__(self) -> "Walk":
+        """Start to count."""
+        sys.setprofile(self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop counting."""
+        sys.setprofile(None)
+
+    def _note(self, frame: FrameType, event: str, _argument: Any) -> None:
+        at = frame if event == "call" else frame.f_back if event == "return" else None
+        file = at.f_code.co_filename if at is not None else ""
+        if file.startswith(str(ROOT)) and file != __file__ and ".venv" not in file:
+            self.moves += file != self._file
+            self._file = file
+
+
+def walks() -> tuple[int, int]:
+    """Moves of an ordinary row's last sample, the median of those before the onset, and of the first alarm's."""
+    fault = f"coolant_flow:step:-0.08@{ONSET_MIN:g}min"
+    measured = simulate_record(PlantConfig(duration_min=SPAN_MIN, seed=1, faults=(fault,)))
+    messages: list[Encoded] = [encode(item) for item in samples_of(measured, "cstr", 0)]
+    monitor = Monitor(MonitorConfig(training_min=TRAINING_MIN, isolation=False), 0, points=False)
+    ordinary: list[int] = []
+    for number, message in enumerate(messages):
+        with Walk() as walk:
+            published = monitor.on_message(message, 0)
+        if any(isinstance(item.message, Alarm) for item in published):
+            return int(np.median(ordinary)), walk.moves
+        last_of_row = number % SIGNALS == SIGNALS - 1
+        if last_of_row and TRAINING_MIN + 1.0 < number / SIGNALS * 0.1 < ONSET_MIN:
+            ordinary.append(walk.moves)
+    raise RuntimeError("the leak raised no alarm")
+
+
+def main() -> None:
+    """Print the table."""
+    lines = product_lines()
+    print(f"product lines without generated code      {sum(lines.values()):,}")
+    for package, count in lines.items():
+        print(f"  {package:<40}{count:,}")
+    graph = grimp.build_graph(*PACKAGES)
+    for package in SHAPED:
+        rooms, storeys = floors(graph, package)
+        print(f"{package:<42}{rooms} rooms on {storeys} floors")
+    ordinary, alarm = walks()
+    print(f"moves between files, an ordinary sample   {ordinary}")
+    print(f"moves between files, one with an alarm    {alarm}")
+
+
+if __name__ == "__main__":
+    main()
