@@ -4,6 +4,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Iterable
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -127,9 +128,13 @@ class LiveRun:
         return changes
 
     def _of_plant(self, recorded: Iterable[Encoded]) -> Iterable[Encoded]:
-        for message in recorded:
-            if is_of_plant(_read(message)):
-                yield message
+        """The plant's samples in the order of its rows: the recorder, too, may have heard some of them late."""
+        samples = ((_read(message), message) for message in recorded)
+        of_plant = [
+            (body.time_ns, message) for body, message in samples if isinstance(body, Sample) and is_of_plant(body)
+        ]
+        for _, message in sorted(of_plant, key=itemgetter(0)):
+            yield message._replace(received_ns=0)
 
     def _on_message(self, message: Encoded) -> None:
         body = _read(message)

@@ -30,29 +30,38 @@ def run(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[LiveRun]:
         yield going
 
 
-def test_a_killed_router_a_frozen_plant_and_a_frozen_monitor_cost_no_alarm(run: LiveRun) -> None:
-    """Of one run: what it missed, the monitor hears later, and while the plant is frozen it is silent.
-
-    The router is killed in training and while alarms stand. The monitor is frozen for longer than its patience with the
-    plant, while the leak begins. The plant is frozen last, as it publishes all rows that it is late with at once.
-    """
+def test_a_monitor_that_was_frozen_hears_later_what_it_missed(run: LiveRun) -> None:
+    """Stopped for longer than its patience with the plant, while it watches."""
     monitor, plant = run.start_all()
-    run.wait_until(8.0)
-    run.router.kill()
-    run.router.restart()
     run.wait_until(18.0)
     monitor.send_signal(signal.SIGSTOP)
-    run.wait_until(32.0)
+    run.wait_until(36.0)
     monitor.send_signal(signal.SIGCONT)
-    run.router.kill()
-    run.router.restart()
-    run.wait_until(35.0)
+    run.end(plant)
+    assert run.health.stalls > 0
+    assert run.health.lost == 0
+    assert run.recorded_alarms() == run.expected_alarms()
+
+
+def test_a_plant_that_is_frozen_is_silent_until_it_goes_on(run: LiveRun) -> None:
+    _, plant = run.start_all()
+    run.wait_until(20.0)
     plant.send_signal(signal.SIGSTOP)
     run.wait(lambda: [alarm.event for alarm in run.alarms if alarm.alarm == SILENCE][-1:] == ["raised"])
     plant.send_signal(signal.SIGCONT)
     run.wait(lambda: [alarm.event for alarm in run.alarms if alarm.alarm == SILENCE][-1:] == ["cleared"])
     run.end(plant)
-    assert run.health.stalls > 0
+    assert run.health.lost == 0
+    assert run.recorded_alarms() == run.expected_alarms()
+
+
+def test_a_router_that_is_killed_and_started_again_costs_no_alarm(run: LiveRun) -> None:
+    _, plant = run.start_all()
+    for minute in (8.0, 20.0):
+        run.wait_until(minute)
+        run.router.kill()
+        run.router.restart()
+    run.end(plant)
     assert run.health.lost == 0
     assert run.recorded_alarms() == run.expected_alarms()
 
