@@ -9,6 +9,7 @@ from monitor_node.core import Monitor
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.process.model import ProcessModel
 from reactorwatch.runtime.model_file import model_on_the_bus
 
 RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
@@ -77,19 +78,22 @@ class Backtest:
         return found
 
 
-def run(messages: Iterable[Encoded], config: MonitorConfig, zero_ns: int = 0) -> Backtest:
+def run(
+    messages: Iterable[Encoded], config: MonitorConfig, zero_ns: int = 0, model: ProcessModel | None = None
+) -> Backtest:
     """Run the monitor over messages in the order they were received; those that are no samples are passed over.
 
     Args:
         messages: of any plant; only samples of `config.plant` are looked at.
         config: of the monitor.
         zero_ns: the time that the minutes of the model count from, where its file does not say.
+        model: whose equations judge, its minutes counted from 1970-01-01 UTC; None: the one that the settings name.
 
     Raises:
         InputError: settings that do not fit together, or a model's file that cannot be used.
     """
     prefix = keys.key(config.plant, keys.SAMPLE, "")
-    monitor = Monitor(config, start_ns=0, points=False, model=model_on_the_bus(config.model, zero_ns))
+    monitor = Monitor(config, start_ns=0, points=False, model=model or model_on_the_bus(config.model, zero_ns))
     alarms: list[Alarm] = []
     first_ns: int | None = None
 

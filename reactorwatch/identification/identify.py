@@ -81,6 +81,11 @@ class Identification(msgspec.Struct, frozen=True):
     whiteness_minus_log10_p: float
     checks: dict[str, str]
 
+    @property
+    def fit(self) -> FitPercent:
+        """Another name of `fit_percent`."""
+        return self.fit_percent
+
 
 def identify(
     time: ArrayLike,

@@ -1,0 +1,100 @@
+"""The public names: a dozen, documented, lazy, with the results that the commands print."""
+
+import inspect
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import reactorwatch as rw
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+
+LEAK_MIN = 40.0
+
+
+@pytest.fixture(scope="module")
+def leaking() -> rw.Record:
+    fault = f"coolant_flow:step:-0.05@{LEAK_MIN:g}min"
+    scenario = {"kind": "random-steps"}
+    return simulate_record(PlantConfig(duration_min=90.0, seed=7, faults=(fault,), scenario=scenario))
+
+
+def test_a_dozen_names_are_public_each_documented_and_no_more() -> None:
+    assert len(rw.__all__) == 12
+    assert set(dir(rw)) == {*rw.__all__, "__version__"}
+    for name in rw.__all__:
+        assert inspect.getdoc(getattr(rw, name)) or name == "processes"
+
+
+def test_importing_the_package_imports_none_of_its_parts() -> None:
+    program = "import sys, reactorwatch; print([name for name in sys.modules if name.startswith('reactorwatch.')])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_another_name_is_no_attribute() -> None:
+    with pytest.raises(AttributeError, match="no attribute 'pipeline'"):
+        rw.pipeline  # noqa: B018 # the access is what is tested
+
+
+def test_a_diagnosis_names_the_leak_and_its_extended_model_simulates_it(leaking: rw.Record, tmp_path: Path) -> None:
+    found = rw.diagnose(leaking)
+    assert (found.verdict, found.causes[0].cause) == ("named", "coolant_flow")
+    before = np.sqrt(np.mean((rw.simulate(leaking).columns["T"] - leaking.columns["T"]) ** 2))
+    after = np.sqrt(np.mean((rw.simulate(leaking, found.extended).columns["T"] - leaking.columns["T"]) ** 2))
+    assert after < 0.5 * before
+    assert json.loads(json.dumps(found.to_dict()))["verdict"] == "named"
+    found.to_html(tmp_path / "report.html")
+    assert "coolant" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_backtest_and_a_monitor_that_is_fed_row_by_row_raise_the_same_alarms(leaking: rw.Record) -> None:
+    settings: dict[str, Any] = {"training_min": 20.0, "isolation": False}
+    result = rw.backtest(leaking, **settings)
+    assert result.alarms
+    assert result.alarms[0].raised_min >= LEAK_MIN
+    assert result.text in str(result)
+    monitor, changes = rw.Monitor(**settings), []
+    for row, minute in enumerate(leaking.time_min):
+        changes += monitor.update(float(minute), {name: float(values[row]) for name, values in leaking.columns.items()})
+        if row == leaking.rows // 2:
+            state, monitor = monitor.to_bytes(), rw.Monitor(**settings)
+            monitor.from_bytes(state)
+    raised = [(item.alarm, item.time_min) for item in changes if item.event == "raised"]
+    assert raised == [(item.alarm, item.raised_min) for item in result.alarms]
+
+
+def test_the_model_that_a_diagnosis_extended_judges_without_alarm(leaking: rw.Record) -> None:
+    extended = rw.diagnose(leaking).extended
+    assert not rw.backtest(leaking, extended, training_min=20.0).alarms
+
+
+def test_identification_gives_its_fit_under_both_names(leaking: rw.Record) -> None:
+    found = rw.identify(leaking, output="T", model="arx", order=2)
+    assert found.fit is found.fit_percent
+    assert found.fit.one_step > 80.0
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda record: rw.simulate(record, "reactor"), r"process must be one of cstr, tanks"),
+        (lambda record: rw.backtest(record, charts=("no such",)), r"settings: .*no such"),
+        (lambda record: rw.backtest(record, forgetting=1.2), r"forgetting must be in"),
+        (lambda record: rw.backtest(record, colour="red"), r"colour"),
+        (lambda record: rw.identify(record, output="p"), r"holds no signal 'p', only qc, C, T"),
+        (lambda _: rw.Monitor().from_bytes(b"\xc1"), r"the state of a monitor cannot be read"),
+        (lambda _: rw.read_record("data.parquet"), r"must be a \.csv or \.mcap file"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_the_cure(call: object, message: str, leaking: rw.Record) -> None:
+    assert callable(call)
+    with pytest.raises(rw.InputError, match=message) as caught:
+        call(leaking)
+    assert not re.search(r"\n", str(caught.value))
