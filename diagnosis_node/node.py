@@ -23,7 +23,7 @@ from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import serve, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
 from recorder.message import Entry
 from recorder.storage.mcap_writer import RecordingWriter
 
@@ -33,7 +33,7 @@ NODE = "diagnosis"
 RECORDING = "record.mcap"
 """Name of what is diagnosed, in the folder of its report."""
 
-LINGER_S = 0.5
+DRAIN_TIMEOUT_S = 0.5
 
 Run = Callable[[list[str]], tuple[int, str, str]]
 """Runs arguments of `reactorwatch`; returns its exit code, what it said, and what it complained of."""
@@ -144,15 +144,10 @@ def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
             return
         try:
             log.info("diagnosing after alarms", plant=config.plant, after_min=config.after_min, out=config.out)
-            kinds = (keys.SAMPLE, keys.ALARM)
-            serve(
-                node,
-                bus,
-                stop,
-                subscriptions=tuple(keys.all_of(config.plant, kind) for kind in kinds),
-                on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
-                linger_s=LINGER_S,
-            )
+            loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S)
+            loop.subscribe(*(keys.all_of(config.plant, kind) for kind in (keys.SAMPLE, keys.ALARM)))
+            bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
+            loop.run()
         finally:
             bus.close()
             command.end()

@@ -27,7 +27,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
-from reactorwatch.runtime.event_loop import serve, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
 from reactorwatch.runtime.metrics import Metrics, served
 from reactorwatch.runtime.model_file import model_on_the_bus
 from reactorwatch.runtime.node_main import main
@@ -41,7 +41,7 @@ PREPARE_EVERY_NS = 100_000_000
 PREPARED = object()
 """Returned where no part is left."""
 
-LINGER_S = 0.5
+DRAIN_TIMEOUT_S = 0.5
 """Silence on the bus after which a monitor that was asked to stop takes everything as heard."""
 
 
@@ -177,10 +177,10 @@ class MonitorNode(Monitor):
             self._said.pop(store, None)
 
 
-def announce(node: MonitorNode, bus: Bus) -> None:
+def declare_tokens(node: MonitorNode, bus: Bus) -> None:
     """Show that the plant has a monitor, and which."""
-    bus.announce(keys.key(node.config.plant, keys.ALIVE, NODE))
-    bus.announce(node.token)
+    bus.declare_token(keys.key(node.config.plant, keys.ALIVE, NODE))
+    bus.declare_token(node.token)
 
 
 def run(
@@ -206,21 +206,15 @@ def run(
             return
         try:
             log.info("listening", plant=config.plant, training_min=config.training_min)
-            serve(
-                node,
-                bus,
-                stop,
-                subscriptions=(keys.all_of(config.plant, keys.SAMPLE),),
-                # What was published since it was stored, however long ago that is; what it knows is passed over.
-                history_s=inf if node.resumed else 0.0,
-                on_told=node.caught_up,
-                commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
-                tokens=node.tokens,
-                on_alive=node.on_alive,
-                on_ready=lambda: announce(node, bus),
-                linger_s=LINGER_S,
-                on_publish=metrics.of(node.alarms.all_alarms) if metrics is not None else None,
-            )
+            on_publish = metrics.of(node.alarms.all_alarms) if metrics is not None else None
+            loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
+            # All samples published since the state was stored, however long ago; the node skips those it knows.
+            history_s = inf if node.resumed else 0.0
+            loop.subscribe(keys.all_of(config.plant, keys.SAMPLE), history_s=history_s, on_history_end=node.caught_up)
+            loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
+            loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))
+            declare_tokens(node, bus)
+            loop.run()
         finally:
             bus.close()
 

@@ -16,7 +16,7 @@ from reactorwatch.records.record import Record
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
-from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
 from reactorwatch.runtime.metrics import Metrics, served
 from reactorwatch.runtime.node_main import main
@@ -65,13 +65,11 @@ def serve_plant(
     on_publish: Callable[[Publication], None] | None = None,
 ) -> None:
     """Run the node on an open bus: listen to commands, show that it is alive, wait for the others, run."""
-
-    def on_ready() -> None:
-        bus.announce(keys.key(config.name, keys.ALIVE, NODE))
-        wait_alive(bus, config.name, config.wait_for, stop, NODE)
-
-    commands = tuple(keys.key(config.name, keys.COMMAND, name) for name in COMMANDS)
-    serve(node, bus, stop, commands=commands, on_ready=on_ready, on_publish=on_publish)
+    loop = EventLoop(node, bus, stop, on_publish=on_publish)
+    loop.accept_commands(*(keys.key(config.name, keys.COMMAND, name) for name in COMMANDS))
+    bus.declare_token(keys.key(config.name, keys.ALIVE, NODE))
+    wait_alive(bus, config.name, config.wait_for, stop, NODE)
+    loop.run()
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def publish(endpoint: str, plants: int, rows: int, per_s: float, first: int) -> 
                 arrived[message.key.split("/")[1], alarm.time_ns] = now
 
     if per_s:
-        bus.gather(f"{FLEET}/{keys.ALARM}/**", on_alarms)
+        bus.subscribe_batched(f"{FLEET}/{keys.ALARM}/**", on_alarms)
     payloads = [item.payload for item in record()[SIGNALS * LEARNED_ROWS :]]
     time.sleep(1.0)  # until the router knows all keys
     sent: dict[tuple[str, int], float] = {}

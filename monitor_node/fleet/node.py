@@ -31,14 +31,14 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
-from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.metrics import FleetMetrics, served
 from reactorwatch.runtime.model_file import model_on_the_bus
 from reactorwatch.runtime.security.command_rate import CommandRate, sender_of
 
 log = structlog.get_logger()
 
-LINGER_S = 0.5
+DRAIN_TIMEOUT_S = 0.5
 """As for the monitor of one plant."""
 
 PASSING = (keys.HEALTH, keys.ALARM_KPIS)
@@ -147,10 +147,10 @@ class FleetNode(FleetMonitor):
             log_report(report)
         if ours and len(self._shown) < MOST_TOKENS:
             self._shown.add(token)
-            self._bus.announce(token)
+            self._bus.declare_token(token)
         elif token in self._shown:
             self._shown.remove(token)
-            self._bus.withdraw(token)
+            self._bus.undeclare_token(token)
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; alarms are logged."""
@@ -343,7 +343,7 @@ def run(
     WatchedPlants(config, 0, model_on_the_bus(config.model), points=fleet.points).prepare()
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
     with served(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
-        bus = bus_zenoh.connect(bus_config, NODE, stop, passing=PASSING, crowded=True)
+        bus = bus_zenoh.connect(bus_config, NODE, stop, uncached=PASSING, many_keys=True)
         if bus is None:
             return
         try:
@@ -355,17 +355,10 @@ def run(
 def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
     """Watch the plants until asked to stop."""
     log.info("listening", plants=node.expression)
-    serve(
-        node,
-        bus,
-        stop,
-        subscriptions=node.subscriptions,
-        on_told=node.listens,
-        on_messages=node.on_messages,
-        tokens=node.tokens,
-        on_alive=node.on_alive,
-        commands=tuple(f"{node.expression}/{keys.COMMAND}/{name}" for name in COMMANDS),
-        on_ready=lambda: bus.announce(node.crew.token),
-        linger_s=LINGER_S,
-        on_publish=node.metrics.published if node.metrics is not None else None,
-    )
+    on_publish = node.metrics.published if node.metrics is not None else None
+    loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
+    loop.subscribe(*node.subscriptions, on_history_end=node.listens, on_batch=node.on_messages)
+    loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
+    loop.accept_commands(*(f"{node.expression}/{keys.COMMAND}/{name}" for name in COMMANDS))
+    bus.declare_token(node.crew.token)
+    loop.run()

@@ -66,7 +66,7 @@ def ask(
     if bus is None:
         raise InputError(f"no router at {bus_config.endpoint} within {timeout_s:g} s; is it running?")
     try:
-        answers = bus.ask(Encoded(keys.key(plant, keys.COMMAND, name), *encode_message(message)), timeout_s)
+        answers = bus.query(Encoded(keys.key(plant, keys.COMMAND, name), *encode_message(message)), timeout_s)
     finally:
         bus.close()
     replies = [decode(answer.payload, answer.encoding) for answer in answers]

@@ -151,7 +151,7 @@ def _free_folder(out: Path | None) -> Path:
 def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folder: Path, plant: PlantConfig) -> bool:
     """Run the nodes until the plant has come to its end; False if that was cut short by a signal."""
     woken = threading.Event()
-    stop.wakes(woken.set)
+    stop.call_on_set(woken.set)
     assert plant.rows is not None, "a demonstration has an end"
     duration_min = plant.rows * plant.period_min
     watch = Watch(bus, to_time_ns((plant.rows - 1) * plant.period_min))

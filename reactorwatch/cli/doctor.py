@@ -181,10 +181,10 @@ class _Listening:
         self.monitors = OtherMonitors("", lambda: ())
         self._settled: set[str] = set()
         self._changed = threading.Condition()
-        bus.watch_alive(keys.all_of(plant, keys.ALIVE), self._on_token)
+        bus.subscribe_liveliness(keys.all_of(plant, keys.ALIVE), self._on_token)
         for tokens in (keys.monitor_token(plant, "*"), keys.FLEET_TOKENS):
-            bus.watch_alive(tokens, self._on_monitor)
-        bus.subscribe_live(keys.key(plant, keys.HEALTH, "*"), self._on_health)
+            bus.subscribe_liveliness(tokens, self._on_monitor)
+        bus.subscribe_uncached(keys.key(plant, keys.HEALTH, "*"), self._on_health)
 
     def wait(self) -> None:
         """Until all who are expected have spoken, and their clocks are known."""

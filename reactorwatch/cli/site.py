@@ -104,7 +104,7 @@ def router(
     with log_refusals(), stop_on_signals() as stop:
         bus = router_from_file(existing(file)) if file is not None else plain_router(settings)
         stopped = threading.Event()
-        stop.wakes(stopped.set)
+        stop.call_on_set(stopped.set)
         structlog.get_logger().info("router", **({"settings": str(file)} if file else {"endpoint": settings.endpoint}))
         try:
             if not stop.is_set:

@@ -138,7 +138,7 @@ def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as
             raise InputError(f"no router at {config.endpoint}: {error}; `reactorwatch doctor` says more") from error
         try:
             stopped = threading.Event()
-            stop.wakes(stopped.set)
+            stop.call_on_set(stopped.set)
             board = _listening(bus, plant or "*")
             if once or as_json:
                 stopped.wait(listen_s)
@@ -152,7 +152,7 @@ def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as
 
 def _listening(bus: ZenohBus, plant: str) -> Board:
     board = Board(time.time_ns())
-    bus.watch_alive(keys.all_of(plant, keys.ALIVE), board.on_token)
+    bus.subscribe_liveliness(keys.all_of(plant, keys.ALIVE), board.on_token)
     bus.subscribe(keys.all_of(plant, keys.HEALTH), board.on_message, history_s=HISTORY_S)
     for kind in (keys.SAMPLE, keys.ALARM):
         bus.subscribe(keys.all_of(plant, kind), board.on_message)
@@ -163,7 +163,7 @@ def _ask_alarms(bus: ZenohBus, board: Board) -> None:
     for plant in board.plants:
         for command in ("list_alarms", keys.LIST_RECORDER_ALARMS):
             question = Encoded(keys.key(plant, keys.COMMAND, command), *encode_message(ListAlarms()))
-            for answer in bus.ask(question, ANSWER_WITHIN_S):
+            for answer in bus.query(question, ANSWER_WITHIN_S):
                 with contextlib.suppress(DecodeError):
                     reply = decode(answer.payload, answer.encoding)
                     if isinstance(reply, CommandReply):

@@ -87,7 +87,7 @@ def run_until_stopped(
         settings = _write_down(recorder, plant.seed, {**tables_written, "log": log_config}, join, nodes)
         with stop_on_signals() as stop, Processes(settings) as processes:
             woken = threading.Event()
-            stop.wakes(woken.set)
+            stop.call_on_set(woken.set)
             for node in nodes:
                 processes.start(node)
             log.info("running", plant=plant.name, router=join[VIEWER].endpoint, out=recorder.out, stop="Ctrl-C")

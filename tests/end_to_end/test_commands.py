@@ -205,7 +205,7 @@ def test_the_plant_obeys_commands_on_the_bus(bus: ZenohBus, endpoint: str, start
 
     def ask(name: str, message: SetInput | InjectFault) -> CommandReply:
         question = Encoded(keys.key("cstr", keys.COMMAND, name), *encode_message(message))
-        (answer,) = bus.ask(question, PATIENCE_S)
+        (answer,) = bus.query(question, PATIENCE_S)
         return CommandReply.FromString(answer.payload)
 
     assert ask("set_input", SetInput(signal="qc", value=95.0)).accepted

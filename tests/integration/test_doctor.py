@@ -55,7 +55,7 @@ def nodes(
     stopped = threading.Event()
 
     def speak(node: str, bus: ZenohBus) -> None:
-        bus.announce(keys.key("cstr", keys.ALIVE, node))
+        bus.declare_token(keys.key("cstr", keys.ALIVE, node))
         lateness_s = itertools.cycle(late_s)
         while not stopped.wait(every_s):
             bus.publish(health(node, next(lateness_s), version))
@@ -231,9 +231,9 @@ def test_two_monitors_of_one_plant_are_reported(site: Site, tmp_path: Path) -> N
     buses = {node: site.join(f"cstr/{node}") for node in NODES}
     other = site.join("cstr/monitor")
     with nodes(buses):
-        buses["monitor"].announce(keys.monitor_token("cstr", "a"))
+        buses["monitor"].declare_token(keys.monitor_token("cstr", "a"))
         assert wrong(settings(site.folder, "cstr/viewer"), tmp_path) == {}
-        other.announce(keys.monitor_token("cstr", "b"))
+        other.declare_token(keys.monitor_token("cstr", "b"))
         found = wrong(settings(site.folder, "cstr/viewer"), tmp_path)
     assert set(found) == {"monitors"}
     assert found["monitors"].found == "2 of them watch cstr: every alarm is raised as often"

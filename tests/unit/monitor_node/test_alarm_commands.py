@@ -47,7 +47,7 @@ class Room:
         self.node = MonitorNode(config, 0)
         self.said: list[Publication] = []
         self._operator = MemoryBus(Exchange())
-        self._operator.answer(f"reactor/{PLANT}/command/*", self._answer)
+        self._operator.declare_queryable(f"reactor/{PLANT}/command/*", self._answer)
         self.hear(messages)
 
     def hear(self, messages: list[Encoded]) -> list[Publication]:
@@ -58,7 +58,7 @@ class Room:
         """A person asks."""
         self.said.clear()
         question = Encoded(f"reactor/{PLANT}/command/{name}", *encode_message(message))
-        (answer,) = self._operator.ask(question, 1.0)
+        (answer,) = self._operator.query(question, 1.0)
         reply = decode(answer.payload, answer.encoding)
         assert isinstance(reply, CommandReply)
         return reply
