@@ -28,10 +28,10 @@ from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
-from reactorwatch.runtime.metrics import Metrics, served
-from reactorwatch.runtime.model_file import model_on_the_bus
+from reactorwatch.runtime.metrics import Metrics, serve_metrics
+from reactorwatch.runtime.model_file import read_model_on_bus_clock
 from reactorwatch.runtime.node_main import main
-from reactorwatch.runtime.security.command_rate import CommandRate, sender_of
+from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
 
 log = structlog.get_logger()
 
@@ -62,9 +62,9 @@ class MonitorNode(Monitor):
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
-        super().__init__(config, start_ns, model=model_on_the_bus(config.model))
+        super().__init__(config, start_ns, model=read_model_on_bus_clock(config.model))
         self._said: dict[object, str] = {}
-        self._rate = CommandRate()
+        self._rate = CommandRateLimiter()
         self.preparation: Iterator[None] | None = None
         self._prepare_ns = start_ns
         self.token = keys.monitor_token(config.plant, f"{start_ns:020d}-{secrets.token_hex(4)}")
@@ -101,7 +101,7 @@ class MonitorNode(Monitor):
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """See `Monitor`; alarms are stored, before the answer goes out, and logged; too many commands are refused."""
-        refusal = self._rate.refusal(sender_of(question), now_ns)
+        refusal = self._rate.check(sender_name(question), now_ns)
         if refusal is not None:
             self.received += 1
             self.refusals.add("too_many_commands", refusal)
@@ -200,13 +200,13 @@ def run(
     """
     node = MonitorNode(config, time.time_ns())
     node.preparation = stage.preparation(config, node.model)
-    with served(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
+    with serve_metrics(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:
             return
         try:
             log.info("listening", plant=config.plant, training_min=config.training_min)
-            on_publish = metrics.of(node.alarms.all_alarms) if metrics is not None else None
+            on_publish = metrics.observe(node.alarms.all_alarms) if metrics is not None else None
             loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
             # All samples published since the state was stored, however long ago; the node skips those it knows.
             history_s = inf if node.resumed else 0.0

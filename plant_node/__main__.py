@@ -18,7 +18,7 @@ from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
-from reactorwatch.runtime.metrics import Metrics, served
+from reactorwatch.runtime.metrics import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
 
 log = structlog.get_logger()
@@ -45,13 +45,17 @@ def run(
     """
     plant = plant_from(config, model, driver)
     log.info("plant", seed=config.seed, settings=msgspec.to_builtins(config))
-    with served(metrics_config, Metrics(config.name, NODE), NODE) as metrics, stop_on_signals() as stop:
+    with serve_metrics(metrics_config, Metrics(config.name, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = connect(bus_config, NODE, stop)
         if bus is None:
             return
         try:
             serve_plant(
-                PlantNode(plant, config, log.info), config, bus, stop, metrics.of() if metrics is not None else None
+                PlantNode(plant, config, log.info),
+                config,
+                bus,
+                stop,
+                metrics.observe() if metrics is not None else None,
             )
         finally:
             bus.close()

@@ -74,7 +74,7 @@ def reproduce(
         jobs = [Job(figure.number, pictures / figure.file_name, seed, measured) for figure in figures]
         for figure, finding in zip(figures, results(draw, jobs, "reproducing", processes, scheduler), strict=True):
             if isinstance(finding, Failed):
-                raise (RuntimeError if finding.ours else InputError)(f"figure {figure.number}: {finding.reason}")
+                raise (RuntimeError if finding.is_internal else InputError)(f"figure {figure.number}: {finding.reason}")
             found.append((figure, finding))
         text = page(found, seed, measured.name if measured else "")
         with replacing(folder / PAGE) as temporary:

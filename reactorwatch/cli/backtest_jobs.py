@@ -16,7 +16,7 @@ from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.runtime.model_file import model_on_the_bus
+from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
 
 @dataclass(frozen=True)
@@ -91,12 +91,14 @@ def answer(job: Job) -> Answer:
         said = msgspec.json.encode({"file": str(job.file), **found} if job.among else found).decode()
     else:
         said = backtest_text(result, zero_ns, job.file)
-    return Answer(said, _row(job.file, found), remark=first.unit_remark(model_on_the_bus(settings.model) or cstr()))
+    return Answer(
+        said, _row(job.file, found), remark=first.unit_remark(read_model_on_bus_clock(settings.model) or cstr())
+    )
 
 
 def _units(settings: MonitorConfig) -> dict[str, str] | None:
     """The units of the signals, if the settings say of which process they are; None: they do not."""
-    model = model_on_the_bus(settings.model)
+    model = read_model_on_bus_clock(settings.model)
     if model is None and settings.reference == "process":
         model = cstr()
     return None if model is None else model.units

@@ -23,7 +23,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import replacing
 from reactorwatch.records.folder import filling
 from reactorwatch.records.reading import files_of
-from reactorwatch.runtime.parallel.jobs import Failed, in_order, workers
+from reactorwatch.runtime.parallel.jobs import Failed, choose_executor, in_job_order
 from reactorwatch.terminal import printable
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
@@ -165,16 +165,16 @@ def results(
     Raises:
         InputError: workers that there are not.
     """
-    done_by = workers(processes, scheduler)
+    executor = choose_executor(processes, scheduler)
     with bar(doing, len(jobs)) as advance:
 
         def counted() -> Iterator[tuple[int, Result | Failed]]:
             advance(0, f"{doing}, none of {len(jobs)} done")
-            for count, done in enumerate(done_by.outcomes(work, jobs), start=1):
+            for count, done in enumerate(executor.map_unordered(work, jobs), start=1):
                 advance(count, f"{doing}, {count} of {len(jobs)} done")
                 yield done
 
-        yield from in_order(counted())
+        yield from in_job_order(counted())
 
 
 def write_remark(file: Path, remark: str) -> None:

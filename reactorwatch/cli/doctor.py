@@ -24,8 +24,8 @@ from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.security.acl import Role, kinds_of, role_of
-from reactorwatch.runtime.security.certificates import common_name_of, read_certificate, read_key
+from reactorwatch.runtime.security.acl import Role, kinds_of, parse_common_name
+from reactorwatch.runtime.security.certificates import read_certificate, read_common_name, read_key
 
 RENEW_DAYS = 30
 LARGEST_OFFSET_S = 1.0
@@ -91,12 +91,12 @@ def _certificate(config: BusConfig, plant: str, now: datetime) -> Iterator[Findi
             yield Finding("certificate", f"none: whoever reaches {config.endpoint} may publish and command", cure)
         return
     own, ca = read_certificate(Path(config.certificate)), read_certificate(Path(config.ca))
-    name = common_name_of(own)
+    name = read_common_name(own)
     renew = "renew it: `reactorwatch certify SITE --renew 30`, and copy the new folder"
     for what, certificate in (("certificate", own), ("authority", ca)):
         left = certificate.not_valid_after_utc - now
         until = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC, {left.days} days"
-        who = common_name_of(certificate)
+        who = read_common_name(certificate)
         if now < certificate.not_valid_before_utc:
             begin = f"{certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC"
             yield Finding(what, f"{who}: not valid before {begin}", "set this machine's clock, or make it anew")
@@ -114,7 +114,7 @@ def _certificate(config: BusConfig, plant: str, now: datetime) -> Iterator[Findi
         yield Finding("identity", f"{config.key} is not the key of {config.certificate}", "copy its whole folder anew")
     if stat.S_IMODE(key_file.stat().st_mode) & 0o077:
         yield Finding("private key", f"{key_file} can be read by others", f"chmod 600 {key_file}")
-    holder = role_of(name)
+    holder = parse_common_name(name)
     if holder is None or holder[0] != plant:
         cure = f"use a certificate of {plant}, or name its plant by --plant"
         yield Finding("identity", f"{name or 'nobody'}: is of no role of plant {plant}", cure)
@@ -162,7 +162,7 @@ def _is_heard(speaker: ZenohBus, listener: ZenohBus, plant: str, kind: str, time
 def _role(config: BusConfig) -> Role | None:
     if config.certificate is None:
         return None
-    holder = role_of(common_name_of(read_certificate(Path(config.certificate))))
+    holder = parse_common_name(read_common_name(read_certificate(Path(config.certificate))))
     return holder[1] if holder is not None else None
 
 

@@ -30,7 +30,7 @@ from reactorwatch.cli import (
 )
 from reactorwatch.cli.interrupt import handled, raise_until_handled
 from reactorwatch.cli.printing import say
-from reactorwatch.runtime.crash import INTERRUPTED, UNUSABLE, complain, guard
+from reactorwatch.runtime.crash import INTERRUPTED, UNUSABLE, guard, print_error
 
 # Typer brings a copy of click, or uses the one installed, depending on its version; its errors are one family in both.
 UsageProblem: type[typer.BadParameter] = next(
@@ -82,7 +82,7 @@ def _run() -> int:
         code = app(prog_name=NAME, standalone_mode=False)
         sys.stdout.flush()
     except UsageProblem as error:
-        complain(NAME, error.format_message())
+        print_error(NAME, error.format_message())
         return UNUSABLE
     except (typer.Abort, KeyboardInterrupt):
         handled()

@@ -32,7 +32,7 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.delivery.delivery import Delivery, SequencedMessage
 from reactorwatch.runtime.delivery.reorder_buffer import Gap, ReorderBuffer
 from reactorwatch.runtime.delivery.streams import STREAM_PARTS, keys_of, stream_of
-from reactorwatch.runtime.security.acl import MEMORY, NOBODY
+from reactorwatch.runtime.security.acl import CACHE_SUFFIX, NO_QUERYABLE
 
 log = structlog.get_logger()
 
@@ -348,7 +348,7 @@ class ZenohBus:
     def _query_cache(self, key_expression: str, which: str) -> "_CacheReply":
         """Query the publishers' caches."""
         replies = self._session.get(
-            f"{zenoh_expression(key_expression)}/{MEMORY}?{which}",
+            f"{zenoh_expression(key_expression)}/{CACHE_SUFFIX}?{which}",
             consolidation=zenoh.ConsolidationMode.NONE,
             accept_replies=zenoh.ReplyKeyExpr.ANY,
             timeout=HISTORY_WITHIN_S,
@@ -437,7 +437,7 @@ class ZenohBus:
         self._closed.set()
         if self._published_at is not None:
             time.sleep(max(0.0, self._published_at + LAST_RECOVERY_S - time.monotonic()))
-        for _ in self._voice.get(NOBODY, timeout=FLUSH_WITHIN_S):
+        for _ in self._voice.get(NO_QUERYABLE, timeout=FLUSH_WITHIN_S):
             pass
         # Advanced ones may outlive the session otherwise, and hang the process (eclipse-zenoh/zenoh-python#624).
         for declared in (*self._declared, *self._tokens.values(), *(key.publisher for key in self._keys.values())):

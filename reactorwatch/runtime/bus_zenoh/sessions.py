@@ -15,8 +15,8 @@ from reactorwatch.runtime.bus_zenoh.bus import ZenohBus
 from reactorwatch.runtime.bus_zenoh.messages import first_line
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.heap import return_large_blocks
-from reactorwatch.runtime.security.identity import ROUTER_FILES, TLS, client_settings
+from reactorwatch.runtime.heap import release_large_blocks
+from reactorwatch.runtime.security.identity import ROUTER_FILES, TLS, client_tls
 
 log = structlog.get_logger()
 
@@ -56,7 +56,7 @@ def connect(
         InputError: Zenoh does not understand the endpoint.
     """
     client = _client(config)
-    return_large_blocks()
+    release_large_blocks()
     woken = threading.Event()
     stop.call_on_set(woken.set)
     retry_s = FIRST_RETRY_S
@@ -99,7 +99,7 @@ def _client(config: BusConfig) -> zenoh.Config:
         "scouting/multicast/enabled": False,
         "timestamping/enabled": True,  # they give the age of a message
         **_TRANSPORT,
-        **client_settings(config),
+        **client_tls(config),
     }
     return _validate(settings, config.endpoint)
 
@@ -127,7 +127,7 @@ def router(config: BusConfig) -> ZenohBus:
         "scouting/multicast/enabled": False,
         **_TRANSPORT,
     }
-    return_large_blocks()
+    release_large_blocks()
     try:
         session = zenoh.open(_validate(settings, config.endpoint))
     except zenoh.ZError as error:
@@ -147,7 +147,7 @@ def router_from_file(path: Path) -> ZenohBus:
     Raises:
         InputError: the file cannot be read or is malformed, or its endpoint cannot be listened at.
     """
-    return_large_blocks()
+    release_large_blocks()
     try:
         config = zenoh.Config.from_file(str(path))
         config.insert_json5(_SHARED_MEMORY, "false")

@@ -176,7 +176,7 @@ def test_the_counts_and_alarms_of_each_plant_are_on_the_page_as_long_as_it_is_wa
     bench.node.on_messages(run, bench.now_ns)
     bench.now_ns += int(QUICK.health_period_s * 1e9)
     for publication in bench.node.on_tick(bench.now_ns):
-        metrics.published(publication)
+        metrics.on_publish(publication)
     shown = {metric.name: metric.samples for metric in metrics.collect()}
     (rows,) = shown["reactorwatch_rows"]
     assert (rows.labels, rows.value) == ({"plant": plant, "node": "monitor"}, len(run) // 3)
