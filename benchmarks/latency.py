@@ -107,7 +107,7 @@ def measure(config: BusConfig) -> None:
 
     bus.subscribe_liveliness("reactor/cstr/alive/*", on_token)
     assert ready.wait(60), f"not alive: {missing}"
-    bus.subscribe(keys.all_of("cstr", keys.ALARM), arrivals.on_alarm)
+    bus.subscribe(keys.all_keys("cstr", keys.ALARM), arrivals.on_alarm)
     bus.subscribe("echo/T", arrivals.on_echo)
     sent = publish(bus.publish)
     last = max(time_ns for time_ns, (_, out) in sent.items() if out)

@@ -20,9 +20,9 @@ from reactorwatch.cli.printing import say_text
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.read_record import stands_for
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
-from reactorwatch.records.folder import filling
-from reactorwatch.records.reading import files_of
+from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.folder import fill_folder
+from reactorwatch.records.input_file import list_files
 from reactorwatch.runtime.parallel.jobs import Failed, choose_executor, in_job_order
 from reactorwatch.terminal import printable
 
@@ -93,7 +93,7 @@ def files_named(names: Sequence[Path]) -> list[Path]:
 
 def _held_by(folder: Path) -> list[Path]:
     """What a folder that is like a pattern stands for: nothing, if it is only called so."""
-    return stands_for(folder) if files_of(folder, ".csv") or files_of(folder, ".mcap") else []
+    return stands_for(folder) if list_files(folder, ".csv") or list_files(folder, ".mcap") else []
 
 
 def say(
@@ -204,9 +204,9 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> None:
     writer.writerows(rows)
     content = {SUMMARY_OBJECT: msgspec.json.format(msgspec.json.encode(said), indent=2) + b"\n"}
     content[SUMMARY_TABLE] = table.getvalue().encode()
-    with filling(folder, "--out") as temporary:
+    with fill_folder(folder, "--out") as temporary:
         for name, text in content.items():
-            with replacing(temporary / name) as file:
+            with atomic_write(temporary / name) as file:
                 file.write_bytes(text)
 
 

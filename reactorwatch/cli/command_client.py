@@ -53,7 +53,7 @@ def ask(
 
     tables, bus_config = begin(config, endpoint)
     try:
-        plant = keys.checked_plant(plant or str(tables.get(node, {}).get("plant") or "cstr"))
+        plant = keys.check_plant(plant or str(tables.get(node, {}).get("plant") or "cstr"))
     except ValueError as error:
         raise InputError(str(error)) from error
     stop = StopSignal()

@@ -24,7 +24,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample
 from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
 from reactorwatch.runtime.bus_zenoh import ZenohBus
@@ -245,7 +245,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     ]
     text = printable_lines(lines)
     say_text(text)
-    with replacing(folder / "summary.md") as temporary:
+    with atomic_write(folder / "summary.md") as temporary:
         temporary.write_text(text, encoding="utf-8")
     say(f"All of it is in {folder}")
     return 0 if after and not before and same else 1

@@ -17,9 +17,9 @@ from reactorwatch.diagnosis.report.machine import with_differences
 from reactorwatch.diagnosis.result import Diagnosis, Experiment
 from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.csv_file import write_csv
-from reactorwatch.records.folder import filling
+from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 
@@ -130,13 +130,13 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     plain = msgspec.json.format(
         msgspec.json.encode(with_differences(diagnosis, str(case.file), seconds, case.measured.zero)), indent=2
     )
-    with filling(folder, "--out") as temporary:
+    with fill_folder(folder, "--out") as temporary:
         write_extended_model(temporary / MODEL, diagnosis.extended_model)
         if diagnosis.experiment is not None:
             _write_experiment(diagnosis.experiment, temporary / EXPERIMENT)
         write_drawing(diagnosis, case.model, case.measured, temporary / DRAWING)
         for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):
-            with replacing(temporary / name) as file:
+            with atomic_write(temporary / name) as file:
                 file.write_bytes(content)
     if diagnosis.experiment is None:
         (folder / EXPERIMENT).unlink(missing_ok=True)  # of an earlier report

@@ -20,7 +20,7 @@ from reactorwatch.diagnosis.result import Cause, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.records.output import checked_folder
+from reactorwatch.records.output import check_output_folder
 from reactorwatch.runtime.model_file import read_extended_model
 
 
@@ -73,18 +73,18 @@ def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, fo
         files: that are diagnosed.
         out: as for `jobs_of`.
         model: file of an extended model, or None.
-        force: as for `checked_output`.
+        force: as for `check_output_file`.
 
     Raises:
-        InputError: as `checked_folder`.
+        InputError: as `check_output_folder`.
     """
     if out is None:
         return
     sources = (*files, model)
-    checked_folder(out, SUMMARY if len(files) > 1 else (), sources, force=force)
+    check_output_folder(out, SUMMARY if len(files) > 1 else (), sources, force=force)
     for folder in _folders(files, out):
         assert folder is not None
-        checked_folder(folder, REPORT, sources, force=force)
+        check_output_folder(folder, REPORT, sources, force=force)
 
 
 def answer(job: Job) -> Answer:

@@ -181,7 +181,7 @@ class _Listening:
         self.monitors = OtherMonitors("", lambda: ())
         self._settled: set[str] = set()
         self._changed = threading.Condition()
-        bus.subscribe_liveliness(keys.all_of(plant, keys.ALIVE), self._on_token)
+        bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), self._on_token)
         for tokens in (keys.monitor_token(plant, "*"), keys.FLEET_TOKENS):
             bus.subscribe_liveliness(tokens, self._on_monitor)
         bus.subscribe_uncached(keys.key(plant, keys.HEALTH, "*"), self._on_health)

@@ -9,7 +9,7 @@ import typer
 from reactorwatch.cli.options import Columns, Force, Plant, columns, existing, existing_recording, output_file
 from reactorwatch.cli.printing import say, say_text
 from reactorwatch.errors import InputError
-from reactorwatch.records.output import checked_folder
+from reactorwatch.records.output import check_output_folder
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record
@@ -53,7 +53,7 @@ def dashboard(
     if drawn is not None and not drawn.is_file():
         raise InputError(f"--diagnosis {diagnosis}: holds no {DRAWING}; it must be the folder that diagnose -o wrote")
     if png is not None:
-        checked_folder(png, picture_names(), (file,), option="--png", force=force)
+        check_output_folder(png, picture_names(), (file,), option="--png", force=force)
     with task(f"drawing {file.name}"):
         recording = tape(existing_recording(file), plant)
         run = stretches(recording.messages, counted_from_ns=recording.zero_ns)

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.output import checked_output
+from reactorwatch.records.output import check_output_file
 
 Settings = Annotated[
     Path | None, typer.Option("--config", help="Settings file (TOML), a table for each node.", show_default=False)
@@ -190,13 +190,13 @@ def output_file(path: Path, suffix: str, sources: Iterable[Path | None], *, forc
     Args:
         path: the file.
         suffix: that its name must have, by which it is opened.
-        sources: as for `checked_output`.
-        force: as for `checked_output`.
+        sources: as for `check_output_file`.
+        force: as for `check_output_file`.
 
     Raises:
-        InputError: as `checked_output`; or its name has another suffix.
+        InputError: as `check_output_file`; or its name has another suffix.
     """
-    checked_output(path, sources, force=force)
+    check_output_file(path, sources, force=force)
     if path.suffix.lower() != suffix:
         raise InputError(f"{path}: the name must end in {suffix}, got {path.suffix or 'no ending'}")
     return path

@@ -15,7 +15,7 @@ from typing import Any, Self
 import msgspec
 import structlog
 
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 
 log = structlog.get_logger()
 
@@ -95,7 +95,7 @@ class Processes:
 
 def write_settings(path: Path, tables: dict[str, msgspec.Struct]) -> None:
     """Write whole settings as TOML, every value spelled out, so that the file says what ran."""
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(settings_text(tables), encoding="utf-8")
 
 

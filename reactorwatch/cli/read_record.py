@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from reactorwatch.contract.codec import Encoded, encode
-from reactorwatch.contract.keys import checked_plant
+from reactorwatch.contract.keys import check_plant
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.reading import files_of
-from reactorwatch.records.record import UNITS, Record, clock_time
+from reactorwatch.records.input_file import list_files
+from reactorwatch.records.record import UNITS, Record, format_utc
 
 DEFAULT_PLANT = "cstr"
 
@@ -68,7 +68,7 @@ class Tape(NamedTuple):
         Args:
             first_ns: time of the first sample.
         """
-        return clock_time(first_ns if self.zero_ns is None else self.zero_ns) if self.has_clock else None
+        return format_utc(first_ns if self.zero_ns is None else self.zero_ns) if self.has_clock else None
 
 
 def tape(
@@ -117,7 +117,7 @@ def stands_for(folder: Path) -> list[Path]:
     from recorder.tools.mcap_file import read_metadata
 
     of_a_piece = {NUMBER, "cut", "merged"}
-    records, recordings = (files_of(folder, suffix) for suffix in (".csv", ".mcap"))
+    records, recordings = (list_files(folder, suffix) for suffix in (".csv", ".mcap"))
     if not records and not recordings:
         raise InputError(f"{folder}: holds no record (.csv) and no recording (.mcap)")
     origins = []
@@ -171,7 +171,7 @@ def plant_of(path: Path, plant: str | None) -> str:
 
     found = one_plant_in(path, plant)
     try:
-        return checked_plant(found)
+        return check_plant(found)
     except ValueError as error:
         cure = "export it, and use the record"
         raise InputError(f"{path}: {error}; {cure}") from error

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from reactorwatch.contract.messages_pb2 import Priority
-from reactorwatch.records.record import clock_time, to_minutes
+from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.terminal import printable_lines
 from recorder.storage.recover import Saved
 from recorder.tools.inspect import Look
@@ -52,7 +52,7 @@ def info_object(seen: Look, file: Path) -> dict[str, Any]:
     span = found.sample_span_ns
     return {
         "file": str(file),
-        "zero": clock_time(seen.zero_ns) if span is not None and has_clock(seen.metadata) else None,
+        "zero": format_utc(seen.zero_ns) if span is not None and has_clock(seen.metadata) else None,
         "whole": not seen.damages,
         "damages": list(seen.damages),
         "messages": found.messages,

@@ -28,7 +28,7 @@ def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record
     Raises:
         InputError: the record cannot drive the model.
     """
-    runs = measured.each_run()
+    runs = measured.split_runs()
     simulated = join_runs([_free_run(run, model, faults, alone=len(runs) == 1) for run in runs])
     return replace(simulated, name=f"simulation of {measured.name}")
 

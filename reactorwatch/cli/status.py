@@ -152,10 +152,10 @@ def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as
 
 def _listening(bus: ZenohBus, plant: str) -> Board:
     board = Board(time.time_ns())
-    bus.subscribe_liveliness(keys.all_of(plant, keys.ALIVE), board.on_token)
-    bus.subscribe(keys.all_of(plant, keys.HEALTH), board.on_message, history_s=HISTORY_S)
+    bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), board.on_token)
+    bus.subscribe(keys.all_keys(plant, keys.HEALTH), board.on_message, history_s=HISTORY_S)
     for kind in (keys.SAMPLE, keys.ALARM):
-        bus.subscribe(keys.all_of(plant, kind), board.on_message)
+        bus.subscribe(keys.all_keys(plant, kind), board.on_message)
     return board
 
 

@@ -89,12 +89,12 @@ def backtest(
     from reactorwatch.cli.backtest_jobs import WATCHING, jobs_of
     from reactorwatch.cli.batch import SUMMARY, files_named, say
     from reactorwatch.cli.read_record import DEFAULT_PLANT
-    from reactorwatch.records.output import checked_folder
+    from reactorwatch.records.output import check_output_folder
     from reactorwatch.runtime.config import read_settings, section
 
     named = files_named(files)
     if out is not None:
-        checked_folder(out, SUMMARY, (*named, config, model), force=force)
+        check_output_folder(out, SUMMARY, (*named, config, model), force=force)
     flags = {
         "plant": plant or DEFAULT_PLANT,
         "training_min": training,

@@ -15,7 +15,7 @@ from reactorwatch.cli.progress import task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import clock_time, to_minutes
+from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.runtime.config import parse_toml, read_settings, section
 from reactorwatch.terminal import printable_lines
 from recorder.tools.inspect import gaps_in, zero_ns_of
@@ -62,10 +62,10 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
         f"{gap.messages} messages of {gap.stream} never reached this recording; what the monitor said of them, "
         "and what it learned from them, is then not said again"
         for gap in gaps_in(file)
-        if gap.stream in {keys.all_of(monitor.plant, kind).removesuffix("/**") for kind in (keys.SAMPLE, *COMPARED)}
+        if gap.stream in {keys.all_keys(monitor.plant, kind).removesuffix("/**") for kind in (keys.SAMPLE, *COMPARED)}
     ]
     zero_ns = zero_ns_of(file)
-    said = _object(found, file, monitor.plant, zero_ns) | {"zero": clock_time(zero_ns) if has_clock(metadata) else None}
+    said = _object(found, file, monitor.plant, zero_ns) | {"zero": format_utc(zero_ns) if has_clock(metadata) else None}
     say_text(msgspec.json.encode(said).decode() if as_json else _text(said))
     return 0 if found.exact else 1
 

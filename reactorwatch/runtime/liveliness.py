@@ -38,7 +38,7 @@ def wait_alive(bus: Bus, plant: str, nodes: Collection[str], stop: StopSignal, w
 
     stop.call_on_set(changed.set)
     if nodes:
-        bus.subscribe_liveliness(keys.all_of(plant, keys.ALIVE), on_token)
+        bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token)
     while True:
         changed.clear()  # before the check: a later change wakes the wait below
         missing = [node for node in nodes if node not in alive]

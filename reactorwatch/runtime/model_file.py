@@ -8,7 +8,7 @@ from typing import Any
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 
 
 def read_extended_model(path: Path) -> ExtendedModel:
@@ -47,5 +47,5 @@ def write_extended_model(path: Path, written: dict[str, Any]) -> None:
     Raises:
         InputError: the folder does not exist or cannot be written to.
     """
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")

@@ -48,7 +48,7 @@ def ask_for_past(bus: Bus, plant: str) -> Past:
                 listed += reply.alarms
                 answered.add(node)
     zero_ns: int | None = None
-    for message in bus.query_history(keys.all_of(plant, keys.HEALTH)):
+    for message in bus.query_history(keys.all_keys(plant, keys.HEALTH)):
         said_ns = zero_of(message)
         zero_ns = zero_ns if said_ns is None else said_ns
     alarms = (encode(Publication(keys.key(plant, keys.ALARM, item.alarm), item)) for item in changes(listed))

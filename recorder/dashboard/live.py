@@ -98,7 +98,7 @@ def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], N
                 dashboard = LiveDashboard(recording, lambda: process.poll() is not None, time.time_ns(), past, query)
                 loop = EventLoop(dashboard, bus, stop)
                 loop.subscribe(f"{keys.ROOT}/{plant}/**", history_s=bus_config.history_s)
-                loop.subscribe_liveliness(keys.all_of(plant, keys.ALIVE), on_token=dashboard.on_alive)
+                loop.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token=dashboard.on_alive)
                 loop.run()
                 recording.disconnect()
             finally:

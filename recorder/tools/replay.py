@@ -87,7 +87,7 @@ def _opened(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterato
     if not config.plant:
         for plant in plants:
             try:
-                keys.checked_plant(plant)
+                keys.check_plant(plant)
             except ValueError as error:
                 raise InputError(f"{path}: {error}; choose the name by --plant") from error
     if config.plant and len(plants) > 1:

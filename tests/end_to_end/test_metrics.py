@@ -49,7 +49,7 @@ def test_every_node_of_up_has_a_page_with_what_it_has_counted(endpoint: str, sta
         if set(heard) == set(NODES):
             all_heard.set()
 
-    listener.subscribe(keys.all_of("cstr", keys.HEALTH), listen)
+    listener.subscribe(keys.all_keys("cstr", keys.HEALTH), listen)
     assert all_heard.wait(PATIENCE_S)
     pages = {}
     for node in NODES:

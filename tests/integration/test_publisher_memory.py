@@ -27,7 +27,7 @@ def remembered(request: pytest.FixtureRequest) -> dict[str, int]:
         for number in range(PUBLISHED):
             for kind in KINDS:
                 buses[1].publish(Encoded(keys.key("cstr", kind, "T"), b"%d" % number, "text/plain"))
-        return {kind: len(buses[2].query_history(keys.all_of("cstr", kind))) for kind in KINDS}
+        return {kind: len(buses[2].query_history(keys.all_keys("cstr", kind))) for kind in KINDS}
     finally:
         for bus in reversed(buses):
             bus.close()

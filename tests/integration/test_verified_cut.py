@@ -40,7 +40,7 @@ OF_RECORDER = keys.key("cstr", keys.HEALTH, "recorder")
 def watch(bus_config: BusConfig, stop: StopSignal) -> None:
     with contextlib.closing(connected(bus_config)) as bus:
         loop = EventLoop(Monitor(MONITOR, time.time_ns()), bus, stop, drain_timeout_s=0.5)
-        loop.subscribe(keys.all_of("cstr", keys.SAMPLE))
+        loop.subscribe(keys.all_keys("cstr", keys.SAMPLE))
         loop.accept_commands(*(keys.key("cstr", keys.COMMAND, name) for name in COMMANDS))
         bus.declare_token(keys.key("cstr", keys.ALIVE, "monitor"))
         loop.run()

@@ -5,7 +5,7 @@ import struct
 
 import zenoh
 
-from reactorwatch.contract.codec import LARGEST_PAYLOAD, Encoded
+from reactorwatch.contract.codec import MAX_PAYLOAD, Encoded
 from reactorwatch.runtime.delivery.delivery import SequencedMessage
 from reactorwatch.runtime.delivery.streams import STREAM_PARTS
 
@@ -22,7 +22,7 @@ def truncated_payload(payload: zenoh.ZBytes) -> bytes:
     A node's backlog is bounded in messages, and would otherwise be as large as a sender likes.
     """
     data = payload.to_bytes()
-    return data if len(data) <= LARGEST_PAYLOAD else data[: LARGEST_PAYLOAD + 1]
+    return data if len(data) <= MAX_PAYLOAD else data[: MAX_PAYLOAD + 1]
 
 
 class SampleReader:

@@ -8,7 +8,7 @@ from collections import OrderedDict
 from typing import NamedTuple
 
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
-from reactorwatch.contract.commands import LONGEST_NAME
+from reactorwatch.contract.commands import MAX_NAME
 
 MAX_NAMES = 1000
 """Names with a bucket; the least recently seen is evicted first."""
@@ -78,7 +78,7 @@ def sender_name(question: Encoded) -> str:
         command = decode(question.payload, question.encoding)
     except DecodeError:
         return ""
-    return str(getattr(command, "by", "")).strip()[:LONGEST_NAME]
+    return str(getattr(command, "by", "")).strip()[:MAX_NAME]
 
 
 def _level(bucket: tuple[float, int], rate: Rate, now_ns: int) -> float:

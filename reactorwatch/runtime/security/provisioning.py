@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives import serialization
 
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.runtime.security.acl import ROLES, SERIAL_BYTES, access_control, common_name
 from reactorwatch.runtime.security.certificates import (
     Identity,
@@ -110,7 +110,7 @@ def make_site(
         if issuer.complete(folder / ROUTER, ROUTER, hosts):
             made.append(folder / ROUTER)
         rules = access_control(plants, register.names, register.revoked)
-        with replacing(folder / ROUTER / ROUTER_SETTINGS) as part:
+        with atomic_write(folder / ROUTER / ROUTER_SETTINGS) as part:
             part.write_text(_router_settings(rules, register.listen), encoding="utf-8")
         for holder in holders:
             settings = _settings(holder.partition("/")[0], register.endpoint)
@@ -124,7 +124,7 @@ def make_site(
 def _check(plants: tuple[str, ...], days: float) -> None:
     for plant in plants:
         try:
-            keys.checked_plant(plant)
+            keys.check_plant(plant)
         except ValueError as error:
             raise InputError(f"--plant: {error}") from error
         if plant in (AUTHORITY, ROUTER):
@@ -165,7 +165,7 @@ def _find_plants(folder: Path) -> list[str]:
         plant = holder.parent.name
         if holder.is_dir() and holder.name in {role.name for role in ROLES} and plant not in (AUTHORITY, ROUTER):
             try:
-                plants.append(keys.checked_plant(plant))
+                plants.append(keys.check_plant(plant))
             except ValueError as error:
                 raise InputError(f"{holder.parent}: is no plant's folder; move it out of the site: {error}") from error
     return list(dict.fromkeys(plants))

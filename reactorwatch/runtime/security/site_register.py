@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.runtime.security.acl import SERIAL_BYTES, common_name
 
 
@@ -40,7 +40,7 @@ class Register(msgspec.Struct, forbid_unknown_fields=True):
 
     def write(self, path: Path) -> None:
         """Write the file, completely or not at all."""
-        with replacing(path) as part:
+        with atomic_write(path) as part:
             part.write_bytes(msgspec.json.encode(self) + b"\n")
 
 

@@ -37,7 +37,7 @@ def cut(record: Record, back_min: float) -> Record:
 def test_each_run_is_simulated_from_its_own_first_row(whole: Record, tmp_path: Path) -> None:
     record = cut(whole, 60.05)
     simulated = free_run(record, cstr(), ["coolant_flow:step:-0.05@75min"])
-    alone = [free_run(run, cstr(), ["coolant_flow:step:-0.05@75min"]) for run in record.each_run()]
+    alone = [free_run(run, cstr(), ["coolant_flow:step:-0.05@75min"]) for run in record.split_runs()]
     assert np.array_equal(simulated.columns["T"], join_runs(alone).columns["T"])
     assert np.array_equal(simulated.time_min, record.time_min)
     assert simulated.runs is not None
