@@ -9,7 +9,7 @@ from benchmarks.study_figures.catalogue import FIGURES
 from benchmarks.study_figures.figure import Figure, Finding
 from benchmarks.study_figures.page import FOLDER, page
 from benchmarks.study_figures.study import Study
-from reactorwatch.cli.batch import results
+from reactorwatch.cli.batch import run_in_order
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import fill_folder, make_folder
@@ -72,7 +72,7 @@ def reproduce(
     with fill_folder(out, "--out") as folder:
         pictures = make_folder(folder / FOLDER).absolute()
         jobs = [Job(figure.number, pictures / figure.file_name, seed, measured) for figure in figures]
-        for figure, finding in zip(figures, results(draw, jobs, "reproducing", processes, scheduler), strict=True):
+        for figure, finding in zip(figures, run_in_order(draw, jobs, "reproducing", processes, scheduler), strict=True):
             if isinstance(finding, Failed):
                 raise (RuntimeError if finding.is_internal else InputError)(f"figure {figure.number}: {finding.reason}")
             found.append((figure, finding))

@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Json
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.errors import InputError
 
 Shift = Annotated[float, typer.Option(help="Of the mean, in standard deviations; 0: the false alarms.")]
@@ -15,7 +15,7 @@ Dimension = Annotated[int, typer.Option(help="Number of signals.")]
 Weight = Annotated[float, typer.Option("--lambda", help="Weight of the newest sample.", show_default=False)]
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     charts = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
     arl = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -114,13 +114,13 @@ def design(
     if as_json:
         import msgspec
 
-        say(msgspec.json.encode(found).decode())
+        print_lines(msgspec.json.encode(found).decode())
         return
-    say(chart)
+    print_lines(chart)
     for name, value in found.parameters.items():
         text = ",".join(map(str, value)) if isinstance(value, list) else f"{value:.6g}"
-        say(f"  {name:<10} {text}")
-    say(f"false alarm every {found.arl0:g} samples; a shift of {found.shift:g} is seen after {found.arl:.4g}")
+        print_lines(f"  {name:<10} {text}")
+    print_lines(f"false alarm every {found.arl0:g} samples; a shift of {found.shift:g} is seen after {found.arl:.4g}")
 
 
 def _rules(text: str) -> tuple[int, ...]:
@@ -133,8 +133,8 @@ def _rules(text: str) -> tuple[int, ...]:
 def _tell(length: float, as_json: bool, **chart: object) -> None:
     """The run length: one number, or one object with the chart's parameters."""
     if not as_json:
-        say(f"{length:.8g}")
+        print_lines(f"{length:.8g}")
         return
     import msgspec
 
-    say(msgspec.json.encode({**chart, "arl": length}).decode())
+    print_lines(msgspec.json.encode({**chart, "arl": length}).decode())

@@ -15,7 +15,7 @@ FAULT = "coolant_flow:step:-0.1@30min"
 TRAINING_MIN = 15.0
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the command."""
     app.command("compile")(compile_kernels)
 

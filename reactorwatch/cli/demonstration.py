@@ -13,8 +13,8 @@ from pathlib import Path
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
-from reactorwatch.cli.bus_settings import VIEWER, heard_by, joining, open_router, write_node_settings
-from reactorwatch.cli.printing import say, say_text
+from reactorwatch.cli.bus_settings import VIEWER, load_bus_settings, open_router, restrict_to_plant, write_node_settings
+from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.read_record import messages
@@ -40,10 +40,10 @@ NODES = ("recorder", "monitor", "plant")
 """In the order in which they are started."""
 START_WITHIN_S = 60.0
 DRAIN_WITHIN_S = 60.0
-LOOK_EVERY_S = 0.1
+POLL_S = 0.1
 SETTINGS_FILE = "settings.toml"
 DIAGNOSIS_FOLDER = "diagnosis"
-LINGER_S = 1.0  # silence after which the recorder, asked to stop last, takes everything as heard
+DRAIN_TIMEOUT_S = 1.0  # silence after which the recorder, asked to stop last, takes everything as heard
 
 
 class Watch:
@@ -113,7 +113,7 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
     """
     configure()
     specification = parse_fault(fault)
-    join = joining(site, PLANT, {}, free_endpoint() if site is None else None)
+    join = load_bus_settings(site, PLANT, {}, free_endpoint() if site is None else None)
     folder = _free_folder(out)
     recording = folder / f"{PLANT}.mcap"
     of_plant = {
@@ -128,15 +128,15 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
     monitor = MonitorConfig(plant=PLANT)
     nodes = {"plant": plant, "monitor": monitor}
     about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **nodes})}
-    recorder = RecorderConfig(plant=PLANT, out=str(recording), linger_s=LINGER_S, black_box_min=0.0, about=about)
+    recorder = RecorderConfig(plant=PLANT, out=str(recording), linger_s=DRAIN_TIMEOUT_S, black_box_min=0.0, about=about)
     with open_router(site, join) as bus:
         make_folder(folder, "--out")
-        tables = {**nodes, "recorder": heard_by(recorder, site)}
+        tables = {**nodes, "recorder": restrict_to_plant(recorder, site)}
         settings = write_node_settings(folder / SETTINGS_FILE, tables, join, NODES)
-        say(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
+        print_lines(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
         with stop_on_signals() as stop:
             if not _run_nodes(bus, stop, settings, folder, plant):
-                say(f"stopped; what was recorded until then is in {folder}", err=True)
+                print_lines(f"stopped; what was recorded until then is in {folder}", err=True)
                 return 130
     return _conclude(folder, recording, monitor, str(specification))
 
@@ -159,7 +159,7 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folde
         for node in NODES:
             processes.start(node)
         started = time.monotonic()
-        while not woken.wait(LOOK_EVERY_S):
+        while not woken.wait(POLL_S):
             ended = processes.ended()
             failed = {node: code for node, code in ended.items() if code or node != "plant"}
             if failed:
@@ -172,14 +172,22 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folde
             advance(watch.plant_min, "starting the nodes" if not watch.started else "running the reactor")
         deadline = time.monotonic() + DRAIN_WITHIN_S
         while not stop.is_set and not watch.all_judged and time.monotonic() < deadline:
-            woken.wait(LOOK_EVERY_S)
+            woken.wait(POLL_S)
         processes.stop(("plant", "monitor", "recorder"))
     return not stop.is_set
 
 
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
     """Diagnose the recording, draw it, read from it what happened, and write that down."""
-    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, Asked, case_of, diagnosed, write_report
+    from reactorwatch.cli.diagnosis import (
+        DRAWING,
+        MODEL,
+        PAGE,
+        DiagnosisOptions,
+        load_case,
+        run_diagnosis,
+        write_report,
+    )
     from reactorwatch.diagnosis.report.words import verdict
     from reactorwatch.process import effects_of
     from recorder.columns.run_reader import stretches
@@ -190,8 +198,8 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         first_ns, faults, alarms = _events(recording)
         again = backtest.run(messages(recording, PLANT), monitor)
     with task("diagnosing"):
-        case = case_of(recording, folder / DIAGNOSIS_FOLDER, Asked(plant=PLANT))
-        diagnosis, seconds = diagnosed(case)
+        case = load_case(recording, folder / DIAGNOSIS_FOLDER, DiagnosisOptions(plant=PLANT))
+        diagnosis, seconds = run_diagnosis(case)
         write_report(diagnosis, case, seconds)
     with task("drawing"):
         write_rrd(stretches(messages(recording, PLANT)), drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)
@@ -244,10 +252,10 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         "",
     ]
     text = printable_lines(lines)
-    say_text(text)
+    print_text(text)
     with atomic_write(folder / "summary.md") as temporary:
         temporary.write_text(text, encoding="utf-8")
-    say(f"All of it is in {folder}")
+    print_lines(f"All of it is in {folder}")
     return 0 if after and not before and same else 1
 
 

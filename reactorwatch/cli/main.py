@@ -28,8 +28,8 @@ from reactorwatch.cli import (
     studies,
     view,
 )
-from reactorwatch.cli.interrupt import handled, raise_until_handled
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.interrupt import clear_interrupt, raise_until_handled
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.runtime.crash import INTERRUPTED, UNUSABLE, guard, print_error
 
 # Typer brings a copy of click, or uses the one installed, depending on its version; its errors are one family in both.
@@ -48,12 +48,12 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for group in (runs, nodes, view, site, playback, alarm, files, recordings, studies, models, charts, compilation):
-    group.add_to(app)
+    group.register_commands(app)
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        say(f"reactorwatch {__version__}")
+        print_lines(f"reactorwatch {__version__}")
         raise typer.Exit
 
 
@@ -85,6 +85,6 @@ def _run() -> int:
         print_error(NAME, error.format_message())
         return UNUSABLE
     except (typer.Abort, KeyboardInterrupt):
-        handled()
+        clear_interrupt()
         return INTERRUPTED
     return code if isinstance(code, int) else 0

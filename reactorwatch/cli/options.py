@@ -17,7 +17,7 @@ Settings = Annotated[
 Endpoint = Annotated[str | None, typer.Option(help="Address of the router [tcp/127.0.0.1:7447].", show_default=False)]
 Plant = Annotated[str | None, typer.Option("--plant", help="Name of the plant [cstr].", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object, for machines.")]
-LONGEST_WAIT_S = 86_400.0
+MAX_WAIT_S = 86_400.0
 """The system's clocks count no endless times."""
 
 Columns = Annotated[
@@ -60,7 +60,7 @@ Scheduler = Annotated[
 ]
 
 
-def sendable(text: str) -> str:
+def check_encodable(text: str) -> str:
     """A text that a message can carry.
 
     Raises:
@@ -73,7 +73,7 @@ def sendable(text: str) -> str:
     return text
 
 
-def columns(pairs: list[str] | None) -> dict[str, str]:
+def parse_columns(pairs: list[str] | None) -> dict[str, str]:
     """The columns' names by signal, from `signal=column` pairs.
 
     Raises:
@@ -88,7 +88,7 @@ def columns(pairs: list[str] | None) -> dict[str, str]:
     return named
 
 
-def tolerances(text: str | None) -> dict[str, float]:
+def parse_tolerances(text: str | None) -> dict[str, float]:
     """The differences that do not matter, by output, from `C=0.002,T=0.5`.
 
     Raises:
@@ -104,7 +104,7 @@ def tolerances(text: str | None) -> dict[str, float]:
     return found
 
 
-def limits(text: str | None) -> dict[str, tuple[float, float]]:
+def parse_limits(text: str | None) -> dict[str, tuple[float, float]]:
     """The lowest and highest values that an experiment may lead to, by signal, from `qc=85..115,T=425..455`.
 
     Raises:
@@ -123,7 +123,7 @@ def limits(text: str | None) -> dict[str, tuple[float, float]]:
     return found
 
 
-def pace(text: str | None, option: str) -> float | None:
+def parse_pace(text: str | None, option: str) -> float | None:
     """A speed or a rate: a positive number, or `max` for as fast as it goes.
 
     Raises:
@@ -145,7 +145,7 @@ def pace(text: str | None, option: str) -> float | None:
 _SECONDS = {"s": 1, "min": 60, "h": 3600}
 
 
-def span_ns(text: str, option: str) -> int:
+def parse_span_ns(text: str, option: str) -> int:
     """A span of time, such as `90s`, `10min`, `1.5h` or `-20min`, in nanoseconds.
 
     Raises:
@@ -162,16 +162,16 @@ def span_ns(text: str, option: str) -> int:
     return round(span_s * 1e9)
 
 
-def existing_recording(path: Path) -> Path:
+def check_recording(path: Path) -> Path:
     """The path of a file that is to be read, or of a folder of recordings.
 
     Raises:
         InputError: there is none.
     """
-    return path if path.is_dir() else existing(path)
+    return path if path.is_dir() else check_input(path)
 
 
-def existing(path: Path) -> Path:
+def check_input(path: Path) -> Path:
     """The path of a file that is to be read.
 
     Raises:
@@ -184,7 +184,7 @@ def existing(path: Path) -> Path:
     return path
 
 
-def output_file(path: Path, suffix: str, sources: Iterable[Path | None], *, force: bool) -> Path:
+def check_output(path: Path, suffix: str, sources: Iterable[Path | None], *, force: bool) -> Path:
     """The path of a file that is to be written.
 
     Args:

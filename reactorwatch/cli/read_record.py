@@ -1,6 +1,6 @@
 """Wherever a file is asked for, `.csv` and `.mcap` both serve: this turns either into a record or into messages.
 
-A folder stands for the recordings in it, as one; where many files may be named, for all in it (`stands_for`). And
+A folder stands for the recordings in it, as one; where many files may be named, for all in it (`expand_folder`). And
 `--model` is turned into a process model on the record's clock.
 """
 
@@ -39,7 +39,7 @@ def record(
     Raises:
         InputError: the file is not one of the two kinds, or is malformed.
     """
-    if kind(path) == "csv":
+    if file_kind(path) == "csv":
         from reactorwatch.records.csv_file import read_csv
 
         measured = read_csv(path, columns, required)
@@ -49,7 +49,7 @@ def record(
     return read_record(path, plant)
 
 
-class Tape(NamedTuple):
+class MessageSource(NamedTuple):
     """The messages of a file.
 
     Attributes:
@@ -71,28 +71,28 @@ class Tape(NamedTuple):
         return format_utc(first_ns if self.zero_ns is None else self.zero_ns) if self.has_clock else None
 
 
-def tape(
+def open_messages(
     path: Path,
     plant: str | None = None,
     columns: dict[str, str] | None = None,
     units: Mapping[str, str] | None = None,
-) -> Tape:
+) -> MessageSource:
     """The messages of a file, and what its minutes count from; see `record`.
 
     Raises:
         InputError: as `record`.
     """
-    if kind(path) == "csv":
+    if file_kind(path) == "csv":
         from recorder.tools.player import samples_of
 
         measured = record(path, plant, columns, units=units)
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
-        return Tape((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
+        return MessageSource((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
     from recorder.tools.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from
 
     read = (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
     metadata = read_metadata(path)
-    return Tape(read, zero_from(metadata, 0) if ZERO_NS in metadata else None, has_clock(metadata))
+    return MessageSource(read, zero_from(metadata, 0) if ZERO_NS in metadata else None, has_clock(metadata))
 
 
 def messages(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Iterator[Encoded]:
@@ -101,10 +101,10 @@ def messages(path: Path, plant: str | None = None, columns: dict[str, str] | Non
     Raises:
         InputError: as `record`.
     """
-    return tape(path, plant, columns).messages
+    return open_messages(path, plant, columns).messages
 
 
-def stands_for(folder: Path) -> list[Path]:
+def expand_folder(folder: Path) -> list[Path]:
     """What a folder stands for where many files may be named: each record (.csv) in it, and its recordings (.mcap).
 
     What a recorder has written there, one file after the other, is one recording, which the folder itself stands for;
@@ -129,7 +129,7 @@ def stands_for(folder: Path) -> list[Path]:
     return sorted([*records, *recordings])
 
 
-def signals_of(path: Path | None) -> tuple[str, ...]:
+def required_signals(path: Path | None) -> tuple[str, ...]:
     """What the model in a file needs of a record: its inputs and outputs.
 
     Raises:
@@ -142,7 +142,7 @@ def signals_of(path: Path | None) -> tuple[str, ...]:
     return (*model.input_names, *model.output_names)
 
 
-def process_model(path: Path | None, measured: Record) -> ProcessModel:
+def load_process_model(path: Path | None, measured: Record) -> ProcessModel:
     """The model in a file, its clock that of the record; the nominal reactor if there is no file.
 
     Where either counts its minutes from a moment that nobody knows, they are taken to count from the same.
@@ -159,13 +159,13 @@ def process_model(path: Path | None, measured: Record) -> ProcessModel:
     return (model.counted_from(measured.zero_ns) if measured.zero_ns else model).build()
 
 
-def plant_of(path: Path, plant: str | None) -> str:
+def resolve_plant(path: Path, plant: str | None) -> str:
     """The plant in a file: the one named, or the only one there.
 
     Raises:
         InputError: as `one_plant_in`; or it has a name that no plant can have.
     """
-    if kind(path) == "csv":
+    if file_kind(path) == "csv":
         return plant or DEFAULT_PLANT
     from recorder.tools.mcap_file import one_plant_in
 
@@ -177,7 +177,7 @@ def plant_of(path: Path, plant: str | None) -> str:
         raise InputError(f"{path}: {error}; {cure}") from error
 
 
-def kind(path: Path) -> str:
+def file_kind(path: Path) -> str:
     """`csv` or `mcap`, by the file's ending; a folder is of recordings.
 
     Raises:

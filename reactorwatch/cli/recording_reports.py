@@ -11,7 +11,7 @@ from recorder.storage.recover import Saved
 from recorder.tools.inspect import Look
 from recorder.tools.mcap_file import has_clock
 
-MOST_LINES = 20
+MAX_LINES = 20
 """Gaps that people are told of one by one."""
 
 
@@ -109,55 +109,55 @@ def info_object(seen: Look, file: Path) -> dict[str, Any]:
 
 def info_text(seen: Look, file: Path) -> str:
     """The same for people."""
-    said = info_object(seen, file)
-    lines = [f"{file}: {said['messages']} messages of {len(said['topics'])} topics"]
-    if said["messages"]:
-        first, last = moment(said["first_ns"]), moment(said["last_ns"])
-        lines[0] += f", received over {said['span_s']:.1f} s ({first} to {last})"
-    if said["from_min"] is not None:
-        lines.append(f"samples from {said['from_min']:g} to {said['to_min']:g} min")
+    report = info_object(seen, file)
+    lines = [f"{file}: {report['messages']} messages of {len(report['topics'])} topics"]
+    if report["messages"]:
+        first, last = moment(report["first_ns"]), moment(report["last_ns"])
+        lines[0] += f", received over {report['span_s']:.1f} s ({first} to {last})"
+    if report["from_min"] is not None:
+        lines.append(f"samples from {report['from_min']:g} to {report['to_min']:g} min")
     for plant, runs in sorted(seen.overview.runs.items()):
         if len(runs) > 1:
             lines.append(f"{len(runs)} runs of {plant}: its clock steps back, or it was restarted:")
             spans = [(to_minutes(run.first_ns, seen.zero_ns), to_minutes(run.last_ns, seen.zero_ns)) for run in runs]
             lines += [
                 f"  run {number}: {first:g} to {last:g} min"
-                for number, (first, last) in enumerate(spans[:MOST_LINES], 1)
+                for number, (first, last) in enumerate(spans[:MAX_LINES], 1)
             ]
-            lines += [f"  and {len(runs) - MOST_LINES} more (--json names them)"] if len(runs) > MOST_LINES else []
+            lines += [f"  and {len(runs) - MAX_LINES} more (--json names them)"] if len(runs) > MAX_LINES else []
     told = [
         f"{name} {seen.metadata[name]}" for name in ("plant", "version", "seed", "started") if name in seen.metadata
     ]
     lines += [", ".join(told)] if told else []
     lines += [
-        f"  {topic['messages']:9d}  {topic['rate_per_s'] or 0.0:9.3g}/s  {topic['topic']}" for topic in said["topics"]
+        f"  {topic['messages']:9d}  {topic['rate_per_s'] or 0.0:9.3g}/s  {topic['topic']}" for topic in report["topics"]
     ]
-    if said["lost"]:
-        lines.append(f"{said['lost']} samples are missing:")
+    if report["lost"]:
+        lines.append(f"{report['lost']} samples are missing:")
     lines += [
         f"  {gap['last'] - gap['first'] + 1:9d}  {gap['topic']}: {gap['first']} to {gap['last']}, "
         f"after {gap['after_min']:g} min"
-        for gap in said["gaps"][:MOST_LINES]
+        for gap in report["gaps"][:MAX_LINES]
     ]
-    if len(said["gaps"]) > MOST_LINES:
-        lines.append(f"  and {len(said['gaps']) - MOST_LINES} more gaps (--json names them)")
+    if len(report["gaps"]) > MAX_LINES:
+        lines.append(f"  and {len(report['gaps']) - MAX_LINES} more gaps (--json names them)")
     lines += [
         f"lost on the way: {gap['messages']} messages of {gap['stream']}, noticed {moment(gap['noticed_ns'])}"
-        for gap in said["lost_on_the_way"][:MOST_LINES]
+        for gap in report["lost_on_the_way"][:MAX_LINES]
     ]
-    if len(said["lost_on_the_way"]) > MOST_LINES:
-        lines.append(f"  and {len(said['lost_on_the_way']) - MOST_LINES} times more (--json names them)")
-    if said["out_of_place"]:
-        lines.append(f"{said['out_of_place']} samples have a time or number that fits no other")
-    if not said["lost"]:
+    if len(report["lost_on_the_way"]) > MAX_LINES:
+        lines.append(f"  and {len(report['lost_on_the_way']) - MAX_LINES} times more (--json names them)")
+    if report["out_of_place"]:
+        lines.append(f"{report['out_of_place']} samples have a time or number that fits no other")
+    if not report["lost"]:
         lines.append("no sample is missing, by their sequence numbers")
     lines += [
         f"  {alarm['raised_min']:9g} min  {alarm['alarm']} ({alarm['priority']}), "
         + ("not cleared" if alarm["cleared_min"] is None else f"cleared at {alarm['cleared_min']:g} min")
         + f": {alarm['text']}"
-        for alarm in said["alarms"]
+        for alarm in report["alarms"]
     ]
-    if not said["alarms"]:
+    if not report["alarms"]:
         lines.append("no alarms")
     if seen.damages:
         lines.append(f"not whole: {'; '.join(seen.damages)}; `reactorwatch recover {file}` saves the rest")

@@ -52,21 +52,21 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
 
 def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     """The same for people."""
-    said = backtest_object(result, zero_ns)
-    lines = [f"{file}: {said['samples']} rows over {said['span_min']:g} min"]
+    report = backtest_object(result, zero_ns)
+    lines = [f"{file}: {report['samples']} rows over {report['span_min']:g} min"]
     lines += [f"  {name} is not watched: {why}" for name, why in result.left_out.items()]
     if result.runs > 1:
         lines.append(
             f"the plant's clock steps back, or the plant was restarted: {result.runs} runs, watched one by one"
         )
-    if said["trained_until_min"] is None and result.refused_trainings:
+    if report["trained_until_min"] is None and result.refused_trainings:
         lines.append("nothing was watched: no training was fit to learn from, for the reasons below")
-    elif said["trained_until_min"] is None:
+    elif report["trained_until_min"] is None:
         lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
     else:
         lines.append(
-            f"trained until {said['trained_until_min']:g} min; "
-            f"{said['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
+            f"trained until {report['trained_until_min']:g} min; "
+            f"{report['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
         )
         lines.append(_judged_by(result))
     for alarm, cleared_ns in result.raised:
@@ -78,7 +78,7 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
     told = dict.fromkeys(filter(None, (suspects_text(alarm.suspects, zero_ns) for alarm, _ in result.raised)))
     lines += [f"  suspect: {text}" for text in told]
     lines += [f"  note: {note}" for note in result.notes]
-    if not result.raised and said["trained_until_min"] is not None:
+    if not result.raised and report["trained_until_min"] is not None:
         lines.append("no alarms")
     if result.refused:
         lines.append("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items())))

@@ -5,11 +5,11 @@ from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import LONGEST_WAIT_S, Endpoint, Json, Plant, Settings
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Settings
+from reactorwatch.cli.printing import print_lines
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("certify")(certify)
     app.command("router")(router)
@@ -60,10 +60,12 @@ def certify(
 
     now, revoked = datetime.now(UTC), tuple(revoke or ())
     for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, now, renew_days=renew, revoke=revoked):
-        said = "; signs new certificates, keep it off line" if made.name == AUTHORITY else ""
-        say(f"{made}{said}")
+        note = "; signs new certificates, keep it off line" if made.name == AUTHORITY else ""
+        print_lines(f"{made}{note}")
     for holder in revoke or ():
-        say(f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; start the router again")
+        print_lines(
+            f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; start the router again"
+        )
 
 
 def router(
@@ -88,7 +90,7 @@ def router(
 
     import structlog
 
-    from reactorwatch.cli.options import existing
+    from reactorwatch.cli.options import check_input
     from reactorwatch.errors import InputError
     from reactorwatch.runtime.bus_zenoh import log_refusals, router_from_file
     from reactorwatch.runtime.bus_zenoh import router as plain_router
@@ -102,7 +104,7 @@ def router(
     settings = section(BusConfig, "bus", tables, {"endpoint": endpoint})
     configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
     with log_refusals(), stop_on_signals() as stop:
-        bus = router_from_file(existing(file)) if file is not None else plain_router(settings)
+        bus = router_from_file(check_input(file)) if file is not None else plain_router(settings)
         stopped = threading.Event()
         stop.call_on_set(stopped.set)
         structlog.get_logger().info("router", **({"settings": str(file)} if file else {"endpoint": settings.endpoint}))
@@ -117,7 +119,7 @@ def doctor(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    timeout: Annotated[float, typer.Option(help="Seconds to listen for nodes.", min=0.1, max=LONGEST_WAIT_S)] = 12.0,
+    timeout: Annotated[float, typer.Option(help="Seconds to listen for nodes.", min=0.1, max=MAX_WAIT_S)] = 12.0,
     as_json: Json = False,
 ) -> None:
     """Check a deployment from here: one line a check, with the cure. Ends with 0 if all is well, 1 if not."""
@@ -125,22 +127,22 @@ def doctor(
 
     import msgspec
 
-    from reactorwatch.cli.doctor import examine
-    from reactorwatch.cli.observer import begin_beside_recorder
+    from reactorwatch.cli.doctor import run_checks
+    from reactorwatch.cli.observer import load_recorder_settings
 
-    bus, recorder = begin_beside_recorder(config, endpoint, name)
+    bus, recorder = load_recorder_settings(config, endpoint, name)
     out = Path(recorder.out)
     folder = out.parent if out.suffix == ".mcap" else out
     is_well = True
     checks = []
-    for finding in examine(bus, recorder.plant, folder, recorder.rotate_mb, timeout, datetime.now(UTC)):
+    for finding in run_checks(bus, recorder.plant, folder, recorder.rotate_mb, timeout, datetime.now(UTC)):
         is_well = is_well and not finding.cure
         checks.append({"ok": not finding.cure, **finding._asdict()})
         if not as_json:
             cure = f"; {finding.cure}" if finding.cure else ""
-            say(f"{'WRONG' if finding.cure else 'ok':5s}  {finding.check}: {finding.found}{cure}")
+            print_lines(f"{'WRONG' if finding.cure else 'ok':5s}  {finding.check}: {finding.found}{cure}")
     if as_json:
-        say(msgspec.json.encode({"ok": is_well, "checks": checks}).decode())
+        print_lines(msgspec.json.encode({"ok": is_well, "checks": checks}).decode())
     raise typer.Exit(0 if is_well else 1)
 
 
@@ -152,14 +154,14 @@ def status(
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="Show it once.")] = False,
     seconds: Annotated[
-        float, typer.Option(help="How long to listen before showing it once.", min=0.1, max=LONGEST_WAIT_S)
+        float, typer.Option(help="How long to listen before showing it once.", min=0.1, max=MAX_WAIT_S)
     ] = 4.0,
     as_json: Json = False,
 ) -> None:
     """Show plants, nodes, rates and alarms as they are now, until stopped."""
-    from reactorwatch.cli.observer import begin_beside_recorder
+    from reactorwatch.cli.observer import load_recorder_settings
     from reactorwatch.cli.status import run
 
-    bus, recorder = begin_beside_recorder(config, endpoint, name)
+    bus, recorder = load_recorder_settings(config, endpoint, name)
     # a certificate is for one plant, and what it may not read it gets nothing of
     run(bus, recorder.plant if name is not None or bus.ca is not None else None, seconds, once=once, as_json=as_json)

@@ -12,7 +12,7 @@ from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import to_minutes
 
-MOST_SAMPLES = 3000
+MAX_SAMPLES = 3000
 """Of each signal: so many tell its unit."""
 
 
@@ -44,7 +44,7 @@ class FirstSamples:
         for message in messages:
             if message.key.startswith(self._prefix):
                 series = self._series.setdefault(message.key.removeprefix(self._prefix), [])
-                if len(series) < MOST_SAMPLES:
+                if len(series) < MAX_SAMPLES:
                     self._note(message, series)
             yield message
 

@@ -27,7 +27,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.metrics import PORT_AFTER
+from reactorwatch.runtime.metrics import PORT_OFFSET
 from tests.ports import three_free_ports
 from tests.running import WITHIN_S
 from tests.unit.monitor_node.fleets import QUICK, alone, run_of
@@ -133,7 +133,7 @@ def test_what_is_counted_of_each_plant_is_on_the_monitor_s_page(bus_config: BusC
             told = set[str]()
             while len(told) < len(PLANTS):
                 told.add(health.get(timeout=WITHIN_S))
-            with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER['monitor']}/metrics", timeout=WITHIN_S) as answer:
+            with urlopen(f"http://{LOOPBACK}:{port + PORT_OFFSET['monitor']}/metrics", timeout=WITHIN_S) as answer:
                 page = answer.read().decode()
         finally:
             process.kill()
