@@ -1,4 +1,4 @@
-"""`alarm`: what the operator does with alarms, asked of the running monitor; of the recorder, for its own alarm."""
+"""`alarm`: an operator's commands for alarms of the running monitor, and of the recorder for its own."""
 
 import contextlib
 from typing import TYPE_CHECKING, Annotated
@@ -39,7 +39,7 @@ def list_alarms(
     timeout: Timeout = TIMEOUT_S,
     json: Json = False,
 ) -> None:
-    """Show all alarms as they are now."""
+    """Show the current state of all alarms."""
     from reactorwatch.contract.messages_pb2 import ListAlarms
 
     reply = send_command(MONITOR, config, endpoint, name, timeout, "list_alarms", ListAlarms())
@@ -60,7 +60,7 @@ def shelve(
     timeout: Timeout = TIMEOUT_S,
     json: Json = False,
 ) -> None:
-    """Put an alarm out of sight for a time."""
+    """Hide an alarm for a time."""
     from reactorwatch.contract.messages_pb2 import ShelveAlarm
 
     node, command_name = _route(alarm, "shelve")
@@ -69,7 +69,7 @@ def shelve(
 
 
 def _register(word: str, command: str, description: str) -> None:
-    """A subcommand that names an alarm and a person, and no more."""
+    """Register a subcommand with an alarm and an operator's name as arguments."""
 
     def act(
         alarm: Name,
@@ -91,22 +91,22 @@ def _register(word: str, command: str, description: str) -> None:
 
 
 for _word, _command, _description in (
-    ("acknowledge", "acknowledge", "Say that you have seen an alarm."),
-    ("unshelve", "unshelve", "Bring a shelved alarm back before its time is over."),
-    ("suppress", "suppress", "Put an alarm out of sight while it means nothing, as in a start-up."),
-    ("unsuppress", "unsuppress", "Bring a suppressed alarm back."),
+    ("acknowledge", "acknowledge", "Acknowledge an alarm."),
+    ("unshelve", "unshelve", "Show a shelved alarm again before its time is over."),
+    ("suppress", "suppress", "Hide an alarm while it has no meaning, as in a start-up."),
+    ("unsuppress", "unsuppress", "Show a suppressed alarm again."),
     ("out-of-service", "take_out_of_service", "Take an alarm out of service, for maintenance."),
     ("in-service", "return_to_service", "Return an alarm to service."),
-    ("comment", "comment", "Say something about an alarm, with --comment."),
+    ("comment", "comment", "Comment on an alarm, with --comment."),
 ):
     _register(_word, _command, _description)
 
 
 def _route(alarm: str, command: str) -> tuple[str, str]:
-    """The node that an alarm is of, and the command as that node knows it.
+    """Node that raises an alarm, and its name of the command.
 
     Raises:
-        InputError: it is the recorder's own alarm, and the command another than to acknowledge.
+        InputError: the recorder's own alarm, and a command other than to acknowledge.
     """
     if not alarm.startswith(f"{RECORDING}/"):
         return MONITOR, command
@@ -116,7 +116,7 @@ def _route(alarm: str, command: str) -> tuple[str, str]:
 
 
 def _show(reply: "CommandReply", *, json: bool) -> None:
-    """Print the alarms of an answer: one JSON object a line, or a line each for people."""
+    """Print the alarms of a reply, one JSON object or text a line."""
     import msgspec
 
     for alarm in reply.alarms:

@@ -37,7 +37,7 @@ def shewhart(
     from reactorwatch.spc import run_length
 
     length = run_length.shewhart(shift, limit, _rules(rules), steady_state=steady_state)
-    _tell(length, as_json, chart="shewhart", rules=list(_rules(rules)), limit=limit, shift=shift)
+    _print_length(length, as_json, chart="shewhart", rules=list(_rules(rules)), limit=limit, shift=shift)
 
 
 def cusum(
@@ -53,7 +53,7 @@ def cusum(
     from reactorwatch.spc import run_length
 
     length = run_length.cusum(shift, k, h, headstart, one_sided=one_sided, steady_state=steady_state)
-    _tell(length, as_json, chart="cusum", k=k, h=h, headstart=headstart, shift=shift)
+    _print_length(length, as_json, chart="cusum", k=k, h=h, headstart=headstart, shift=shift)
 
 
 def ewma(
@@ -68,7 +68,7 @@ def ewma(
     from reactorwatch.spc import run_length
 
     length = run_length.ewma(shift, weight, limit, exact_limits=exact_limits, steady_state=steady_state)
-    _tell(length, as_json, chart="ewma", **{"lambda": weight}, limit=limit, shift=shift)
+    _print_length(length, as_json, chart="ewma", **{"lambda": weight}, limit=limit, shift=shift)
 
 
 def mewma(
@@ -83,7 +83,7 @@ def mewma(
     from reactorwatch.spc import run_length
 
     length = run_length.mewma(shift, dimension, weight, limit, steady_state=steady_state)
-    _tell(length, as_json, chart="mewma", dimension=dimension, **{"lambda": weight}, limit=limit, shift=shift)
+    _print_length(length, as_json, chart="mewma", dimension=dimension, **{"lambda": weight}, limit=limit, shift=shift)
 
 
 def t2(
@@ -96,7 +96,9 @@ def t2(
     """Hotelling's T2, known covariance; it has no memory, so its steady state is as any other."""
     from reactorwatch.spc import run_length
 
-    _tell(run_length.t2(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift)
+    _print_length(
+        run_length.t2(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift
+    )
 
 
 def design(
@@ -130,8 +132,8 @@ def _rules(text: str) -> tuple[int, ...]:
         raise InputError(f"--rules must be some of 1,2,3,4 with commas between, got {text!r}") from None
 
 
-def _tell(length: float, as_json: bool, **chart: object) -> None:
-    """The run length: one number, or one object with the chart's parameters."""
+def _print_length(length: float, as_json: bool, **chart: object) -> None:
+    """Print the run length: one number, or one object with the chart's parameters."""
     if not as_json:
         print_lines(f"{length:.8g}")
         return

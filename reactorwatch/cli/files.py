@@ -1,4 +1,4 @@
-"""Files into other files: `import`, `export`, `dashboard`."""
+"""Conversion of files: `import`, `export`, `dashboard`."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -67,10 +67,10 @@ def dashboard(
 
 
 def _measured(runs: "Iterable[Run]", file: Path) -> "Iterator[Run]":
-    """The stretches of a run as they come.
+    """Yield the segments of a run.
 
     Raises:
-        InputError: at the end, in none of them anything was measured.
+        InputError: at the end, if no segment holds a measured value.
     """
     import numpy as np
 

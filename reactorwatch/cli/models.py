@@ -1,4 +1,4 @@
-"""Linear models: from a record, `identify`; from the equations, `linearise`; and the study of both, `reproduce`."""
+"""Commands for linear models: `identify` from a record, `linearise` from the equations, `reproduce` the study."""
 
 from pathlib import Path
 from typing import Annotated
@@ -37,7 +37,7 @@ def identify(
     column: Columns = None,
     as_json: Json = False,
 ) -> None:
-    """Fit a linear model to one half, judge it by the other."""
+    """Fit a linear model to one half, validate it on the other."""
     from reactorwatch.cli import identification
     from reactorwatch.cli.batch import write_remark
     from reactorwatch.cli.progress import task

@@ -1,4 +1,4 @@
-"""One node each: `plant`, `monitor`, `record`, `replay`. Every one runs until it is finished or stopped."""
+"""Commands that run one node until it is finished or stopped: `plant`, `monitor`, `record`, `replay`."""
 
 import logging
 from pathlib import Path
@@ -78,7 +78,7 @@ def plant(
     ] = None,
     model: Model = None,
 ) -> None:
-    """Simulate the reactor and publish what its sensors see."""
+    """Simulate the reactor and publish its sensors' samples."""
     from plant_node.__main__ import run
     from plant_node.config import PlantConfig
     from reactorwatch.runtime.config import section
@@ -110,17 +110,19 @@ def monitor(
         Path | None,
         typer.Option(
             "--state",
-            help="Folder where all that it has learned is kept, so that it resumes after a restart; made if not there.",
+            help="Folder of the monitor's state, from which it resumes after a restart; made if it does not exist.",
             show_default=False,
         ),
     ] = None,
     plants: Annotated[
         str | None,
-        typer.Option("--plants", help="Watch all of them: 'reactor/*', 'reactor/north_*'.", show_default=False),
+        typer.Option("--plants", help="Watch all of these plants: 'reactor/*', 'reactor/north_*'.", show_default=False),
     ] = None,
     shard: Annotated[
         str | None,
-        typer.Option("--shard", help="With --plants: our part of them, such as 2/5 [1/1].", show_default=False),
+        typer.Option(
+            "--shard", help="With --plants: this monitor's part of them, such as 2/5 [1/1].", show_default=False
+        ),
     ] = None,
 ) -> None:
     """Watch a plant, or a fleet of them: predict signals, raise alarms."""
@@ -200,21 +202,21 @@ def replay(
     end: Annotated[
         str | None, typer.Option("--to", help="Since the start, such as 20min [the end].", show_default=False)
     ] = None,
-    loop: Annotated[bool | None, typer.Option("--loop", help="Begin anew at the end.", show_default=False)] = None,
+    loop: Annotated[bool | None, typer.Option("--loop", help="Restart at the end.", show_default=False)] = None,
     column: Columns = None,
     verify: Annotated[
         bool,
         typer.Option(
             "--verify",
-            help="Publish nothing; run it through the monitor's core and compare what that says with what was "
-            "recorded. Ends with 0 if all is equal, 1 if not.",
+            help="Publish nothing; run it through the monitor's core and compare the output with the recorded "
+            "messages. Ends with 0 if all are equal, 1 if not.",
         ),
     ] = False,
     as_json: Json = False,
 ) -> None:
     """Publish a recording or a record as the plant did, or verify a recording.
 
-    While it plays, `playback` pauses it, goes on step by step, or changes its rate.
+    While it runs, `playback` pauses, resumes or steps it, or changes its rate.
     """
     if verify:
         from reactorwatch.cli.verification import run

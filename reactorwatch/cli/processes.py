@@ -25,7 +25,7 @@ MODULES = {
     "recorder": "recorder",
 }
 STOP_WITHIN_S = 60.0
-"""A stopping node drains its inbox for up to 5 s, and its bus closes within 11 s; on a busy machine both take longer."""
+"""A stopping node drains its inbox for up to 5 s, and its bus closes within 11 s; longer on a busy machine."""
 
 
 class Processes:

@@ -1,7 +1,6 @@
-"""Wherever a file is asked for, `.csv` and `.mcap` both serve: this turns either into a record or into messages.
+"""Read `.csv` and `.mcap` files as a record or as messages, and `--model` as a process model on the record's clock.
 
-A folder stands for the recordings in it, as one; where many files may be named, for all in it (`expand_folder`). And
-`--model` is turned into a process model on the record's clock.
+A folder is one recording of all the files in it; in a list of files it stands for each of them (`expand_folder`).
 """
 
 from collections.abc import Iterator, Mapping
@@ -27,17 +26,17 @@ def record(
     required: tuple[str, ...] = tuple(UNITS),
     units: Mapping[str, str] | None = None,
 ) -> Record:
-    """The columns of a file.
+    """Read a file as a record.
 
     Args:
-        path: of a .csv, an .mcap or a folder.
-        plant: in a recording.
-        columns: a .csv's own names, by signal.
+        path: a .csv, an .mcap or a folder.
+        plant: plant in a recording.
+        columns: names of a .csv's columns, by signal.
         required: signals that a .csv must have.
-        units: of the process's signals, if the columns are known to be these; None: see `read_csv`.
+        units: units of the process's signals, if they are those of the columns; None: see `read_csv`.
 
     Raises:
-        InputError: the file is not one of the two kinds, or is malformed.
+        InputError: the file is neither a .csv nor an .mcap, or is malformed.
     """
     if file_kind(path) == "csv":
         from reactorwatch.records.csv_file import read_csv
@@ -50,12 +49,12 @@ def record(
 
 
 class MessageSource(NamedTuple):
-    """The messages of a file.
+    """Messages of a file.
 
     Attributes:
-        messages: in the order they were received; those of a .csv are its samples.
-        zero_ns: the time of the messages that the file's minutes count from; None: the first sample.
-        has_clock: whether the times of the messages are clock times.
+        messages: messages in the order of receipt; those of a .csv are its samples.
+        zero_ns: time from which the file's minutes are counted; None: that of the first sample.
+        has_clock: True if the times of the messages are clock times.
     """
 
     messages: Iterator[Encoded]
@@ -63,7 +62,7 @@ class MessageSource(NamedTuple):
     has_clock: bool
 
     def zero(self, first_ns: int) -> str | None:
-        """The clock time that the minutes count from, as in ISO 8601; None: not known.
+        """Time from which the minutes are counted, as ISO 8601; None: unknown.
 
         Args:
             first_ns: time of the first sample.
@@ -77,7 +76,7 @@ def open_messages(
     columns: dict[str, str] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> MessageSource:
-    """The messages of a file, and what its minutes count from; see `record`.
+    """Open a file as messages; arguments as for `record`.
 
     Raises:
         InputError: as `record`.
@@ -96,7 +95,7 @@ def open_messages(
 
 
 def messages(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Iterator[Encoded]:
-    """The messages of a file, in the order they were received; those of a .csv are its samples.
+    """Read the messages of a file in the order of receipt; those of a .csv are its samples.
 
     Raises:
         InputError: as `record`.
@@ -105,32 +104,32 @@ def messages(path: Path, plant: str | None = None, columns: dict[str, str] | Non
 
 
 def expand_folder(folder: Path) -> list[Path]:
-    """What a folder stands for where many files may be named: each record (.csv) in it, and its recordings (.mcap).
+    """List the records (.csv) and recordings (.mcap) in a folder.
 
-    What a recorder has written there, one file after the other, is one recording, which the folder itself stands for;
-    so is what was cut or merged. Where there are recordings of another origin, such as imported ones, each is one.
+    Files that a recorder wrote one after the other, and cut or merged ones, are one recording, named by the folder.
+    With recordings of another origin, such as imported ones, each file is a recording.
 
     Raises:
-        InputError: there is neither in it.
+        InputError: the folder holds neither.
     """
     from recorder.storage.mcap_writer import NUMBER
     from recorder.tools.mcap_file import read_metadata
 
-    of_a_piece = {NUMBER, "cut", "merged"}
+    one_recording = {NUMBER, "cut", "merged"}
     records, recordings = (list_files(folder, suffix) for suffix in (".csv", ".mcap"))
     if not records and not recordings:
         raise InputError(f"{folder}: holds no record (.csv) and no recording (.mcap)")
     origins = []
     for file in recordings:
-        with suppress(InputError):  # one that is damaged is told of when it is read
+        with suppress(InputError):  # a damaged one is reported when it is read
             origins.append(read_metadata(file))
-    if origins and all(of_a_piece & origin.keys() for origin in origins):
+    if origins and all(one_recording & origin.keys() for origin in origins):
         return [folder, *records]
     return sorted([*records, *recordings])
 
 
 def required_signals(path: Path | None) -> tuple[str, ...]:
-    """What the model in a file needs of a record: its inputs and outputs.
+    """Inputs and outputs of the model in a file, which a record must have.
 
     Raises:
         InputError: as `process_model`.
@@ -143,9 +142,9 @@ def required_signals(path: Path | None) -> tuple[str, ...]:
 
 
 def load_process_model(path: Path | None, measured: Record) -> ProcessModel:
-    """The model in a file, its clock that of the record; the nominal reactor if there is no file.
+    """Load the model in a file, on the clock of the record; without a file, the nominal reactor.
 
-    Where either counts its minutes from a moment that nobody knows, they are taken to count from the same.
+    If the zero of either clock is unknown, both are taken to be the same.
 
     Raises:
         InputError: the file cannot be read, or holds no model.
@@ -160,28 +159,28 @@ def load_process_model(path: Path | None, measured: Record) -> ProcessModel:
 
 
 def resolve_plant(path: Path, plant: str | None) -> str:
-    """The plant in a file: the one named, or the only one there.
+    """Name of the plant in a file: the given one, or the only one.
 
     Raises:
-        InputError: as `one_plant_in`; or it has a name that no plant can have.
+        InputError: as `one_plant_in`; or the name is invalid.
     """
     if file_kind(path) == "csv":
         return plant or DEFAULT_PLANT
     from recorder.tools.mcap_file import one_plant_in
 
-    found = one_plant_in(path, plant)
+    name = one_plant_in(path, plant)
     try:
-        return check_plant(found)
+        return check_plant(name)
     except ValueError as error:
         cure = "export it, and use the record"
         raise InputError(f"{path}: {error}; {cure}") from error
 
 
 def file_kind(path: Path) -> str:
-    """`csv` or `mcap`, by the file's ending; a folder is of recordings.
+    """Kind of a file by its suffix, `csv` or `mcap`; a folder is of recordings.
 
     Raises:
-        InputError: neither.
+        InputError: the suffix is another one.
     """
     if path.is_dir():
         return "mcap"

@@ -1,4 +1,4 @@
-"""What can be done with recordings: `recover`, `info`, `cut` and `merge`."""
+"""Commands for recordings: `recover`, `info`, `cut` and `merge`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +27,7 @@ def recover(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Save what is whole in a damaged recording."""
+    """Recover the intact messages of a damaged recording."""
     import msgspec
 
     from reactorwatch.cli.progress import task
@@ -47,7 +47,7 @@ def info(
     file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
     as_json: Json = False,
 ) -> None:
-    """Say what is in a recording, and what is missing."""
+    """Show the contents of a recording, and missing messages."""
     import msgspec
 
     from reactorwatch.cli.progress import task
@@ -70,7 +70,7 @@ def cut(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Copy a stretch of plant time out of a recording."""
+    """Copy a span of plant time out of a recording."""
     from reactorwatch.cli.progress import task
     from recorder.tools.cut import cut as copy
     from recorder.tools.cut import sampled_between
@@ -96,7 +96,7 @@ def merge(
     out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.mcap).", show_default=False)],
     force: Force = False,
 ) -> None:
-    """Put several recordings into one, in order of receipt."""
+    """Merge several recordings into one, in order of receipt."""
     from reactorwatch.cli.progress import task
     from recorder.tools.cut import merge as join
     from recorder.tools.mcap_file import read_metadata, recordings_in
@@ -113,10 +113,10 @@ def merge(
 
 
 def _beside(file: Path) -> Path:
-    """Where a recovered file goes if nothing is said: it is never written over.
+    """Default path of a recovered file, which is never overwritten.
 
     Raises:
-        InputError: there is one already.
+        InputError: the file exists.
     """
     out = file.with_name(f"{file.name.removesuffix('.part').removesuffix('.mcap')}-recovered.mcap")
     if out.exists():

@@ -1,4 +1,4 @@
-"""Everything at once: `up` and `demo`."""
+"""Commands that run all nodes: `up` and `demo`."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""A site: `certify` makes its certificates and rules, `router` keeps them, `doctor` and `status` say how it is."""
+"""Commands of a site: `certify` makes certificates and rules, `router` enforces them, `doctor` and `status` check."""
 
 from pathlib import Path
 from typing import Annotated
@@ -25,24 +25,26 @@ def certify(
     ] = None,
     endpoint: Annotated[
         str | None,
-        typer.Option(help="Where nodes call the router [as before, or tls/127.0.0.1:7447].", show_default=False),
+        typer.Option(
+            help="Address at which nodes connect to the router [as before, or tls/127.0.0.1:7447].", show_default=False
+        ),
     ] = None,
     listen: Annotated[
         str | None,
-        typer.Option(help="Where the router listens [as before, or where it is called].", show_default=False),
+        typer.Option(help="Address at which the router listens [as before, or --endpoint].", show_default=False),
     ] = None,
     days: Annotated[float, typer.Option(help="How long certificates are valid.", min=1, max=3650)] = 365.0,
     renew: Annotated[
         float | None,
         typer.Option(
-            "--renew", help="Make certificates again that end within so many days.", min=0, max=3650, show_default=False
+            "--renew", help="Renew certificates that end within this many days.", min=0, max=3650, show_default=False
         ),
     ] = None,
     revoke: Annotated[
         list[str] | None,
         typer.Option(
             "--revoke",
-            help="Have the router refuse the certificates so far of this plant and role, such as cstr/monitor, and "
+            help="Make the router refuse the present certificates of this plant and role, such as cstr/monitor, and "
             "make a new one. Repeatable.",
             show_default=False,
         ),
@@ -50,9 +52,9 @@ def certify(
 ) -> None:
     """Make the certificates and access rules of a site.
 
-    Each who joins its bus gets a folder of its own, to be copied to its machine: certificate, key and settings for
-    --config. What is complete stays, what is half made is completed: a plant is added by naming it. The router's rules
-    are written again; start it again after that, unless certificates were only renewed.
+    Each client of its bus gets a folder of its own, to be copied to its machine: certificate, key and settings for
+    --config. Complete folders stay, incomplete ones are completed: a plant is added by naming it. The router's rules
+    are written again; restart it after that, unless certificates were only renewed.
     """
     from datetime import UTC, datetime
 
@@ -64,7 +66,7 @@ def certify(
         print_lines(f"{made}{note}")
     for holder in revoke or ():
         print_lines(
-            f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; start the router again"
+            f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; restart the router"
         )
 
 
@@ -79,12 +81,12 @@ def router(
     config: Settings = None,
     endpoint: Annotated[
         str | None,
-        typer.Option(help="Where a plain router listens [tcp/127.0.0.1:7447].", show_default=False),
+        typer.Option(help="Address at which a plain router listens [tcp/127.0.0.1:7447].", show_default=False),
     ] = None,
 ) -> None:
-    """Run a router until stopped: of a site, with its certificates and access rules, or without a file a plain one.
+    """Run a router until stopped: that of a site, with certificates and access rules, or without a file a plain one.
 
-    The log says what the rules refuse.
+    Refused messages are logged.
     """
     import threading
 
@@ -122,7 +124,7 @@ def doctor(
     timeout: Annotated[float, typer.Option(help="Seconds to listen for nodes.", min=0.1, max=MAX_WAIT_S)] = 12.0,
     as_json: Json = False,
 ) -> None:
-    """Check a deployment from here: one line a check, with the cure. Ends with 0 if all is well, 1 if not."""
+    """Check a deployment from here: one line a check, with the cure. Ends with 0 if all checks pass, 1 if not."""
     from datetime import UTC, datetime
 
     import msgspec
@@ -158,10 +160,10 @@ def status(
     ] = 4.0,
     as_json: Json = False,
 ) -> None:
-    """Show plants, nodes, rates and alarms as they are now, until stopped."""
+    """Show the current state of plants, nodes, rates and alarms, until stopped."""
     from reactorwatch.cli.observer import load_recorder_settings
     from reactorwatch.cli.status import run
 
     bus, recorder = load_recorder_settings(config, endpoint, name)
-    # a certificate is for one plant, and what it may not read it gets nothing of
+    # a certificate is for one plant, and messages of others are not received
     run(bus, recorder.plant if name is not None or bus.ca is not None else None, seconds, once=once, as_json=as_json)

@@ -1,4 +1,4 @@
-"""`view`: the dashboard of a plant that runs, in a window or in the browser."""
+"""`view`: dashboard of a running plant, in a window or in the browser."""
 
 from typing import Annotated
 
@@ -33,7 +33,7 @@ def view(
 ) -> None:
     """Show a running plant live: a window, or with --web a page for the browser.
 
-    Ends when the window is closed or with Ctrl-C. What was published in the last minute is shown, too.
+    Ends when the window is closed or with Ctrl-C. The last minute before the start is shown, too.
     """
     import logging
 
