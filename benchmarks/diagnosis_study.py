@@ -25,7 +25,7 @@ from benchmarks.hidden.classes import CLASSES, StudyClass, class_named, drawn
 from benchmarks.hidden.tables import confusion_table, failures, main_table
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.runtime.parallel.jobs import Failed, workers
+from reactorwatch.runtime.parallel.jobs import Failed, choose_executor
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.judge import Judged, failed, judge
 
@@ -72,7 +72,7 @@ def main() -> None:
     with Progress(console=Console(stderr=True)) as progress:
         bar = progress.add_task("diagnoses", total=len(tasks))
         jobs = [(study.name, number, chosen.seed) for study, number in tasks]
-        for number, outcome in workers(chosen.jobs, chosen.scheduler).outcomes(judge_one, jobs):
+        for number, outcome in choose_executor(chosen.jobs, chosen.scheduler).map_unordered(judge_one, jobs):
             study, of_class = tasks[number]
             found[study.name].append(
                 failed(drawn(study, of_class, chosen.seed), outcome.reason, 0.0)

@@ -31,7 +31,7 @@ from benchmarks.faults.report_method import METHODS, calibrated_width
 from benchmarks.faults.score import rows_to_false_alarm
 from benchmarks.faults.study import Widths, fault_free_statistics, run_case, run_fault_free
 from benchmarks.faults.tables import as_json, print_fault_free, print_summary, print_table
-from reactorwatch.runtime.parallel.jobs import Failed, Workers, in_order, workers
+from reactorwatch.runtime.parallel.jobs import Executor, Failed, choose_executor, in_job_order
 
 SEEDS, FAULT_FREE_RUNS, CALIBRATION_RUNS = 20, 200, 400
 QUICK_SEEDS, QUICK_FAULT_FREE_RUNS, QUICK_CALIBRATION_RUNS = 2, 6, 60
@@ -61,7 +61,7 @@ def main() -> None:
     budgets = tuple(chosen.budgets)
     began = time.perf_counter()
     with Progress(console=Console(stderr=True)) as progress:
-        everywhere = Everywhere(workers(chosen.jobs, chosen.scheduler), progress)
+        everywhere = Everywhere(choose_executor(chosen.jobs, chosen.scheduler), progress)
         widths = report_widths(everywhere, calibration_runs, budgets)
         found = everywhere.do("faults", partial(run_case, budgets=budgets, widths=widths), cases(seeds))
         quiet = everywhere.do(
@@ -100,12 +100,12 @@ class Everywhere:
     """Does a piece of work for many arguments, in order, under a bar.
 
     Args:
-        done_by: who does it.
+        executor: who does it.
         progress: that is shown.
     """
 
-    def __init__(self, done_by: Workers, progress: Progress) -> None:
-        self._done_by = done_by
+    def __init__(self, executor: Executor, progress: Progress) -> None:
+        self._executor = executor
         self._progress = progress
 
     def do(self, title: str, work: Callable[..., Result], *arguments: Sequence[Any]) -> list[Result]:
@@ -120,7 +120,7 @@ class Everywhere:
             RuntimeError: one failed.
         """
         jobs = list(zip(*arguments, strict=True))
-        outcomes = in_order(self._done_by.outcomes(partial(_spread, work), jobs))
+        outcomes = in_job_order(self._executor.map_unordered(partial(_spread, work), jobs))
         found: list[Result] = []
         for job, outcome in zip(jobs, self._progress.track(outcomes, total=len(jobs), description=title), strict=True):
             if isinstance(outcome, Failed):

@@ -39,7 +39,7 @@ from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.event_loop import StopSignal
 bus = connect(BusConfig(endpoint=sys.argv[1]), "echo", StopSignal())
 bus.subscribe("reactor/cstr/sample/T", lambda message: bus.publish(message._replace(key="echo/T")))
-bus.announce("reactor/cstr/alive/echo")
+bus.declare_token("reactor/cstr/alive/echo")
 threading.Event().wait()
 """
 
@@ -105,9 +105,9 @@ def measure(config: BusConfig) -> None:
         if alive and not missing:
             ready.set()
 
-    bus.watch_alive("reactor/cstr/alive/*", on_token)
+    bus.subscribe_liveliness("reactor/cstr/alive/*", on_token)
     assert ready.wait(60), f"not alive: {missing}"
-    bus.subscribe(keys.all_of("cstr", keys.ALARM), arrivals.on_alarm)
+    bus.subscribe(keys.all_keys("cstr", keys.ALARM), arrivals.on_alarm)
     bus.subscribe("echo/T", arrivals.on_echo)
     sent = publish(bus.publish)
     last = max(time_ns for time_ns, (_, out) in sent.items() if out)

@@ -109,7 +109,7 @@ class Tokens:
     def __init__(self, bus: ZenohBus, plant: str = "cstr") -> None:
         self._changed = threading.Condition()
         self._alive = False
-        bus.watch_alive(keys.key(plant, keys.ALIVE, "recorder"), self._on_token)
+        bus.subscribe_liveliness(keys.key(plant, keys.ALIVE, "recorder"), self._on_token)
 
     def wait(self, *, alive: bool) -> None:
         """Wait until it does, or does not."""

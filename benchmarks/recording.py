@@ -84,7 +84,7 @@ def through_a_router(folder: Path, sent: list[Encoded], rate_per_s: float | None
         plant = connect(config, "benchmark", StopSignal())
         assert plant is not None
         ready = threading.Event()
-        plant.watch_alive(keys.all_of("cstr", keys.ALIVE), lambda _, alive: ready.set() if alive else None)
+        plant.subscribe_liveliness(keys.all_keys("cstr", keys.ALIVE), lambda _, alive: ready.set() if alive else None)
         assert ready.wait(30), "no recorder"
         start = time.perf_counter()
         for number, message in enumerate(sent):

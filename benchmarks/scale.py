@@ -133,7 +133,7 @@ def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
     """Watch the fleet until so many samples have come, or until terminated."""
     alone_on_a_core(0)
     stop = StopSignal()
-    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, passing=PASSING, crowded=True)
+    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, uncached=PASSING, many_keys=True)
     assert bus is not None
     node = Counting(SHARP if sharp else FAST, bus, stop)
     core = 0.0 if sharp else without_bus(plants)
@@ -160,8 +160,8 @@ def held(endpoint: str, plants: int) -> None:
     """
     alone_on_a_core(0)
     stop = StopSignal()
-    bus_zenoh.bus.MOST_NEW_KEYS = plants  # as it is after some minutes
-    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, passing=PASSING, crowded=True)
+    bus_zenoh.bus.MAX_NEW_KEYS = plants  # as it is after some minutes
+    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, uncached=PASSING, many_keys=True)
     assert bus is not None
     node = Counting(FAST, bus, stop)
     node.learn(plants)
@@ -174,8 +174,10 @@ def held(endpoint: str, plants: int) -> None:
     for expected in (plants // 2, plants):
         print("ready", flush=True)
         deadline = time.monotonic() + WITHIN_S
-        while node.samples < HELD_ROWS * SIGNALS * expected or len(bus._passing_keys) < expected:
-            assert time.monotonic() < deadline, f"{node.samples} samples, health of {len(bus._passing_keys)} plants"
+        while node.samples < HELD_ROWS * SIGNALS * expected or len(bus._uncached_publishers) < expected:
+            assert time.monotonic() < deadline, (
+                f"{node.samples} samples, health of {len(bus._uncached_publishers)} plants"
+            )
             time.sleep(1.0)
         print(json.dumps({"bytes": memory_bytes(), "quiet": len(node.quiet)}), flush=True)
         due_ns[plants // 2 : plants] = 0

@@ -19,11 +19,11 @@ import structlog
 from diagnosis_node.trigger import AfterAlarm, Asked, DiagnosisConfig
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import serve, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
 from recorder.message import Entry
 from recorder.storage.mcap_writer import RecordingWriter
 
@@ -33,7 +33,7 @@ NODE = "diagnosis"
 RECORDING = "record.mcap"
 """Name of what is diagnosed, in the folder of its report."""
 
-LINGER_S = 0.5
+DRAIN_TIMEOUT_S = 0.5
 
 Run = Callable[[list[str]], tuple[int, str, str]]
 """Runs arguments of `reactorwatch`; returns its exit code, what it said, and what it complained of."""
@@ -77,7 +77,7 @@ class Diagnoses:
         """The folder with the samples in it."""
         folder = make_folder(self._free_folder(asked.raised_ns), may_exist=False)
         about = {"plant": self._config.plant, "alarm": asked.alarm, "raised_ns": str(asked.raised_ns)}
-        with replacing(folder / RECORDING) as temporary, RecordingWriter(temporary, about) as writer:
+        with atomic_write(folder / RECORDING) as temporary, RecordingWriter(temporary, about) as writer:
             for time_ns, item in asked.samples:
                 writer.write(Entry(item.key, item.payload, item.encoding, item.received_ns or time_ns, time_ns))
         return folder
@@ -144,15 +144,10 @@ def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
             return
         try:
             log.info("diagnosing after alarms", plant=config.plant, after_min=config.after_min, out=config.out)
-            kinds = (keys.SAMPLE, keys.ALARM)
-            serve(
-                node,
-                bus,
-                stop,
-                subscriptions=tuple(keys.all_of(config.plant, kind) for kind in kinds),
-                on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
-                linger_s=LINGER_S,
-            )
+            loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S)
+            loop.subscribe(*(keys.all_keys(config.plant, kind) for kind in (keys.SAMPLE, keys.ALARM)))
+            bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
+            loop.run()
         finally:
             bus.close()
             command.end()

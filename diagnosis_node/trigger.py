@@ -16,7 +16,7 @@ from typing import NamedTuple
 import msgspec
 
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.keys import checked_plant
+from reactorwatch.contract.keys import check_plant
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Sample
 from reactorwatch.records.record import MINUTE_NS
 
@@ -61,7 +61,7 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tolerance: dict[str, float] = {}
 
     def __post_init__(self) -> None:
-        checked_plant(self.plant)
+        check_plant(self.plant)
         for what, value, low in (("window_min", self.window_min, 20.0), ("after_min", self.after_min, 1.0)):
             if not low <= value <= 1e6:
                 raise ValueError(f"{what} must be in [{low:g}, 1e+06], got {value:g}")

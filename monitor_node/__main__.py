@@ -27,11 +27,11 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
-from reactorwatch.runtime.event_loop import serve, stop_on_signals
-from reactorwatch.runtime.metrics import Metrics, served
-from reactorwatch.runtime.model_file import model_on_the_bus
+from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
+from reactorwatch.runtime.metrics import Metrics, serve_metrics
+from reactorwatch.runtime.model_file import read_model_on_bus_clock
 from reactorwatch.runtime.node_main import main
-from reactorwatch.runtime.security.command_rate import CommandRate, sender_of
+from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
 
 log = structlog.get_logger()
 
@@ -41,7 +41,7 @@ PREPARE_EVERY_NS = 100_000_000
 PREPARED = object()
 """Returned where no part is left."""
 
-LINGER_S = 0.5
+DRAIN_TIMEOUT_S = 0.5
 """Silence on the bus after which a monitor that was asked to stop takes everything as heard."""
 
 
@@ -62,9 +62,9 @@ class MonitorNode(Monitor):
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
-        super().__init__(config, start_ns, model=model_on_the_bus(config.model))
+        super().__init__(config, start_ns, model=read_model_on_bus_clock(config.model))
         self._said: dict[object, str] = {}
-        self._rate = CommandRate()
+        self._rate = CommandRateLimiter()
         self.preparation: Iterator[None] | None = None
         self._prepare_ns = start_ns
         self.token = keys.monitor_token(config.plant, f"{start_ns:020d}-{secrets.token_hex(4)}")
@@ -101,7 +101,7 @@ class MonitorNode(Monitor):
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
         """See `Monitor`; alarms are stored, before the answer goes out, and logged; too many commands are refused."""
-        refusal = self._rate.refusal(sender_of(question), now_ns)
+        refusal = self._rate.check(sender_name(question), now_ns)
         if refusal is not None:
             self.received += 1
             self.refusals.add("too_many_commands", refusal)
@@ -177,10 +177,10 @@ class MonitorNode(Monitor):
             self._said.pop(store, None)
 
 
-def announce(node: MonitorNode, bus: Bus) -> None:
+def declare_tokens(node: MonitorNode, bus: Bus) -> None:
     """Show that the plant has a monitor, and which."""
-    bus.announce(keys.key(node.config.plant, keys.ALIVE, NODE))
-    bus.announce(node.token)
+    bus.declare_token(keys.key(node.config.plant, keys.ALIVE, NODE))
+    bus.declare_token(node.token)
 
 
 def run(
@@ -200,27 +200,21 @@ def run(
     """
     node = MonitorNode(config, time.time_ns())
     node.preparation = stage.preparation(config, node.model)
-    with served(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
+    with serve_metrics(metrics_config, Metrics(config.plant, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:
             return
         try:
             log.info("listening", plant=config.plant, training_min=config.training_min)
-            serve(
-                node,
-                bus,
-                stop,
-                subscriptions=(keys.all_of(config.plant, keys.SAMPLE),),
-                # What was published since it was stored, however long ago that is; what it knows is passed over.
-                history_s=inf if node.resumed else 0.0,
-                on_told=node.caught_up,
-                commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
-                tokens=node.tokens,
-                on_alive=node.on_alive,
-                on_ready=lambda: announce(node, bus),
-                linger_s=LINGER_S,
-                on_publish=metrics.of(node.alarms.all_alarms) if metrics is not None else None,
-            )
+            on_publish = metrics.observe(node.alarms.all_alarms) if metrics is not None else None
+            loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
+            # All samples published since the state was stored, however long ago; the node skips those it knows.
+            history_s = inf if node.resumed else 0.0
+            loop.subscribe(keys.all_keys(config.plant, keys.SAMPLE), history_s=history_s, on_history_end=node.caught_up)
+            loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
+            loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))
+            declare_tokens(node, bus)
+            loop.run()
         finally:
             bus.close()
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 import msgspec
 
-from reactorwatch.contract.keys import checked_plant
+from reactorwatch.contract.keys import check_plant
 from reactorwatch.spc.m_of_n import check_rule
 
 ChartName = Literal["shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe", "parameters"]
@@ -93,7 +93,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: DEFAULT_PRIORITIES)
 
     def __post_init__(self) -> None:
-        checked_plant(self.plant)
+        check_plant(self.plant)
         check_rule(self.raise_count, self.window, self.clear_count)
         if not self.outputs or self.input in self.outputs or len(set(self.outputs)) != len(self.outputs):
             raise ValueError(

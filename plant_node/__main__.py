@@ -16,9 +16,9 @@ from reactorwatch.records.record import Record
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
-from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
-from reactorwatch.runtime.metrics import Metrics, served
+from reactorwatch.runtime.metrics import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
 
 log = structlog.get_logger()
@@ -45,13 +45,17 @@ def run(
     """
     plant = plant_from(config, model, driver)
     log.info("plant", seed=config.seed, settings=msgspec.to_builtins(config))
-    with served(metrics_config, Metrics(config.name, NODE), NODE) as metrics, stop_on_signals() as stop:
+    with serve_metrics(metrics_config, Metrics(config.name, NODE), NODE) as metrics, stop_on_signals() as stop:
         bus = connect(bus_config, NODE, stop)
         if bus is None:
             return
         try:
             serve_plant(
-                PlantNode(plant, config, log.info), config, bus, stop, metrics.of() if metrics is not None else None
+                PlantNode(plant, config, log.info),
+                config,
+                bus,
+                stop,
+                metrics.observe() if metrics is not None else None,
             )
         finally:
             bus.close()
@@ -65,13 +69,11 @@ def serve_plant(
     on_publish: Callable[[Publication], None] | None = None,
 ) -> None:
     """Run the node on an open bus: listen to commands, show that it is alive, wait for the others, run."""
-
-    def on_ready() -> None:
-        bus.announce(keys.key(config.name, keys.ALIVE, NODE))
-        wait_alive(bus, config.name, config.wait_for, stop, NODE)
-
-    commands = tuple(keys.key(config.name, keys.COMMAND, name) for name in COMMANDS)
-    serve(node, bus, stop, commands=commands, on_ready=on_ready, on_publish=on_publish)
+    loop = EventLoop(node, bus, stop, on_publish=on_publish)
+    loop.accept_commands(*(keys.key(config.name, keys.COMMAND, name) for name in COMMANDS))
+    bus.declare_token(keys.key(config.name, keys.ALIVE, NODE))
+    wait_alive(bus, config.name, config.wait_for, stop, NODE)
+    loop.run()
 
 
 if __name__ == "__main__":

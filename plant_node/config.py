@@ -8,7 +8,7 @@ import msgspec
 from plant_node.controllers import LevelControl, TemperatureControl
 from plant_node.presets import PRESETS
 from plant_node.scenario import RandomSteps, Settings, scenario_settings
-from reactorwatch.contract.keys import checked_plant
+from reactorwatch.contract.keys import check_plant
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 
 
@@ -81,7 +81,7 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     wait_for: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        checked_plant(self.name)
+        check_plant(self.name)
         for what, value, low, high in (
             ("period_min", self.period_min, 1e-4, 60.0),
             ("health_period_s", self.health_period_s, 0.1, 3600.0),

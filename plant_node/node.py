@@ -13,7 +13,7 @@ from plant_node.core import FaultChange, Plant, Row
 from reactorwatch import __version__
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication
-from reactorwatch.contract.commands import command_in
+from reactorwatch.contract.commands import decode_command
 from reactorwatch.contract.messages_pb2 import (
     ClearFault,
     CommandReply,
@@ -122,7 +122,7 @@ class PlantNode:
         return started_ns + round(self._plant.time_min * 60e9 / self._config.speed)
 
     def _obey(self, question: Encoded) -> str:
-        _, command = command_in(question, COMMANDS)
+        _, command = decode_command(question, COMMANDS)
         when = f"from {self._plant.time_min:g} min on"
         match command:
             case SetInput():

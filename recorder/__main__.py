@@ -14,8 +14,8 @@ from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
-from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
-from reactorwatch.runtime.metrics import Metrics, served
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
+from reactorwatch.runtime.metrics import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
 from recorder.config import RecorderConfig
 from recorder.core import NODE, Recorder
@@ -78,7 +78,7 @@ def record(
     ):  # run.csv is a file of another kind, not a folder's name
         make_folder(series.folder, "--out")
     files = files_for(config)
-    with served(metrics_config, Metrics(config.plant, NODE, files.free_bytes), NODE) as metrics:
+    with serve_metrics(metrics_config, Metrics(config.plant, NODE, files.free_bytes), NODE) as metrics:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:
             return None
@@ -88,18 +88,12 @@ def record(
                 history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
                 known = files.received_since(start_ns - history_ns)
                 node = begin(config, files, start_ns, known, known_until_ns=start_ns + history_ns)
-                serve(
-                    node,
-                    bus,
-                    stop,
-                    subscriptions=(config.key_expression,),
-                    history_s=bus_config.history_s,
-                    on_gap=node.on_gap,
-                    commands=tuple(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS),
-                    on_ready=lambda: bus.announce(keys.key(config.plant, keys.ALIVE, NODE)),
-                    linger_s=config.linger_s,
-                    on_publish=metrics.of(node.alarms) if metrics is not None else None,
-                )
+                on_publish = metrics.observe(node.alarms) if metrics is not None else None
+                loop = EventLoop(node, bus, stop, drain_timeout_s=config.linger_s, on_publish=on_publish)
+                loop.subscribe(config.key_expression, history_s=bus_config.history_s, on_gap=node.on_gap)
+                loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))
+                bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
+                loop.run()
                 return files.path
         finally:
             bus.close()

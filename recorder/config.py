@@ -59,8 +59,8 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     about: dict[str, str] = {}
 
     def __post_init__(self) -> None:
-        keys.checked_plant(self.plant)
-        keys.checked_expression(self.key_expression)
+        keys.check_plant(self.plant)
+        keys.check_expression(self.key_expression)
         for name in ("health_period_s", "flush_period_s", "linger_s"):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
@@ -110,4 +110,4 @@ class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if not self.from_min < self.to_min:
             raise ValueError(f"from_min must be before to_min, got {self.from_min:g} and {self.to_min:g}")
         if self.plant:
-            keys.checked_plant(self.plant)
+            keys.check_plant(self.plant)

@@ -2,7 +2,7 @@
 
 import socket
 
-from reactorwatch.runtime.loopback import LOOPBACK, free_port, keep
+from reactorwatch.runtime.loopback import LOOPBACK, free_port, reserve_port
 
 
 def three_free_ports() -> int:
@@ -13,7 +13,7 @@ def three_free_ports() -> int:
             for port in (first + 1, first + 2):
                 with socket.socket() as probe:
                     probe.bind((LOOPBACK, port))  # else it may be kept for somebody else
-                keep(port)
+                reserve_port(port)
         except (OSError, OverflowError):
             continue
         return first

@@ -17,7 +17,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.security.acl import NOBODY
+from reactorwatch.runtime.security.acl import NO_QUERYABLE
 from recorder.tools.player import samples_of
 
 SIGNALS = 3
@@ -80,7 +80,7 @@ def publish(endpoint: str, plants: int, rows: int, per_s: float, first: int) -> 
                 arrived[message.key.split("/")[1], alarm.time_ns] = now
 
     if per_s:
-        bus.gather(f"{FLEET}/{keys.ALARM}/**", on_alarms)
+        bus.subscribe_batched(f"{FLEET}/{keys.ALARM}/**", on_alarms)
     payloads = [item.payload for item in record()[SIGNALS * LEARNED_ROWS :]]
     time.sleep(1.0)  # until the router knows all keys
     sent: dict[tuple[str, int], float] = {}
@@ -88,7 +88,7 @@ def publish(endpoint: str, plants: int, rows: int, per_s: float, first: int) -> 
     for row in range(rows):
         if row == KNOWN_ROWS and per_s:
             for each in buses:  # what comes back from the router was behind all that came before it
-                for _ in each._session.get(NOBODY, timeout=WITHIN_S):  # type: ignore[union-attr]
+                for _ in each._session.get(NO_QUERYABLE, timeout=WITHIN_S):  # type: ignore[union-attr]
                     pass
             time.sleep(1.0)  # until the monitor has heard it
             begin, count = time.perf_counter(), 0

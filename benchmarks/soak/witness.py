@@ -31,7 +31,7 @@ class Witness:
         self.health: dict[str, Health] = {}
         self.longest_lag_ms = 0.0
         self._bus = connected(config)
-        self._bus.watch_alive(f"{keys.ROOT}/{keys.FLEET}/**", self._on_token)
+        self._bus.subscribe_liveliness(f"{keys.ROOT}/{keys.FLEET}/**", self._on_token)
         self._bus.subscribe(f"{FLEET}/{keys.ALARM}/**", self._on_message)
         self._bus.subscribe(f"{FLEET}/{keys.HEALTH}/{NODE}", self._on_message)
 

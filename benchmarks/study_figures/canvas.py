@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -83,7 +83,7 @@ def paper(path: Path, height_px: int) -> Iterator[Drawing]:
         pixels = io.BytesIO()
         drawing.savefig(pixels, format="png", dpi=DPI, metadata={"Software": None})
     picture = Image.open(pixels).convert("RGB").quantize(_PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         picture.save(temporary, format="PNG", optimize=True)
 
 

@@ -9,11 +9,11 @@ from benchmarks.study_figures.catalogue import FIGURES
 from benchmarks.study_figures.figure import Figure, Finding
 from benchmarks.study_figures.page import FOLDER, page
 from benchmarks.study_figures.study import Study
-from reactorwatch.cli.batch import results
+from reactorwatch.cli.batch import run_in_order
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
-from reactorwatch.records.folder import filling, make_folder
-from reactorwatch.records.output import checked_folder
+from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.folder import fill_folder, make_folder
+from reactorwatch.records.output import check_output_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.parallel.jobs import Failed
 from reactorwatch.terminal import printable_lines
@@ -67,29 +67,29 @@ def reproduce(
     """
     figures = _chosen(only)
     require_matplotlib()
-    checked_folder(checked_folder(out) / FOLDER)
+    check_output_folder(check_output_folder(out) / FOLDER)
     found: list[tuple[Figure, Finding]] = []
-    with filling(out, "--out") as folder:
+    with fill_folder(out, "--out") as folder:
         pictures = make_folder(folder / FOLDER).absolute()
         jobs = [Job(figure.number, pictures / figure.file_name, seed, measured) for figure in figures]
-        for figure, finding in zip(figures, results(draw, jobs, "reproducing", processes, scheduler), strict=True):
+        for figure, finding in zip(figures, run_in_order(draw, jobs, "reproducing", processes, scheduler), strict=True):
             if isinstance(finding, Failed):
-                raise (RuntimeError if finding.ours else InputError)(f"figure {figure.number}: {finding.reason}")
+                raise (RuntimeError if finding.is_internal else InputError)(f"figure {figure.number}: {finding.reason}")
             found.append((figure, finding))
         text = page(found, seed, measured.name if measured else "")
-        with replacing(folder / PAGE) as temporary:
+        with atomic_write(folder / PAGE) as temporary:
             temporary.write_text(text, encoding="utf-8")
     return _report(out, found)
 
 
 def check_out(out: Path, only: str | None, sources: Iterable[Path | None], *, force: bool) -> None:
-    """Check that the page and its pictures may be written; the arguments are those of `reproduce` and `checked_output`.
+    """Check that the page and its pictures may be written; arguments as for `reproduce` and `check_output_file`.
 
     Raises:
-        InputError: as `checked_folder`, or figures that there are not.
+        InputError: as `check_output_folder`, or figures that there are not.
     """
     pictures = [f"{FOLDER}/{figure.file_name}" for figure in _chosen(only)]
-    checked_folder(out, (PAGE, *pictures), sources, force=force)
+    check_output_folder(out, (PAGE, *pictures), sources, force=force)
 
 
 def draw(job: Job) -> Finding:

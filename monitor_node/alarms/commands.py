@@ -7,7 +7,7 @@ from google.protobuf.message import Message
 from monitor_node.alarms.annunciator import AlarmBoard
 from monitor_node.alarms.states import Event
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.commands import command_in, signed
+from reactorwatch.contract.commands import check_signature, decode_command
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms, ShelveAlarm
 
 EVENTS: Mapping[str, Event] = {
@@ -40,12 +40,12 @@ def obey(board: AlarmBoard, question: Encoded) -> tuple[CommandReply, list[Publi
         InputError: it cannot be done; nothing has changed.
         DecodeError: the payload is not what the command carries; nothing has changed.
     """
-    name, command = command_in(question, COMMANDS)
+    name, command = decode_command(question, COMMANDS)
     if isinstance(command, ListAlarms):
         alarms = board.all_alarms()
         return CommandReply(accepted=True, text=f"{len(alarms)} alarms", alarms=alarms), []
     assert isinstance(command, AlarmCommand | ShelveAlarm), "the catalogue holds no others"
-    by, comment = signed(command.by, command.comment)
+    by, comment = check_signature(command.by, command.comment)
     if isinstance(command, ShelveAlarm):
         said = board.shelve(command.alarm, command.minutes, by, comment)
     elif name == "comment":

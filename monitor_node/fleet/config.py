@@ -26,7 +26,7 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         if self.plants is not None:
-            keys.checked_plants(self.plants)
+            keys.check_plants(self.plants)
         try:
             sharding.parsed(self.shard)
         except InputError as error:

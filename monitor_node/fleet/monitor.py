@@ -273,7 +273,7 @@ class FleetMonitor:
         if len(self._met) >= MOST_PLANTS or not (vouched or self._strangers.have_room):
             return
         try:
-            keys.checked_plant(plant)
+            keys.check_plant(plant)
         except ValueError:
             return
         self._met[plant] = None

@@ -31,14 +31,14 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
-from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
-from reactorwatch.runtime.metrics import FleetMetrics, served
-from reactorwatch.runtime.model_file import model_on_the_bus
-from reactorwatch.runtime.security.command_rate import CommandRate, sender_of
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
+from reactorwatch.runtime.metrics import FleetMetrics, serve_metrics
+from reactorwatch.runtime.model_file import read_model_on_bus_clock
+from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
 
 log = structlog.get_logger()
 
-LINGER_S = 0.5
+DRAIN_TIMEOUT_S = 0.5
 """As for the monitor of one plant."""
 
 PASSING = (keys.HEALTH, keys.ALARM_KPIS)
@@ -99,12 +99,12 @@ class FleetNode(FleetMonitor):
         self._shown: set[str] = set()
         self._report_ns = start_ns
         self._forgotten_told = 0
-        self._rate, self._commands_refused = CommandRate(), Refusals()
+        self._rate, self._commands_refused = CommandRateLimiter(), Refusals()
         # The older of two with the same shard is in charge: names sort by the time of the start.
         name = f"{start_ns:020d}-{secrets.token_hex(4)}"
         self.crew = Crew(self.expression, sharding.parsed(fleet.shard), name)
         self._others = OtherMonitors(self.crew.token, lambda: self.plants)
-        model = model_on_the_bus(config.model)
+        model = read_model_on_bus_clock(config.model)
         super().__init__(
             config,
             start_ns,
@@ -137,9 +137,9 @@ class FleetNode(FleetMonitor):
         self._stored_at.pop(plant, None)
         if self.metrics is not None:
             if ours:
-                self.metrics.watch(plant, lambda: self.alarms_of(plant))
+                self.metrics.add_plant(plant, lambda: self.alarms_of(plant))
             else:
-                self.metrics.leave(plant)
+                self.metrics.remove_plant(plant)
         if ours and self.crew.is_shared:
             self._changed.add(plant)  # another who was only cut off is to find that we have gone on from his state
         log.info("watching" if ours else "no longer watching", plant=plant)
@@ -147,10 +147,10 @@ class FleetNode(FleetMonitor):
             log_report(report)
         if ours and len(self._shown) < MOST_TOKENS:
             self._shown.add(token)
-            self._bus.announce(token)
+            self._bus.declare_token(token)
         elif token in self._shown:
             self._shown.remove(token)
-            self._bus.withdraw(token)
+            self._bus.undeclare_token(token)
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; alarms are logged."""
@@ -168,7 +168,7 @@ class FleetNode(FleetMonitor):
         topic = keys.parse(question.key)
         if topic is None or self.holds or not self.is_watched(topic.plant):
             return None, []
-        refusal = self._rate.refusal(sender_of(question), now_ns)
+        refusal = self._rate.check(sender_name(question), now_ns)
         if refusal is not None:
             self._commands_refused.add("too_many_commands", refusal)
             if (own := self.own(topic.plant)) is not None:  # a quiet plant stays one
@@ -340,10 +340,10 @@ def run(
         if getattr(config, setting) is not None:
             raise InputError(f"{setting} holds what is known of one plant; a fleet takes [fleet] state, a folder")
     # Settings that make no monitor are refused now, and nobody waits for what has to be compiled.
-    WatchedPlants(config, 0, model_on_the_bus(config.model), points=fleet.points).prepare()
+    WatchedPlants(config, 0, read_model_on_bus_clock(config.model), points=fleet.points).prepare()
     states = FleetStates(Path(fleet.state)) if fleet.state is not None else None
-    with served(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
-        bus = bus_zenoh.connect(bus_config, NODE, stop, passing=PASSING, crowded=True)
+    with serve_metrics(metrics_config, FleetMetrics(NODE), NODE) as metrics, stop_on_signals() as stop:
+        bus = bus_zenoh.connect(bus_config, NODE, stop, uncached=PASSING, many_keys=True)
         if bus is None:
             return
         try:
@@ -355,17 +355,10 @@ def run(
 def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
     """Watch the plants until asked to stop."""
     log.info("listening", plants=node.expression)
-    serve(
-        node,
-        bus,
-        stop,
-        subscriptions=node.subscriptions,
-        on_told=node.listens,
-        on_messages=node.on_messages,
-        tokens=node.tokens,
-        on_alive=node.on_alive,
-        commands=tuple(f"{node.expression}/{keys.COMMAND}/{name}" for name in COMMANDS),
-        on_ready=lambda: bus.announce(node.crew.token),
-        linger_s=LINGER_S,
-        on_publish=node.metrics.published if node.metrics is not None else None,
-    )
+    on_publish = node.metrics.on_publish if node.metrics is not None else None
+    loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
+    loop.subscribe(*node.subscriptions, on_history_end=node.listens, on_batch=node.on_messages)
+    loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
+    loop.accept_commands(*(f"{node.expression}/{keys.COMMAND}/{name}" for name in COMMANDS))
+    bus.declare_token(node.crew.token)
+    loop.run()

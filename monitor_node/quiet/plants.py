@@ -25,7 +25,7 @@ from reactorwatch.codegen.compiled_function import RowCode
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
-from reactorwatch.contract.sample_bytes import SampleColumns, sample_columns
+from reactorwatch.contract.sample_bytes import SampleColumns, parse_samples
 from reactorwatch.kalman.ekf_step import row_function
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
 from reactorwatch.process.model import ProcessModel
@@ -89,7 +89,7 @@ class QuietPlants:
     def prepare(self) -> None:
         """Have the machine code made that is made at its first use: on a new machine that takes seconds."""
         nobody, now = np.array([-1], np.int32), np.zeros(1, np.int64)
-        rows, _ = self._lined_up(nobody, sample_columns([b""]), now, 0)
+        rows, _ = self._lined_up(nobody, parse_samples([b""]), now, 0)
         self._judged(rows, [])
         self._silent_from_ns()
 
@@ -182,7 +182,7 @@ class QuietPlants:
         )
         if codes.max(initial=-1) < 0:
             return Taken([], messages, {})
-        samples = sample_columns([payload if len(payload) <= LARGEST_SAMPLE else b"" for _, payload, _, _ in messages])
+        samples = parse_samples([payload if len(payload) <= LARGEST_SAMPLE else b"" for _, payload, _, _ in messages])
         received_ns = np.fromiter([came_ns for _, _, _, came_ns in messages], np.int64, len(messages))
         rows, others = self._lined_up(codes, samples, received_ns, now_ns)
         publications: list[Publication] = []
@@ -212,7 +212,7 @@ class QuietPlants:
         count, left_over = take_samples(
             self._slots.plants,
             codes,
-            samples.plain & good,
+            samples.is_canonical & good,
             samples.time_ns,
             samples.sequence,
             samples.value,

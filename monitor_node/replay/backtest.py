@@ -10,7 +10,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.runtime.model_file import model_on_the_bus
+from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
 RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
@@ -93,7 +93,8 @@ def run(
         InputError: settings that do not fit together, or a model's file that cannot be used.
     """
     prefix = keys.key(config.plant, keys.SAMPLE, "")
-    monitor = Monitor(config, start_ns=0, points=False, model=model or model_on_the_bus(config.model, zero_ns))
+    model = model or read_model_on_bus_clock(config.model, zero_ns)
+    monitor = Monitor(config, start_ns=0, points=False, model=model)
     alarms: list[Alarm] = []
     first_ns: int | None = None
 

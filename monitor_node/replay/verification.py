@@ -25,7 +25,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.runtime.model_file import model_on_the_bus
+from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
 COMPARED = frozenset({keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.ALARM_KPIS, keys.RECONSTRUCTION})
 """The kinds of messages that follow from the samples; health does not."""
@@ -68,7 +68,7 @@ def verify(read: Callable[[], Iterable[Encoded]], config: MonitorConfig) -> Veri
         InputError: there is nothing in it that could be verified, or the settings cannot be used.
     """
     lives = lives_in(read(), config.plant)
-    model = model_on_the_bus(config.model)
+    model = read_model_on_bus_clock(config.model)
     found = Verification(Comparison())
     stored: bytes | None = None
     verified = 0

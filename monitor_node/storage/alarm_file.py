@@ -8,7 +8,7 @@ from monitor_node.core import Monitor
 from monitor_node.state.seal import ForeignFileError, Seal
 from monitor_node.storage.kept_aside import DAMAGED, keep_aside, read_regular
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import is_full, replacing
+from reactorwatch.records.atomic import atomic_write, is_disk_full
 
 SEAL = Seal(b"reactorwatch alarms", 1, "alarm state")
 
@@ -84,7 +84,7 @@ class AlarmFile:
         try:
             self.store()
         except InputError as error:
-            if not is_full(error):
+            if not is_disk_full(error):
                 raise
         return line
 
@@ -98,7 +98,7 @@ class AlarmFile:
         if self._stored == (board, board.changes):
             return
         try:
-            with replacing(self._path) as temporary, temporary.open("wb") as file:
+            with atomic_write(self._path) as temporary, temporary.open("wb") as file:
                 file.write(SEAL.close(board.to_bytes()))
                 file.flush()
                 os.fsync(file.fileno())

@@ -20,7 +20,7 @@ from typing import TypeAlias
 
 from monitor_node.storage.kept_aside import find_kept_aside, keep_aside, put_back, read_regular
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import is_full, replacing
+from reactorwatch.records.atomic import atomic_write, is_disk_full
 
 ENDING = ".state"
 
@@ -59,13 +59,13 @@ class FleetStates:
         self._changed = threading.Condition()
         self._closed = False
         try:
-            with replacing(folder / f".{ENDING}") as probe:
+            with atomic_write(folder / f".{ENDING}") as probe:
                 probe.write_bytes(b"")
             (folder / f".{ENDING}").unlink(missing_ok=True)  # another one that starts just now may have tried, too
         except OSError as error:
             raise InputError(f"state folder {folder}: cannot be written to: {error.strerror}") from error
         except InputError as error:
-            if not is_full(error):
+            if not is_disk_full(error):
                 raise InputError(f"state folder {folder}: {error}") from error
         self._clear_up()
         self._aside = find_kept_aside(folder)
@@ -224,7 +224,7 @@ class FleetStates:
                 return f"state {path}: cannot be used and is not overwritten; move it away"
             self._left_alone.discard(plant)
         try:
-            with replacing(path) as temporary:
+            with atomic_write(path) as temporary:
                 with temporary.open("wb") as file:
                     file.write(state)
                     file.flush()

@@ -13,7 +13,7 @@ from monitor_node.state.monitor_state import OtherSettingsError
 from monitor_node.state.seal import ForeignFileError
 from monitor_node.storage.kept_aside import DAMAGED, OTHER_SETTINGS, find_kept_aside, keep_aside, put_back, read_regular
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import is_full, replacing
+from reactorwatch.records.atomic import atomic_write, is_disk_full
 
 
 class StateFile:
@@ -54,7 +54,7 @@ class StateFile:
         try:
             self._write()
         except InputError as error:
-            if not is_full(error):
+            if not is_disk_full(error):
                 raise
             told = f"{told}; {error}"
         return told
@@ -84,7 +84,7 @@ class StateFile:
 
     def _write(self) -> None:
         try:
-            with replacing(self._path) as temporary, temporary.open("wb") as file:
+            with atomic_write(self._path) as temporary, temporary.open("wb") as file:
                 file.write(self._monitor.to_bytes())
                 file.flush()
                 os.fsync(file.fileno())

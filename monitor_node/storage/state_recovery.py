@@ -87,7 +87,7 @@ class Pasts:
                 state = self._states.read(plant) if self._states is not None else None
             except InputError as error:
                 self._say(plant, str(error))
-            self._found.put(Past(plant, state, self._bus.recall(keys.all_of(plant, keys.SAMPLE))))
+            self._found.put(Past(plant, state, self._bus.query_history(keys.all_keys(plant, keys.SAMPLE))))
 
     def _wait_for_the_others(self) -> None:
         """If we are cut off ourselves, wait until they are to be seen again."""

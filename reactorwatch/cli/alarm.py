@@ -1,13 +1,13 @@
-"""`alarm`: what the operator does with alarms, asked of the running monitor; of the recorder, for its own alarm."""
+"""`alarm`: an operator's commands for alarms of the running monitor, and of the recorder for its own."""
 
 import contextlib
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.command_client import PATIENCE_S, NoAnswerError, ask
-from reactorwatch.cli.options import LONGEST_WAIT_S, Endpoint, Json, Plant, Settings, sendable
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.command_client import TIMEOUT_S, NoReplyError, send_command
+from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Settings, check_encodable
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.contract.keys import ACKNOWLEDGE_RECORDER, LIST_RECORDER_ALARMS, RECORDING
 from reactorwatch.errors import InputError
 
@@ -15,20 +15,18 @@ if TYPE_CHECKING:
     from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 
 Name = Annotated[
-    str, typer.Argument(help="As `alarm list` names it: shewhart/T.", callback=sendable, show_default=False)
+    str, typer.Argument(help="As `alarm list` names it: shewhart/T.", callback=check_encodable, show_default=False)
 ]
-By = Annotated[str, typer.Option("--by", help="Who you are.", callback=sendable, show_default=False)]
-Comment = Annotated[str, typer.Option("--comment", help="Why.", callback=sendable, show_default=False)]
-Timeout = Annotated[
-    float, typer.Option("--timeout", help="Seconds to wait for the monitor.", min=0.1, max=LONGEST_WAIT_S)
-]
+By = Annotated[str, typer.Option("--by", help="Who you are.", callback=check_encodable, show_default=False)]
+Comment = Annotated[str, typer.Option("--comment", help="Why.", callback=check_encodable, show_default=False)]
+Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the monitor.", min=0.1, max=MAX_WAIT_S)]
 
 MONITOR, RECORDER = "monitor", "recorder"
 
 alarms = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.add_typer(alarms, name="alarm", help="List, acknowledge, shelve, suppress or comment the alarms of a plant.")
 
@@ -38,16 +36,16 @@ def list_alarms(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    timeout: Timeout = PATIENCE_S,
+    timeout: Timeout = TIMEOUT_S,
     json: Json = False,
 ) -> None:
-    """Show all alarms as they are now."""
+    """Show the current state of all alarms."""
     from reactorwatch.contract.messages_pb2 import ListAlarms
 
-    reply = ask(MONITOR, config, endpoint, name, timeout, "list_alarms", ListAlarms())
+    reply = send_command(MONITOR, config, endpoint, name, timeout, "list_alarms", ListAlarms())
     _show(reply, json=json)
-    with contextlib.suppress(NoAnswerError):  # a plant may be watched and not be recorded
-        _show(ask(RECORDER, config, endpoint, name, timeout, LIST_RECORDER_ALARMS, ListAlarms()), json=json)
+    with contextlib.suppress(NoReplyError):  # a plant may be watched and not be recorded
+        _show(send_command(RECORDER, config, endpoint, name, timeout, LIST_RECORDER_ALARMS, ListAlarms()), json=json)
 
 
 @alarms.command("shelve")
@@ -59,19 +57,19 @@ def shelve(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    timeout: Timeout = PATIENCE_S,
+    timeout: Timeout = TIMEOUT_S,
     json: Json = False,
 ) -> None:
-    """Put an alarm out of sight for a time."""
+    """Hide an alarm for a time."""
     from reactorwatch.contract.messages_pb2 import ShelveAlarm
 
-    node, told = _addressed(alarm, "shelve")
+    node, command_name = _route(alarm, "shelve")
     command = ShelveAlarm(alarm=alarm, by=by, comment=comment, minutes=minutes)
-    _show(ask(node, config, endpoint, name, timeout, told, command), json=json)
+    _show(send_command(node, config, endpoint, name, timeout, command_name, command), json=json)
 
 
 def _register(word: str, command: str, description: str) -> None:
-    """A subcommand that names an alarm and a person, and no more."""
+    """Register a subcommand with an alarm and an operator's name as arguments."""
 
     def act(
         alarm: Name,
@@ -80,35 +78,35 @@ def _register(word: str, command: str, description: str) -> None:
         config: Settings = None,
         endpoint: Endpoint = None,
         name: Plant = None,
-        timeout: Timeout = PATIENCE_S,
+        timeout: Timeout = TIMEOUT_S,
         json: Json = False,
     ) -> None:
         from reactorwatch.contract.messages_pb2 import AlarmCommand
 
-        node, told = _addressed(alarm, command)
-        asked = AlarmCommand(alarm=alarm, by=by, comment=comment)
-        _show(ask(node, config, endpoint, name, timeout, told, asked), json=json)
+        node, command_name = _route(alarm, command)
+        message = AlarmCommand(alarm=alarm, by=by, comment=comment)
+        _show(send_command(node, config, endpoint, name, timeout, command_name, message), json=json)
 
     alarms.command(word, help=description)(act)
 
 
 for _word, _command, _description in (
-    ("acknowledge", "acknowledge", "Say that you have seen an alarm."),
-    ("unshelve", "unshelve", "Bring a shelved alarm back before its time is over."),
-    ("suppress", "suppress", "Put an alarm out of sight while it means nothing, as in a start-up."),
-    ("unsuppress", "unsuppress", "Bring a suppressed alarm back."),
+    ("acknowledge", "acknowledge", "Acknowledge an alarm."),
+    ("unshelve", "unshelve", "Show a shelved alarm again before its time is over."),
+    ("suppress", "suppress", "Hide an alarm while it has no meaning, as in a start-up."),
+    ("unsuppress", "unsuppress", "Show a suppressed alarm again."),
     ("out-of-service", "take_out_of_service", "Take an alarm out of service, for maintenance."),
     ("in-service", "return_to_service", "Return an alarm to service."),
-    ("comment", "comment", "Say something about an alarm, with --comment."),
+    ("comment", "comment", "Comment on an alarm, with --comment."),
 ):
     _register(_word, _command, _description)
 
 
-def _addressed(alarm: str, command: str) -> tuple[str, str]:
-    """The node that an alarm is of, and the command as that node knows it.
+def _route(alarm: str, command: str) -> tuple[str, str]:
+    """Node that raises an alarm, and its name of the command.
 
     Raises:
-        InputError: it is the recorder's own alarm, and the command another than to acknowledge.
+        InputError: the recorder's own alarm, and a command other than to acknowledge.
     """
     if not alarm.startswith(f"{RECORDING}/"):
         return MONITOR, command
@@ -118,11 +116,11 @@ def _addressed(alarm: str, command: str) -> tuple[str, str]:
 
 
 def _show(reply: "CommandReply", *, json: bool) -> None:
-    """Print the alarms of an answer: one JSON object a line, or a line each for people."""
+    """Print the alarms of a reply, one JSON object or text a line."""
     import msgspec
 
     for alarm in reply.alarms:
-        say(msgspec.json.encode(_object(alarm)).decode() if json else _line(alarm))
+        print_lines(msgspec.json.encode(_object(alarm)).decode() if json else _line(alarm))
 
 
 def _object(alarm: "Alarm") -> dict[str, object]:

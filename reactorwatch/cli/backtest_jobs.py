@@ -1,4 +1,4 @@
-"""`backtest`: the monitor's core over each file, a job of its own; and of several files a summary."""
+"""`backtest`: one job for each file: run the monitor's core over it; and a summary of several files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,28 +9,28 @@ import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.backtest import run
-from reactorwatch.cli.batch import Answer, Kind, Row, as_table
-from reactorwatch.cli.options import existing_recording
-from reactorwatch.cli.read_record import plant_of, tape
+from reactorwatch.cli.batch import JobKind, JobResult, Row, as_table
+from reactorwatch.cli.options import check_recording
+from reactorwatch.cli.read_record import open_messages, resolve_plant
 from reactorwatch.cli.reports import backtest_object, backtest_text
 from reactorwatch.cli.unit_remarks import FirstSamples
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.runtime.model_file import model_on_the_bus
+from reactorwatch.runtime.model_file import read_model_on_bus_clock
 
 
 @dataclass(frozen=True)
 class Job:
-    """A file to be watched.
+    """A file to be monitored.
 
     Attributes:
-        file: as it was named.
-        at: where it is.
-        settings: of the monitor, but for the plant, which the file may name.
-        plant: in it; None: the only one there.
-        columns: their names by signal.
-        as_json: whether it is to be said to a machine.
-        among: whether there are other files, so that what is said has to name this one.
+        file: the file as named.
+        at: path of the file for the worker.
+        settings: settings of the monitor, except the plant, which the file may name.
+        plant: plant in the file; None: the only one.
+        columns: names of columns by signal.
+        as_json: format the result as JSON.
+        among: name the file in the result, because there are others.
     """
 
     file: Path
@@ -42,7 +42,7 @@ class Job:
     among: bool
 
 
-def jobs_of(
+def make_jobs(
     files: Sequence[Path],
     settings: MonitorConfig,
     plant: str | None,
@@ -51,15 +51,15 @@ def jobs_of(
     as_json: bool,
     elsewhere: bool,
 ) -> list[Job]:
-    """A job for each file.
+    """Make a job for each file.
 
     Args:
         files: .csv, .mcap, or folders of recordings.
-        settings: of the monitor.
-        plant: in recordings; None: the only one there.
-        columns: their names by signal.
-        as_json: whether it is to be said to a machine.
-        elsewhere: whether the jobs are done by who sees the same files, but from another folder.
+        settings: settings of the monitor.
+        plant: plant in recordings; None: the only one.
+        columns: names of columns by signal.
+        as_json: format the results as JSON.
+        elsewhere: use absolute paths, for workers with another working folder.
     """
     if elsewhere and settings.model is not None:
         settings = msgspec.structs.replace(settings, model=str(Path(settings.model).absolute()))
@@ -69,15 +69,15 @@ def jobs_of(
     ]
 
 
-def answer(job: Job) -> Answer:
+def run_job(job: Job) -> JobResult:
     """Run the monitor over a file.
 
     Raises:
         InputError: the file cannot be read or has no value of any output, or settings do not fit together.
     """
-    plant = plant_of(existing_recording(job.at), job.plant)
+    plant = resolve_plant(check_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
-    recording, first = tape(job.at, plant, job.columns, _units(settings)), FirstSamples(plant)
+    recording, first = open_messages(job.at, plant, job.columns, _units(settings)), FirstSamples(plant)
     result = run(first.pass_on(recording.messages), settings, recording.zero_ns or 0)
     if not result.rows:
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items()))
@@ -88,15 +88,17 @@ def answer(job: Job) -> Answer:
     zero_ns = result.first_ns if recording.zero_ns is None else recording.zero_ns
     found = backtest_object(result, zero_ns, recording.zero(result.first_ns))
     if job.as_json:
-        said = msgspec.json.encode({"file": str(job.file), **found} if job.among else found).decode()
+        text = msgspec.json.encode({"file": str(job.file), **found} if job.among else found).decode()
     else:
-        said = backtest_text(result, zero_ns, job.file)
-    return Answer(said, _row(job.file, found), remark=first.unit_remark(model_on_the_bus(settings.model) or cstr()))
+        text = backtest_text(result, zero_ns, job.file)
+    return JobResult(
+        text, _row(job.file, found), remark=first.unit_remark(read_model_on_bus_clock(settings.model) or cstr())
+    )
 
 
 def _units(settings: MonitorConfig) -> dict[str, str] | None:
-    """The units of the signals, if the settings say of which process they are; None: they do not."""
-    model = model_on_the_bus(settings.model)
+    """Units of the signals; None if the settings name no process."""
+    model = read_model_on_bus_clock(settings.model)
     if model is None and settings.reference == "process":
         model = cstr()
     return None if model is None else model.units
@@ -124,7 +126,7 @@ def _failed(file: Path, reason: str) -> Row:
 
 
 def _summary(rows: Sequence[Row]) -> str:
-    """A line for each file, and how many there are with alarms and without."""
+    """Summary table: a line for each file, and the counts of files with and without alarms."""
     lines = [
         {
             "file": row["file"],
@@ -141,4 +143,4 @@ def _summary(rows: Sequence[Row]) -> str:
     return f"{as_table(lines)}\n\n{len(rows)} files: {counts}"
 
 
-WATCHING = Kind("watching", answer, _failed, _summary)
+BACKTEST = JobKind("watching", run_job, _failed, _summary)

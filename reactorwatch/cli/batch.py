@@ -1,7 +1,7 @@
-"""Many files: what was named becomes a list of them, each is a job, and what came of all is said in one order.
+"""Run one job for each of many files, and print the results in the order of the files.
 
-One file that cannot be used is one line, and the rest is finished; the exit code is 2 then, at the end. A single file
-is done by this process, as if there were no others to think of.
+A file that cannot be used costs one line, and an exit code of 2 after the others are done. This process runs the job of
+a single file itself.
 """
 
 import csv
@@ -15,15 +15,14 @@ from typing import Any, Generic, TypeVar
 import msgspec
 import typer
 
-from reactorwatch.cli.printing import say as print_lines
-from reactorwatch.cli.printing import say_text
+from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.cli.progress import bar, task
-from reactorwatch.cli.read_record import stands_for
+from reactorwatch.cli.read_record import expand_folder
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
-from reactorwatch.records.folder import filling
-from reactorwatch.records.reading import files_of
-from reactorwatch.runtime.parallel.jobs import Failed, in_order, workers
+from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.folder import fill_folder
+from reactorwatch.records.input_file import list_files
+from reactorwatch.runtime.parallel.jobs import Failed, choose_executor, in_job_order
 from reactorwatch.terminal import printable
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
@@ -31,73 +30,73 @@ SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 Row = dict[str, Any]
-"""A line of a summary: of every file the same names."""
+"""Row of a summary; the rows of all files have the same names."""
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What came of a file.
+class JobResult:
+    """Result of a file.
 
     Attributes:
-        said: to be printed.
-        row: of the summary.
-        remark: about the file, for people, on standard error; empty: none.
-        not_written: why the files that belong to the answer could not be written; empty if they were.
+        text: output.
+        row: row of the summary.
+        remark: remark on the file for standard error; empty: none.
+        not_written: error of writing the result's files; empty: none.
     """
 
-    said: str
+    text: str
     row: Row
     remark: str = ""
     not_written: str = ""
 
 
 @dataclass(frozen=True)
-class Kind(Generic[Job]):
-    """A kind of job about a file.
+class JobKind(Generic[Job]):
+    """A kind of job.
 
     Attributes:
-        doing: what is being done, for people.
-        work: does it.
-        failed: the row of a file that could not be used, and why.
-        summary: rows for people.
+        doing: name of the work, for the progress display.
+        work: runs a job.
+        failed: makes the row of a file that could not be used, from the file and the reason.
+        summary: formats rows as a table.
     """
 
     doing: str
-    work: Callable[[Job], Answer]
+    work: Callable[[Job], JobResult]
     failed: Callable[[Path, str], Row]
     summary: Callable[[Sequence[Row]], str]
 
 
-def files_named(names: Sequence[Path]) -> list[Path]:
-    """The files that are meant, in the order of the names, and within one in the order of theirs.
+def expand_files(names: Sequence[Path]) -> list[Path]:
+    """Expand folders and patterns to files, in the order given; files of one are sorted.
 
     Args:
-        names: of files, of folders (see `stands_for`), or patterns such as `runs/*.csv` and `runs/**/*.mcap`. What is
-            no pattern is taken as it is, there or not.
+        names: names of files, folders (see `expand_folder`), or patterns such as `runs/*.csv` and `runs/**/*.mcap`.
+            Names of files are not checked.
 
     Raises:
-        InputError: nothing is like a pattern, or a folder that was named holds nothing to be read.
+        InputError: a pattern has no match, or a folder holds no records and recordings.
     """
-    found: list[Path] = []
+    files: list[Path] = []
     for name in names:
         if glob.has_magic(str(name)) and not name.exists():
             paths = sorted(map(Path, glob.glob(str(name), recursive=True)))  # noqa: PTH207 (Path has none for absolute patterns)
-            like = [file for path in paths for file in (_held_by(path) if path.is_dir() else [path])]
-            if not like:
+            matches = [file for path in paths for file in (_expand_match(path) if path.is_dir() else [path])]
+            if not matches:
                 raise InputError(f"{name}: no file is called like this")
+            files += matches
         else:
-            like = stands_for(name) if name.is_dir() else [name]
-        found += like
-    return found
+            files += expand_folder(name) if name.is_dir() else [name]
+    return files
 
 
-def _held_by(folder: Path) -> list[Path]:
-    """What a folder that is like a pattern stands for: nothing, if it is only called so."""
-    return stands_for(folder) if files_of(folder, ".csv") or files_of(folder, ".mcap") else []
+def _expand_match(folder: Path) -> list[Path]:
+    """Expand a folder that matches a pattern; one without records and recordings is no file."""
+    return expand_folder(folder) if list_files(folder, ".csv") or list_files(folder, ".mcap") else []
 
 
-def say(
-    kind: Kind[Job],
+def run_jobs(
+    kind: JobKind[Job],
     jobs: Sequence[Job],
     files: Sequence[Path],
     out: Path | None,
@@ -106,85 +105,85 @@ def say(
     scheduler: str | None,
     as_json: bool,
 ) -> None:
-    """Do the jobs, say what came of each file in their order, and of several what came of all.
+    """Run the jobs and print the result of each file in their order, and a summary of several.
 
     Args:
-        kind: of the jobs.
+        kind: kind of the jobs.
         jobs: one for each file.
-        files: that they are about.
-        out: folder for the summary, if there are several; None: none is wanted.
-        processes: how many; None: one a core.
-        scheduler: of a cluster, or None.
-        as_json: whether it is said to a machine, so that each line is an object.
+        files: the files.
+        out: folder for the summary of several files; None: no folder.
+        processes: number of processes; None: one a core.
+        scheduler: address of a cluster, or None.
+        as_json: print one JSON object a line, without a summary.
 
     Raises:
-        InputError: what a single file cannot be used for; workers that there are not.
-        typer.Exit: with 2, some of several files could not be used; which ones has been said.
+        InputError: the single file cannot be used, or there are no such workers.
+        typer.Exit: with 2, some of several files could not be used; each has its line.
     """
     if len(jobs) == 1 and scheduler is None:
         with task(f"{kind.doing} {files[0].name}"):
-            answer = kind.work(jobs[0])
-        say_text(answer.said)
-        write_remark(files[0], answer.remark)
-        if answer.not_written:
-            raise InputError(answer.not_written)
+            result = kind.work(jobs[0])
+        print_text(result.text)
+        write_remark(files[0], result.remark)
+        if result.not_written:
+            raise InputError(result.not_written)
         return
     rows: list[Row] = []
-    for file, outcome in zip(files, results(kind.work, jobs, kind.doing, processes, scheduler), strict=True):
+    for file, outcome in zip(files, run_in_order(kind.work, jobs, kind.doing, processes, scheduler), strict=True):
         if isinstance(outcome, Failed):
-            reason = _without_name(outcome.reason, file)
+            reason = _strip_name(outcome.reason, file)
             print_lines(f"reactorwatch: {file}: {reason}", err=True)
             rows.append(kind.failed(file, reason))
         else:
-            say_text(outcome.said)
+            print_text(outcome.text)
             write_remark(file, outcome.remark)
             if outcome.not_written:
                 print_lines(f"reactorwatch: {file}: {outcome.not_written}", err=True)
             rows.append(outcome.row)
     failed = sum(bool(row["error"]) for row in rows)
     if len(rows) > 1 and not as_json:
-        say_text(f"\n{kind.summary(rows)}")
+        print_text(f"\n{kind.summary(rows)}")
     if len(rows) > 1 and out is not None and failed < len(rows):
         write_summary(out, rows)
     if failed:
         raise typer.Exit(2)
 
 
-def results(
+def run_in_order(
     work: Callable[[Job], Result], jobs: Sequence[Job], doing: str, processes: int | None, scheduler: str | None
 ) -> Iterator[Result | Failed]:
-    """The outcomes of jobs in their order, under a bar that counts those that are done.
+    """Yield the results of jobs in their order, with a bar that counts the finished ones.
 
     Args:
         work: a plain function.
         jobs: its arguments.
-        doing: what is being done, for people.
-        processes: how many; None: one a core.
-        scheduler: of a cluster, or None.
+        doing: name of the work, for the bar.
+        processes: number of processes; None: one a core.
+        scheduler: address of a cluster, or None.
 
     Raises:
-        InputError: workers that there are not.
+        InputError: there are no such workers.
     """
-    done_by = workers(processes, scheduler)
+    executor = choose_executor(processes, scheduler)
     with bar(doing, len(jobs)) as advance:
 
         def counted() -> Iterator[tuple[int, Result | Failed]]:
             advance(0, f"{doing}, none of {len(jobs)} done")
-            for count, done in enumerate(done_by.outcomes(work, jobs), start=1):
+            for count, done in enumerate(executor.map_unordered(work, jobs), start=1):
                 advance(count, f"{doing}, {count} of {len(jobs)} done")
                 yield done
 
-        yield from in_order(counted())
+        yield from in_job_order(counted())
 
 
 def write_remark(file: Path, remark: str) -> None:
-    """Write a remark about a file to standard error, where it disturbs no machine that reads the answer."""
+    """Write a remark on a file to standard error, apart from the output."""
     if remark:
         print_lines(f"reactorwatch: {file}: remark: {remark}", err=True)
 
 
-def _without_name(reason: str, file: Path) -> str:
-    """Why a file cannot be used, without what it is called where the work was done."""
+def _strip_name(reason: str, file: Path) -> str:
+    """Remove the file's name, as the worker knows it, from the start of a reason."""
     for name in (str(file.absolute()), str(file), file.name):
         if name and reason.startswith(name) and reason[len(name) :].startswith((": ", ", ")):
             return reason[len(name) + 2 :]
@@ -197,21 +196,21 @@ def write_summary(folder: Path, rows: Sequence[Row]) -> None:
     Raises:
         InputError: the folder cannot be made or written to.
     """
-    said = {"files": len(rows), "failed": sum(bool(row["error"]) for row in rows), "results": list(rows)}
+    summary = {"files": len(rows), "failed": sum(bool(row["error"]) for row in rows), "results": list(rows)}
     table = io.StringIO()
     writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    content = {SUMMARY_OBJECT: msgspec.json.format(msgspec.json.encode(said), indent=2) + b"\n"}
+    content = {SUMMARY_OBJECT: msgspec.json.format(msgspec.json.encode(summary), indent=2) + b"\n"}
     content[SUMMARY_TABLE] = table.getvalue().encode()
-    with filling(folder, "--out") as temporary:
+    with fill_folder(folder, "--out") as temporary:
         for name, text in content.items():
-            with replacing(temporary / name) as file:
+            with atomic_write(temporary / name) as file:
                 file.write_bytes(text)
 
 
 def as_table(rows: Sequence[dict[str, str]]) -> str:
-    """Rows for people, in columns that are as wide as what is in them; an empty column is left out."""
+    """Format rows as a table; empty columns are left out."""
     rows = [{name: printable(cell) for name, cell in row.items()} for row in rows]
     names = [name for name in rows[0] if any(row[name] for row in rows)]
     widths = {name: max(len(name), *(len(row[name]) for row in rows)) for name in names}

@@ -1,7 +1,7 @@
-"""How the nodes of a run join their bus: all alike on loopback, or each as its role in a site.
+"""Bus settings of the nodes of a run: the same for all on loopback, or one for each role of a site.
 
-In a site each node shows a certificate of its own, so each has settings of its own, whose `[bus]` names it. The
-settings that are written down beside them are for who looks on, as the site's viewer.
+In a site each node has its own certificate, and so its own settings file with a `[bus]` table. The settings file beside
+them is for observers, with the site's role viewer.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from reactorwatch.cli.options import existing
+from reactorwatch.cli.options import check_input
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
@@ -22,29 +22,31 @@ from recorder.config import RecorderConfig
 
 VIEWER = "viewer"
 ROLES = {"plant": "plant", "monitor": "monitor", "diagnosis": "monitor", "recorder": "recorder", VIEWER: VIEWER}
-"""In a site, by node; and of who looks on."""
+"""Roles in a site, by node; and the role of an observer."""
 
-Joining = Mapping[str, BusConfig]
-"""How each node, and who looks on, joins the bus."""
+BusSettings = Mapping[str, BusConfig]
+"""Bus settings by node, and of an observer."""
 
 
-def joining(site: Path | None, plant: str, tables: dict[str, dict[str, Any]], endpoint: str | None = None) -> Joining:
-    """How each node joins.
+def load_bus_settings(
+    site: Path | None, plant: str, tables: dict[str, dict[str, Any]], endpoint: str | None = None
+) -> BusSettings:
+    """Load the bus settings of each node.
 
     Args:
-        site: its folder; None: there is none, and all join alike.
-        plant: of the nodes.
-        tables: of the settings file; where the bus is and who joins it are the site's to say.
+        site: folder of the site; None: all nodes have the same settings.
+        plant: name of the plant.
+        tables: tables of the settings file; a site's endpoint and certificates take precedence.
         endpoint: the router's address, or None.
 
     Raises:
-        InputError: settings that cannot be used, or a site that does not know the plant.
+        InputError: invalid settings, or a site without the plant.
     """
     if site is None:
         return dict.fromkeys(ROLES, section(BusConfig, "bus", tables, {"endpoint": endpoint}))
     if endpoint is not None:
         raise InputError(f"--endpoint {endpoint}: with --site the site says where its router is; leave it out")
-    found = {}
+    settings = {}
     for node, role in ROLES.items():
         file = site.absolute() / plant / role / SETTINGS
         if not file.is_file():
@@ -53,48 +55,48 @@ def joining(site: Path | None, plant: str, tables: dict[str, dict[str, Any]], en
                 f"make it with: reactorwatch certify {site} --plant {plant}"
             )
         of_site = read_settings(file).get("bus", {})
-        found[node] = section(BusConfig, "bus", {"bus": {**tables.get("bus", {}), **of_site}}, {})
-    return found
+        settings[node] = section(BusConfig, "bus", {"bus": {**tables.get("bus", {}), **of_site}}, {})
+    return settings
 
 
 @contextmanager
-def open_router(site: Path | None, join: Joining) -> Iterator[ZenohBus]:
-    """Be the router that the nodes join, while the context lasts; that of a site logs what it refuses.
+def open_router(site: Path | None, join: BusSettings) -> Iterator[ZenohBus]:
+    """Run the nodes' router while the context lasts; that of a site logs refusals.
 
     Raises:
-        InputError: nothing can listen at its address, or it has no settings.
+        InputError: its address cannot be listened at, or it has no settings.
     """
     with nullcontext() if site is None else log_refusals():
         if site is None:
             bus = router(join[VIEWER])
         else:
-            bus = router_from_file(existing(site.absolute() / ROUTER / ROUTER_SETTINGS))
+            bus = router_from_file(check_input(site.absolute() / ROUTER / ROUTER_SETTINGS))
         try:
             yield bus
         finally:
             bus.close()
 
 
-def heard_by(recorder: RecorderConfig, site: Path | None) -> RecorderConfig:
-    """The settings of a recorder that asks a site for no more than its plant: more would be refused as a whole."""
+def restrict_to_plant(recorder: RecorderConfig, site: Path | None) -> RecorderConfig:
+    """Restrict a recorder in a site to its plant: a wider subscription would be refused as a whole."""
     if site is None or recorder.key_expression != keys.EVERYTHING:
         return recorder
     return msgspec.structs.replace(recorder, key_expression=f"{keys.ROOT}/{recorder.plant}/**")
 
 
 def write_node_settings(
-    path: Path, tables: dict[str, msgspec.Struct], join: Joining, nodes: Sequence[str]
+    path: Path, tables: dict[str, msgspec.Struct], join: BusSettings, nodes: Sequence[str]
 ) -> dict[str, Path]:
-    """Write down the settings of a run.
+    """Write the settings files of a run.
 
     Args:
-        path: of those for who looks on, which are all nodes' where all join alike.
-        tables: all but the bus.
-        join: how each node joins.
-        nodes: that there are.
+        path: path of the observer's file, which all nodes with the same bus settings share.
+        tables: all tables but the bus.
+        join: bus settings by node.
+        nodes: names of the nodes.
 
     Returns:
-        The file of each.
+        The file of each node.
     """
     write_settings(path, {"bus": join[VIEWER], **tables})
     files = {}

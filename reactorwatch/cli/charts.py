@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Json
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.errors import InputError
 
 Shift = Annotated[float, typer.Option(help="Of the mean, in standard deviations; 0: the false alarms.")]
@@ -15,7 +15,7 @@ Dimension = Annotated[int, typer.Option(help="Number of signals.")]
 Weight = Annotated[float, typer.Option("--lambda", help="Weight of the newest sample.", show_default=False)]
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     charts = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
     arl = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -37,7 +37,7 @@ def shewhart(
     from reactorwatch.spc import run_length
 
     length = run_length.shewhart(shift, limit, _rules(rules), steady_state=steady_state)
-    _tell(length, as_json, chart="shewhart", rules=list(_rules(rules)), limit=limit, shift=shift)
+    _print_length(length, as_json, chart="shewhart", rules=list(_rules(rules)), limit=limit, shift=shift)
 
 
 def cusum(
@@ -53,7 +53,7 @@ def cusum(
     from reactorwatch.spc import run_length
 
     length = run_length.cusum(shift, k, h, headstart, one_sided=one_sided, steady_state=steady_state)
-    _tell(length, as_json, chart="cusum", k=k, h=h, headstart=headstart, shift=shift)
+    _print_length(length, as_json, chart="cusum", k=k, h=h, headstart=headstart, shift=shift)
 
 
 def ewma(
@@ -68,7 +68,7 @@ def ewma(
     from reactorwatch.spc import run_length
 
     length = run_length.ewma(shift, weight, limit, exact_limits=exact_limits, steady_state=steady_state)
-    _tell(length, as_json, chart="ewma", **{"lambda": weight}, limit=limit, shift=shift)
+    _print_length(length, as_json, chart="ewma", **{"lambda": weight}, limit=limit, shift=shift)
 
 
 def mewma(
@@ -83,7 +83,7 @@ def mewma(
     from reactorwatch.spc import run_length
 
     length = run_length.mewma(shift, dimension, weight, limit, steady_state=steady_state)
-    _tell(length, as_json, chart="mewma", dimension=dimension, **{"lambda": weight}, limit=limit, shift=shift)
+    _print_length(length, as_json, chart="mewma", dimension=dimension, **{"lambda": weight}, limit=limit, shift=shift)
 
 
 def t2(
@@ -96,7 +96,9 @@ def t2(
     """Hotelling's T2, known covariance; it has no memory, so its steady state is as any other."""
     from reactorwatch.spc import run_length
 
-    _tell(run_length.t2(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift)
+    _print_length(
+        run_length.t2(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift
+    )
 
 
 def design(
@@ -114,13 +116,13 @@ def design(
     if as_json:
         import msgspec
 
-        say(msgspec.json.encode(found).decode())
+        print_lines(msgspec.json.encode(found).decode())
         return
-    say(chart)
+    print_lines(chart)
     for name, value in found.parameters.items():
         text = ",".join(map(str, value)) if isinstance(value, list) else f"{value:.6g}"
-        say(f"  {name:<10} {text}")
-    say(f"false alarm every {found.arl0:g} samples; a shift of {found.shift:g} is seen after {found.arl:.4g}")
+        print_lines(f"  {name:<10} {text}")
+    print_lines(f"false alarm every {found.arl0:g} samples; a shift of {found.shift:g} is seen after {found.arl:.4g}")
 
 
 def _rules(text: str) -> tuple[int, ...]:
@@ -130,11 +132,11 @@ def _rules(text: str) -> tuple[int, ...]:
         raise InputError(f"--rules must be some of 1,2,3,4 with commas between, got {text!r}") from None
 
 
-def _tell(length: float, as_json: bool, **chart: object) -> None:
-    """The run length: one number, or one object with the chart's parameters."""
+def _print_length(length: float, as_json: bool, **chart: object) -> None:
+    """Print the run length: one number, or one object with the chart's parameters."""
     if not as_json:
-        say(f"{length:.8g}")
+        print_lines(f"{length:.8g}")
         return
     import msgspec
 
-    say(msgspec.json.encode({**chart, "arl": length}).decode())
+    print_lines(msgspec.json.encode({**chart, "arl": length}).decode())

@@ -1,4 +1,4 @@
-"""Asking a running node something, from the command line."""
+"""Client for commands to a running node."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,15 +10,15 @@ if TYPE_CHECKING:
 
     from reactorwatch.contract.messages_pb2 import CommandReply
 
-PATIENCE_S = 5.0
-"""For how long, if nobody says."""
+TIMEOUT_S = 5.0
+"""Default timeout."""
 
 
-class NoAnswerError(InputError):
-    """There is no such node."""
+class NoReplyError(InputError):
+    """No such node replied."""
 
 
-def ask(
+def send_command(
     node: str,
     config: Path | None,
     endpoint: str | None,
@@ -27,33 +27,33 @@ def ask(
     name: str,
     message: "Message",
 ) -> "CommandReply":
-    """A node's answer to a command.
+    """Send a command to a node and return its reply.
 
     Args:
-        node: `monitor`, `recorder` or `replay`, for what is said if none answers; and whose settings name the plant.
+        node: `monitor`, `recorder` or `replay`: the node named in errors, whose settings name the plant.
         config: settings file, or None.
         endpoint: the router's address, or None.
-        plant: its name; None: that of the settings, else `cstr`.
-        timeout_s: how long to wait.
-        name: of the command.
-        message: what it carries.
+        plant: name of the plant; None: that of the settings, else `cstr`.
+        timeout_s: seconds to wait for the router, and for the reply.
+        name: name of the command.
+        message: message of the command.
 
     Raises:
-        InputError: no router within the time, or the node refuses.
-        NoAnswerError: no such node within the time.
+        InputError: no router within the time, or the node refuses the command.
+        NoReplyError: no reply within the time.
     """
     import threading
 
-    from reactorwatch.cli.observer import begin
+    from reactorwatch.cli.observer import load_settings
     from reactorwatch.contract import keys
     from reactorwatch.contract.codec import Encoded, decode, encode_message
     from reactorwatch.contract.messages_pb2 import CommandReply
     from reactorwatch.runtime.bus_zenoh import connect
     from reactorwatch.runtime.event_loop import StopSignal
 
-    tables, bus_config = begin(config, endpoint)
+    tables, bus_config = load_settings(config, endpoint)
     try:
-        plant = keys.checked_plant(plant or str(tables.get(node, {}).get("plant") or "cstr"))
+        plant = keys.check_plant(plant or str(tables.get(node, {}).get("plant") or "cstr"))
     except ValueError as error:
         raise InputError(str(error)) from error
     stop = StopSignal()
@@ -66,14 +66,14 @@ def ask(
     if bus is None:
         raise InputError(f"no router at {bus_config.endpoint} within {timeout_s:g} s; is it running?")
     try:
-        answers = bus.ask(Encoded(keys.key(plant, keys.COMMAND, name), *encode_message(message)), timeout_s)
+        answers = bus.query(Encoded(keys.key(plant, keys.COMMAND, name), *encode_message(message)), timeout_s)
     finally:
         bus.close()
     replies = [decode(answer.payload, answer.encoding) for answer in answers]
     reply = next((item for item in replies if isinstance(item, CommandReply)), None)
     if reply is None:
-        refused = ", and may our certificate ask it?" if bus_config.ca is not None else "?"  # refusals are silent
-        raise NoAnswerError(f"no {node} of plant {plant!r} answered within {timeout_s:g} s; is it running{refused}")
+        refused = ", and may this certificate ask it?" if bus_config.ca is not None else "?"  # refusals are silent
+        raise NoReplyError(f"no {node} of plant {plant!r} answered within {timeout_s:g} s; is it running{refused}")
     if not reply.accepted:
         raise InputError(reply.text)
     return reply

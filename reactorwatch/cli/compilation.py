@@ -1,21 +1,20 @@
-"""`compile`: make the machine code that is otherwise made when it is first needed.
+"""`compile`: compile all numerical kernels ahead of their first call.
 
-Numerical kernels are compiled at their first call and kept on disk (`reactorwatch.codegen.numba_kernel`,
-`codegen.compiled_function`). On a new machine that call comes in the middle of a watch or of a diagnosis, and takes
-half a minute in all. So all that compiles is run here once, over a short simulated record: by `make setup`, by the
-images, or by hand.
+Kernels are compiled at their first call and cached on disk (`reactorwatch.codegen.numba_kernel`,
+`codegen.compiled_function`). On a new machine that call interrupts a monitor or a diagnosis, for half a minute in all.
+So all kernels run here once, over a short simulated record: by `make setup`, by the images, or by hand.
 """
 
 import typer
 
 ROWS = 600
-"""Of the record: a diagnosis takes some hundreds, and the monitor sees a fault after its training."""
+"""Rows of the record: enough for a diagnosis, and for a fault after the monitor's training."""
 
 FAULT = "coolant_flow:step:-0.1@30min"
 TRAINING_MIN = 15.0
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the command."""
     app.command("compile")(compile_kernels)
 

@@ -1,8 +1,7 @@
-"""`demo`: the whole chain once, at accelerated plant time with a fault in it, and what came of it in plain words.
+"""`demo`: run all nodes once, in accelerated plant time with a fault, and summarise the result.
 
-Real processes on a real router on loopback. Afterwards everything that is claimed is read from the recording: when the
-fault set in, which alarms came, that a back-test over the recording gives the same alarms, value for value, and what a
-diagnosis of it says.
+These are real processes on a real router on loopback. The summary is made from the recording: the onset of the fault,
+the alarms, a comparison with the alarms of a back-test, value for value, and a diagnosis.
 """
 
 import sys
@@ -10,11 +9,14 @@ import threading
 import time
 from pathlib import Path
 
-from monitor_node.config import MonitorConfig
-from monitor_node.replay import backtest
-from plant_node.config import PlantConfig
-from reactorwatch.cli.bus_settings import VIEWER, heard_by, joining, open_router, write_node_settings
-from reactorwatch.cli.printing import say, say_text
+from reactorwatch.cli.bus_settings import (
+    VIEWER,
+    load_bus_settings,
+    open_router,
+    restrict_to_plant,
+    write_node_settings,
+)
+from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.cli.processes import Processes, settings_text
 from reactorwatch.cli.progress import bar, task
 from reactorwatch.cli.read_record import messages
@@ -24,7 +26,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Fault, Sample
 from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
 from reactorwatch.runtime.bus_zenoh import ZenohBus
@@ -33,25 +35,29 @@ from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.terminal import printable_lines
+
+from monitor_node.config import MonitorConfig
+from monitor_node.replay import backtest
+from plant_node.config import PlantConfig
 from recorder.config import RecorderConfig
 
 PLANT = "demo"
 NODES = ("recorder", "monitor", "plant")
-"""In the order in which they are started."""
+"""Nodes in the order of their start."""
 START_WITHIN_S = 60.0
 DRAIN_WITHIN_S = 60.0
-LOOK_EVERY_S = 0.1
+POLL_S = 0.1
 SETTINGS_FILE = "settings.toml"
 DIAGNOSIS_FOLDER = "diagnosis"
-LINGER_S = 1.0  # silence after which the recorder, asked to stop last, takes everything as heard
+DRAIN_TIMEOUT_S = 1.0  # for the recorder, which is stopped last
 
 
-class Watch:
-    """Follows on the bus how far the plant has come, and how far the monitor has.
+class Progress:
+    """Progress of plant and monitor, observed on the bus.
 
     Args:
-        bus: of the run.
-        span_ns: from the first row of the run to its last.
+        bus: the bus of the run.
+        span_ns: time from the first row of the run to its last.
     """
 
     def __init__(self, bus: ZenohBus, span_ns: int) -> None:
@@ -59,26 +65,26 @@ class Watch:
         self._lock = threading.Lock()
         self._first_ns: int | None = None
         self._plant_ns = 0
-        self._judged_ns = 0
+        self._evaluated_ns = 0
         bus.subscribe(keys.key(PLANT, keys.SAMPLE, "T"), self._on_sample)
         bus.subscribe(keys.key(PLANT, keys.ESTIMATE, "T"), self._on_estimate)
 
     @property
     def started(self) -> bool:
-        """Whether a sample has come."""
+        """True once a sample has arrived."""
         return self._first_ns is not None
 
     @property
     def plant_min(self) -> float:
-        """How far the plant has come."""
+        """Plant time since the first sample, in minutes."""
         with self._lock:
             return 0.0 if self._first_ns is None else (self._plant_ns - self._first_ns) / MINUTE_NS
 
     @property
-    def all_judged(self) -> bool:
-        """Whether the monitor has judged the last row of the run."""
+    def all_evaluated(self) -> bool:
+        """True once the monitor has evaluated the last row of the run."""
         with self._lock:
-            return self._first_ns is not None and self._judged_ns >= self._first_ns + self._span_ns
+            return self._first_ns is not None and self._evaluated_ns >= self._first_ns + self._span_ns
 
     def _on_sample(self, message: Encoded) -> None:
         sample = decode(message.payload, message.encoding)
@@ -91,7 +97,7 @@ class Watch:
         estimate = decode(message.payload, message.encoding)
         assert isinstance(estimate, Estimate)
         with self._lock:
-            self._judged_ns = max(self._judged_ns, estimate.time_ns)
+            self._evaluated_ns = max(self._evaluated_ns, estimate.time_ns)
 
 
 def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: int, site: Path | None = None) -> int:
@@ -99,21 +105,22 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
 
     Args:
         out: folder to make; None: one named after the time.
-        duration_min: of plant time.
+        duration_min: minutes of plant time.
         speed: plant time over wall time.
-        fault: specification.
-        seed: of input and noise.
-        site: folder of certificates, whose router is run and whose roles the nodes take; None: all is plain.
+        fault: specification of the fault.
+        seed: seed of input and noise.
+        site: folder of a site, for its router and the nodes' certificates; None: without TLS.
 
     Returns:
-        0 if the alarm came after the fault and not before, and the back-test agreed; 1 if not; 130 if it was stopped.
+        0 if alarms were raised after the fault and not before, and the back-test agreed; 1 if not; 130 if it was
+        stopped.
 
     Raises:
-        InputError: arguments that cannot be used, or a node that failed.
+        InputError: invalid arguments, or a node that failed.
     """
     configure()
     specification = parse_fault(fault)
-    join = joining(site, PLANT, {}, free_endpoint() if site is None else None)
+    join = load_bus_settings(site, PLANT, {}, free_endpoint() if site is None else None)
     folder = _free_folder(out)
     recording = folder / f"{PLANT}.mcap"
     of_plant = {
@@ -128,15 +135,15 @@ def run(out: Path | None, duration_min: float, speed: float, fault: str, seed: i
     monitor = MonitorConfig(plant=PLANT)
     nodes = {"plant": plant, "monitor": monitor}
     about = {"seed": str(seed), "settings": settings_text({"bus": join[VIEWER], **nodes})}
-    recorder = RecorderConfig(plant=PLANT, out=str(recording), linger_s=LINGER_S, black_box_min=0.0, about=about)
+    recorder = RecorderConfig(plant=PLANT, out=str(recording), linger_s=DRAIN_TIMEOUT_S, black_box_min=0.0, about=about)
     with open_router(site, join) as bus:
         make_folder(folder, "--out")
-        tables = {**nodes, "recorder": heard_by(recorder, site)}
+        tables = {**nodes, "recorder": restrict_to_plant(recorder, site)}
         settings = write_node_settings(folder / SETTINGS_FILE, tables, join, NODES)
-        say(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
+        print_lines(f"to see it as it runs: reactorwatch view --web --config {folder / SETTINGS_FILE}", err=True)
         with stop_on_signals() as stop:
             if not _run_nodes(bus, stop, settings, folder, plant):
-                say(f"stopped; what was recorded until then is in {folder}", err=True)
+                print_lines(f"stopped; what was recorded until then is in {folder}", err=True)
                 return 130
     return _conclude(folder, recording, monitor, str(specification))
 
@@ -149,17 +156,17 @@ def _free_folder(out: Path | None) -> Path:
 
 
 def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folder: Path, plant: PlantConfig) -> bool:
-    """Run the nodes until the plant has come to its end; False if that was cut short by a signal."""
+    """Run the nodes until the plant has finished; returns False if a signal stopped it before."""
     woken = threading.Event()
-    stop.wakes(woken.set)
+    stop.call_on_set(woken.set)
     assert plant.rows is not None, "a demonstration has an end"
     duration_min = plant.rows * plant.period_min
-    watch = Watch(bus, to_time_ns((plant.rows - 1) * plant.period_min))
+    progress = Progress(bus, to_time_ns((plant.rows - 1) * plant.period_min))
     with Processes(settings, logs=folder) as processes, bar("starting the nodes", duration_min) as advance:
         for node in NODES:
             processes.start(node)
         started = time.monotonic()
-        while not woken.wait(LOOK_EVERY_S):
+        while not woken.wait(POLL_S):
             ended = processes.ended()
             failed = {node: code for node, code in ended.items() if code or node != "plant"}
             if failed:
@@ -167,21 +174,30 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folde
                 raise InputError(f"the {node} ended with code {code}; it says why in {folder / (node + '.log')}")
             if "plant" in ended:
                 break
-            if not watch.started and time.monotonic() - started > START_WITHIN_S:
+            if not progress.started and time.monotonic() - started > START_WITHIN_S:
                 raise InputError(f"no sample within {START_WITHIN_S:g} s of the start; see the .log files in {folder}")
-            advance(watch.plant_min, "starting the nodes" if not watch.started else "running the reactor")
+            advance(progress.plant_min, "starting the nodes" if not progress.started else "running the reactor")
         deadline = time.monotonic() + DRAIN_WITHIN_S
-        while not stop.is_set and not watch.all_judged and time.monotonic() < deadline:
-            woken.wait(LOOK_EVERY_S)
+        while not stop.is_set and not progress.all_evaluated and time.monotonic() < deadline:
+            woken.wait(POLL_S)
         processes.stop(("plant", "monitor", "recorder"))
     return not stop.is_set
 
 
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
-    """Diagnose the recording, draw it, read from it what happened, and write that down."""
-    from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, Asked, case_of, diagnosed, write_report
+    """Diagnose and draw the recording, and write the summary; returns the exit code."""
+    from reactorwatch.cli.diagnosis import (
+        DRAWING,
+        MODEL,
+        PAGE,
+        DiagnosisOptions,
+        load_case,
+        run_diagnosis,
+        write_report,
+    )
     from reactorwatch.diagnosis.report.words import verdict
     from reactorwatch.process import effects_of
+
     from recorder.columns.run_reader import stretches
     from recorder.dashboard.file import write_rrd
 
@@ -190,8 +206,8 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         first_ns, faults, alarms = _events(recording)
         again = backtest.run(messages(recording, PLANT), monitor)
     with task("diagnosing"):
-        case = case_of(recording, folder / DIAGNOSIS_FOLDER, Asked(plant=PLANT))
-        diagnosis, seconds = diagnosed(case)
+        case = load_case(recording, folder / DIAGNOSIS_FOLDER, DiagnosisOptions(plant=PLANT))
+        diagnosis, seconds = run_diagnosis(case)
         write_report(diagnosis, case, seconds)
     with task("drawing"):
         write_rrd(stretches(messages(recording, PLANT)), drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)
@@ -204,20 +220,21 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     before = [alarm for alarm in raised if onset_ns is None or alarm.time_ns < onset_ns]
     after = [alarm for alarm in raised if onset_ns is not None and alarm.time_ns >= onset_ns]
 
-    def at(time_ns: int) -> str:
+    def minutes(time_ns: int) -> str:
         return f"{to_minutes(time_ns, first_ns):.1f} min"
 
     lines = [
         "# What happened",
         "",
-        f"- Fault injected: `{fault}`, set in at {at(onset_ns)}."
+        f"- Fault injected: `{fault}`, set in at {minutes(onset_ns)}."
         if onset_ns is not None
         else f"- Fault `{fault}` never set in: the run was too short.",
     ]
     for alarm in after:
         late = (alarm.time_ns - (onset_ns or 0)) / MINUTE_NS
         lines.append(
-            f"- Alarm raised: `{alarm.alarm}` at {at(alarm.time_ns)}, {late:.1f} min after the fault: {alarm.text}."
+            f"- Alarm raised: `{alarm.alarm}` at {minutes(alarm.time_ns)}, {late:.1f} min after the fault: "
+            f"{alarm.text}."
         )
     if not after:
         lines.append("- No alarm was raised after the fault.")
@@ -227,7 +244,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         lines.append(f"- Suspect, {late:.1f} min after the fault: {suspects_text(last.suspects, first_ns)}.")
     lines.append(
         "- False alarms before the fault: "
-        + (", ".join(f"`{alarm.alarm}` at {at(alarm.time_ns)}" for alarm in before) or "none")
+        + (", ".join(f"`{alarm.alarm}` at {minutes(alarm.time_ns)}" for alarm in before) or "none")
         + f" ({again.expected_false_alarms:.2g} to be expected in the whole run)."
     )
     lines.append(f"- Diagnosis of the whole recording: {verdict(diagnosis, effects_of(case.model))}")
@@ -244,15 +261,15 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         "",
     ]
     text = printable_lines(lines)
-    say_text(text)
-    with replacing(folder / "summary.md") as temporary:
+    print_text(text)
+    with atomic_write(folder / "summary.md") as temporary:
         temporary.write_text(text, encoding="utf-8")
-    say(f"All of it is in {folder}")
+    print_lines(f"All of it is in {folder}")
     return 0 if after and not before and same else 1
 
 
 def _program(name: str) -> str:
-    """How a program that came with this installation is called from here."""
+    """Path of a program of this installation, relative to the working folder if it is below."""
     path = Path(sys.executable).with_name(name)
     folder = Path.cwd()
     return str(path.relative_to(folder) if path.is_relative_to(folder) else path)

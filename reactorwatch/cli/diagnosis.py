@@ -1,4 +1,4 @@
-"""What the simulation gets wrong of a record: read, checked, diagnosed, and written down as a report."""
+"""Read and check a record, diagnose the simulation against it, and write the report."""
 
 import time
 from dataclasses import dataclass, field
@@ -8,8 +8,8 @@ from typing import TypeAlias
 import msgspec
 import numpy as np
 
-from reactorwatch.cli.options import existing_recording
-from reactorwatch.cli.read_record import process_model, record, signals_of
+from reactorwatch.cli.options import check_recording
+from reactorwatch.cli.read_record import load_process_model, record, required_signals
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.parameter_priors import stated
 from reactorwatch.diagnosis.record_checks import run_of
@@ -17,20 +17,20 @@ from reactorwatch.diagnosis.report.machine import with_differences
 from reactorwatch.diagnosis.result import Diagnosis, Experiment
 from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.csv_file import write_csv
-from reactorwatch.records.folder import filling
+from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 
 PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "report.rrd"
-"""What a report is made of."""
+"""Files of a report."""
 
 PLANT = "cstr"
 """The process that the plant node simulates and the monitor watches."""
 
 EXPERIMENT = "experiment.csv"
-"""The proposed input, if there is one: it can drive a plant."""
+"""File of the proposed input, if there is one; it can drive a plant."""
 
 REPORT = (PAGE, OBJECT, MODEL, DRAWING, EXPERIMENT)
 """The files that a report writes or deletes in its folder."""
@@ -39,17 +39,17 @@ Limits: TypeAlias = dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is asked about all files alike, as it was given.
+class DiagnosisOptions:
+    """Options of a diagnosis, the same for all files.
 
     Attributes:
-        plant: in recordings.
-        columns: their names by signal.
+        plant: plant in recordings.
+        columns: names of columns by signal.
         model: file of an extended model; None: the nominal reactor.
-        uncertain: which parameters are known but to a standard deviation, as text; None: none.
+        uncertain: parameters with a standard deviation, as text; None: none.
         tolerance: differences that do not matter, by output.
-        limits: that an experiment keeps to, by signal.
-        as_json: whether it is to be said to a machine.
+        limits: lowest and highest values of an experiment, by signal.
+        as_json: format the result as JSON.
     """
 
     plant: str | None = None
@@ -66,11 +66,11 @@ class Case:
     """A record to be diagnosed.
 
     Attributes:
-        file: as it was named.
+        file: the file as named.
         measured: the record.
-        model: the simulation, its clock that of the record.
-        folder: for the report; None: none is wanted.
-        uncertain: parameters that are known but to a standard deviation.
+        model: the simulation, on the clock of the record.
+        folder: folder for the report; None: no report.
+        uncertain: standard deviations of uncertain parameters, by name.
     """
 
     file: Path
@@ -80,36 +80,36 @@ class Case:
     uncertain: dict[str, float] = field(default_factory=dict)
 
 
-def case_of(file: Path, folder: Path | None, asked: Asked, at: Path | None = None) -> Case:
-    """The record in a file, read and checked, and the simulation of it.
+def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path | None = None) -> Case:
+    """Read and check the record in a file, and load its model.
 
     Args:
-        file: as it was named.
-        folder: for the report; None: none is wanted.
-        asked: about it.
-        at: where the file is; None: where its name says.
+        file: the file as named.
+        folder: folder for the report; None: no report.
+        asked: options of the diagnosis.
+        at: path of the file; None: `file`.
 
     Raises:
-        InputError: the file cannot be read or diagnosed, or what is uncertain is no parameter.
+        InputError: the file cannot be read or diagnosed, or an uncertain parameter does not exist.
     """
-    measured = record(existing_recording(at or file), asked.plant, asked.columns, signals_of(asked.model))
-    process = process_model(asked.model, measured)
+    measured = record(check_recording(at or file), asked.plant, asked.columns, required_signals(asked.model))
+    process = load_process_model(asked.model, measured)
     known = stated(asked.uncertain, process) if asked.uncertain is not None else {}
     run_of(measured, process)
     return Case(file, measured, process, folder, known)
 
 
-def diagnosed(
+def run_diagnosis(
     case: Case, tolerance: dict[str, float] | None = None, limits: Limits | None = None
 ) -> tuple[Diagnosis, float]:
-    """The diagnosis of a record and the seconds that it took.
+    """Diagnose a record; returns the diagnosis and the seconds that it took.
 
     Raises:
-        InputError: a tolerance or limits that cannot be.
+        InputError: invalid tolerances or limits.
     """
-    began = time.monotonic()
+    started = time.monotonic()
     diagnosis = diagnose(case.measured, case.model, None, tolerance, case.uncertain, limits)
-    return diagnosis, time.monotonic() - began
+    return diagnosis, time.monotonic() - started
 
 
 def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
@@ -118,7 +118,7 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     Raises:
         InputError: the folder cannot be made or written to.
     """
-    # Imported where a report is wanted: Rerun and Jinja take longer to import than most records to diagnose.
+    # Imported only for a report: Rerun and Jinja take longer to import than most records to diagnose.
     from reactorwatch.cli.diagnosis_drawing import write_drawing
     from reactorwatch.diagnosis.report.page import as_page
 
@@ -130,16 +130,16 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     plain = msgspec.json.format(
         msgspec.json.encode(with_differences(diagnosis, str(case.file), seconds, case.measured.zero)), indent=2
     )
-    with filling(folder, "--out") as temporary:
+    with fill_folder(folder, "--out") as temporary:
         write_extended_model(temporary / MODEL, diagnosis.extended_model)
         if diagnosis.experiment is not None:
             _write_experiment(diagnosis.experiment, temporary / EXPERIMENT)
         write_drawing(diagnosis, case.model, case.measured, temporary / DRAWING)
         for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):
-            with replacing(temporary / name) as file:
+            with atomic_write(temporary / name) as file:
                 file.write_bytes(content)
     if diagnosis.experiment is None:
-        (folder / EXPERIMENT).unlink(missing_ok=True)  # of an earlier report
+        (folder / EXPERIMENT).unlink(missing_ok=True)  # from an earlier report
 
 
 def _write_experiment(experiment: Experiment, path: Path) -> None:

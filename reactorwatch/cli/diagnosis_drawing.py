@@ -1,4 +1,4 @@
-"""A diagnosis as views of a dashboard: what was measured and what either model makes of it, on one timeline."""
+"""A diagnosis as views of a dashboard: measurements and both simulations on one timeline."""
 
 from pathlib import Path
 
@@ -17,10 +17,10 @@ def write_drawing(diagnosis: Diagnosis, model: ProcessModel, measured: Record, p
     """Write a Rerun file.
 
     Args:
-        diagnosis: with its curves.
-        model: that was diagnosed.
+        diagnosis: the diagnosis with its curves.
+        model: the diagnosed model.
         measured: the record.
-        path: of the file.
+        path: path of the file.
 
     Raises:
         InputError: the folder does not exist or cannot be written to.

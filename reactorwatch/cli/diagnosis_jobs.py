@@ -1,6 +1,6 @@
-"""`diagnose`: each file is a job of its own, read, diagnosed, and its report written; and all of them a summary.
+"""`diagnose`: one job for each file: read, diagnose, write the report; and a summary of several files.
 
-What is wrong with the options, and not with a file, is told before the first.
+Errors in the options, not in a file, are raised before the first job.
 """
 
 from collections.abc import Sequence
@@ -9,8 +9,17 @@ from pathlib import Path
 
 import msgspec
 
-from reactorwatch.cli.batch import SUMMARY, Answer, Kind, Row, as_table
-from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, REPORT, Asked, Case, case_of, diagnosed, write_report
+from reactorwatch.cli.batch import SUMMARY, JobKind, JobResult, Row, as_table
+from reactorwatch.cli.diagnosis import (
+    EXPERIMENT,
+    PAGE,
+    REPORT,
+    Case,
+    DiagnosisOptions,
+    load_case,
+    run_diagnosis,
+    write_report,
+)
 from reactorwatch.diagnosis.experiment.constraints import checked_limits
 from reactorwatch.diagnosis.parameter_priors import stated
 from reactorwatch.diagnosis.practical_significance import checked_tolerance
@@ -20,7 +29,7 @@ from reactorwatch.diagnosis.result import Cause, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.records.output import checked_folder
+from reactorwatch.records.output import check_output_folder
 from reactorwatch.runtime.model_file import read_extended_model
 
 
@@ -29,83 +38,85 @@ class Job:
     """A file to be diagnosed.
 
     Attributes:
-        file: as it was named.
-        at: where it is.
-        folder: for the report; None: none is wanted.
-        asked: about it.
-        as_json: whether it is to be said to a machine.
+        file: the file as named.
+        at: path of the file for the worker.
+        folder: folder for the report; None: no report.
+        asked: options of the diagnosis.
+        as_json: format the result as JSON.
     """
 
     file: Path
     at: Path
     folder: Path | None
-    asked: Asked
+    asked: DiagnosisOptions
     as_json: bool
 
 
-def jobs_of(files: Sequence[Path], out: Path | None, asked: Asked, *, as_json: bool, elsewhere: bool) -> list[Job]:
-    """A job for each file.
+def make_jobs(
+    files: Sequence[Path], out: Path | None, asked: DiagnosisOptions, *, as_json: bool, elsewhere: bool
+) -> list[Job]:
+    """Make a job for each file.
 
     Args:
         files: .csv, .mcap, or folders of recordings.
-        out: folder for the report; of several files, each gets a folder in it.
-        asked: about all of them.
-        as_json: whether it is to be said to a machine.
-        elsewhere: whether the jobs are done by who sees the same files, but from another folder.
+        out: folder for the report; each of several files gets a folder in it.
+        asked: options of the diagnosis.
+        as_json: format the results as JSON.
+        elsewhere: use absolute paths, for workers with another working folder.
 
     Raises:
-        InputError: what is asked cannot be meant, of whatever file.
+        InputError: invalid options.
     """
     if len(files) > 1 or elsewhere:
         _check(asked)
-    places = list(files)
+    paths = list(files)
     if elsewhere:
-        places, out = [file.absolute() for file in files], out and out.absolute()
+        paths, out = [file.absolute() for file in files], out and out.absolute()
         asked = replace(asked, model=asked.model and asked.model.absolute())
     folders = _folders(files, out)
-    return [Job(*item, asked, as_json) for item in zip(files, places, folders, strict=True)]
+    return [Job(*item, asked, as_json) for item in zip(files, paths, folders, strict=True)]
 
 
 def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, force: bool) -> None:
     """Check that the reports may be written.
 
     Args:
-        files: that are diagnosed.
-        out: as for `jobs_of`.
+        files: files to be diagnosed.
+        out: as for `make_jobs`.
         model: file of an extended model, or None.
-        force: as for `checked_output`.
+        force: as for `check_output_file`.
 
     Raises:
-        InputError: as `checked_folder`.
+        InputError: as `check_output_folder`.
     """
     if out is None:
         return
     sources = (*files, model)
-    checked_folder(out, SUMMARY if len(files) > 1 else (), sources, force=force)
+    check_output_folder(out, SUMMARY if len(files) > 1 else (), sources, force=force)
     for folder in _folders(files, out):
         assert folder is not None
-        checked_folder(folder, REPORT, sources, force=force)
+        check_output_folder(folder, REPORT, sources, force=force)
 
 
-def answer(job: Job) -> Answer:
-    """Diagnose a file, and write its report if there is a folder for it; the answer says where that failed.
+def run_job(job: Job) -> JobResult:
+    """Diagnose a file, and write its report if there is a folder for it.
 
     Raises:
-        InputError: the file cannot be read or diagnosed, or what is asked cannot be meant.
+        InputError: the file cannot be read or diagnosed, or the options are invalid.
     """
-    case = case_of(job.file, job.folder, job.asked, job.at)
-    diagnosis, seconds = diagnosed(case, job.asked.tolerance, job.asked.limits)
+    case = load_case(job.file, job.folder, job.asked, job.at)
+    diagnosis, seconds = run_diagnosis(case, job.asked.tolerance, job.asked.limits)
     not_written = ""
     if case.folder is not None:
         try:
             write_report(diagnosis, case, seconds)
         except InputError as error:
             case, not_written = replace(case, folder=None), str(error)
-    said = _said(case, diagnosis, seconds, as_json=job.as_json)
-    return Answer(said, _row(job.file, diagnosis, seconds) | {"error": not_written or None}, not_written=not_written)
+    text = _text(case, diagnosis, seconds, as_json=job.as_json)
+    return JobResult(text, _row(job.file, diagnosis, seconds) | {"error": not_written or None}, not_written=not_written)
 
 
-def _check(asked: Asked) -> None:
+def _check(asked: DiagnosisOptions) -> None:
     model = cstr() if asked.model is None else read_extended_model(asked.model).build()
     if asked.uncertain is not None:
         stated(asked.uncertain, model)
@@ -113,24 +124,24 @@ def _check(asked: Asked) -> None:
     checked_tolerance(model, asked.tolerance)
 
 
-def _said(case: Case, diagnosis: Diagnosis, seconds: float, *, as_json: bool) -> str:
+def _text(case: Case, diagnosis: Diagnosis, seconds: float, *, as_json: bool) -> str:
     if as_json:
         return msgspec.json.encode(as_object(diagnosis, str(case.file), seconds, case.measured.zero)).decode()
-    said = as_text(diagnosis, str(case.file), effects_of(case.model))
+    text = as_text(diagnosis, str(case.file), effects_of(case.model))
     if case.folder is None:
-        return said
+        return text
     if diagnosis.experiment is not None:
-        said += f"\n  input       {case.folder / EXPERIMENT}"
-    return f"{said}\n  report      {case.folder / PAGE}"
+        text += f"\n  input       {case.folder / EXPERIMENT}"
+    return f"{text}\n  report      {case.folder / PAGE}"
 
 
 _COLUMNS = ("samples", "span_min", "seconds", "verdict", "causes", "location", "significant", "practical", "delta_bic")
 
 
 def _row(file: Path, diagnosis: Diagnosis, seconds: float) -> Row:
-    said = as_object(diagnosis, str(file), seconds)
-    said |= {"causes": " + ".join(map(_written, diagnosis.causes)), "delta_bic": said["gain"]["delta_bic"]}
-    return {"file": str(file), **{name: said[name] for name in _COLUMNS}, "error": None}
+    report = as_object(diagnosis, str(file), seconds)
+    report |= {"causes": " + ".join(map(_written, diagnosis.causes)), "delta_bic": report["gain"]["delta_bic"]}
+    return {"file": str(file), **{name: report[name] for name in _COLUMNS}, "error": None}
 
 
 def _failed(file: Path, reason: str) -> Row:
@@ -138,14 +149,14 @@ def _failed(file: Path, reason: str) -> Row:
 
 
 def _written(cause: Cause) -> str:
-    """As a fault is written: `coolant_flow:step:-0.0497@312min`."""
+    """Format a cause as a fault: `coolant_flow:step:-0.0497@312min`."""
     size, onset = cause.parameters["size"], cause.parameters.get("onset")
     begin = "" if onset is None else f"@{onset.value:.4g}min"
     return f"{cause.cause}:{cause.profile}:{size.value:.3g}{begin}"
 
 
 def _folders(files: Sequence[Path], out: Path | None) -> list[Path | None]:
-    """One for each file: named after it, if there are several."""
+    """Folders of the reports, one for each file; those of several files are named after them."""
     if out is None or len(files) == 1:
         return [out] * len(files)
     names: dict[str, int] = {}
@@ -161,7 +172,7 @@ def _folders(files: Sequence[Path], out: Path | None) -> list[Path | None]:
 
 
 def _summary(rows: Sequence[Row]) -> str:
-    """The summary for people: a line for each file, and how many there are of each verdict."""
+    """Summary table: a line for each file, and the count of each verdict."""
     lines = [
         {
             "file": row["file"],
@@ -178,4 +189,4 @@ def _summary(rows: Sequence[Row]) -> str:
     return f"{as_table(lines)}\n\n{len(rows)} files: {counts}"
 
 
-DIAGNOSING = Kind("diagnosing", answer, _failed, _summary)
+DIAGNOSIS = JobKind("diagnosing", run_job, _failed, _summary)

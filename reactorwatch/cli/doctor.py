@@ -1,8 +1,8 @@
-"""`doctor`: what is wrong with a deployment, seen from this machine with these settings.
+"""`doctor`: checks of a deployment from this machine with these settings.
 
-What a router refuses it refuses in silence, so a node that may not publish looks like one that has nothing to say.
-The doctor therefore says something and listens for it by a second session of the same certificate: below `@doctor`,
-where the same role may publish the same kinds, and no node listens.
+A router refuses messages silently, so a node without the right to publish looks like one with nothing to publish. The
+doctor therefore publishes a message and receives it in a second session of the same certificate: below `@doctor`, where
+the same role may publish the same kinds, and no node subscribes.
 """
 
 import shutil
@@ -24,23 +24,23 @@ from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.security.acl import Role, kinds_of, role_of
-from reactorwatch.runtime.security.certificates import common_name_of, read_certificate, read_key
+from reactorwatch.runtime.security.acl import Role, kinds_of, parse_common_name
+from reactorwatch.runtime.security.certificates import read_certificate, read_common_name, read_key
 
 RENEW_DAYS = 30
-LARGEST_OFFSET_S = 1.0
-SAY_AGAIN_S = 0.2
+MAX_OFFSET_S = 1.0
+REPEAT_S = 0.2
 NODES = ("plant", "monitor", "recorder")
 MB = 1_000_000
 
 
 class Finding(NamedTuple):
-    """What one check found.
+    """Result of one check.
 
     Attributes:
-        check: in a word or two.
-        found: what is so.
-        cure: what to do; empty if nothing is wrong.
+        check: name of the check.
+        found: the result.
+        cure: the action to take; empty if nothing is wrong.
     """
 
     check: str
@@ -48,24 +48,24 @@ class Finding(NamedTuple):
     cure: str = ""
 
 
-def examine(
+def run_checks(
     config: BusConfig, plant: str, folder: Path, room_mb: float, timeout_s: float, now: datetime
 ) -> Iterator[Finding]:
-    """Check a deployment, one thing after the other; what cannot be checked without a router is left out without one.
+    """Run the checks of a deployment; those that need a router are skipped without one.
 
     Args:
-        config: how the bus is joined.
-        plant: the plant's name.
-        folder: where recordings go.
-        room_mb: what they need there.
-        timeout_s: how long to listen for nodes.
+        config: connection to the bus.
+        plant: name of the plant.
+        folder: folder of the recordings.
+        room_mb: space that recordings need there.
+        timeout_s: seconds to wait for nodes.
         now: the time.
 
     Raises:
-        InputError: a certificate or key that cannot be read.
+        InputError: a certificate or key cannot be read.
     """
-    yield from _certificate(config, plant, now)
-    yield _disk(folder, room_mb)
+    yield from _check_certificate(config, plant, now)
+    yield _check_disk(folder, room_mb)
     try:
         bus = connect_now(config)
     except ConnectionError as error:
@@ -76,13 +76,13 @@ def examine(
         return
     try:
         yield Finding("router", f"lets us in at {config.endpoint}")
-        yield from _heard(bus, config, plant, timeout_s)
-        yield from _nodes(bus, plant, timeout_s)
+        yield from _check_publishing(bus, config, plant, timeout_s)
+        yield from _check_nodes(bus, plant, timeout_s)
     finally:
         bus.close()
 
 
-def _certificate(config: BusConfig, plant: str, now: datetime) -> Iterator[Finding]:
+def _check_certificate(config: BusConfig, plant: str, now: datetime) -> Iterator[Finding]:
     if config.ca is None or config.certificate is None or config.key is None:
         if _is_loopback(config.endpoint):
             yield Finding("certificate", "none, and the bus is on this machine's loopback only")
@@ -91,17 +91,17 @@ def _certificate(config: BusConfig, plant: str, now: datetime) -> Iterator[Findi
             yield Finding("certificate", f"none: whoever reaches {config.endpoint} may publish and command", cure)
         return
     own, ca = read_certificate(Path(config.certificate)), read_certificate(Path(config.ca))
-    name = common_name_of(own)
+    name = read_common_name(own)
     renew = "renew it: `reactorwatch certify SITE --renew 30`, and copy the new folder"
     for what, certificate in (("certificate", own), ("authority", ca)):
-        left = certificate.not_valid_after_utc - now
-        until = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC, {left.days} days"
-        who = common_name_of(certificate)
+        remaining = certificate.not_valid_after_utc - now
+        until = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC, {remaining.days} days"
+        who = read_common_name(certificate)
         if now < certificate.not_valid_before_utc:
             begin = f"{certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC"
-            yield Finding(what, f"{who}: not valid before {begin}", "set this machine's clock, or make it anew")
-        elif left.days < RENEW_DAYS:
-            passed = left.total_seconds() <= 0
+            yield Finding(what, f"{who}: not valid before {begin}", "set this machine's clock, or make it again")
+        elif remaining.days < RENEW_DAYS:
+            passed = remaining.total_seconds() <= 0
             yield Finding(what, f"{who}: expired" if passed else f"{who}: {until}", renew)
         else:
             yield Finding(what, f"{who}: {until}")
@@ -109,19 +109,21 @@ def _certificate(config: BusConfig, plant: str, now: datetime) -> Iterator[Findi
     try:
         own.verify_directly_issued_by(ca)
     except (ValueError, TypeError, InvalidSignature):
-        yield Finding("identity", f"{name} is not signed by the authority in {config.ca}", "copy its whole folder anew")
+        yield Finding(
+            "identity", f"{name} is not signed by the authority in {config.ca}", "copy its whole folder again"
+        )
     if read_key(key_file).public_key() != own.public_key():
-        yield Finding("identity", f"{config.key} is not the key of {config.certificate}", "copy its whole folder anew")
+        yield Finding("identity", f"{config.key} is not the key of {config.certificate}", "copy its whole folder again")
     if stat.S_IMODE(key_file.stat().st_mode) & 0o077:
         yield Finding("private key", f"{key_file} can be read by others", f"chmod 600 {key_file}")
-    holder = role_of(name)
+    holder = parse_common_name(name)
     if holder is None or holder[0] != plant:
         cure = f"use a certificate of {plant}, or name its plant by --plant"
-        yield Finding("identity", f"{name or 'nobody'}: is of no role of plant {plant}", cure)
+        yield Finding("identity", f"{name or 'nobody'}: has no role of plant {plant}", cure)
 
 
-def _disk(folder: Path, room_mb: float) -> Finding:
-    while not folder.exists() and folder != folder.parent:  # it is made when it is needed
+def _check_disk(folder: Path, room_mb: float) -> Finding:
+    while not folder.exists() and folder != folder.parent:  # it is made when needed
         folder = folder.parent
     free_mb = shutil.disk_usage(folder).free / MB
     found = f"{free_mb:,.0f} MB free at {folder.resolve()}"
@@ -130,7 +132,7 @@ def _disk(folder: Path, room_mb: float) -> Finding:
     return Finding("disk", found)
 
 
-def _heard(bus: ZenohBus, config: BusConfig, plant: str, timeout_s: float) -> Iterator[Finding]:
+def _check_publishing(bus: ZenohBus, config: BusConfig, plant: str, timeout_s: float) -> Iterator[Finding]:
     role = _role(config)
     kinds = (keys.SAMPLE,) if role is None else kinds_of(role)
     if not kinds:
@@ -138,58 +140,58 @@ def _heard(bus: ZenohBus, config: BusConfig, plant: str, timeout_s: float) -> It
         return
     speaker = connect_now(config)
     try:
-        deaf = [kind for kind in kinds if not _is_heard(speaker, bus, plant, kind, timeout_s)]
+        refused = [kind for kind in kinds if not _is_received(speaker, bus, plant, kind, timeout_s)]
     finally:
         speaker.close()
-    if deaf:
+    if refused:
         cure = "its rules know no such holder: call `certify` for the plant, and start the router with its router.json5"
-        yield Finding("heard", f"what we publish does not come through: {', '.join(deaf)}", cure)
+        yield Finding("heard", f"what we publish does not come through: {', '.join(refused)}", cure)
     else:
         yield Finding("heard", f"what we publish comes through: {', '.join(kinds)}")
 
 
-def _is_heard(speaker: ZenohBus, listener: ZenohBus, plant: str, kind: str, timeout_s: float) -> bool:
+def _is_received(speaker: ZenohBus, listener: ZenohBus, plant: str, kind: str, timeout_s: float) -> bool:
     heard = threading.Event()
     proof = Encoded(keys.key(plant, kind, "@doctor/proof"), b"heard", "text/plain")
     listener.subscribe(proof.key, lambda _: heard.set())
     until = time.monotonic() + timeout_s
     while not heard.is_set() and time.monotonic() < until:
         speaker.publish(proof)
-        heard.wait(SAY_AGAIN_S)
+        heard.wait(REPEAT_S)
     return heard.is_set()
 
 
 def _role(config: BusConfig) -> Role | None:
     if config.certificate is None:
         return None
-    holder = role_of(common_name_of(read_certificate(Path(config.certificate))))
+    holder = parse_common_name(read_common_name(read_certificate(Path(config.certificate))))
     return holder[1] if holder is not None else None
 
 
-class _Listening:
-    """Who says that he is alive, and what each says of himself, with how far his clock is ahead of ours in seconds.
+class _NodeListener:
+    """Subscriber to the nodes' tokens and health, with the offset of each clock from this machine's in seconds.
 
-    What a publisher remembers is a minute old, so only what is published from now on counts. A message that crossed a
-    busy network comes late and makes a clock seem behind. So of two messages the later clock is the truer, and a clock
-    behind by what a message may be late by is listened to until a message says better, or to the end.
+    Cached messages may be a minute old, so only live ones count. A delayed message makes a clock seem behind, so the
+    largest offset is the best estimate. A clock behind by no more than a message's delay is observed further, until a
+    better message arrives or the time is over.
     """
 
     def __init__(self, bus: ZenohBus, plant: str, timeout_s: float) -> None:
         self._timeout_s = timeout_s
         self.alive: set[str] = set()
-        self.said: dict[str, tuple[Health, float]] = {}
+        self.health: dict[str, tuple[Health, float]] = {}
         self.monitors = OtherMonitors("", lambda: ())
-        self._settled: set[str] = set()
+        self._done: set[str] = set()
         self._changed = threading.Condition()
-        bus.watch_alive(keys.all_of(plant, keys.ALIVE), self._on_token)
+        bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), self._on_token)
         for tokens in (keys.monitor_token(plant, "*"), keys.FLEET_TOKENS):
-            bus.watch_alive(tokens, self._on_monitor)
-        bus.subscribe_live(keys.key(plant, keys.HEALTH, "*"), self._on_health)
+            bus.subscribe_liveliness(tokens, self._on_monitor)
+        bus.subscribe_uncached(keys.key(plant, keys.HEALTH, "*"), self._on_health)
 
     def wait(self) -> None:
-        """Until all who are expected have spoken, and their clocks are known."""
+        """Wait until all expected nodes have published their health, and their offsets are known."""
         with self._changed:
-            self._changed.wait_for(lambda: set(NODES) <= self._settled & self.alive, self._timeout_s)
+            self._changed.wait_for(lambda: set(NODES) <= self._done & self.alive, self._timeout_s)
 
     def _on_token(self, key: str, is_alive: bool) -> None:
         topic = keys.parse(key)
@@ -211,43 +213,43 @@ class _Listening:
         if topic is not None and isinstance(health, Health):
             with self._changed:
                 offset_s = (health.time_ns - message.received_ns) / 1e9
-                before = self.said.get(topic.name)
+                before = self.health.get(topic.name)
                 if before is not None:
                     offset_s = max(offset_s, before[1])
-                if offset_s >= -LARGEST_OFFSET_S or (before is not None and offset_s < -self._timeout_s):
-                    self._settled.add(topic.name)
-                self.said[topic.name] = health, offset_s
+                if offset_s >= -MAX_OFFSET_S or (before is not None and offset_s < -self._timeout_s):
+                    self._done.add(topic.name)
+                self.health[topic.name] = health, offset_s
                 self._changed.notify_all()
 
 
-def _nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Finding]:
-    listening = _Listening(bus, plant, timeout_s)
-    listening.wait()
-    alive, said = set(listening.alive), dict(listening.said)
+def _check_nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Finding]:
+    listener = _NodeListener(bus, plant, timeout_s)
+    listener.wait()
+    alive, reports = set(listener.alive), dict(listener.health)
     expected = [node for node in NODES if node != "plant" or "replay" not in alive]
     for node in (*expected, *sorted(alive - set(expected))):
         if node not in alive:
             cure = f"start it, and call doctor with the settings of {node} if it is running"
             yield Finding(node, f"is not there on {plant}", cure)
-        elif node not in said:
+        elif node not in reports:
             if node not in NODES:
-                yield Finding(node, "is alive")  # a replay, and who diagnoses, say nothing of themselves
+                yield Finding(node, "is alive")  # a replay and the diagnosis node publish no health
             else:
                 cure = "call doctor with its settings; or listen for longer than its health_period_s by --timeout"
                 yield Finding(node, f"is alive, and says nothing of itself within {timeout_s:g} s", cure)
         else:
-            yield _node(node, *said[node])
-    if (monitors := listening.monitors.count(plant)) > 1:
+            yield _check_node(node, *reports[node])
+    if (monitors := listener.monitors.count(plant)) > 1:
         found = f"{monitors} of them watch {plant}: every alarm is raised as often"
         yield Finding("monitors", found, "stop all but one; for a stand-by, start both with the same --plants")
 
 
-def _node(node: str, health: Health, offset_s: float) -> Finding:
+def _check_node(node: str, health: Health, offset_s: float) -> Finding:
     found = f"{health.phase}, version {health.version}, its clock {offset_s:+.3f} s from ours"
     cures = []
     if health.version != __version__:
         cures.append(f"install the same version as here, {__version__}")
-    if abs(offset_s) > LARGEST_OFFSET_S:
+    if abs(offset_s) > MAX_OFFSET_S:
         cures.append("have both machines' clocks set by NTP, as with chrony")
     return Finding(node, found, "; ".join(cures))
 

@@ -1,4 +1,4 @@
-"""Files into other files: `import`, `export`, `dashboard`."""
+"""Conversion of files: `import`, `export`, `dashboard`."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Force, Plant, columns, existing, existing_recording, output_file
-from reactorwatch.cli.printing import say, say_text
+from reactorwatch.cli.options import Columns, Force, Plant, check_input, check_output, check_recording, parse_columns
+from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.errors import InputError
-from reactorwatch.records.output import checked_folder
+from reactorwatch.records.output import check_output_folder
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("dashboard")(dashboard)
     app.command("import")(import_csv)
@@ -43,34 +43,34 @@ def dashboard(
     """Draw a recording into a Rerun file, without a screen."""
     from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import tape
+    from reactorwatch.cli.read_record import open_messages
     from recorder.columns.run_reader import stretches
     from recorder.dashboard.file import write_rrd
     from recorder.dashboard.picture import picture_names, render_tabs
 
     drawn = diagnosis / DRAWING if diagnosis is not None else None
-    out = output_file(out, ".rrd", (file, drawn), force=force)
+    out = check_output(out, ".rrd", (file, drawn), force=force)
     if drawn is not None and not drawn.is_file():
         raise InputError(f"--diagnosis {diagnosis}: holds no {DRAWING}; it must be the folder that diagnose -o wrote")
     if png is not None:
-        checked_folder(png, picture_names(), (file,), option="--png", force=force)
+        check_output_folder(png, picture_names(), (file,), option="--png", force=force)
     with task(f"drawing {file.name}"):
-        recording = tape(existing_recording(file), plant)
+        recording = open_messages(check_recording(file), plant)
         run = stretches(recording.messages, counted_from_ns=recording.zero_ns)
         write_rrd(_measured(run, file), out, diagnosis=drawn)
-    say(f"wrote {out}")
+    print_lines(f"wrote {out}")
     if png is not None:
         with task("rendering"):
             pictures = render_tabs(out, png)
         for picture in pictures:
-            say(f"wrote {picture}")
+            print_lines(f"wrote {picture}")
 
 
 def _measured(runs: "Iterable[Run]", file: Path) -> "Iterator[Run]":
-    """The stretches of a run as they come.
+    """Yield the segments of a run.
 
     Raises:
-        InputError: at the end, in none of them anything was measured.
+        InputError: at the end, if no segment holds a measured value.
     """
     import numpy as np
 
@@ -93,10 +93,10 @@ def import_csv(
     from reactorwatch.cli.progress import task
     from recorder.tools.convert import import_csv as convert
 
-    out = output_file(out, ".mcap", (file,), force=force)
+    out = check_output(out, ".mcap", (file,), force=force)
     with task(f"importing {file.name}"):
-        record = convert(existing(file), out, plant or "cstr", columns(column))
-    say_text(_written(out, record))
+        record = convert(check_input(file), out, plant or "cstr", parse_columns(column))
+    print_text(_written(out, record))
 
 
 def export_csv(
@@ -109,10 +109,10 @@ def export_csv(
     from reactorwatch.cli.progress import task
     from recorder.tools.convert import export_csv as convert
 
-    out = output_file(out, ".csv", (file,), force=force)
+    out = check_output(out, ".csv", (file,), force=force)
     with task(f"exporting {file.name}"):
-        record = convert(existing_recording(file), out, plant)
-    say_text(_written(out, record))
+        record = convert(check_recording(file), out, plant)
+    print_text(_written(out, record))
 
 
 def _written(out: Path, record: "Record") -> str:

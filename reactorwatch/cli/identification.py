@@ -1,4 +1,4 @@
-"""`identify`: what a record says of a linear model, for machines and for people."""
+"""`identify`: fit linear models to a record and format the results."""
 
 import msgspec
 import numpy as np
@@ -15,7 +15,7 @@ from reactorwatch.records.record import Record
 INPUT = "qc"
 
 
-def one(
+def fit(
     measured: Record,
     output: str,
     model: str,
@@ -26,12 +26,12 @@ def one(
     report_rows: bool,
     as_json: bool,
 ) -> str:
-    """One model of one output.
+    """Fit one model of one output and format it.
 
     Raises:
-        InputError: the record or the options cannot give one.
+        InputError: the record or the options are unsuitable.
     """
-    found = identify_model(
+    identification = identify_model(
         measured.continuous_min,
         *_columns(measured, output),
         model=model,
@@ -42,14 +42,16 @@ def one(
         choice=REPORT_ROWS if report_rows else ALL_ROWS,
         missing="leave out",
     )
-    return msgspec.json.encode(found).decode() if as_json else f"{_text(found, measured)}{_remarks_text(measured)}"
+    if as_json:
+        return msgspec.json.encode(identification).decode()
+    return f"{_text(identification, measured)}{_remarks_text(measured)}"
 
 
 def compare(measured: Record, output: str, order: int, delay: int, *, neural: bool, as_json: bool) -> str:
-    """Every family at every order up to one, and which is chosen and why.
+    """Compare every family at every order up to `order`, and format the choice with its reason.
 
     Raises:
-        InputError: as `one`, or the extra for neural networks is not installed.
+        InputError: as `fit`, or the extra for neural networks is not installed.
     """
     families: list[Family] = [Arx(), OutputError()]
     if neural:
@@ -89,13 +91,13 @@ def _columns(measured: Record, output: str) -> tuple[Array, Array]:
 
 
 def _selection_json(selection: Selection, output: str) -> str:
-    said = {
+    report = {
         "output": output,
         "candidates": selection.candidates,
         "chosen": {"family": selection.chosen.family, "order": selection.chosen.order} if selection.fits else None,
         "reason": selection.reason,
     }
-    return msgspec.json.encode(said).decode()
+    return msgspec.json.encode(report).decode()
 
 
 def _text(found: Identification, measured: Record) -> str:

@@ -1,4 +1,4 @@
-"""`linearise`: the linear models of the reactor at a coolant flow, and how far they follow it."""
+"""`linearise`: linear models of the reactor at a coolant flow, and their error in a step response."""
 
 from typing import Any
 
@@ -14,15 +14,15 @@ from reactorwatch.process.step_response import compare_step
 
 
 def describe(qc: float, step: float, *, as_json: bool) -> str:
-    """All steady states at a flow with their linear models.
+    """Format all steady states at a flow with their linear models.
 
     Args:
         qc: coolant flow, l/min.
-        step: of the flow, by which plant and linear model are compared at the stable states, l/min.
-        as_json: for machines.
+        step: step of the flow with which plant and linear model are compared at the stable states, l/min.
+        as_json: format as a JSON object.
 
     Raises:
-        InputError: a flow that the valve cannot give.
+        InputError: a flow outside the valve's range.
     """
     model = cstr()
     valve = model.inputs[0]

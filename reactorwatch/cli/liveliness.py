@@ -1,4 +1,4 @@
-"""`alive`: ask the bus whether a node shows its token."""
+"""`alive`: wait for the liveliness token of a node."""
 
 import threading
 
@@ -8,14 +8,14 @@ from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.liveliness import wait_alive
 
 
-def comes_alive(config: BusConfig, plant: str, node: str, timeout_s: float) -> bool:
-    """Whether a node is there, or comes within the time.
+def wait_for_node(config: BusConfig, plant: str, node: str, timeout_s: float) -> bool:
+    """Wait for a node; returns whether it is alive in time.
 
     Args:
-        config: where the router is.
-        plant: the node's.
-        node: its name.
-        timeout_s: how long to wait, for the router too.
+        config: connection to the bus.
+        plant: name of the plant.
+        node: name of the node.
+        timeout_s: seconds to wait for router and node together.
     """
     stop = StopSignal()
     timer = threading.Timer(timeout_s, stop.set)

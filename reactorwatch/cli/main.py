@@ -1,9 +1,8 @@
-"""The command's entry: gathers the subcommands, and turns a person's mistakes into one line and exit code 2.
+"""Entry of the command: its subcommands, and one line and exit code 2 for a usage error.
 
-An error that is no mistake of a person's is a fault of this software, and is reported as in every process of ours
-(`runtime/crash.py`).
+Any other error is a fault of this software and is reported as in every process (`runtime/crash.py`).
 
-Only what `--help` needs is imported here; each command imports its own when it is called.
+Only the imports for `--help` are here; each command imports its own when it is called.
 """
 
 import gc
@@ -28,9 +27,9 @@ from reactorwatch.cli import (
     studies,
     view,
 )
-from reactorwatch.cli.interrupt import handled, raise_until_handled
-from reactorwatch.cli.printing import say
-from reactorwatch.runtime.crash import INTERRUPTED, UNUSABLE, complain, guard
+from reactorwatch.cli.interrupt import clear_interrupt, raise_until_handled
+from reactorwatch.cli.printing import print_lines
+from reactorwatch.runtime.crash import INTERRUPTED, UNUSABLE, guard, print_error
 
 # Typer brings a copy of click, or uses the one installed, depending on its version; its errors are one family in both.
 UsageProblem: type[typer.BadParameter] = next(
@@ -48,12 +47,12 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for group in (runs, nodes, view, site, playback, alarm, files, recordings, studies, models, charts, compilation):
-    group.add_to(app)
+    group.register_commands(app)
 
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        say(f"reactorwatch {__version__}")
+        print_lines(f"reactorwatch {__version__}")
         raise typer.Exit
 
 
@@ -66,14 +65,14 @@ def _root(
 
 def main() -> None:
     """Run the command and end the process with its exit code."""
-    # Before NumPy is imported: our matrices are small, and threads of the linear algebra would wait for each other
-    # longer than they work; and the last bits of a chart's limit depend on how many they are. So a back-test says what
-    # the live monitor said, on whatever machine. Who sets it otherwise has to do so for both; nodes inherit it.
+    # Before NumPy is imported: the matrices are small, and threads of the linear algebra would wait for each other
+    # longer than they work; and the last bits of a chart's limit depend on their number. With one thread a back-test
+    # reproduces the live monitor on any machine. Another setting has to be the same for both; nodes inherit it.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    os.environ.setdefault("RUST_LOG", "off")  # what Rerun logs of a full disk or a closed viewer, we say ourselves
+    os.environ.setdefault("RUST_LOG", "off")  # a full disk or a closed viewer is reported here, not by Rerun
     raise_until_handled()
     code = guard(NAME, _run)
-    gc.freeze()  # the process ends: to look for garbage among a million objects would take a third of a second
+    gc.freeze()  # the process ends: garbage collection of a million objects would take a third of a second
     sys.exit(code)
 
 
@@ -82,9 +81,9 @@ def _run() -> int:
         code = app(prog_name=NAME, standalone_mode=False)
         sys.stdout.flush()
     except UsageProblem as error:
-        complain(NAME, error.format_message())
+        print_error(NAME, error.format_message())
         return UNUSABLE
     except (typer.Abort, KeyboardInterrupt):
-        handled()
+        clear_interrupt()
         return INTERRUPTED
     return code if isinstance(code, int) else 0

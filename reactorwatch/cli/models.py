@@ -1,16 +1,16 @@
-"""Linear models: from a record, `identify`; from the equations, `linearise`; and the study of both, `reproduce`."""
+"""Commands for linear models: `identify` from a record, `linearise` from the equations, `reproduce` the study."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Columns, Force, Json, Plant, Processes, Scheduler, columns, existing_recording
-from reactorwatch.cli.printing import say_text
+from reactorwatch.cli.options import Columns, Force, Json, Plant, Processes, Scheduler, check_recording, parse_columns
+from reactorwatch.cli.printing import print_text
 from reactorwatch.errors import InputError
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("identify")(identify)
     app.command("linearise")(linearise)
@@ -37,7 +37,7 @@ def identify(
     column: Columns = None,
     as_json: Json = False,
 ) -> None:
-    """Fit a linear model to one half, judge it by the other."""
+    """Fit a linear model to one half, validate it on the other."""
     from reactorwatch.cli import identification
     from reactorwatch.cli.batch import write_remark
     from reactorwatch.cli.progress import task
@@ -45,16 +45,16 @@ def identify(
     from reactorwatch.cli.unit_remarks import unit_remark
     from reactorwatch.process.library.cstr.model import cstr
 
-    measured = record(existing_recording(file), plant, columns(column))
+    measured = record(check_recording(file), plant, parse_columns(column))
     remark = unit_remark(cstr(), measured.columns, measured.time_min)
     with task(f"identifying {file.name}"):
         if compare:
-            said = identification.compare(measured, output, order, delay, neural=neural, as_json=as_json)
+            text = identification.compare(measured, output, order, delay, neural=neural, as_json=as_json)
         else:
-            said = identification.one(
+            text = identification.fit(
                 measured, output, model, order, delay, recursive=recursive, report_rows=report_rows, as_json=as_json
             )
-    say_text(said)
+    print_text(text)
     write_remark(file, remark)
 
 
@@ -66,7 +66,7 @@ def linearise(
     """The linear models at all steady states of a coolant flow."""
     from reactorwatch.cli.linear_models import describe
 
-    say_text(describe(qc, step, as_json=as_json))
+    print_text(describe(qc, step, as_json=as_json))
 
 
 def reproduce(
@@ -100,7 +100,7 @@ def reproduce(
         ) from error
 
     check_out(out, only, (file,), force=force)
-    measured = record(existing_recording(file), plant, columns(column)) if file else None
+    measured = record(check_recording(file), plant, parse_columns(column)) if file else None
     if measured is not None and measured.runs is not None:
         raise InputError(f"--record {file}: must be one run, {measured.describe_runs()}; cut one run out of it")
-    say_text(reproduce_figures(out, seed, only, measured, processes=jobs, scheduler=scheduler))
+    print_text(reproduce_figures(out, seed, only, measured, processes=jobs, scheduler=scheduler))

@@ -1,4 +1,4 @@
-"""One node each: `plant`, `monitor`, `record`, `replay`. Every one runs until it is finished or stopped."""
+"""Commands that run one node until it is finished or stopped: `plant`, `monitor`, `record`, `replay`."""
 
 import logging
 from pathlib import Path
@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from reactorwatch.cli.options import (
-    LONGEST_WAIT_S,
+    MAX_WAIT_S,
     Columns,
     Diagnose,
     Endpoint,
@@ -15,17 +15,17 @@ from reactorwatch.cli.options import (
     Model,
     Plant,
     Settings,
-    columns,
-    existing,
-    existing_recording,
-    pace,
-    span_ns,
+    check_input,
+    check_recording,
+    parse_columns,
+    parse_pace,
+    parse_span_ns,
 )
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.errors import InputError
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("plant")(plant)
     app.command("monitor")(monitor)
@@ -78,7 +78,7 @@ def plant(
     ] = None,
     model: Model = None,
 ) -> None:
-    """Simulate the reactor and publish what its sensors see."""
+    """Simulate the reactor and publish its sensors' samples."""
     from plant_node.__main__ import run
     from plant_node.config import PlantConfig
     from reactorwatch.runtime.config import section
@@ -87,12 +87,12 @@ def plant(
     flags = {
         "name": name,
         "preset": preset,
-        "speed": pace(speed, "--speed"),
+        "speed": parse_pace(speed, "--speed"),
         "duration_min": duration,
         "seed": seed,
         "scenario": scenario,
         "faults": fault or None,
-        "model": str(existing(model)) if model is not None else None,
+        "model": str(check_input(model)) if model is not None else None,
     }
     run(section(PlantConfig, "plant", tables, flags), bus, _metrics(tables))
 
@@ -110,17 +110,19 @@ def monitor(
         Path | None,
         typer.Option(
             "--state",
-            help="Folder where all that it has learned is kept, so that it resumes after a restart; made if not there.",
+            help="Folder of the monitor's state, from which it resumes after a restart; made if it does not exist.",
             show_default=False,
         ),
     ] = None,
     plants: Annotated[
         str | None,
-        typer.Option("--plants", help="Watch all of them: 'reactor/*', 'reactor/north_*'.", show_default=False),
+        typer.Option("--plants", help="Watch all of these plants: 'reactor/*', 'reactor/north_*'.", show_default=False),
     ] = None,
     shard: Annotated[
         str | None,
-        typer.Option("--shard", help="With --plants: our part of them, such as 2/5 [1/1].", show_default=False),
+        typer.Option(
+            "--shard", help="With --plants: this monitor's part of them, such as 2/5 [1/1].", show_default=False
+        ),
     ] = None,
 ) -> None:
     """Watch a plant, or a fleet of them: predict signals, raise alarms."""
@@ -130,12 +132,12 @@ def monitor(
     from monitor_node.config import MonitorConfig
     from monitor_node.fleet.config import FleetConfig
     from monitor_node.fleet.node import run as run_fleet
-    from reactorwatch.cli.supervise import diagnosing, diagnosis_settings
+    from reactorwatch.cli.supervise import diagnosis_settings, run_diagnosis_node
     from reactorwatch.records.folder import make_folder
     from reactorwatch.runtime.config import LogConfig, section
 
     tables, bus = _settings(config, endpoint)
-    flags = {"plant": name, "training_min": training, "model": str(existing(model)) if model is not None else None}
+    flags = {"plant": name, "training_min": training, "model": str(check_input(model)) if model is not None else None}
     of_fleet = {"plants": plants, "shard": shard, "state": str(state) if state is not None else None}
     fleet = section(FleetConfig, "fleet", tables, of_fleet)
     if state is not None and fleet.plants is None:
@@ -154,7 +156,7 @@ def monitor(
         run_fleet(config_of_monitor, fleet, bus, _metrics(tables))
         return
     diagnosis = diagnosis_settings(tables, config_of_monitor, diagnose)
-    with diagnosing(diagnosis, bus, section(LogConfig, "log", tables, {})) if diagnosis.out else nullcontext():
+    with run_diagnosis_node(diagnosis, bus, section(LogConfig, "log", tables, {})) if diagnosis.out else nullcontext():
         run(config_of_monitor, bus, _metrics(tables))
 
 
@@ -200,21 +202,21 @@ def replay(
     end: Annotated[
         str | None, typer.Option("--to", help="Since the start, such as 20min [the end].", show_default=False)
     ] = None,
-    loop: Annotated[bool | None, typer.Option("--loop", help="Begin anew at the end.", show_default=False)] = None,
+    loop: Annotated[bool | None, typer.Option("--loop", help="Restart at the end.", show_default=False)] = None,
     column: Columns = None,
     verify: Annotated[
         bool,
         typer.Option(
             "--verify",
-            help="Publish nothing; run it through the monitor's core and compare what that says with what was "
-            "recorded. Ends with 0 if all is equal, 1 if not.",
+            help="Publish nothing; run it through the monitor's core and compare the output with the recorded "
+            "messages. Ends with 0 if all are equal, 1 if not.",
         ),
     ] = False,
     as_json: Json = False,
 ) -> None:
     """Publish a recording or a record as the plant did, or verify a recording.
 
-    While it plays, `playback` pauses it, goes on step by step, or changes its rate.
+    While it runs, `playback` pauses, resumes or steps it, or changes its rate.
     """
     if verify:
         from reactorwatch.cli.verification import run
@@ -223,7 +225,7 @@ def replay(
         for option, value in given.items():
             if value:
                 raise InputError(f"--verify publishes nothing and takes the whole recording; leave out {option}")
-        raise typer.Exit(run(existing_recording(file), config, name, as_json=as_json))
+        raise typer.Exit(run(check_recording(file), config, name, as_json=as_json))
     from reactorwatch.records.record import MINUTE_NS
     from reactorwatch.runtime.config import section
     from recorder.tools.replay import ReplayConfig, run_replay
@@ -232,13 +234,13 @@ def replay(
         raise InputError(f"--column is for the columns of a .csv file, got {file}")
     tables, bus = _settings(config, endpoint)
     flags = {
-        "file": str(existing_recording(file)),
+        "file": str(check_recording(file)),
         "plant": name,
-        "rate": pace(rate, "--rate"),
-        "from_min": span_ns(begin, "--from") / MINUTE_NS if begin is not None else None,
-        "to_min": span_ns(end, "--to") / MINUTE_NS if end is not None else None,
+        "rate": parse_pace(rate, "--rate"),
+        "from_min": parse_span_ns(begin, "--from") / MINUTE_NS if begin is not None else None,
+        "to_min": parse_span_ns(end, "--to") / MINUTE_NS if end is not None else None,
         "loop": loop,
-        "columns": columns(column) or None,
+        "columns": parse_columns(column) or None,
     }
     run_replay(section(ReplayConfig, "replay", tables, flags), bus)
 
@@ -248,12 +250,12 @@ def alive(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    timeout: Annotated[float, typer.Option(help="Seconds to wait for it.", min=0.1, max=LONGEST_WAIT_S)] = 5.0,
+    timeout: Annotated[float, typer.Option(help="Seconds to wait for it.", min=0.1, max=MAX_WAIT_S)] = 5.0,
 ) -> None:
     """Is a node there? A health check: ends with 0 or 1."""
-    from reactorwatch.cli.liveliness import comes_alive
+    from reactorwatch.cli.liveliness import wait_for_node
 
     _, bus = _settings(config, endpoint, quiet=True)
-    there = comes_alive(bus, name or "cstr", node, timeout)
-    say(f"{node} is {'alive' if there else f'not there within {timeout:g} s'}")
+    there = wait_for_node(bus, name or "cstr", node, timeout)
+    print_lines(f"{node} is {'alive' if there else f'not there within {timeout:g} s'}")
     raise typer.Exit(0 if there else 1)

@@ -1,6 +1,6 @@
-"""How a command that looks on, or asks, begins: its log, its settings, and where the bus is.
+"""Set-up of a command that observes a run or sends commands: log and settings.
 
-What it logs is for the person at the terminal, whatever the settings say of the log of the nodes.
+Its log is text for the terminal, independent of the nodes' log settings.
 """
 
 import logging
@@ -12,37 +12,37 @@ from reactorwatch.runtime.logs import configure
 from recorder.config import RecorderConfig
 
 
-def begin(
+def load_settings(
     config: Path | None, endpoint: str | None, level: int = logging.WARNING
 ) -> tuple[dict[str, dict[str, Any]], BusConfig]:
-    """Set the log up; the tables of the settings, and of them the bus.
+    """Configure the log; returns the tables of the settings, and the bus settings.
 
     Args:
         config: settings file, or None.
         endpoint: the router's address, or None.
-        level: what is less is not logged.
+        level: the least severe level that is logged.
 
     Raises:
-        InputError: settings that cannot be used.
+        InputError: invalid settings.
     """
     configure(level)
     tables = read_settings(config)
     return tables, section(BusConfig, "bus", tables, {"endpoint": endpoint})
 
 
-def begin_beside_recorder(
+def load_recorder_settings(
     config: Path | None, endpoint: str | None, plant: str | None, level: int = logging.WARNING
 ) -> tuple[BusConfig, RecorderConfig]:
-    """Where the bus is, and the settings of the recorder, which name the plant.
+    """Configure the log; returns the settings of the bus, and of the recorder, which name the plant.
 
     Args:
-        config: as for `begin`.
-        endpoint: likewise.
-        plant: its name; None: that of the settings.
-        level: as for `begin`.
+        config: as for `load_settings`.
+        endpoint: as for `load_settings`.
+        plant: name of the plant; None: that of the settings.
+        level: as for `load_settings`.
 
     Raises:
-        InputError: settings that cannot be used.
+        InputError: invalid settings.
     """
-    tables, bus = begin(config, endpoint, level)
+    tables, bus = load_settings(config, endpoint, level)
     return bus, section(RecorderConfig, "recorder", tables, {"plant": plant})

@@ -1,4 +1,4 @@
-"""Options that several commands share, and how their values are read."""
+"""Options that several commands share, and parsers of their values."""
 
 import re
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.output import checked_output
+from reactorwatch.records.output import check_output_file
 
 Settings = Annotated[
     Path | None, typer.Option("--config", help="Settings file (TOML), a table for each node.", show_default=False)
@@ -17,8 +17,8 @@ Settings = Annotated[
 Endpoint = Annotated[str | None, typer.Option(help="Address of the router [tcp/127.0.0.1:7447].", show_default=False)]
 Plant = Annotated[str | None, typer.Option("--plant", help="Name of the plant [cstr].", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object, for machines.")]
-LONGEST_WAIT_S = 86_400.0
-"""The system's clocks count no endless times."""
+MAX_WAIT_S = 86_400.0
+"""Largest timeout: the system's clocks take no infinite times."""
 
 Columns = Annotated[
     list[str] | None,
@@ -60,8 +60,8 @@ Scheduler = Annotated[
 ]
 
 
-def sendable(text: str) -> str:
-    """A text that a message can carry.
+def check_encodable(text: str) -> str:
+    """Check that a text can be sent in a message; returns it.
 
     Raises:
         BadParameter: the terminal sent bytes that are no UTF-8.
@@ -73,61 +73,61 @@ def sendable(text: str) -> str:
     return text
 
 
-def columns(pairs: list[str] | None) -> dict[str, str]:
-    """The columns' names by signal, from `signal=column` pairs.
+def parse_columns(pairs: list[str] | None) -> dict[str, str]:
+    """Parse `signal=column` pairs to names of columns by signal.
 
     Raises:
-        InputError: not such a pair.
+        InputError: a text is no such pair.
     """
-    named = {}
+    names = {}
     for pair in pairs or []:
         signal, equals, column = pair.partition("=")
         if not (signal and equals and column):
             raise InputError(f"--column must be signal=column, such as T=reactor_temp, got {pair!r}")
-        named[signal] = column
-    return named
+        names[signal] = column
+    return names
 
 
-def tolerances(text: str | None) -> dict[str, float]:
-    """The differences that do not matter, by output, from `C=0.002,T=0.5`.
+def parse_tolerances(text: str | None) -> dict[str, float]:
+    """Parse `C=0.002,T=0.5` to tolerances by output.
 
     Raises:
-        InputError: not such a text.
+        InputError: the text has another form.
     """
-    found = {}
+    tolerances = {}
     for part in text.split(",") if text is not None else ():
         output, _, value = (item.strip() for item in part.partition("="))
         try:
-            found[output] = float(value)
+            tolerances[output] = float(value)
         except ValueError:
             raise InputError(f"--tolerance must be output=number, such as C=0.002,T=0.5, got {part!r}") from None
-    return found
+    return tolerances
 
 
-def limits(text: str | None) -> dict[str, tuple[float, float]]:
-    """The lowest and highest values that an experiment may lead to, by signal, from `qc=85..115,T=425..455`.
+def parse_limits(text: str | None) -> dict[str, tuple[float, float]]:
+    """Parse `qc=85..115,T=425..455` to the lowest and highest values in an experiment, by signal.
 
     Raises:
-        InputError: not such a text.
+        InputError: the text has another form.
     """
-    found = {}
+    limits = {}
     for part in text.split(",") if text is not None else ():
         signal, _, ends = (item.strip() for item in part.partition("="))
         low, _, high = ends.partition("..")
         try:
-            found[signal] = (float(low), float(high))
+            limits[signal] = (float(low), float(high))
         except ValueError:
             raise InputError(
                 f"--limits must be signal=lowest..highest, such as qc=85..115,T=425..455, got {part!r}"
             ) from None
-    return found
+    return limits
 
 
-def pace(text: str | None, option: str) -> float | None:
-    """A speed or a rate: a positive number, or `max` for as fast as it goes.
+def parse_pace(text: str | None, option: str) -> float | None:
+    """Parse a speed or a rate: a positive number, or `max` for infinity.
 
     Raises:
-        InputError: neither.
+        InputError: the text is neither.
     """
     if text is None:
         return None
@@ -145,11 +145,11 @@ def pace(text: str | None, option: str) -> float | None:
 _SECONDS = {"s": 1, "min": 60, "h": 3600}
 
 
-def span_ns(text: str, option: str) -> int:
-    """A span of time, such as `90s`, `10min`, `1.5h` or `-20min`, in nanoseconds.
+def parse_span_ns(text: str, option: str) -> int:
+    """Parse a span of time, such as `90s`, `10min`, `1.5h` or `-20min`, to nanoseconds.
 
     Raises:
-        InputError: no such span.
+        InputError: the text has another form.
     """
     match = re.fullmatch(r"(-?\d+(?:\.\d+)?)(s|min|h)", text)
     if match is None:
@@ -162,20 +162,20 @@ def span_ns(text: str, option: str) -> int:
     return round(span_s * 1e9)
 
 
-def existing_recording(path: Path) -> Path:
-    """The path of a file that is to be read, or of a folder of recordings.
+def check_recording(path: Path) -> Path:
+    """Check that an input file, or a folder of recordings, exists; returns its path.
 
     Raises:
-        InputError: there is none.
+        InputError: it does not.
     """
-    return path if path.is_dir() else existing(path)
+    return path if path.is_dir() else check_input(path)
 
 
-def existing(path: Path) -> Path:
-    """The path of a file that is to be read.
+def check_input(path: Path) -> Path:
+    """Check that an input file exists; returns its path.
 
     Raises:
-        InputError: there is none, or it is a folder.
+        InputError: it does not, or is a folder.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder, a file was expected")
@@ -184,19 +184,19 @@ def existing(path: Path) -> Path:
     return path
 
 
-def output_file(path: Path, suffix: str, sources: Iterable[Path | None], *, force: bool) -> Path:
-    """The path of a file that is to be written.
+def check_output(path: Path, suffix: str, sources: Iterable[Path | None], *, force: bool) -> Path:
+    """Check that an output file may be written and has the right suffix; returns its path.
 
     Args:
         path: the file.
-        suffix: that its name must have, by which it is opened.
-        sources: as for `checked_output`.
-        force: as for `checked_output`.
+        suffix: the required suffix.
+        sources: as for `check_output_file`.
+        force: as for `check_output_file`.
 
     Raises:
-        InputError: as `checked_output`; or its name has another suffix.
+        InputError: as `check_output_file`; or its name has another suffix.
     """
-    checked_output(path, sources, force=force)
+    check_output_file(path, sources, force=force)
     if path.suffix.lower() != suffix:
         raise InputError(f"{path}: the name must end in {suffix}, got {path.suffix or 'no ending'}")
     return path

@@ -1,47 +1,43 @@
-"""`playback`: pause a running replay, let it go on, step it, or change its rate."""
+"""`playback`: pause, resume or step a running replay, or change its rate."""
 
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from reactorwatch.cli.command_client import PATIENCE_S, ask
-from reactorwatch.cli.options import LONGEST_WAIT_S, Endpoint, Plant, Settings, pace
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.command_client import TIMEOUT_S, send_command
+from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Plant, Settings, parse_pace
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.terminal import printable
 
 if TYPE_CHECKING:
     from reactorwatch.contract.messages_pb2 import ReplayCommand
 
-Timeout = Annotated[
-    float, typer.Option("--timeout", help="Seconds to wait for the replay.", min=0.1, max=LONGEST_WAIT_S)
-]
+Timeout = Annotated[float, typer.Option("--timeout", help="Seconds to wait for the replay.", min=0.1, max=MAX_WAIT_S)]
 
 playback = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.add_typer(playback, name="playback", help="Pause a running replay, step it, or change its rate.")
 
 
 @playback.command("pause")
-def pause(
-    config: Settings = None, endpoint: Endpoint = None, name: Plant = None, timeout: Timeout = PATIENCE_S
-) -> None:
-    """Hold a replay where it is."""
+def pause(config: Settings = None, endpoint: Endpoint = None, name: Plant = None, timeout: Timeout = TIMEOUT_S) -> None:
+    """Pause a replay."""
     from reactorwatch.contract.messages_pb2 import ReplayCommand
 
-    _tell("pause", ReplayCommand(), config, endpoint, name, timeout)
+    _send("pause", ReplayCommand(), config, endpoint, name, timeout)
 
 
 @playback.command("resume")
 def resume(
-    config: Settings = None, endpoint: Endpoint = None, name: Plant = None, timeout: Timeout = PATIENCE_S
+    config: Settings = None, endpoint: Endpoint = None, name: Plant = None, timeout: Timeout = TIMEOUT_S
 ) -> None:
-    """Let a replay that is paused go on."""
+    """Resume a paused replay."""
     from reactorwatch.contract.messages_pb2 import ReplayCommand
 
-    _tell("resume", ReplayCommand(), config, endpoint, name, timeout)
+    _send("resume", ReplayCommand(), config, endpoint, name, timeout)
 
 
 @playback.command("step")
@@ -50,12 +46,12 @@ def step(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    timeout: Timeout = PATIENCE_S,
+    timeout: Timeout = TIMEOUT_S,
 ) -> None:
-    """Publish the next rows of a replay that is paused."""
+    """Publish the next rows of a paused replay."""
     from reactorwatch.contract.messages_pb2 import ReplayCommand
 
-    _tell("step", ReplayCommand(rows=rows), config, endpoint, name, timeout)
+    _send("step", ReplayCommand(rows=rows), config, endpoint, name, timeout)
 
 
 @playback.command("rate")
@@ -64,18 +60,18 @@ def rate(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    timeout: Timeout = PATIENCE_S,
+    timeout: Timeout = TIMEOUT_S,
 ) -> None:
-    """Change how fast a replay goes."""
+    """Change the rate of a replay."""
     from reactorwatch.contract.messages_pb2 import ReplayCommand
 
-    _tell("set_rate", ReplayCommand(rate=pace(times, "rate")), config, endpoint, name, timeout)
+    _send("set_rate", ReplayCommand(rate=parse_pace(times, "rate")), config, endpoint, name, timeout)
 
 
-def _tell(
+def _send(
     command: str, message: "ReplayCommand", config: Settings, endpoint: Endpoint, name: Plant, timeout: float
 ) -> None:
     import os
 
     message.by = printable(os.environ.get("USER", ""))  # its bytes may be no UTF-8, which a message cannot carry
-    say(ask("replay", config, endpoint, name, timeout, command, message).text)
+    print_lines(send_command("replay", config, endpoint, name, timeout, command, message).text)

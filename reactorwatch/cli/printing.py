@@ -1,20 +1,20 @@
-"""The one place where the command prints."""
+"""Output of the command."""
 
 import typer
 
 from reactorwatch.terminal import printable_lines
 
 
-def say(*lines: str, err: bool = False) -> None:
-    """Print lines; each stays one, and none holds what a terminal would act on.
+def print_lines(*lines: str, err: bool = False) -> None:
+    """Print lines without line breaks and control characters in them.
 
     Args:
-        lines: to be printed.
-        err: on standard error, not on standard output.
+        lines: the lines.
+        err: print on standard error instead of standard output.
     """
     typer.echo(printable_lines(lines), err=err)
 
 
-def say_text(text: str) -> None:
-    """Print a text of several lines, whose parts from outside are in one line each; see `printable_lines`."""
-    say(*text.split("\n"))
+def print_text(text: str) -> None:
+    """Print a text of several lines; see `printable_lines`."""
+    print_lines(*text.split("\n"))

@@ -1,8 +1,7 @@
-"""The nodes as processes of their own, under one supervisor that also is their router.
+"""Nodes as processes, under one supervisor that is also their router.
 
 A node is started as `python -m plant_node SETTINGS`, in a session of its own, so that Ctrl-C on the terminal reaches
-the supervisor alone. It then stops them in order: the plant first, the recorder last, each after the one
-before has said its last words.
+the supervisor only. It then stops the nodes one after the other: the plant first, the recorder last.
 """
 
 import subprocess
@@ -15,7 +14,7 @@ from typing import Any, Self
 import msgspec
 import structlog
 
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 
 log = structlog.get_logger()
 
@@ -26,16 +25,15 @@ MODULES = {
     "recorder": "recorder",
 }
 STOP_WITHIN_S = 60.0
-"""A node that is asked to stop hears for up to 5 s what is still on its way, and has up to 11 s to send its last words;
-on a busy machine all of that takes longer."""
+"""A stopping node drains its inbox for up to 5 s, and its bus closes within 11 s; longer on a busy machine."""
 
 
 class Processes:
-    """The running nodes, as a context that ends them.
+    """Running nodes, as a context that ends them.
 
     Args:
-        settings: the file that each of them reads.
-        logs: folder for what they say; None: to our own standard error.
+        settings: settings file by node.
+        logs: folder for their output; None: this process's standard error.
     """
 
     def __init__(self, settings: Mapping[str, Path], logs: Path | None = None) -> None:
@@ -61,7 +59,7 @@ class Processes:
         return process
 
     def ended(self) -> dict[str, int]:
-        """Exit codes of the nodes that have ended by themselves."""
+        """Exit codes of the nodes that ended by themselves."""
         codes = {node: process.poll() for node, process in self._running.items()}
         return {node: code for node, code in codes.items() if code is not None}
 
@@ -83,24 +81,24 @@ class Processes:
         return codes
 
     def __enter__(self) -> Self:
-        """The processes themselves."""
+        """Return the processes."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End what still runs, the recorder last."""
+        """Stop the running nodes, the recorder last."""
         self.stop([*(node for node in MODULES if node != "recorder"), "recorder"])
 
 
 def write_settings(path: Path, tables: dict[str, msgspec.Struct]) -> None:
-    """Write whole settings as TOML, every value spelled out, so that the file says what ran."""
-    with replacing(path) as temporary:
+    """Write settings as TOML with every value, so that the file documents the run."""
+    with atomic_write(path) as temporary:
         temporary.write_text(settings_text(tables), encoding="utf-8")
 
 
 def settings_text(tables: dict[str, msgspec.Struct]) -> str:
-    """Whole settings as TOML, every value spelled out."""
+    """Format settings as TOML with every value."""
     import tomli_w
 
     return tomli_w.dumps({name: _without_none(msgspec.to_builtins(table)) for name, table in tables.items()})

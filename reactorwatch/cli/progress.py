@@ -1,6 +1,6 @@
-"""Progress for people: only on a terminal, and on standard error, so that what a command prints stays clean.
+"""Progress display: only on a terminal, and on standard error, so that a command's output stays clean.
 
-What is printed meanwhile goes above the bar if it goes to the terminal, too; into a file it goes as it is.
+Output to the terminal appears above the bar; output to a file is unchanged.
 """
 
 import contextlib
@@ -13,7 +13,7 @@ Advance = Callable[[float, str], None]
 
 
 def _unmarked(text: str) -> str:
-    """A text that neither the terminal nor Rich takes for more than it is: names of files are in it."""
+    """Escape a text, which may hold names of files, for the terminal and for Rich."""
     from rich.markup import escape
 
     return escape(printable(text))
@@ -21,7 +21,7 @@ def _unmarked(text: str) -> str:
 
 @contextlib.contextmanager
 def task(text: str) -> Iterator[None]:
-    """A spinner while something of unknown length runs."""
+    """Show a spinner while the context lasts."""
     if not sys.stderr.isatty():
         yield
         return
@@ -37,7 +37,7 @@ def task(text: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def bar(text: str, total: float) -> Iterator[Advance]:
-    """A bar while something of known length runs; call what it gives with (how far, what is going on)."""
+    """Show a bar while the context lasts; yields a function of the progress and a text."""
     if not sys.stderr.isatty():
         yield lambda _completed, _now: None
         return

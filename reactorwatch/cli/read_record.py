@@ -1,7 +1,6 @@
-"""Wherever a file is asked for, `.csv` and `.mcap` both serve: this turns either into a record or into messages.
+"""Read `.csv` and `.mcap` files as a record or as messages, and `--model` as a process model on the record's clock.
 
-A folder stands for the recordings in it, as one; where many files may be named, for all in it (`stands_for`). And
-`--model` is turned into a process model on the record's clock.
+A folder is one recording of all the files in it; in a list of files it stands for each of them (`expand_folder`).
 """
 
 from collections.abc import Iterator, Mapping
@@ -11,11 +10,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from reactorwatch.contract.codec import Encoded, encode
-from reactorwatch.contract.keys import checked_plant
+from reactorwatch.contract.keys import check_plant
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.reading import files_of
-from reactorwatch.records.record import UNITS, Record, clock_time
+from reactorwatch.records.input_file import list_files
+from reactorwatch.records.record import UNITS, Record, format_utc
 
 DEFAULT_PLANT = "cstr"
 
@@ -27,19 +26,19 @@ def record(
     required: tuple[str, ...] = tuple(UNITS),
     units: Mapping[str, str] | None = None,
 ) -> Record:
-    """The columns of a file.
+    """Read a file as a record.
 
     Args:
-        path: of a .csv, an .mcap or a folder.
-        plant: in a recording.
-        columns: a .csv's own names, by signal.
+        path: a .csv, an .mcap or a folder.
+        plant: plant in a recording.
+        columns: names of a .csv's columns, by signal.
         required: signals that a .csv must have.
-        units: of the process's signals, if the columns are known to be these; None: see `read_csv`.
+        units: units of the process's signals, if they are those of the columns; None: see `read_csv`.
 
     Raises:
-        InputError: the file is not one of the two kinds, or is malformed.
+        InputError: the file is neither a .csv nor an .mcap, or is malformed.
     """
-    if kind(path) == "csv":
+    if file_kind(path) == "csv":
         from reactorwatch.records.csv_file import read_csv
 
         measured = read_csv(path, columns, required)
@@ -49,13 +48,13 @@ def record(
     return read_record(path, plant)
 
 
-class Tape(NamedTuple):
-    """The messages of a file.
+class MessageSource(NamedTuple):
+    """Messages of a file.
 
     Attributes:
-        messages: in the order they were received; those of a .csv are its samples.
-        zero_ns: the time of the messages that the file's minutes count from; None: the first sample.
-        has_clock: whether the times of the messages are clock times.
+        messages: messages in the order of receipt; those of a .csv are its samples.
+        zero_ns: time from which the file's minutes are counted; None: that of the first sample.
+        has_clock: True if the times of the messages are clock times.
     """
 
     messages: Iterator[Encoded]
@@ -63,74 +62,74 @@ class Tape(NamedTuple):
     has_clock: bool
 
     def zero(self, first_ns: int) -> str | None:
-        """The clock time that the minutes count from, as in ISO 8601; None: not known.
+        """Time from which the minutes are counted, as ISO 8601; None: unknown.
 
         Args:
             first_ns: time of the first sample.
         """
-        return clock_time(first_ns if self.zero_ns is None else self.zero_ns) if self.has_clock else None
+        return format_utc(first_ns if self.zero_ns is None else self.zero_ns) if self.has_clock else None
 
 
-def tape(
+def open_messages(
     path: Path,
     plant: str | None = None,
     columns: dict[str, str] | None = None,
     units: Mapping[str, str] | None = None,
-) -> Tape:
-    """The messages of a file, and what its minutes count from; see `record`.
+) -> MessageSource:
+    """Open a file as messages; arguments as for `record`.
 
     Raises:
         InputError: as `record`.
     """
-    if kind(path) == "csv":
+    if file_kind(path) == "csv":
         from recorder.tools.player import samples_of
 
         measured = record(path, plant, columns, units=units)
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
-        return Tape((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
+        return MessageSource((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
     from recorder.tools.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from
 
     read = (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
     metadata = read_metadata(path)
-    return Tape(read, zero_from(metadata, 0) if ZERO_NS in metadata else None, has_clock(metadata))
+    return MessageSource(read, zero_from(metadata, 0) if ZERO_NS in metadata else None, has_clock(metadata))
 
 
 def messages(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Iterator[Encoded]:
-    """The messages of a file, in the order they were received; those of a .csv are its samples.
+    """Read the messages of a file in the order of receipt; those of a .csv are its samples.
 
     Raises:
         InputError: as `record`.
     """
-    return tape(path, plant, columns).messages
+    return open_messages(path, plant, columns).messages
 
 
-def stands_for(folder: Path) -> list[Path]:
-    """What a folder stands for where many files may be named: each record (.csv) in it, and its recordings (.mcap).
+def expand_folder(folder: Path) -> list[Path]:
+    """List the records (.csv) and recordings (.mcap) in a folder.
 
-    What a recorder has written there, one file after the other, is one recording, which the folder itself stands for;
-    so is what was cut or merged. Where there are recordings of another origin, such as imported ones, each is one.
+    Files that a recorder wrote one after the other, and cut or merged ones, are one recording, named by the folder.
+    With recordings of another origin, such as imported ones, each file is a recording.
 
     Raises:
-        InputError: there is neither in it.
+        InputError: the folder holds neither.
     """
     from recorder.storage.mcap_writer import NUMBER
     from recorder.tools.mcap_file import read_metadata
 
-    of_a_piece = {NUMBER, "cut", "merged"}
-    records, recordings = (files_of(folder, suffix) for suffix in (".csv", ".mcap"))
+    one_recording = {NUMBER, "cut", "merged"}
+    records, recordings = (list_files(folder, suffix) for suffix in (".csv", ".mcap"))
     if not records and not recordings:
         raise InputError(f"{folder}: holds no record (.csv) and no recording (.mcap)")
     origins = []
     for file in recordings:
-        with suppress(InputError):  # one that is damaged is told of when it is read
+        with suppress(InputError):  # a damaged one is reported when it is read
             origins.append(read_metadata(file))
-    if origins and all(of_a_piece & origin.keys() for origin in origins):
+    if origins and all(one_recording & origin.keys() for origin in origins):
         return [folder, *records]
     return sorted([*records, *recordings])
 
 
-def signals_of(path: Path | None) -> tuple[str, ...]:
-    """What the model in a file needs of a record: its inputs and outputs.
+def required_signals(path: Path | None) -> tuple[str, ...]:
+    """Inputs and outputs of the model in a file, which a record must have.
 
     Raises:
         InputError: as `process_model`.
@@ -142,10 +141,10 @@ def signals_of(path: Path | None) -> tuple[str, ...]:
     return (*model.input_names, *model.output_names)
 
 
-def process_model(path: Path | None, measured: Record) -> ProcessModel:
-    """The model in a file, its clock that of the record; the nominal reactor if there is no file.
+def load_process_model(path: Path | None, measured: Record) -> ProcessModel:
+    """Load the model in a file, on the clock of the record; without a file, the nominal reactor.
 
-    Where either counts its minutes from a moment that nobody knows, they are taken to count from the same.
+    If the zero of either clock is unknown, both are taken to be the same.
 
     Raises:
         InputError: the file cannot be read, or holds no model.
@@ -159,29 +158,29 @@ def process_model(path: Path | None, measured: Record) -> ProcessModel:
     return (model.counted_from(measured.zero_ns) if measured.zero_ns else model).build()
 
 
-def plant_of(path: Path, plant: str | None) -> str:
-    """The plant in a file: the one named, or the only one there.
+def resolve_plant(path: Path, plant: str | None) -> str:
+    """Name of the plant in a file: the given one, or the only one.
 
     Raises:
-        InputError: as `one_plant_in`; or it has a name that no plant can have.
+        InputError: as `one_plant_in`; or the name is invalid.
     """
-    if kind(path) == "csv":
+    if file_kind(path) == "csv":
         return plant or DEFAULT_PLANT
     from recorder.tools.mcap_file import one_plant_in
 
-    found = one_plant_in(path, plant)
+    name = one_plant_in(path, plant)
     try:
-        return checked_plant(found)
+        return check_plant(name)
     except ValueError as error:
         cure = "export it, and use the record"
         raise InputError(f"{path}: {error}; {cure}") from error
 
 
-def kind(path: Path) -> str:
-    """`csv` or `mcap`, by the file's ending; a folder is of recordings.
+def file_kind(path: Path) -> str:
+    """Kind of a file by its suffix, `csv` or `mcap`; a folder is of recordings.
 
     Raises:
-        InputError: neither.
+        InputError: the suffix is another one.
     """
     if path.is_dir():
         return "mcap"

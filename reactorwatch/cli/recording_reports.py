@@ -1,18 +1,18 @@
-"""What `recover` and `info` print: a JSON object for machines, a few lines for people."""
+"""Output of `recover` and `info`: a JSON object, or lines for people."""
 
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from reactorwatch.contract.messages_pb2 import Priority
-from reactorwatch.records.record import clock_time, to_minutes
+from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.terminal import printable_lines
 from recorder.storage.recover import Saved
 from recorder.tools.inspect import Look
 from recorder.tools.mcap_file import has_clock
 
-MOST_LINES = 20
-"""Gaps that people are told of one by one."""
+MAX_LINES = 20
+"""Gaps that are listed one by one for people."""
 
 
 def saved_object(saved: Saved, out: Path) -> dict[str, Any]:
@@ -29,7 +29,7 @@ def saved_object(saved: Saved, out: Path) -> dict[str, Any]:
 
 
 def saved_text(saved: Saved, file: Path, out: Path) -> str:
-    """The same for people."""
+    """Format the output of `recover` for people."""
     span_s = (saved.last_ns - saved.first_ns) / 1e9
     return printable_lines(
         [
@@ -44,26 +44,26 @@ def saved_text(saved: Saved, file: Path, out: Path) -> str:
 
 def info_object(seen: Look, file: Path) -> dict[str, Any]:
     """The object that `info --json` prints; minutes are those of the plant, as `cut` counts them."""
-    found = seen.overview
+    overview = seen.overview
 
     def minutes(time_ns: int | None) -> float | None:
         return None if time_ns is None else to_minutes(time_ns, seen.zero_ns)
 
-    span = found.sample_span_ns
+    span = overview.sample_span_ns
     return {
         "file": str(file),
-        "zero": clock_time(seen.zero_ns) if span is not None and has_clock(seen.metadata) else None,
+        "zero": format_utc(seen.zero_ns) if span is not None and has_clock(seen.metadata) else None,
         "whole": not seen.damages,
         "damages": list(seen.damages),
-        "messages": found.messages,
-        "first_ns": found.first_ns,
-        "last_ns": found.last_ns,
-        "span_s": found.span_s,
+        "messages": overview.messages,
+        "first_ns": overview.first_ns,
+        "last_ns": overview.last_ns,
+        "span_s": overview.span_s,
         "from_min": minutes(span.first_ns) if span is not None else None,
         "to_min": minutes(span.last_ns) if span is not None else None,
         "runs": [
             {"plant": plant, "from_min": minutes(run.first_ns), "to_min": minutes(run.last_ns)}
-            for plant, runs in sorted(found.runs.items())
+            for plant, runs in sorted(overview.runs.items())
             for run in runs
         ],
         "topics": [
@@ -71,17 +71,17 @@ def info_object(seen: Look, file: Path) -> dict[str, Any]:
                 "topic": topic.key,
                 "encoding": topic.encoding,
                 "messages": topic.count,
-                "rate_per_s": topic.count / found.span_s if found.span_s else None,
+                "rate_per_s": topic.count / overview.span_s if overview.span_s else None,
             }
-            for _, topic in sorted(found.topics.items())
+            for _, topic in sorted(overview.topics.items())
         ],
-        "lost": found.lost,
-        "duplicated": found.duplicated,
-        "out_of_order": found.out_of_order,
-        "out_of_place": found.out_of_place,
+        "lost": overview.lost,
+        "duplicated": overview.duplicated,
+        "out_of_order": overview.out_of_order,
+        "out_of_place": overview.out_of_place,
         "gaps": [
             {"topic": gap.key, "first": gap.first, "last": gap.last, "after_min": minutes(gap.after_ns)}
-            for gap in found.gaps
+            for gap in overview.gaps
         ],
         "lost_on_the_way": [
             {
@@ -101,63 +101,63 @@ def info_object(seen: Look, file: Path) -> dict[str, Any]:
                 "cleared_min": minutes(alarm.cleared_ns),
                 "text": alarm.text,
             }
-            for alarm in found.alarms
+            for alarm in overview.alarms
         ],
         "metadata": seen.metadata,
     }
 
 
 def info_text(seen: Look, file: Path) -> str:
-    """The same for people."""
-    said = info_object(seen, file)
-    lines = [f"{file}: {said['messages']} messages of {len(said['topics'])} topics"]
-    if said["messages"]:
-        first, last = moment(said["first_ns"]), moment(said["last_ns"])
-        lines[0] += f", received over {said['span_s']:.1f} s ({first} to {last})"
-    if said["from_min"] is not None:
-        lines.append(f"samples from {said['from_min']:g} to {said['to_min']:g} min")
+    """Format the output of `info` for people."""
+    report = info_object(seen, file)
+    lines = [f"{file}: {report['messages']} messages of {len(report['topics'])} topics"]
+    if report["messages"]:
+        first, last = moment(report["first_ns"]), moment(report["last_ns"])
+        lines[0] += f", received over {report['span_s']:.1f} s ({first} to {last})"
+    if report["from_min"] is not None:
+        lines.append(f"samples from {report['from_min']:g} to {report['to_min']:g} min")
     for plant, runs in sorted(seen.overview.runs.items()):
         if len(runs) > 1:
             lines.append(f"{len(runs)} runs of {plant}: its clock steps back, or it was restarted:")
             spans = [(to_minutes(run.first_ns, seen.zero_ns), to_minutes(run.last_ns, seen.zero_ns)) for run in runs]
             lines += [
                 f"  run {number}: {first:g} to {last:g} min"
-                for number, (first, last) in enumerate(spans[:MOST_LINES], 1)
+                for number, (first, last) in enumerate(spans[:MAX_LINES], 1)
             ]
-            lines += [f"  and {len(runs) - MOST_LINES} more (--json names them)"] if len(runs) > MOST_LINES else []
-    told = [
+            lines += [f"  and {len(runs) - MAX_LINES} more (--json names them)"] if len(runs) > MAX_LINES else []
+    facts = [
         f"{name} {seen.metadata[name]}" for name in ("plant", "version", "seed", "started") if name in seen.metadata
     ]
-    lines += [", ".join(told)] if told else []
+    lines += [", ".join(facts)] if facts else []
     lines += [
-        f"  {topic['messages']:9d}  {topic['rate_per_s'] or 0.0:9.3g}/s  {topic['topic']}" for topic in said["topics"]
+        f"  {topic['messages']:9d}  {topic['rate_per_s'] or 0.0:9.3g}/s  {topic['topic']}" for topic in report["topics"]
     ]
-    if said["lost"]:
-        lines.append(f"{said['lost']} samples are missing:")
+    if report["lost"]:
+        lines.append(f"{report['lost']} samples are missing:")
     lines += [
         f"  {gap['last'] - gap['first'] + 1:9d}  {gap['topic']}: {gap['first']} to {gap['last']}, "
         f"after {gap['after_min']:g} min"
-        for gap in said["gaps"][:MOST_LINES]
+        for gap in report["gaps"][:MAX_LINES]
     ]
-    if len(said["gaps"]) > MOST_LINES:
-        lines.append(f"  and {len(said['gaps']) - MOST_LINES} more gaps (--json names them)")
+    if len(report["gaps"]) > MAX_LINES:
+        lines.append(f"  and {len(report['gaps']) - MAX_LINES} more gaps (--json names them)")
     lines += [
         f"lost on the way: {gap['messages']} messages of {gap['stream']}, noticed {moment(gap['noticed_ns'])}"
-        for gap in said["lost_on_the_way"][:MOST_LINES]
+        for gap in report["lost_on_the_way"][:MAX_LINES]
     ]
-    if len(said["lost_on_the_way"]) > MOST_LINES:
-        lines.append(f"  and {len(said['lost_on_the_way']) - MOST_LINES} times more (--json names them)")
-    if said["out_of_place"]:
-        lines.append(f"{said['out_of_place']} samples have a time or number that fits no other")
-    if not said["lost"]:
+    if len(report["lost_on_the_way"]) > MAX_LINES:
+        lines.append(f"  and {len(report['lost_on_the_way']) - MAX_LINES} times more (--json names them)")
+    if report["out_of_place"]:
+        lines.append(f"{report['out_of_place']} samples have a time or number that fits no other")
+    if not report["lost"]:
         lines.append("no sample is missing, by their sequence numbers")
     lines += [
         f"  {alarm['raised_min']:9g} min  {alarm['alarm']} ({alarm['priority']}), "
         + ("not cleared" if alarm["cleared_min"] is None else f"cleared at {alarm['cleared_min']:g} min")
         + f": {alarm['text']}"
-        for alarm in said["alarms"]
+        for alarm in report["alarms"]
     ]
-    if not said["alarms"]:
+    if not report["alarms"]:
         lines.append("no alarms")
     if seen.damages:
         lines.append(f"not whole: {'; '.join(seen.damages)}; `reactorwatch recover {file}` saves the rest")
@@ -165,7 +165,7 @@ def info_text(seen: Look, file: Path) -> str:
 
 
 def moment(time_ns: int) -> str:
-    """A time for people."""
+    """Format a time in UTC for people."""
     try:
         return datetime.fromtimestamp(time_ns // 1_000_000_000, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
     except (OverflowError, ValueError, OSError):
@@ -173,7 +173,7 @@ def moment(time_ns: int) -> str:
 
 
 def priority_word(priority: int) -> str:
-    """`high` for PRIORITY_HIGH; a number that means nothing is told as it is."""
+    """Word of a priority: `high` for PRIORITY_HIGH; an unknown number is returned as text."""
     try:
         return Priority.Name(priority).removeprefix("PRIORITY_").lower()
     except ValueError:

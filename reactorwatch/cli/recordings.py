@@ -1,16 +1,16 @@
-"""What can be done with recordings: `recover`, `info`, `cut` and `merge`."""
+"""Commands for recordings: `recover`, `info`, `cut` and `merge`."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Force, Json, existing, existing_recording, output_file, span_ns
-from reactorwatch.cli.printing import say, say_text
+from reactorwatch.cli.options import Force, Json, check_input, check_output, check_recording, parse_span_ns
+from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.errors import InputError
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("recover")(recover)
     app.command("info")(info)
@@ -27,7 +27,7 @@ def recover(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Save what is whole in a damaged recording."""
+    """Recover the intact messages of a damaged recording."""
     import msgspec
 
     from reactorwatch.cli.progress import task
@@ -35,19 +35,19 @@ def recover(
     from recorder.storage.part_file import is_held
     from recorder.storage.recover import recover as save
 
-    if is_held(existing(file)):
+    if is_held(check_input(file)):
         raise InputError(f"{file}: is still being written; stop its recorder first")
-    out = output_file(out, ".mcap", (file,), force=force) if out is not None else _beside(file)
+    out = check_output(out, ".mcap", (file,), force=force) if out is not None else _beside(file)
     with task(f"recovering {file.name}"):
         saved = save(file, out)
-    say_text(msgspec.json.encode(saved_object(saved, out)).decode() if as_json else saved_text(saved, file, out))
+    print_text(msgspec.json.encode(saved_object(saved, out)).decode() if as_json else saved_text(saved, file, out))
 
 
 def info(
     file: Annotated[Path, typer.Argument(help="A recording (.mcap), or a folder of them.", show_default=False)],
     as_json: Json = False,
 ) -> None:
-    """Say what is in a recording, and what is missing."""
+    """Show the contents of a recording, and missing messages."""
     import msgspec
 
     from reactorwatch.cli.progress import task
@@ -55,8 +55,8 @@ def info(
     from recorder.tools.inspect import look_over
 
     with task(f"reading {file.name}"):
-        seen = look_over(existing_recording(file))
-    say_text(msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file))
+        seen = look_over(check_recording(file))
+    print_text(msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file))
 
 
 def cut(
@@ -70,25 +70,25 @@ def cut(
     ] = None,
     force: Force = False,
 ) -> None:
-    """Copy a stretch of plant time out of a recording."""
+    """Copy a span of plant time out of a recording."""
     from reactorwatch.cli.progress import task
     from recorder.tools.cut import cut as copy
     from recorder.tools.cut import sampled_between
     from recorder.tools.inspect import zero_ns_of
     from recorder.tools.mcap_file import ZERO_NS, read_metadata, recordings_in
 
-    from_ns = span_ns(begin, "--from") if begin is not None else -(2**63)
-    to_ns = span_ns(end, "--to") if end is not None else 2**63
+    from_ns = parse_span_ns(begin, "--from") if begin is not None else -(2**63)
+    to_ns = parse_span_ns(end, "--to") if end is not None else 2**63
     if from_ns >= to_ns:
         raise InputError(f"--from must be before --to, got {begin} and {end or 'the end'}")
-    out = output_file(out, ".mcap", (file,), force=force)
+    out = check_output(out, ".mcap", (file,), force=force)
     with task(f"cutting {file.name}"):
-        sources = recordings_in(existing_recording(file))
+        sources = recordings_in(check_recording(file))
         zero_ns = zero_ns_of(file)
         window = sampled_between(sources, zero_ns + from_ns, zero_ns + to_ns)
         about = {**read_metadata(file), "cut": f"from {begin or 'the start'} to {end or 'the end'} of {file.name}"}
         count = copy(sources, out, window, {**about, ZERO_NS: str(zero_ns)})
-    say(f"wrote {out}: {count} messages")
+    print_lines(f"wrote {out}: {count} messages")
 
 
 def merge(
@@ -96,27 +96,27 @@ def merge(
     out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.mcap).", show_default=False)],
     force: Force = False,
 ) -> None:
-    """Put several recordings into one, in order of receipt."""
+    """Merge several recordings into one, in order of receipt."""
     from reactorwatch.cli.progress import task
     from recorder.tools.cut import merge as join
     from recorder.tools.mcap_file import read_metadata, recordings_in
 
-    out = output_file(out, ".mcap", files, force=force)
+    out = check_output(out, ".mcap", files, force=force)
     with task(f"merging into {out.name}"):
-        sources = [source for file in files for source in recordings_in(existing_recording(file))]
+        sources = [source for file in files for source in recordings_in(check_recording(file))]
         for number, source in enumerate(sources):
             if any(source.samefile(other) for other in sources[:number]):
                 raise InputError(f"{source}: is named twice, and its messages would be there twice; name it once")
         about = {**read_metadata(files[0]), "merged": ", ".join(source.name for source in sources)}
         count = join(sources, out, about)
-    say(f"wrote {out}: {count} messages")
+    print_lines(f"wrote {out}: {count} messages")
 
 
 def _beside(file: Path) -> Path:
-    """Where a recovered file goes if nothing is said: it is never written over.
+    """Default path of a recovered file, which is never overwritten.
 
     Raises:
-        InputError: there is one already.
+        InputError: the file exists.
     """
     out = file.with_name(f"{file.name.removesuffix('.part').removesuffix('.mcap')}-recovered.mcap")
     if out.exists():

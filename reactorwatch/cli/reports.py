@@ -1,4 +1,4 @@
-"""What commands print: a JSON object for machines, a few lines for people."""
+"""Output of `backtest`: a JSON object, or lines for people."""
 
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
     """The object that `backtest --json` prints.
 
     Args:
-        result: of the back-test.
-        zero_ns: where the file's minutes start.
-        zero: the same as a clock time; None: not known.
+        result: result of the back-test.
+        zero_ns: time from which the file's minutes are counted.
+        zero: the same time as ISO 8601; None: unknown.
     """
 
     def minutes(time_ns: int | None) -> float | None:
@@ -51,22 +51,22 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
 
 
 def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
-    """The same for people."""
-    said = backtest_object(result, zero_ns)
-    lines = [f"{file}: {said['samples']} rows over {said['span_min']:g} min"]
+    """Format the result of `backtest` for people."""
+    report = backtest_object(result, zero_ns)
+    lines = [f"{file}: {report['samples']} rows over {report['span_min']:g} min"]
     lines += [f"  {name} is not watched: {why}" for name, why in result.left_out.items()]
     if result.runs > 1:
         lines.append(
             f"the plant's clock steps back, or the plant was restarted: {result.runs} runs, watched one by one"
         )
-    if said["trained_until_min"] is None and result.refused_trainings:
+    if report["trained_until_min"] is None and result.refused_trainings:
         lines.append("nothing was watched: no training was fit to learn from, for the reasons below")
-    elif said["trained_until_min"] is None:
+    elif report["trained_until_min"] is None:
         lines.append("too short to watch: all of it went into the training (make it shorter with --training)")
     else:
         lines.append(
-            f"trained until {said['trained_until_min']:g} min; "
-            f"{said['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
+            f"trained until {report['trained_until_min']:g} min; "
+            f"{report['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
         )
         lines.append(_judged_by(result))
     for alarm, cleared_ns in result.raised:
@@ -75,10 +75,10 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
         )
         raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
         lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}")
-    told = dict.fromkeys(filter(None, (suspects_text(alarm.suspects, zero_ns) for alarm, _ in result.raised)))
-    lines += [f"  suspect: {text}" for text in told]
+    suspects = dict.fromkeys(filter(None, (suspects_text(alarm.suspects, zero_ns) for alarm, _ in result.raised)))
+    lines += [f"  suspect: {text}" for text in suspects]
     lines += [f"  note: {note}" for note in result.notes]
-    if not result.raised and said["trained_until_min"] is not None:
+    if not result.raised and report["trained_until_min"] is not None:
         lines.append("no alarms")
     if result.refused:
         lines.append("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items())))
@@ -86,7 +86,7 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
 
 
 def _judged_by(result: Backtest) -> str:
-    """The line that names the reference and its noise levels."""
+    """Line with the reference and its noise levels."""
     if result.noise_levels is None:
         return "judged by identified models (ARX)"
     levels = (f"{name} {sd:.3g}" for name, sd in result.noise_levels["sensors"].items())
@@ -94,5 +94,5 @@ def _judged_by(result: Backtest) -> str:
 
 
 def priority_word(alarm: Alarm) -> str:
-    """`high` for PRIORITY_HIGH."""
+    """Word of an alarm's priority: `high` for PRIORITY_HIGH."""
     return Priority.Name(alarm.priority).removeprefix("PRIORITY_").lower()

@@ -1,11 +1,11 @@
-"""Everything at once: `up` and `demo`."""
+"""Commands that run all nodes: `up` and `demo`."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import Diagnose, Endpoint, Plant, Settings, pace
+from reactorwatch.cli.options import Diagnose, Endpoint, Plant, Settings, parse_pace
 
 Site = Annotated[
     Path | None,
@@ -16,7 +16,7 @@ Site = Annotated[
 ]
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("up")(up)
     app.command("demo")(demo)
@@ -46,7 +46,7 @@ def up(
     """Run router, plant, monitor and recorder until stopped."""
     from reactorwatch.cli.supervise import run_until_stopped
 
-    flags = {"name": name, "speed": pace(speed, "--speed"), "seed": seed, "faults": fault or None}
+    flags = {"name": name, "speed": parse_pace(speed, "--speed"), "seed": seed, "faults": fault or None}
     raise typer.Exit(run_until_stopped(config, endpoint, out, flags, diagnose, site))
 
 
@@ -65,6 +65,6 @@ def demo(
     """Run it all with a fault in it, draw it, say what happened."""
     from reactorwatch.cli.demonstration import run
 
-    speed_value = pace(speed, "--speed")
+    speed_value = parse_pace(speed, "--speed")
     assert speed_value is not None
     raise typer.Exit(run(out, duration, speed_value, fault, seed, site))

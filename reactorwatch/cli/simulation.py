@@ -1,4 +1,4 @@
-"""`simulate`: the plant's equations against a record."""
+"""`simulate`: simulate the plant along a record."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,24 +17,24 @@ from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record, join_runs
 
 
-def free_run(measured: Record, model: ProcessModel, faults: list[str]) -> Record:
+def simulate_along(measured: Record, model: ProcessModel, faults: list[str]) -> Record:
     """Run the equations from the first row of each run of the record, driven by its input.
 
     Args:
-        measured: with the model's inputs and outputs as columns.
-        model: the process; a state of its own that no column shows begins at rest.
-        faults: specifications; their onsets are in the record's time.
+        measured: record with the model's inputs and outputs as columns.
+        model: the process; states without a column start at rest.
+        faults: specifications of faults, with onsets in the record's time.
 
     Raises:
         InputError: the record cannot drive the model.
     """
-    runs = measured.each_run()
-    simulated = join_runs([_free_run(run, model, faults, alone=len(runs) == 1) for run in runs])
+    runs = measured.split_runs()
+    simulated = join_runs([_simulate_run(run, model, faults, alone=len(runs) == 1) for run in runs])
     return replace(simulated, name=f"simulation of {measured.name}")
 
 
-def _free_run(measured: Record, model: ProcessModel, faults: list[str], *, alone: bool) -> Record:
-    """The free run along one run of a record; of a single row among other runs it is that row."""
+def _simulate_run(measured: Record, model: ProcessModel, faults: list[str], *, alone: bool) -> Record:
+    """Simulate along one run of a record; a single row among other runs is returned unchanged."""
     for text in faults:
         model = parse_fault(text, effects_of(model)).extend(model, end_min=float(measured.time_min[-1]))
     wrong = find_wrong_unit(model, measured.columns, measured.time_min)
@@ -44,10 +44,10 @@ def _free_run(measured: Record, model: ProcessModel, faults: list[str], *, alone
     inputs = np.column_stack([measured.columns[name] for name in model.input_names])
     first = {name: float(measured.columns[name][0]) for name in model.output_names}
     if not np.all(np.isfinite(list(first.values()))):
-        said = ", ".join(f"{name} = {value:g}" for name, value in first.items())
+        levels = ", ".join(f"{name} = {value:g}" for name, value in first.items())
         first_row = "the first row" if alone else "the first row of each run"
         raise InputError(
-            f"{measured.name}: {first_row} must have {' and '.join(first)}, the run starts from them; got {said}"
+            f"{measured.name}: {first_row} must have {' and '.join(first)}, the run starts from them; got {levels}"
         )
     if not np.all(np.isfinite(inputs)):
         row = int(np.argmax(~np.all(np.isfinite(inputs), axis=1)))
@@ -68,27 +68,27 @@ def _free_run(measured: Record, model: ProcessModel, faults: list[str], *, alone
 
 
 def report(measured: Record, simulated: Record, model: ProcessModel, out: Path | None, *, as_json: bool) -> str:
-    """How far the simulation is from the record, by signal.
+    """Format the root mean square difference between simulation and record, by signal.
 
     Args:
         measured: the record.
         simulated: the simulation, in the rows of the record.
         model: the process.
-        out: the file that the simulation was written to; None: it could not be written.
-        as_json: for machines.
+        out: file of the simulation; None: it could not be written.
+        as_json: format as a JSON object.
     """
     rmse, units = {}, model.units
     for name in model.output_names:
         difference = simulated.columns[name] - measured.columns[name]
         rmse[name] = float(np.sqrt(np.nanmean(difference**2)))
     if as_json:
-        said = {
+        result = {
             "file": None if out is None else str(out),
             "rows": measured.rows,
             "runs": len(measured.run_starts),
             "rmse": {name: {"value": value, "unit": units[name]} for name, value in rmse.items()},
         }
-        return msgspec.json.encode(said).decode()
+        return msgspec.json.encode(result).decode()
     parts = ", ".join(f"{name} {value:.3g} {units[name]}" for name, value in rmse.items())
     written = "not written" if out is None else f"wrote {out}"
     line = f"{written}: {measured.rows} rows; root mean square difference from the record: {parts}"

@@ -1,15 +1,15 @@
-"""A site: `certify` makes its certificates and rules, `router` keeps them, `doctor` and `status` say how it is."""
+"""Commands of a site: `certify` makes certificates and rules, `router` enforces them, `doctor` and `status` check."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from reactorwatch.cli.options import LONGEST_WAIT_S, Endpoint, Json, Plant, Settings
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.options import MAX_WAIT_S, Endpoint, Json, Plant, Settings
+from reactorwatch.cli.printing import print_lines
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("certify")(certify)
     app.command("router")(router)
@@ -25,24 +25,26 @@ def certify(
     ] = None,
     endpoint: Annotated[
         str | None,
-        typer.Option(help="Where nodes call the router [as before, or tls/127.0.0.1:7447].", show_default=False),
+        typer.Option(
+            help="Address at which nodes connect to the router [as before, or tls/127.0.0.1:7447].", show_default=False
+        ),
     ] = None,
     listen: Annotated[
         str | None,
-        typer.Option(help="Where the router listens [as before, or where it is called].", show_default=False),
+        typer.Option(help="Address at which the router listens [as before, or --endpoint].", show_default=False),
     ] = None,
     days: Annotated[float, typer.Option(help="How long certificates are valid.", min=1, max=3650)] = 365.0,
     renew: Annotated[
         float | None,
         typer.Option(
-            "--renew", help="Make certificates again that end within so many days.", min=0, max=3650, show_default=False
+            "--renew", help="Renew certificates that end within this many days.", min=0, max=3650, show_default=False
         ),
     ] = None,
     revoke: Annotated[
         list[str] | None,
         typer.Option(
             "--revoke",
-            help="Have the router refuse the certificates so far of this plant and role, such as cstr/monitor, and "
+            help="Make the router refuse the present certificates of this plant and role, such as cstr/monitor, and "
             "make a new one. Repeatable.",
             show_default=False,
         ),
@@ -50,9 +52,9 @@ def certify(
 ) -> None:
     """Make the certificates and access rules of a site.
 
-    Each who joins its bus gets a folder of its own, to be copied to its machine: certificate, key and settings for
-    --config. What is complete stays, what is half made is completed: a plant is added by naming it. The router's rules
-    are written again; start it again after that, unless certificates were only renewed.
+    Each client of its bus gets a folder of its own, to be copied to its machine: certificate, key and settings for
+    --config. Complete folders stay, incomplete ones are completed: a plant is added by naming it. The router's rules
+    are written again; restart it after that, unless certificates were only renewed.
     """
     from datetime import UTC, datetime
 
@@ -60,10 +62,12 @@ def certify(
 
     now, revoked = datetime.now(UTC), tuple(revoke or ())
     for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, now, renew_days=renew, revoke=revoked):
-        said = "; signs new certificates, keep it off line" if made.name == AUTHORITY else ""
-        say(f"{made}{said}")
+        note = "; signs new certificates, keep it off line" if made.name == AUTHORITY else ""
+        print_lines(f"{made}{note}")
     for holder in revoke or ():
-        say(f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; start the router again")
+        print_lines(
+            f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; restart the router"
+        )
 
 
 def router(
@@ -77,18 +81,18 @@ def router(
     config: Settings = None,
     endpoint: Annotated[
         str | None,
-        typer.Option(help="Where a plain router listens [tcp/127.0.0.1:7447].", show_default=False),
+        typer.Option(help="Address at which a plain router listens [tcp/127.0.0.1:7447].", show_default=False),
     ] = None,
 ) -> None:
-    """Run a router until stopped: of a site, with its certificates and access rules, or without a file a plain one.
+    """Run a router until stopped: that of a site, with certificates and access rules, or without a file a plain one.
 
-    The log says what the rules refuse.
+    Refused messages are logged.
     """
     import threading
 
     import structlog
 
-    from reactorwatch.cli.options import existing
+    from reactorwatch.cli.options import check_input
     from reactorwatch.errors import InputError
     from reactorwatch.runtime.bus_zenoh import log_refusals, router_from_file
     from reactorwatch.runtime.bus_zenoh import router as plain_router
@@ -102,9 +106,9 @@ def router(
     settings = section(BusConfig, "bus", tables, {"endpoint": endpoint})
     configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
     with log_refusals(), stop_on_signals() as stop:
-        bus = router_from_file(existing(file)) if file is not None else plain_router(settings)
+        bus = router_from_file(check_input(file)) if file is not None else plain_router(settings)
         stopped = threading.Event()
-        stop.wakes(stopped.set)
+        stop.call_on_set(stopped.set)
         structlog.get_logger().info("router", **({"settings": str(file)} if file else {"endpoint": settings.endpoint}))
         try:
             if not stop.is_set:
@@ -117,30 +121,30 @@ def doctor(
     config: Settings = None,
     endpoint: Endpoint = None,
     name: Plant = None,
-    timeout: Annotated[float, typer.Option(help="Seconds to listen for nodes.", min=0.1, max=LONGEST_WAIT_S)] = 12.0,
+    timeout: Annotated[float, typer.Option(help="Seconds to listen for nodes.", min=0.1, max=MAX_WAIT_S)] = 12.0,
     as_json: Json = False,
 ) -> None:
-    """Check a deployment from here: one line a check, with the cure. Ends with 0 if all is well, 1 if not."""
+    """Check a deployment from here: one line a check, with the cure. Ends with 0 if all checks pass, 1 if not."""
     from datetime import UTC, datetime
 
     import msgspec
 
-    from reactorwatch.cli.doctor import examine
-    from reactorwatch.cli.observer import begin_beside_recorder
+    from reactorwatch.cli.doctor import run_checks
+    from reactorwatch.cli.observer import load_recorder_settings
 
-    bus, recorder = begin_beside_recorder(config, endpoint, name)
+    bus, recorder = load_recorder_settings(config, endpoint, name)
     out = Path(recorder.out)
     folder = out.parent if out.suffix == ".mcap" else out
     is_well = True
     checks = []
-    for finding in examine(bus, recorder.plant, folder, recorder.rotate_mb, timeout, datetime.now(UTC)):
+    for finding in run_checks(bus, recorder.plant, folder, recorder.rotate_mb, timeout, datetime.now(UTC)):
         is_well = is_well and not finding.cure
         checks.append({"ok": not finding.cure, **finding._asdict()})
         if not as_json:
             cure = f"; {finding.cure}" if finding.cure else ""
-            say(f"{'WRONG' if finding.cure else 'ok':5s}  {finding.check}: {finding.found}{cure}")
+            print_lines(f"{'WRONG' if finding.cure else 'ok':5s}  {finding.check}: {finding.found}{cure}")
     if as_json:
-        say(msgspec.json.encode({"ok": is_well, "checks": checks}).decode())
+        print_lines(msgspec.json.encode({"ok": is_well, "checks": checks}).decode())
     raise typer.Exit(0 if is_well else 1)
 
 
@@ -152,14 +156,14 @@ def status(
     ] = None,
     once: Annotated[bool, typer.Option("--once", help="Show it once.")] = False,
     seconds: Annotated[
-        float, typer.Option(help="How long to listen before showing it once.", min=0.1, max=LONGEST_WAIT_S)
+        float, typer.Option(help="How long to listen before showing it once.", min=0.1, max=MAX_WAIT_S)
     ] = 4.0,
     as_json: Json = False,
 ) -> None:
-    """Show plants, nodes, rates and alarms as they are now, until stopped."""
-    from reactorwatch.cli.observer import begin_beside_recorder
+    """Show the current state of plants, nodes, rates and alarms, until stopped."""
+    from reactorwatch.cli.observer import load_recorder_settings
     from reactorwatch.cli.status import run
 
-    bus, recorder = begin_beside_recorder(config, endpoint, name)
-    # a certificate is for one plant, and what it may not read it gets nothing of
+    bus, recorder = load_recorder_settings(config, endpoint, name)
+    # a certificate is for one plant, and messages of others are not received
     run(bus, recorder.plant if name is not None or bus.ca is not None else None, seconds, once=once, as_json=as_json)

@@ -1,4 +1,4 @@
-"""`status`: plants, their nodes, rates and alarms, as they are now."""
+"""`status`: current state of plants, their nodes, rates and alarms."""
 
 import contextlib
 import threading
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from reactorwatch.cli.printing import say_text
+from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.reports import priority_word
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
 
 SECOND_NS = 1_000_000_000
 WINDOW_S = 10
-"""Rates are of so many whole seconds, the one that is running left out."""
+"""Seconds over which rates are counted, without the current one."""
 REFRESH_S = 1.0
 HISTORY_S = 60.0
-"""Of health: longer than any node waits until it publishes it again."""
+"""History of health: longer than any node's period."""
 ANSWER_WITHIN_S = 2.0
 
 
-class Board:
-    """What is known of the plants; may be called from any thread.
+class StatusBoard:
+    """State of the plants; may be called from any thread.
 
     Args:
-        start_ns: when listening began.
+        start_ns: time of the subscription.
     """
 
     def __init__(self, start_ns: int) -> None:
@@ -47,27 +47,27 @@ class Board:
         self._lock = threading.Lock()
 
     def on_token(self, key: str, is_alive: bool) -> None:
-        """A node came or went."""
+        """Record that a node's token appeared or disappeared."""
         topic = keys.parse(key)
         if topic is not None:
             with self._lock:
                 (self._alive.add if is_alive else self._alive.discard)((topic.plant, topic.name))
 
     def on_message(self, message: Encoded) -> None:
-        """Something was published."""
+        """Record a publication."""
         topic = keys.parse(message.key)
         try:
-            said = decode(message.payload, message.encoding)
+            body = decode(message.payload, message.encoding)
         except DecodeError:
             return
         if topic is None:
             return
         with self._lock:
-            if isinstance(said, Health):
-                self._health[topic.plant, topic.name] = said
-            elif isinstance(said, Alarm):
-                self._alarms[topic.plant, said.alarm] = said
-            elif isinstance(said, Sample):
+            if isinstance(body, Health):
+                self._health[topic.plant, topic.name] = body
+            elif isinstance(body, Alarm):
+                self._alarms[topic.plant, body.alarm] = body
+            elif isinstance(body, Sample):
                 seconds = self._samples.setdefault(topic.plant, Counter())
                 second = message.received_ns // SECOND_NS
                 seconds[second] += 1
@@ -75,39 +75,39 @@ class Board:
                     del seconds[old]
 
     def on_alarms(self, plant: str, alarms: list[Alarm]) -> None:
-        """All alarms of a node, as it lists them; what was published meanwhile is newer."""
+        """Record a node's list of alarms; published ones are newer and stay."""
         with self._lock:
             for alarm in alarms:
                 self._alarms.setdefault((plant, alarm.alarm), alarm)
 
     @property
     def plants(self) -> list[str]:
-        """All of which anything is known."""
+        """Names of all plants with any record."""
         with self._lock:
-            known = {plant for plant, _ in (*self._alive, *self._health, *self._alarms)}
-            return sorted(known | self._samples.keys())
+            plants = {plant for plant, _ in (*self._alive, *self._health, *self._alarms)}
+            return sorted(plants | self._samples.keys())
 
     def plant(self, name: str, now_ns: int) -> dict[str, Any]:
-        """A plant as it is now, for machines."""
+        """State of a plant as a JSON object."""
         with self._lock:
             second = now_ns // SECOND_NS
-            span_s = min(WINDOW_S, second - self._start_ns // SECOND_NS - 1)  # the second of the start was not whole
+            span_s = min(WINDOW_S, second - self._start_ns // SECOND_NS - 1)  # without the second of the start
             counts = self._samples.get(name, Counter())
-            heard = sum(count for item, count in counts.items() if second - span_s <= item < second)
+            samples = sum(count for item, count in counts.items() if second - span_s <= item < second)
             nodes = {node for plant, node in (*self._alive, *self._health) if plant == name}
             alarms = [alarm for (plant, _), alarm in self._alarms.items() if plant == name]
             return {
                 "plant": name,
-                "samples_per_s": heard / span_s if span_s > 0 else None,
+                "samples_per_s": samples / span_s if span_s > 0 else None,
                 "nodes": [self._node(name, node, now_ns) for node in sorted(nodes)],
-                "alarms": [_alarm(alarm) for alarm in sorted(alarms, key=_rank) if _is_in_sight(alarm)],
+                "alarms": [_alarm(alarm) for alarm in sorted(alarms, key=_rank) if _is_visible(alarm)],
             }
 
     def _node(self, plant: str, node: str, now_ns: int) -> dict[str, Any]:
-        found: dict[str, Any] = {"node": node, "alive": (plant, node) in self._alive}
+        state: dict[str, Any] = {"node": node, "alive": (plant, node) in self._alive}
         health = self._health.get((plant, node))
         if health is not None:
-            found |= {
+            state |= {
                 "phase": health.phase,
                 "version": health.version,
                 "said_s_ago": (now_ns - health.time_ns) / SECOND_NS,
@@ -115,21 +115,21 @@ class Board:
                 **{name: getattr(health, name) for name in ("received", "published", "lost", "late", "refused")},
                 "lag_ms": health.lag_ms,
             }
-        return found
+        return state
 
 
 def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as_json: bool) -> None:
     """Show the status, once or until SIGINT or SIGTERM.
 
     Args:
-        config: where the bus is.
-        plant: which; None: all that there are.
-        listen_s: for how long, before it is shown once.
-        once: whether that is all.
-        as_json: whether it is one JSON object, once.
+        config: connection to the bus.
+        plant: name of the plant; None: all plants.
+        listen_s: seconds before the status is shown once.
+        once: show it once.
+        as_json: show it once, as one JSON object.
 
     Raises:
-        InputError: there is no router, or it does not let us in.
+        InputError: there is no router, or it refuses the connection.
     """
     with stop_on_signals() as stop:
         try:
@@ -138,51 +138,51 @@ def run(config: BusConfig, plant: str | None, listen_s: float, *, once: bool, as
             raise InputError(f"no router at {config.endpoint}: {error}; `reactorwatch doctor` says more") from error
         try:
             stopped = threading.Event()
-            stop.wakes(stopped.set)
-            board = _listening(bus, plant or "*")
+            stop.call_on_set(stopped.set)
+            board = _subscribe(bus, plant or "*")
             if once or as_json:
                 stopped.wait(listen_s)
-                _ask_alarms(bus, board)
-                say_text(_text(board, as_json=as_json).removesuffix("\n"))
+                _query_alarms(bus, board)
+                print_text(_text(board, as_json=as_json).removesuffix("\n"))
             else:
                 _show(bus, board, stopped)
         finally:
             bus.close()
 
 
-def _listening(bus: ZenohBus, plant: str) -> Board:
-    board = Board(time.time_ns())
-    bus.watch_alive(keys.all_of(plant, keys.ALIVE), board.on_token)
-    bus.subscribe(keys.all_of(plant, keys.HEALTH), board.on_message, history_s=HISTORY_S)
+def _subscribe(bus: ZenohBus, plant: str) -> StatusBoard:
+    board = StatusBoard(time.time_ns())
+    bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), board.on_token)
+    bus.subscribe(keys.all_keys(plant, keys.HEALTH), board.on_message, history_s=HISTORY_S)
     for kind in (keys.SAMPLE, keys.ALARM):
-        bus.subscribe(keys.all_of(plant, kind), board.on_message)
+        bus.subscribe(keys.all_keys(plant, kind), board.on_message)
     return board
 
 
-def _ask_alarms(bus: ZenohBus, board: Board) -> None:
+def _query_alarms(bus: ZenohBus, board: StatusBoard) -> None:
     for plant in board.plants:
         for command in ("list_alarms", keys.LIST_RECORDER_ALARMS):
             question = Encoded(keys.key(plant, keys.COMMAND, command), *encode_message(ListAlarms()))
-            for answer in bus.ask(question, ANSWER_WITHIN_S):
+            for answer in bus.query(question, ANSWER_WITHIN_S):
                 with contextlib.suppress(DecodeError):
                     reply = decode(answer.payload, answer.encoding)
                     if isinstance(reply, CommandReply):
                         board.on_alarms(plant, list(reply.alarms))
 
 
-def _show(bus: ZenohBus, board: Board, stopped: threading.Event) -> None:
+def _show(bus: ZenohBus, board: StatusBoard, stopped: threading.Event) -> None:
     from rich.live import Live
 
     asked: list[str] = []
     with Live(auto_refresh=False) as live:
         while not stopped.wait(REFRESH_S):
             if board.plants != asked:
-                _ask_alarms(bus, board)
+                _query_alarms(bus, board)
                 asked = board.plants
             live.update(_table(board, time.time_ns()), refresh=True)
 
 
-def _text(board: Board, *, as_json: bool) -> str:
+def _text(board: StatusBoard, *, as_json: bool) -> str:
     now_ns = time.time_ns()
     if as_json:
         plants = [board.plant(name, now_ns) for name in board.plants]
@@ -197,7 +197,7 @@ def _text(board: Board, *, as_json: bool) -> str:
     return console.file.getvalue()
 
 
-def _table(board: Board, now_ns: int) -> "Table":
+def _table(board: StatusBoard, now_ns: int) -> "Table":
     from rich.table import Table
     from rich.text import Text
 
@@ -221,9 +221,9 @@ def _table(board: Board, now_ns: int) -> "Table":
                 (alarms or "none") if first else "",
             )
             lines = (printable_lines(cell.split("\n")) for cell in cells)
-            table.add_row(*map(Text, lines))  # what came from the bus is no markup
+            table.add_row(*map(Text, lines))  # text from the bus is no markup
     if not table.row_count:
-        table.add_row("nobody is there", *[""] * 8)
+        table.add_row("no nodes", *[""] * 8)
     return table
 
 
@@ -236,7 +236,7 @@ def _alarm(alarm: Alarm) -> dict[str, Any]:
     }
 
 
-def _is_in_sight(alarm: Alarm) -> bool:
+def _is_visible(alarm: Alarm) -> bool:
     return alarm.state in (
         AlarmState.ALARM_STATE_UNACKNOWLEDGED,
         AlarmState.ALARM_STATE_ACKNOWLEDGED,
@@ -245,5 +245,5 @@ def _is_in_sight(alarm: Alarm) -> bool:
 
 
 def _rank(alarm: Alarm) -> tuple[int, int]:
-    """The most urgent first, then the newest."""
+    """Sort key: the most urgent first, then the newest."""
     return -alarm.priority, -alarm.raised_ns

@@ -15,18 +15,18 @@ from reactorwatch.cli.options import (
     Processes,
     Scheduler,
     Settings,
-    columns,
-    existing,
-    existing_recording,
-    limits,
-    output_file,
-    tolerances,
+    check_input,
+    check_output,
+    check_recording,
+    parse_columns,
+    parse_limits,
+    parse_tolerances,
 )
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.errors import InputError
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
     app.command("simulate")(simulate)
     app.command("backtest")(backtest)
@@ -50,21 +50,21 @@ def simulate(
     They start from its first row and run freely, driven by its inputs.
     """
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import process_model, record, signals_of
-    from reactorwatch.cli.simulation import free_run, report
+    from reactorwatch.cli.read_record import load_process_model, record, required_signals
+    from reactorwatch.cli.simulation import report, simulate_along
     from reactorwatch.records.csv_file import write_csv
 
-    out = output_file(out, ".csv", (file, model), force=force)
-    measured = record(existing_recording(file), plant, columns(column), signals_of(model))
-    process = process_model(model, measured)
+    out = check_output(out, ".csv", (file, model), force=force)
+    measured = record(check_recording(file), plant, parse_columns(column), required_signals(model))
+    process = load_process_model(model, measured)
     with task(f"simulating {file.name}"):
-        simulated = free_run(measured, process, fault or [])
+        simulated = simulate_along(measured, process, fault or [])
         try:
             write_csv(out, simulated)
         except InputError:
-            say(report(measured, simulated, process, None, as_json=as_json))
+            print_lines(report(measured, simulated, process, None, as_json=as_json))
             raise
-    say(report(measured, simulated, process, out, as_json=as_json))
+    print_lines(report(measured, simulated, process, out, as_json=as_json))
 
 
 def backtest(
@@ -86,23 +86,23 @@ def backtest(
 ) -> None:
     """Run the monitor over recordings at full speed."""
     from monitor_node.config import MonitorConfig
-    from reactorwatch.cli.backtest_jobs import WATCHING, jobs_of
-    from reactorwatch.cli.batch import SUMMARY, files_named, say
+    from reactorwatch.cli.backtest_jobs import BACKTEST, make_jobs
+    from reactorwatch.cli.batch import SUMMARY, expand_files, run_jobs
     from reactorwatch.cli.read_record import DEFAULT_PLANT
-    from reactorwatch.records.output import checked_folder
+    from reactorwatch.records.output import check_output_folder
     from reactorwatch.runtime.config import read_settings, section
 
-    named = files_named(files)
+    named = expand_files(files)
     if out is not None:
-        checked_folder(out, SUMMARY, (*named, config, model), force=force)
+        check_output_folder(out, SUMMARY, (*named, config, model), force=force)
     flags = {
         "plant": plant or DEFAULT_PLANT,
         "training_min": training,
-        "model": str(existing(model)) if model is not None else None,
+        "model": str(check_input(model)) if model is not None else None,
     }
     settings = section(MonitorConfig, "monitor", read_settings(config), flags)
-    todo = jobs_of(named, settings, plant, columns(column), as_json=as_json, elsewhere=scheduler is not None)
-    say(WATCHING, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)
+    todo = make_jobs(named, settings, plant, parse_columns(column), as_json=as_json, elsewhere=scheduler is not None)
+    run_jobs(BACKTEST, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)
 
 
 def diagnose(
@@ -142,12 +142,14 @@ def diagnose(
     as_json: Json = False,
 ) -> None:
     """Say what the simulation gets wrong, and why."""
-    from reactorwatch.cli.batch import files_named, say
-    from reactorwatch.cli.diagnosis import Asked
-    from reactorwatch.cli.diagnosis_jobs import DIAGNOSING, check_out, jobs_of
+    from reactorwatch.cli.batch import expand_files, run_jobs
+    from reactorwatch.cli.diagnosis import DiagnosisOptions
+    from reactorwatch.cli.diagnosis_jobs import DIAGNOSIS, check_out, make_jobs
 
-    named = files_named(files)
+    named = expand_files(files)
     check_out(named, out, model, force=force)
-    asked = Asked(plant, columns(column), model, uncertain, tolerances(tolerance), limits(limit))
-    todo = jobs_of(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
-    say(DIAGNOSING, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)
+    asked = DiagnosisOptions(
+        plant, parse_columns(column), model, uncertain, parse_tolerances(tolerance), parse_limits(limit)
+    )
+    todo = make_jobs(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
+    run_jobs(DIAGNOSIS, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)

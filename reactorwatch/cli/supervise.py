@@ -1,4 +1,4 @@
-"""`up`: the router in this process, the nodes as processes, until somebody says stop."""
+"""`up`: run the router in this process and the nodes as processes, until stopped."""
 
 import contextlib
 import threading
@@ -15,7 +15,14 @@ from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
 from monitor_node.pipeline import check_promise
 from plant_node.config import PlantConfig
-from reactorwatch.cli.bus_settings import VIEWER, Joining, heard_by, joining, open_router, write_node_settings
+from reactorwatch.cli.bus_settings import (
+    VIEWER,
+    BusSettings,
+    load_bus_settings,
+    open_router,
+    restrict_to_plant,
+    write_node_settings,
+)
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
 from reactorwatch.diagnosis.practical_significance import checked_tolerance
 from reactorwatch.errors import InputError
@@ -32,9 +39,9 @@ from recorder.policy.series import ENDING
 
 log = structlog.get_logger()
 
-LOOK_EVERY_S = 0.5
+POLL_S = 0.5
 DEFAULT_OUT = "runs"
-"""Folder of recordings where neither the command line nor the settings give one."""
+"""Default folder of recordings."""
 
 
 def run_until_stopped(
@@ -52,15 +59,15 @@ def run_until_stopped(
         endpoint: the router's address, or None.
         out: folder for the recording and the settings that ran, or the recording's file; a folder that does not exist
             is made. None: `out` of the recorder's settings, or the folder `runs`.
-        flags: of the plant; None: not said.
+        flags: flags of the plant; None: not given.
         diagnose: folder for diagnoses after alarms; None: that of the settings, or none.
-        site: folder of certificates, whose router is run and whose roles the nodes take; None: all is plain.
+        site: folder of a site, for its router and the nodes' certificates; None: without TLS.
 
     Returns:
-        0 if it was stopped or the plant came to its end, 1 if a node failed.
+        0 if it was stopped or the plant finished, 1 if a node failed.
 
     Raises:
-        InputError: settings that cannot be used.
+        InputError: invalid settings.
     """
     tables = read_settings(config)
     log_config = section(LogConfig, "log", tables, {})
@@ -75,23 +82,23 @@ def run_until_stopped(
         raise InputError(f"settings [monitor]: {error}") from error
     of_recorder = {"recorder": {"out": DEFAULT_OUT, **tables.get("recorder", {})}}
     recorder_flags = {"plant": name or plant.name, "out": str(out) if out is not None else None}
-    recorder = heard_by(section(RecorderConfig, "recorder", of_recorder, recorder_flags), site)
-    join = joining(site, plant.name, tables, endpoint)
+    recorder = restrict_to_plant(section(RecorderConfig, "recorder", of_recorder, recorder_flags), site)
+    join = load_bus_settings(site, plant.name, tables, endpoint)
     diagnosis = diagnosis_settings(tables, monitor, diagnose)
     metrics = section(MetricsConfig, "metrics", tables, {})
     if Path(recorder.out).suffix != ENDING:
         check_folder_name(Path(recorder.out), "--out")
-    with open_router(site, join):  # before anything is written: an address that is taken leaves nothing behind
+    with open_router(site, join):  # before anything is written, in case the address is taken
         tables_written = {"plant": plant, "monitor": monitor, "diagnosis": diagnosis, "metrics": metrics}
         nodes = ("recorder", *(["diagnosis"] if diagnosis.out else []), "monitor", "plant")
-        settings = _write_down(recorder, plant.seed, {**tables_written, "log": log_config}, join, nodes)
+        settings = _write_settings(recorder, plant.seed, {**tables_written, "log": log_config}, join, nodes)
         with stop_on_signals() as stop, Processes(settings) as processes:
             woken = threading.Event()
-            stop.wakes(woken.set)
+            stop.call_on_set(woken.set)
             for node in nodes:
                 processes.start(node)
             log.info("running", plant=plant.name, router=join[VIEWER].endpoint, out=recorder.out, stop="Ctrl-C")
-            while not woken.wait(LOOK_EVERY_S):
+            while not woken.wait(POLL_S):
                 ended = processes.ended()
                 if ended:
                     for node, code in ended.items():
@@ -101,31 +108,31 @@ def run_until_stopped(
 
 
 def diagnosis_settings(tables: dict[str, dict[str, Any]], monitor: MonitorConfig, out: Path | None) -> DiagnosisConfig:
-    """Those of diagnoses after alarms.
+    """Settings of diagnoses after alarms.
 
     Args:
-        tables: of the settings file.
-        monitor: whose plant is diagnosed, against the model that it has, unless the settings say another.
+        tables: tables of the settings file.
+        monitor: settings of the monitor, whose plant and model are the defaults.
         out: folder for the reports; None: as in the settings.
 
     Raises:
-        InputError: settings that cannot be used, or a folder that is a file.
+        InputError: invalid settings, or a folder that is a file.
     """
     of_monitor = {"plant": monitor.plant, **({"model": monitor.model} if monitor.model else {})}
     tables = {"diagnosis": {**of_monitor, **tables.get("diagnosis", {})}}
-    found = section(DiagnosisConfig, "diagnosis", tables, {"out": str(out) if out is not None else None})
-    if found.out is not None and Path(found.out).exists() and not Path(found.out).is_dir():
-        raise InputError(f"--diagnose {found.out}: is a file, the name of a folder was expected")
-    if found.out is not None:
-        check_meant(found)
-    return found
+    settings = section(DiagnosisConfig, "diagnosis", tables, {"out": str(out) if out is not None else None})
+    if settings.out is not None:
+        if Path(settings.out).exists() and not Path(settings.out).is_dir():
+            raise InputError(f"--diagnose {settings.out}: is a file, the name of a folder was expected")
+        check_against_model(settings)
+    return settings
 
 
-def check_meant(config: DiagnosisConfig) -> None:
-    """Check what only the model can say of settings, so that it is said now and not after an alarm.
+def check_against_model(config: DiagnosisConfig) -> None:
+    """Check settings against the model now, and not after an alarm.
 
     Raises:
-        InputError: there is no such model, or a tolerance is of none of its outputs.
+        InputError: there is no such model, or a tolerance is for none of its outputs.
     """
     model = cstr() if config.model is None else read_extended_model(Path(config.model)).build()
     try:
@@ -135,8 +142,8 @@ def check_meant(config: DiagnosisConfig) -> None:
 
 
 @contextlib.contextmanager
-def diagnosing(config: DiagnosisConfig, bus_config: BusConfig, log_config: LogConfig) -> Iterator[None]:
-    """Diagnose after alarms, in a process of its own, while the context lasts."""
+def run_diagnosis_node(config: DiagnosisConfig, bus_config: BusConfig, log_config: LogConfig) -> Iterator[None]:
+    """Run the diagnosis node in a process of its own while the context lasts."""
     with TemporaryDirectory() as folder:
         settings = Path(folder) / "settings.toml"
         write_settings(settings, {"bus": bus_config, "diagnosis": config, "log": log_config})
@@ -145,14 +152,14 @@ def diagnosing(config: DiagnosisConfig, bus_config: BusConfig, log_config: LogCo
             yield
 
 
-def _write_down(
+def _write_settings(
     recorder: RecorderConfig,
     seed: int,
     others: dict[str, msgspec.Struct],
-    join: Joining,
+    join: BusSettings,
     nodes: Sequence[str],
 ) -> dict[str, Path]:
-    """Write the whole settings where the recordings will be, named after the moment as they are; each node's file."""
+    """Write the settings beside the recordings, under the same name; returns each node's file."""
     out = Path(recorder.out)
     make_folder(out.parent if out.suffix == ENDING and not out.is_dir() else out, "--out")
     recording = file_for(recorder, datetime.now(UTC))

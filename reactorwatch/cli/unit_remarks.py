@@ -1,4 +1,4 @@
-"""Remarks about units, where a command can answer without the plant's equations but they could not judge the record."""
+"""Remarks on wrong units for commands that work without the plant's equations."""
 
 from collections.abc import Iterable, Iterator, Mapping
 
@@ -12,27 +12,27 @@ from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import to_minutes
 
-MOST_SAMPLES = 3000
-"""Of each signal: so many tell its unit."""
+MAX_SAMPLES = 3000
+"""Samples of each signal from which its unit is checked."""
 
 
 def unit_remark(model: ProcessModel, columns: Mapping[str, Array], time_min: Array) -> str:
-    """The first unit that is not the model's, and what follows from it; empty if there is none.
+    """Remark on the first unit that is not the model's; empty if there is none.
 
     Args:
-        model: of the plant.
-        columns: values by signal, NaN where not measured.
-        time_min: shape (rows,).
+        model: model of the plant.
+        columns: values by signal, each of shape (rows,); NaN: not measured.
+        time_min: times, shape (rows,).
     """
     wrong = find_wrong_unit(model, columns, time_min)
     return "" if wrong is None else f"{wrong.text}. The plant's equations cannot judge it so; a learned model can"
 
 
 class FirstSamples:
-    """The first samples of a plant among messages that go by.
+    """Collects the first samples of a plant from a stream of messages.
 
     Args:
-        plant: its name.
+        plant: name of the plant.
     """
 
     def __init__(self, plant: str) -> None:
@@ -40,15 +40,15 @@ class FirstSamples:
         self._series: dict[str, list[tuple[int, float]]] = {}
 
     def pass_on(self, messages: Iterable[Encoded]) -> Iterator[Encoded]:
-        """Yield the messages unchanged, and note the first samples."""
+        """Yield the messages unchanged, and collect the first samples."""
         for message in messages:
             if message.key.startswith(self._prefix):
                 series = self._series.setdefault(message.key.removeprefix(self._prefix), [])
-                if len(series) < MOST_SAMPLES:
-                    self._note(message, series)
+                if len(series) < MAX_SAMPLES:
+                    self._collect(message, series)
             yield message
 
-    def _note(self, message: Encoded, series: list[tuple[int, float]]) -> None:
+    def _collect(self, message: Encoded, series: list[tuple[int, float]]) -> None:
         try:
             sample = decode(message.payload, message.encoding)
         except DecodeError:
@@ -57,7 +57,7 @@ class FirstSamples:
             series.append((sample.time_ns, sample.value))
 
     def unit_remark(self, model: ProcessModel) -> str:
-        """The remark of `unit_remark` on these samples."""
+        """Remark on these samples, see `unit_remark`."""
         columns = {name: np.array([value for _, value in series]) for name, series in self._series.items()}
         times = next(iter(self._series.values()), [])
         return unit_remark(model, columns, np.array([to_minutes(time_ns) for time_ns, _ in times]))

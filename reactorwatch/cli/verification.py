@@ -1,4 +1,4 @@
-"""`replay --verify`: a recording through the monitor's core, and what it says held against what was recorded."""
+"""`replay --verify`: run a recording through the monitor's core and compare the output with the recorded messages."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,37 +10,37 @@ from monitor_node.config import MonitorConfig
 from monitor_node.replay.message_diff import Difference
 from monitor_node.replay.verification import COMPARED, Verification, verify
 from reactorwatch import __version__
-from reactorwatch.cli.printing import say_text
+from reactorwatch.cli.printing import print_text
 from reactorwatch.cli.progress import task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import clock_time, to_minutes
+from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.runtime.config import parse_toml, read_settings, section
 from reactorwatch.terminal import printable_lines
 from recorder.tools.inspect import gaps_in, zero_ns_of
 from recorder.tools.mcap_file import has_clock, one_plant_in, read_messages, read_metadata
 
 SETTINGS = "settings"
-"""What our metadata of a recording calls the settings of the nodes that ran."""
-MOST_LINES = 10
-LONGEST_VALUE = 60
+"""Name of the nodes' settings in the metadata of a recording."""
+MAX_LINES = 10
+MAX_VALUE = 60
 
 
 def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) -> int:
-    """Verify a recording and print what came of it.
+    """Verify a recording and print the result.
 
     Args:
         file: the recording, or a folder of them.
-        config: settings file; None: those in the recording.
-        plant: whose monitor; may be left out if there is but one.
-        as_json: whether one JSON object is printed, for machines.
+        config: settings file; None: the settings in the recording.
+        plant: plant of the monitor; None: the only one in the recording.
+        as_json: print one JSON object.
 
     Returns:
-        The exit code: 0 if everything is said again as it was recorded, 1 if not.
+        The exit code: 0 if every recorded message is reproduced, 1 if not.
 
     Raises:
-        InputError: it cannot be read, or nothing in it can be verified.
+        InputError: the recording cannot be read, or holds nothing to verify.
     """
     if file.suffix.lower() == ".csv":
         raise InputError(f"{file}: holds no alarms to verify; a recording (.mcap) was expected")
@@ -52,29 +52,31 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
 
     with task(f"verifying {file.name}"):
         try:
-            found = verify(read, monitor)
+            verification = verify(read, monitor)
         except InputError as error:
             raise error if str(error).startswith(str(file)) else InputError(f"{file}: {error}") from error
     version = metadata.get("version", __version__)
     if version != __version__:
-        found.notes.append(f"it was recorded by version {version}, and this is {__version__}")
-    found.notes += [
-        f"{gap.messages} messages of {gap.stream} never reached this recording; what the monitor said of them, "
-        "and what it learned from them, is then not said again"
+        verification.notes.append(f"it was recorded by version {version}, and this is {__version__}")
+    verification.notes += [
+        f"{gap.messages} messages of {gap.stream} never reached this recording; what the monitor published about "
+        "them, and what it learned from them, is then not reproduced"
         for gap in gaps_in(file)
-        if gap.stream in {keys.all_of(monitor.plant, kind).removesuffix("/**") for kind in (keys.SAMPLE, *COMPARED)}
+        if gap.stream in {keys.all_keys(monitor.plant, kind).removesuffix("/**") for kind in (keys.SAMPLE, *COMPARED)}
     ]
     zero_ns = zero_ns_of(file)
-    said = _object(found, file, monitor.plant, zero_ns) | {"zero": clock_time(zero_ns) if has_clock(metadata) else None}
-    say_text(msgspec.json.encode(said).decode() if as_json else _text(said))
-    return 0 if found.exact else 1
+    report = _object(verification, file, monitor.plant, zero_ns) | {
+        "zero": format_utc(zero_ns) if has_clock(metadata) else None
+    }
+    print_text(msgspec.json.encode(report).decode() if as_json else _text(report))
+    return 0 if verification.exact else 1
 
 
 def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: str) -> MonitorConfig:
-    """How the monitor was set when this was recorded.
+    """Settings of the monitor when this was recorded.
 
     Raises:
-        InputError: nobody says.
+        InputError: they are neither given nor in the recording.
     """
     if config is not None:
         tables = read_settings(config)
@@ -90,22 +92,22 @@ def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: 
     return section(MonitorConfig, "monitor", tables, {"plant": plant})
 
 
-def _object(found: Verification, file: Path, plant: str, zero_ns: int) -> dict[str, Any]:
-    counts = found.comparison.counts
+def _object(verification: Verification, file: Path, plant: str, zero_ns: int) -> dict[str, Any]:
+    counts = verification.comparison.counts
     return {
         "file": str(file),
         "plant": plant,
-        "exact": found.exact,
-        "rows": found.rows,
-        "from_min": to_minutes(found.first_ns, zero_ns),
+        "exact": verification.exact,
+        "rows": verification.rows,
+        "from_min": to_minutes(verification.first_ns, zero_ns),
         "compared": sum(count.recorded for count in counts.values()),
         "kinds": [
             {"kind": kind, "recorded": count.recorded, "equal": count.equal} for kind, count in sorted(counts.items())
         ],
-        "differing": found.comparison.differing,
-        "differences": [_difference(item, zero_ns) for item in found.comparison.differences],
-        "after_the_end": found.comparison.unrecorded,
-        "notes": found.notes,
+        "differing": verification.comparison.differing,
+        "differences": [_difference(item, zero_ns) for item in verification.comparison.differences],
+        "after_the_end": verification.comparison.unrecorded,
+        "notes": verification.notes,
     }
 
 
@@ -119,25 +121,27 @@ def _difference(item: Difference, zero_ns: int) -> dict[str, Any]:
     }
 
 
-def _text(said: dict[str, Any]) -> str:
-    lines = [f"{said['file']}: {said['rows']} rows from {said['from_min']:g} min on, through the monitor's core again"]
+def _text(report: dict[str, Any]) -> str:
+    lines = [
+        f"{report['file']}: {report['rows']} rows from {report['from_min']:g} min on, through the monitor's core again"
+    ]
     lines.append(f"  {'':16s} {'recorded':>9s} {'equal':>9s}")
-    lines += [f"  {item['kind']:16s} {item['recorded']:9d} {item['equal']:9d}" for item in said["kinds"]]
-    if said["exact"]:
-        lines.append(f"all {said['compared']} are said again, value for value")
+    lines += [f"  {item['kind']:16s} {item['recorded']:9d} {item['equal']:9d}" for item in report["kinds"]]
+    if report["exact"]:
+        lines.append(f"all {report['compared']} are reproduced, value for value")
     else:
-        lines.append(f"{said['differing']} DIFFER:")
-    for item in said["differences"][:MOST_LINES]:
+        lines.append(f"{report['differing']} DIFFER:")
+    for item in report["differences"][:MAX_LINES]:
         values = f": recorded {_short(item['recorded'])}, again {_short(item['again'])}"
         told = item["what"] + (values if item["recorded"] and item["again"] else "")
         lines.append(f"  {item['at_min']:9.4g} min  {item['topic']}: {told}")
-    if said["differing"] > MOST_LINES:
-        lines.append(f"  and {said['differing'] - MOST_LINES} more (--json tells the first hundred)")
-    if said["after_the_end"]:
-        lines.append(f"{said['after_the_end']} more would have come after the end of the recording")
-    lines += [f"note: {note}" for note in said["notes"]]
+    if report["differing"] > MAX_LINES:
+        lines.append(f"  and {report['differing'] - MAX_LINES} more (--json tells the first hundred)")
+    if report["after_the_end"]:
+        lines.append(f"{report['after_the_end']} more would have come after the end of the recording")
+    lines += [f"note: {note}" for note in report["notes"]]
     return printable_lines(lines)
 
 
 def _short(text: str) -> str:
-    return text if len(text) <= LONGEST_VALUE else text[: LONGEST_VALUE - 1] + "…"
+    return text if len(text) <= MAX_VALUE else text[: MAX_VALUE - 1] + "…"

@@ -1,16 +1,16 @@
-"""`view`: the dashboard of a plant that runs, in a window or in the browser."""
+"""`view`: dashboard of a running plant, in a window or in the browser."""
 
 from typing import Annotated
 
 import typer
 
 from reactorwatch.cli.options import Endpoint, Plant, Settings
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.printing import print_lines
 
 LOOPBACK = "127.0.0.1"
 
 
-def add_to(app: typer.Typer) -> None:
+def register_commands(app: typer.Typer) -> None:
     """Register the command."""
     app.command("view")(view)
 
@@ -33,12 +33,12 @@ def view(
 ) -> None:
     """Show a running plant live: a window, or with --web a page for the browser.
 
-    Ends when the window is closed or with Ctrl-C. What was published in the last minute is shown, too.
+    Ends when the window is closed or with Ctrl-C. The last minute before the start is shown, too.
     """
     import logging
 
-    from reactorwatch.cli.observer import begin_beside_recorder
+    from reactorwatch.cli.observer import load_recorder_settings
     from recorder.dashboard.live import Shown, show
 
-    bus, recorder = begin_beside_recorder(config, endpoint, name, logging.INFO)
-    show(recorder.plant, bus, Shown(web=web, bind=bind, port=port), say)
+    bus, recorder = load_recorder_settings(config, endpoint, name, logging.INFO)
+    show(recorder.plant, bus, Shown(web=web, bind=bind, port=port), print_lines)

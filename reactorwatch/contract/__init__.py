@@ -1,1 +1,1 @@
-"""The message contract: key expressions, messages and their bytes. Pure: it knows no network and no file."""
+"""The message contract: key expressions, messages and their encoding. Pure: no network and no files."""

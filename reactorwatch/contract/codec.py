@@ -1,8 +1,8 @@
-"""Between messages and bytes.
+"""Encode and decode messages.
 
-The bytes on the bus carry an encoding, `application/protobuf;reactorwatch.v1.Sample`, which names the message
-and its version. A payload is decoded by that name alone, so a stranger's bytes on one of our keys are refused
-instead of guessed at: protobuf itself would take many of them for an empty message.
+The bytes on the bus carry an encoding, `application/protobuf;reactorwatch.v1.Sample`, which names the message and its
+version. A payload is decoded by that name only, so foreign bytes on a key are refused: protobuf itself would decode
+many of them as an empty message.
 """
 
 from collections.abc import Callable
@@ -15,8 +15,8 @@ from reactorwatch.contract import messages_pb2 as messages
 
 PREFIX = "application/protobuf;"
 
-LARGEST_PAYLOAD = 1 << 20
-"""Bytes. Messages of ours take less than a hundredth of it; what is larger is not read."""
+MAX_PAYLOAD = 1 << 20
+"""Largest payload that is decoded, in bytes; messages take less than a hundredth of it."""
 
 MESSAGES: tuple[type[Message], ...] = (
     messages.Sample,
@@ -51,18 +51,18 @@ Body: TypeAlias = (
     | messages.Fault
     | messages.Audit
 )
-"""What travels by publication; each has `time_ns`."""
+"""Messages that are published; each has `time_ns`."""
 
 
 class Publication(NamedTuple):
-    """A message and the key it goes out on: what every core returns."""
+    """A message and the key to publish it on, as every core returns them."""
 
     key: str
     message: Body
 
 
 class Encoded(NamedTuple):
-    """Bytes as they arrive from, or go to, a bus or a file; `received_ns` is when they arrived, 0 if they did not."""
+    """Encoded message of a bus or a file; `received_ns` is its time of arrival, 0 for one that is sent."""
 
     key: str
     payload: bytes
@@ -71,7 +71,7 @@ class Encoded(NamedTuple):
 
 
 class DecodeError(ValueError):
-    """Bytes that are not what they claim to be. `reason` is a word to count by."""
+    """Bytes that do not match their encoding. `reason` is a word to count by."""
 
     def __init__(self, reason: str, text: str) -> None:
         super().__init__(text)
@@ -79,7 +79,7 @@ class DecodeError(ValueError):
 
 
 def encoding_of(message_type: type[Message]) -> str:
-    """The encoding that goes with a message type.
+    """Encoding of a message type.
 
     >>> encoding_of(messages.Sample)
     'application/protobuf;reactorwatch.v1.Sample'
@@ -93,30 +93,30 @@ _ENCODINGS: dict[type[Message], str] = {kind: text for text, kind in _BY_ENCODIN
 
 
 def message_type(encoding: str) -> type[Message] | None:
-    """The message type that an encoding names; None if it is not one of ours."""
+    """Message type of an encoding; None if it is unknown."""
     return _BY_ENCODING.get(encoding)
 
 
 def encode(publication: Publication) -> Encoded:
-    """The bytes of a publication, with their encoding."""
+    """Encode a publication."""
     message = publication.message
     return Encoded(publication.key, message.SerializeToString(), _ENCODINGS[type(message)])
 
 
 def encode_message(message: Message) -> tuple[bytes, str]:
-    """The bytes of any of our messages, and their encoding."""
+    """Encode any message of `MESSAGES`; returns its bytes and their encoding."""
     return message.SerializeToString(), _ENCODINGS[type(message)]
 
 
 def decode(payload: bytes, encoding: str) -> Message:
-    """The message that the encoding names, read from the bytes.
+    """Decode a payload as the message that the encoding names.
 
     Raises:
-        DecodeError: the encoding is not ours (reason `encoding`), the bytes are too many (`too_large`), or do not parse
+        DecodeError: the encoding is unknown (reason `encoding`), the payload is too large (`too_large`) or malformed
             (`payload`).
     """
-    if len(payload) > LARGEST_PAYLOAD:
-        raise DecodeError("too_large", f"a payload must have at most {LARGEST_PAYLOAD} bytes, got {len(payload)}")
+    if len(payload) > MAX_PAYLOAD:
+        raise DecodeError("too_large", f"a payload must have at most {MAX_PAYLOAD} bytes, got {len(payload)}")
     read = _READERS.get(encoding)
     if read is None:
         raise DecodeError("encoding", f"encoding must be '{PREFIX}reactorwatch.v1.<message>', got {encoding!r}")

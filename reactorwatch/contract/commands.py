@@ -1,4 +1,4 @@
-"""What somebody asks of a node by `reactor/{plant}/command/{name}`, read and checked alike by all that are asked."""
+"""Decoding and checks of commands on `reactor/{plant}/command/{name}`, shared by all nodes."""
 
 from collections.abc import Mapping
 
@@ -8,20 +8,20 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encoding_of
 from reactorwatch.errors import InputError
 
-LONGEST_NAME = 64
-LONGEST_COMMENT = 1000
+MAX_NAME = 64
+MAX_COMMENT = 1000
 
 
-def command_in(question: Encoded, catalogue: Mapping[str, type[Message]]) -> tuple[str, Message]:
-    """The name of a command and what it carries.
+def decode_command(question: Encoded, catalogue: Mapping[str, type[Message]]) -> tuple[str, Message]:
+    """Decode a command; returns its name and message.
 
     Args:
-        question: that was asked.
-        catalogue: the node's commands and what they carry.
+        question: the encoded command.
+        catalogue: message types of the node's commands, by name.
 
     Raises:
         InputError: there is no such command.
-        DecodeError: the payload is not what the command carries.
+        DecodeError: the payload is not a message of the command's type.
     """
     topic = keys.parse(question.key)
     name = topic.name if topic is not None and topic.kind == keys.COMMAND else question.key
@@ -34,15 +34,15 @@ def command_in(question: Encoded, catalogue: Mapping[str, type[Message]]) -> tup
     return name, command
 
 
-def signed(by: str, comment: str) -> tuple[str, str]:
-    """Who did something to an alarm, and why, without the blanks around.
+def check_signature(by: str, comment: str) -> tuple[str, str]:
+    """Check the operator's name and comment on an alarm; returns them without surrounding blanks.
 
     Raises:
-        InputError: nobody, or more than an alarm can hold.
+        InputError: the name is empty, or one of them is too long.
     """
     by, comment = by.strip(), comment.strip()
-    if not 1 <= len(by) <= LONGEST_NAME:
-        raise InputError(f"by must name the person, in 1 to {LONGEST_NAME} characters, got {by[:LONGEST_NAME]!r}")
-    if len(comment) > LONGEST_COMMENT:
-        raise InputError(f"comment must have at most {LONGEST_COMMENT} characters, got {len(comment)}")
+    if not 1 <= len(by) <= MAX_NAME:
+        raise InputError(f"by must name the person, in 1 to {MAX_NAME} characters, got {by[:MAX_NAME]!r}")
+    if len(comment) > MAX_COMMENT:
+        raise InputError(f"comment must have at most {MAX_COMMENT} characters, got {len(comment)}")
     return by, comment

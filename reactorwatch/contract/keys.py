@@ -1,4 +1,4 @@
-"""The key expressions of the bus: built here, taken apart here, and nowhere else.
+"""Key expressions of the bus: built and parsed here only.
 
 A key is `reactor/{plant}/{kind}/{name}`; the name of a chart point or an alarm may itself hold a slash
 (`chart/ewma/T`, `alarm/ewma/T`).
@@ -26,13 +26,13 @@ AUDIT = "audit"
 ALIVE = "alive"
 
 RECORDING = "recording"
-"""What the names of a recorder's own alarms begin with: no monitor raises them, and the recorder answers for them."""
+"""First part of the names of a recorder's own alarms; the recorder executes commands on them."""
 LIST_RECORDER_ALARMS = "list_recorder_alarms"
 ACKNOWLEDGE_RECORDER = "acknowledge_recorder"
-"""The recorder's commands; others than the monitor's, so that it is known whether each of the two is there."""
+"""The recorder's commands, different from the monitor's, so that a missing reply identifies the node."""
 
 FLEET = "@fleet"
-"""In place of a plant: what monitors that share a fleet tell each other. No plant is called so; no `*` reaches it."""
+"""In place of a plant: messages between monitors that share a fleet. It is no plant's name, and no `*` matches it."""
 
 _PLANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
@@ -40,18 +40,18 @@ _PART = re.compile(r"\*\*?|(\$\*)?[^/*$#?\0]+(\$\*[^/*$#?\0]+)*(\$\*)?")
 
 
 class Topic(NamedTuple):
-    """A key taken apart."""
+    """Parts of a key."""
 
     plant: str
     kind: str
     name: str
 
 
-def checked_plant(plant: str) -> str:
-    """The plant's name, if it can be part of a key.
+def check_plant(plant: str) -> str:
+    """Check that a plant's name can be part of a key and of a file name; returns it.
 
     Raises:
-        ValueError: a name with characters that a key expression or a file name could take for something else.
+        ValueError: it holds characters with a meaning in key expressions or file names.
     """
     if not _PLANT.fullmatch(plant):
         raise ValueError(
@@ -61,11 +61,11 @@ def checked_plant(plant: str) -> str:
     return plant
 
 
-def checked_expression(expression: str) -> str:
-    """A key expression, if it is one in canonical form.
+def check_expression(expression: str) -> str:
+    """Check that a key expression is valid and canonical; returns it.
 
     Raises:
-        ValueError: Zenoh would refuse it: a part is empty or holds '#', '?' or '$' (but in '$*'), or '*' is beside a
+        ValueError: Zenoh would refuse it: a part is empty or holds '#', '?' or '$' (except in '$*'), '*' is next to a
             letter, or '**' is followed by '*' or '**'.
     """
     parts = expression.split("/")
@@ -80,7 +80,7 @@ def checked_expression(expression: str) -> str:
 
 
 def key(plant: str, kind: str, name: str) -> str:
-    """The key of one thing of one plant, such as `reactor/cstr/sample/T`.
+    """Build a key, such as `reactor/cstr/sample/T`.
 
     >>> key("cstr", SAMPLE, "T")
     'reactor/cstr/sample/T'
@@ -89,17 +89,17 @@ def key(plant: str, kind: str, name: str) -> str:
 
 
 def chart_name(chart: str, signal: str) -> str:
-    """The name of a chart of a signal, in keys of chart points and of alarms: `shewhart/T`."""
+    """Name of a signal's chart in keys of chart points and alarms: `shewhart/T`."""
     return f"{chart}/{signal}"
 
 
-def all_of(plant: str, kind: str) -> str:
-    """The key expression of everything of one kind of one plant, such as `reactor/cstr/sample/**`."""
+def all_keys(plant: str, kind: str) -> str:
+    """Key expression of all of one kind of one plant, such as `reactor/cstr/sample/**`."""
     return f"{ROOT}/{plant}/{kind}/**"
 
 
 def parse(text: str) -> Topic | None:
-    """Take a key apart; None if it is not one of ours.
+    """Parse a key; None if it has another form.
 
     >>> parse("reactor/cstr/chart/shewhart/T")
     Topic(plant='cstr', kind='chart', name='shewhart/T')
@@ -113,46 +113,46 @@ def parse(text: str) -> Topic | None:
 
 
 def monitor_token(plant: str, name: str) -> str:
-    """The liveliness token by which monitors of a plant notice each other, beside that of their node.
+    """Liveliness token by which monitors of a plant detect each other, in addition to that of their node.
 
     Args:
-        plant: its name.
-        name: of the monitor, unlike any other's; `*`: the key expression of all.
+        plant: name of the plant.
+        name: unique name of the monitor; `*`: the key expression of all.
     """
     return key(plant, ALIVE, f"@monitor/{name}")
 
 
 def fleet_token(fleet: str, of: str, number: str, name: str) -> str:
-    """The liveliness token of one of the monitors that share a fleet.
+    """Liveliness token of a monitor that shares a fleet.
 
     Args:
-        fleet: what they share, as one part of a key.
-        of: how many shards it has.
-        number: of the monitor's shard.
-        name: of the monitor, as `fleet_member` makes it.
+        fleet: digest of the shared settings, as one part of a key.
+        of: count of shards.
+        number: number of the monitor's shard.
+        name: name of the monitor, from `fleet_member`.
     """
     return f"{ROOT}/{FLEET}/{ALIVE}/{fleet}/{of}/{number}/{name}"
 
 
 FLEET_TOKENS = fleet_token("*", "*", "*", "*")
-"""The key expression of the tokens of all monitors of all fleets."""
+"""Key expression of the tokens of all monitors of all fleets."""
 
 
 def fleet_member(name: str, plants: str) -> str:
-    """The name of a fleet's monitor in its token, from which others see which plants the fleet watches.
+    """Name of a fleet's monitor in its token, with the plants that the fleet watches.
 
     >>> fleet_member("01", "reactor/north_*")
     '01@north_+'
 
     Args:
-        name: of the monitor, unlike any other's.
-        plants: the key expression of the fleet's plants. A key cannot hold its `*`, so `+` stands for it.
+        name: unique name of the monitor.
+        plants: key expression of the fleet's plants. A key cannot hold its `*`, which `+` replaces.
     """
     return f"{name}@{plants.removeprefix(f'{ROOT}/').replace('*', '+')}"
 
 
 class FleetToken(NamedTuple):
-    """The token of a monitor of a fleet, taken apart; see `fleet_token`."""
+    """Parts of the token of a fleet's monitor, see `fleet_token`."""
 
     fleet: str
     of: str
@@ -161,16 +161,16 @@ class FleetToken(NamedTuple):
 
     @property
     def plants(self) -> str:
-        """The key expression of the fleet's plants; empty if the token does not say it."""
+        """Key expression of the fleet's plants; empty if the token does not hold it."""
         expression = f"{ROOT}/{self.name.partition('@')[2].replace('+', '*')}"
         try:
-            return checked_plants(expression)
+            return check_plants(expression)
         except ValueError:
             return ""
 
 
 def parse_fleet_token(token: str) -> FleetToken | None:
-    """Take the token of a monitor of a fleet apart; None if it is not one.
+    """Parse the token of a fleet's monitor; None if it has another form.
 
     >>> parse_fleet_token(fleet_token("0f", "5", "2", "a"))
     FleetToken(fleet='0f', of='5', number='2', name='a')
@@ -183,15 +183,15 @@ def parse_fleet_token(token: str) -> FleetToken | None:
 
 
 def samples_of(plants: str) -> str:
-    """The key expression of the samples of all plants that an expression such as `reactor/*` is of."""
+    """Key expression of the samples of all plants that an expression such as `reactor/*` matches."""
     return f"{plants}/{SAMPLE}/**"
 
 
-def checked_plants(expression: str) -> str:
-    """The key expression of a set of plants, if it is one.
+def check_plants(expression: str) -> str:
+    """Check the key expression of a set of plants; returns it.
 
     Raises:
-        ValueError: it is not `reactor/` and one name, in which `*` stands for any letters.
+        ValueError: it is not `reactor/` and one name, in which `*` matches any letters.
     """
     root, _, name = expression.partition("/")
     if root != ROOT or not re.fullmatch(r"[A-Za-z0-9_.*-]+", name) or "**" in name:
@@ -203,9 +203,9 @@ def checked_plants(expression: str) -> str:
 
 
 def matches(key_expression: str, key: str) -> bool:
-    """Match a key with a key expression: `*` stands for letters of one part, `**` for any number of parts.
+    """Match a key with a key expression: `*` matches letters of one part, `**` any number of parts.
 
-    No `*` stands for a part that begins with `@`.
+    No `*` matches a part that starts with `@`.
 
     >>> matches("reactor/*/sample/**", "reactor/cstr/sample/T"), matches("reactor/**", "reactor")
     (True, True)

@@ -1,9 +1,9 @@
-"""The fields of many samples at once, read from their bytes by compiled code.
+"""Compiled parser for the fields of many samples at once.
 
-A `Sample` is parsed by protobuf in half a microsecond, and each look into it costs as much again as a line of Python.
-Here the bytes of all are one after the other, and one loop reads them. It knows the form that protobuf writes: known
-fields, each once, in their order, without those that are zero (Protocol Buffers, encoding). What has another form is
-left to protobuf itself, which alone decides what is a sample.
+Protobuf parses a `Sample` in half a microsecond, and each access to a field costs as much again as a line of Python.
+Here one loop reads the concatenated bytes of all. It knows the canonical form: known fields, each once, in their order,
+without zeros (Protocol Buffers, encoding). Bytes in another form are left to protobuf itself, which alone defines a
+sample.
 """
 
 from collections.abc import Sequence
@@ -16,25 +16,25 @@ from reactorwatch.codegen.numba_kernel import compiled
 
 _TIME, _SEQUENCE, _VALUE, _UNIT, _QUALITY = 0x09, 0x10, 0x19, 0x22, 0x28  # field and wire type of each
 _TIME_TAG, _SEQUENCE_TAG = bytes([_TIME]), bytes([_SEQUENCE])
-LONGEST_VARINT = 10
-"""Bytes of the longest number that protobuf writes."""
+MAX_VARINT = 10
+"""Bytes of protobuf's longest number."""
 
 _FNV_START, _FNV_FACTOR = np.uint64(0xCBF29CE484222325), np.uint64(0x100000001B3)
 
 
 class SampleColumns(NamedTuple):
-    """Of each sample a number; all are of shape (samples,).
+    """Fields of samples, each of shape (samples,).
 
     Attributes:
-        plain: whether it has the form that is read here; what else is said of it means nothing if not.
-        time_ns: of the sample.
-        sequence: its number.
-        value: what was measured.
-        unit: a digest of its unit, see `unit_digest`.
-        quality: as in the message.
+        is_canonical: True for bytes in canonical form; the other fields are valid only for these.
+        time_ns: time of the sample.
+        sequence: sequence number.
+        value: measured value.
+        unit: digest of the unit, see `unit_digest`.
+        quality: quality as in the message.
     """
 
-    plain: NDArray[np.bool_]
+    is_canonical: NDArray[np.bool_]
     time_ns: NDArray[np.int64]
     sequence: NDArray[np.int64]
     value: NDArray[np.float64]
@@ -42,27 +42,23 @@ class SampleColumns(NamedTuple):
     quality: NDArray[np.int64]
 
 
-def sample_number(payload: bytes) -> int:
-    """The number of one sample, read without parsing the rest; 0 where the bytes have another form."""
-    at = 9 if payload[:1] == _TIME_TAG else 0  # the time takes eight bytes, and none where it is zero
+def read_sequence(payload: bytes) -> int:
+    """Read the sequence number of one sample without parsing the rest; 0 for bytes in another form."""
+    at = 9 if payload[:1] == _TIME_TAG else 0  # the time takes eight bytes, or none if it is zero
     if payload[at : at + 1] != _SEQUENCE_TAG:
         return 0
     number = 0
-    for place, byte in enumerate(payload[at + 1 : at + 1 + LONGEST_VARINT]):
-        number |= (byte & 0x7F) << 7 * place
+    for position, byte in enumerate(payload[at + 1 : at + 1 + MAX_VARINT]):
+        number |= (byte & 0x7F) << 7 * position
         if byte < 0x80:
             return number
     return 0
 
 
-def sample_columns(payloads: Sequence[bytes]) -> SampleColumns:
-    """The fields of samples.
-
-    Args:
-        payloads: their bytes.
-    """
+def parse_samples(payloads: Sequence[bytes]) -> SampleColumns:
+    """Parse encoded samples."""
     count = len(payloads)
-    found = SampleColumns(
+    columns = SampleColumns(
         np.zeros(count, np.bool_),
         np.zeros(count, np.int64),
         np.zeros(count, np.int64),
@@ -74,19 +70,19 @@ def sample_columns(payloads: Sequence[bytes]) -> SampleColumns:
     _read(
         np.frombuffer(b"".join(payloads), np.uint8),
         ends,
-        found.plain,
-        found.time_ns,
-        found.time_ns.view(np.uint8),
-        found.sequence,
-        found.value.view(np.uint8),
-        found.unit,
-        found.quality,
+        columns.is_canonical,
+        columns.time_ns,
+        columns.time_ns.view(np.uint8),
+        columns.sequence,
+        columns.value.view(np.uint8),
+        columns.unit,
+        columns.quality,
     )
-    return found
+    return columns
 
 
 def unit_digest(unit: str) -> int:
-    """What the unit of a sample is known by: the 64-bit FNV-1a hash (Fowler, Noll & Vo) of its bytes.
+    """64-bit FNV-1a hash (Fowler, Noll & Vo) of a unit's bytes.
 
     >>> hex(unit_digest("a"))
     '0xaf63dc4c8601ec8c'
@@ -98,15 +94,15 @@ def unit_digest(unit: str) -> int:
 
 
 @compiled
-def _varint(data: NDArray[np.uint8], place: int, end: int) -> tuple[int, int]:
-    """A number of at most 63 bits and the place behind it; the place is -1 if there is none."""
+def _varint(data: NDArray[np.uint8], position: int, end: int) -> tuple[int, int]:
+    """Read a number of at most 63 bits; returns it and the position behind it, -1 if there is none."""
     number, shift = 0, 0
-    while place < end and shift < 63:
-        byte = int(data[place])
-        place += 1
+    while position < end and shift < 63:
+        byte = int(data[position])
+        position += 1
         number |= (byte & 0x7F) << shift
         if byte < 0x80:
-            return number, place
+            return number, position
         shift += 7
     return 0, -1
 
@@ -115,7 +111,7 @@ def _varint(data: NDArray[np.uint8], place: int, end: int) -> tuple[int, int]:
 def _read(
     data: NDArray[np.uint8],
     ends: NDArray[np.int64],
-    plain: NDArray[np.bool_],
+    is_canonical: NDArray[np.bool_],
     time_ns: NDArray[np.int64],
     time_bytes: NDArray[np.uint8],
     sequence: NDArray[np.int64],
@@ -123,37 +119,37 @@ def _read(
     unit: NDArray[np.uint64],
     quality: NDArray[np.int64],
 ) -> None:
-    place = 0
+    start = 0
     for k in range(ends.size):
-        begin, end = place, ends[k]
-        place = end
+        position, end = start, ends[k]
+        start = end
         digest, last, good = _FNV_START, 0, True
-        while good and begin < end:
-            tag = int(data[begin])
-            begin += 1
+        while good and position < end:
+            tag = int(data[position])
+            position += 1
             good = tag > last
             last = tag
-            if tag in (_TIME, _VALUE) and begin + 8 <= end:
+            if tag in (_TIME, _VALUE) and position + 8 <= end:
                 for byte in range(8):
                     if tag == _TIME:
-                        time_bytes[8 * k + byte] = data[begin + byte]
+                        time_bytes[8 * k + byte] = data[position + byte]
                     else:
-                        value_bytes[8 * k + byte] = data[begin + byte]
-                begin += 8
+                        value_bytes[8 * k + byte] = data[position + byte]
+                position += 8
             elif tag in (_SEQUENCE, _QUALITY, _UNIT):
-                number, begin = _varint(data, begin, end)
-                good = good and begin >= 0
+                number, position = _varint(data, position, end)
+                good = good and position >= 0
                 if tag == _SEQUENCE:
                     sequence[k] = number
                 elif tag == _QUALITY:
                     quality[k] = number
-                elif good and begin + number <= end:
+                elif good and position + number <= end:
                     for byte in range(number):
-                        digest = (digest ^ np.uint64(data[begin + byte])) * _FNV_FACTOR
-                    begin += number
+                        digest = (digest ^ np.uint64(data[position + byte])) * _FNV_FACTOR
+                    position += number
                 else:
                     good = False
             else:
                 good = False
         unit[k] = digest
-        plain[k] = good
+        is_canonical[k] = good

@@ -39,7 +39,7 @@ from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
 from reactorwatch.process import effects_of
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.record import MOST_SPANS, Record
+from reactorwatch.records.record import MAX_SPANS, Record
 
 LEAST_GAIN = 10.0
 """In BIC: less does not refute the nominal model (Kass & Raftery 1995, J. American Statistical Association 90)."""
@@ -260,7 +260,7 @@ def _said_of(record: Record) -> list[str]:
     """Remarks on the rows of a record, for people."""
     if record.runs is None:
         return record.remarks
-    shifts = ", ".join(f"{shift:+.4g}" for shift in record.run_shifts_min[1 : MOST_SPANS + 1])
+    shifts = ", ".join(f"{shift:+.4g}" for shift in record.run_shifts_min[1 : MAX_SPANS + 1])
     later = f"pictures and differences show those after the first {shifts} min later"
     return [f"{record.remarks[0]}; the state starts again in each, and {later}", *record.remarks[1:]]
 

@@ -59,7 +59,7 @@ def run_of(record: Record, model: ProcessModel) -> Run:
         outputs.append(values)
     inputs = []
     for item in model.inputs:
-        values = np.concatenate([_held(part.columns[item.name]) for part in record.each_run()])
+        values = np.concatenate([_held(part.columns[item.name]) for part in record.split_runs()])
         if not np.all(np.isfinite(values)):
             of_run = "the first row" if record.runs is None else "the first row of each run"
             raise InputError(

@@ -1,1 +1,1 @@
-"""Measured records: a run of the plant as columns, from wherever it came."""
+"""Measured records: a run of the plant as columns, and its file formats."""

@@ -1,4 +1,4 @@
-"""A file appears whole or not at all: it is written beside its place and then renamed into it."""
+"""Atomic writes: a file is written under a temporary name beside its path, and then renamed."""
 
 import glob
 import os
@@ -12,51 +12,51 @@ from reactorwatch.records.output import is_replaceable
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write to; what is there when the block ends takes the place of `path`.
+def atomic_write(path: Path) -> Iterator[Path]:
+    """Yield a temporary name to write to; when the block ends, that file replaces `path`.
 
-    When the block raises, `path` is as it was and nothing is left beside it. A link stays: the file that it leads to
-    is replaced.
+    When the block raises, `path` is unchanged and the temporary file is removed. The target of a link is replaced, not
+    the link.
 
     Raises:
         InputError: the folder does not exist or cannot be written to, or `path` is no regular file.
     """
     is_replaceable(path)
-    place = Path(os.path.realpath(path)) if path.is_symlink() else path
-    temporary = place.with_name(f".{place.name}.{os.getpid()}.tmp")
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
     try:
-        if not place.parent.is_dir():
-            raise InputError(f"cannot write {path}: the folder {place.parent} does not exist")
+        if not target.parent.is_dir():
+            raise InputError(f"cannot write {path}: the folder {target.parent} does not exist")
         temporary.touch()
-        temporary.unlink()  # some writers refuse a file that is there
+        temporary.unlink()  # some writers refuse an existing file
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}") from error
     try:
-        with cannot_write(path, temporary):
+        with wrap_write_errors(path, temporary):
             yield temporary
-            temporary.replace(place)
+            temporary.replace(target)
     except BaseException:
-        for left in temporary.parent.glob(f"{glob.escape(temporary.name)}*"):  # a writer may have a name of its own
-            left.unlink()
+        for rest in temporary.parent.glob(f"{glob.escape(temporary.name)}*"):  # a writer may add a suffix
+            rest.unlink()
         raise
 
 
 @contextmanager
-def cannot_write(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """While a file is written: that it cannot be, for lack of room perhaps, is one line about it.
+def wrap_write_errors(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Turn the system's errors about a file that is written into an `InputError` of one line.
 
     Args:
-        path: the file, as people know it.
-        temporary: the name that it is written under meanwhile; None: the same.
+        path: the file, as named in messages.
+        temporary: name under which it is written; None: `path`.
 
     Raises:
-        InputError: it cannot be written; its cause is the system's error.
+        InputError: the file cannot be written; its cause is the system's error.
     """
     try:
         yield
     except OSError as error:
         if error.filename is not None and Path(error.filename).name != (temporary or path).name:
-            raise  # of another file
+            raise  # about another file
         raise InputError(f"cannot write {path}: {error.strerror or error}") from error
     except InputError as error:
         cause = error.__cause__
@@ -65,8 +65,8 @@ def cannot_write(path: Path, temporary: Path | None = None) -> Iterator[None]:
         raise InputError(f"cannot write {path}: {cause.strerror or cause}") from cause
 
 
-def is_full(error: BaseException | None) -> bool:
-    """Whether something could not be written because there is no room, which may change, and for no other reason."""
+def is_disk_full(error: BaseException | None) -> bool:
+    """True if a write failed for lack of space on the disk, which may be temporary."""
     while error is not None:
         if isinstance(error, OSError) and error.errno in (ENOSPC, EDQUOT):
             return True

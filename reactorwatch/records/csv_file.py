@@ -1,11 +1,11 @@
 """Records as CSV: from a plant's historian, a spreadsheet, another program, or `export`.
 
-The header names the columns: `time_min` or `time_s`, then `qc`, `C`, `T` in any order among others, which are
-ignored. Rows are in time order; gaps and irregular times are allowed; an empty cell was not measured. Where the time
-steps back a new run starts, and where a column `run` counts up from 1 by 1, each of its numbers is a run.
+The header names the columns: `time_min` or `time_s`, then `qc`, `C`, `T` in any order among others, which are ignored.
+Rows are in time order; gaps and irregular times are allowed; an empty cell was not measured. A step back in time starts
+a new run; in a column `run` that counts up from 1 by 1, each number is a run.
 
-A well-formed file is parsed by NumPy in one go. Whatever that cannot take is read again row by row, which is slow,
-knows the few things more that are fine (quoted numbers, say), and otherwise finds the row and the column to blame.
+NumPy parses a well-formed file at once. Any other file is parsed again row by row, which is slow, accepts a few more
+forms (quoted numbers, for instance), and otherwise finds the row and the column for the message.
 """
 
 import csv
@@ -20,19 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
-from reactorwatch.records.reading import reading
+from reactorwatch.records.atomic import atomic_write
+from reactorwatch.records.input_file import wrap_read_errors
 from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN, UNITS, Record
 
 LONGEST_NUMBER = 18
-"""Digits of a run's number that are read."""
+"""Most digits of a run's number."""
 
 _MINUTES_PER_UNIT = {"time_min": 1.0, "time_s": 60.0}  # divided by, so that 7 s is the same 7/60 min everywhere
 RUN = "run"
-"""The column that counts the runs of a record, where there are several."""
+"""Column with the run of each row, if a record has several."""
 
-LARGEST_SHARE_BACK = 1 / 3
-"""Of the rows, before which the time steps back: a file with more of them is not in time order."""
+MAX_SHARE_BACK = 1 / 3
+"""Largest share of rows with a step back in time; a file with more is not in time order."""
 
 _BRACKETED = re.compile(r"[\[(]([^\[\]()]+)[\])]\s*$")
 _MCAP_MAGIC = b"\x89MCAP"
@@ -44,7 +44,7 @@ class _Column(NamedTuple):
 
 
 class _Layout(NamedTuple):
-    """Where in the file what is; `runs` is the number of each row's run, if a column says so."""
+    """Columns of a file; `runs` is the number of each row's run, if there is such a column."""
 
     width: int
     header_lines: int
@@ -64,23 +64,23 @@ def read_csv(
 
     Args:
         path: the file: UTF-8, comma separated.
-        columns: the file's own name for a column, where it has another: `{"T": "reactor_temp", "time_s": "t"}`.
-        required: the signals that must be there; the reactor's others are read if they are.
-        units: of the process's signals. A column of the signal's own name has this unit; one of another name has the
-            unit in brackets at its end, and otherwise none that is known.
+        columns: the file's names of columns with other names: `{"T": "reactor_temp", "time_s": "t"}`.
+        required: signals that must have a column; the reactor's others are read if they have one.
+        units: units of the process's signals. A column with the signal's name has this unit; one with another name has
+            the unit in brackets at its end, or an unknown one.
 
     Returns:
         The record; an empty cell is NaN.
 
     Raises:
-        InputError: the file cannot be read or is malformed: one line that names file, row (as a text editor counts
-            it), column, what was expected and what was found.
+        InputError: the file cannot be read or is malformed; one line with file, row (as a text editor counts it),
+            column, the expected and the actual content.
     """
     text = _text(path)
     layout = _layout(path, text, columns or {}, required)
-    values = _parsed_at_once(text, layout)
+    values = _parse_fast(text, layout)
     if values is None:
-        values = _parsed_by_row(path, text, layout)
+        values = _parse_rows(path, text, layout)
     time_min = values[:, 0] / layout.units_per_minute
     signals = {signal: values[:, number].copy() for number, signal in enumerate(layout.signals, start=1)}
     known = {signal: _unit(signal, column.name, units) for signal, column in layout.signals.items()}
@@ -92,7 +92,7 @@ def read_csv(
 
 
 def _unit(signal: str, column: str, units: Mapping[str, str]) -> str:
-    """The unit of a signal in a column; empty: not known."""
+    """Unit of a signal in a column; empty: unknown."""
     if column == signal:
         return units.get(signal, "")
     bracketed = _BRACKETED.search(column)
@@ -100,13 +100,13 @@ def _unit(signal: str, column: str, units: Mapping[str, str]) -> str:
 
 
 def write_csv(path: Path, record: Record) -> None:
-    """Write a record so that `read_csv` gives exactly the same numbers.
+    """Write a record so that `read_csv` returns exactly the same numbers.
 
     Raises:
         InputError: the folder does not exist or cannot be written to.
-        ValueError: a time or a value is not one that `read_csv` takes, such as an infinite one.
+        ValueError: a time or a value that `read_csv` refuses, such as an infinite one.
     """
-    if not _can_be(record.time_min, 1.0).all():
+    if not _is_valid_time(record.time_min, 1.0).all():
         raise ValueError(f"times must be within {LONGEST_MIN:.3g} min of their zero to be read again from CSV")
     cells = [record.time_min.tolist()]
     header = ["time_min", *record.columns]
@@ -120,14 +120,14 @@ def write_csv(path: Path, record: Record) -> None:
     if record.runs is not None:
         header.append(RUN)
         cells.append(record.runs.tolist())
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")  # writes a float as its repr, which reads back exactly
         writer.writerow(header)
         writer.writerows(zip(*cells, strict=True))
 
 
 def _text(path: Path) -> str:
-    with reading(path):
+    with wrap_read_errors(path):
         try:
             data = path.read_bytes()
         except IsADirectoryError as error:
@@ -140,8 +140,8 @@ def _text(path: Path) -> str:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         row = data.count(b"\n", 0, error.start) + 1
-        found = f"byte 0x{data[error.start]:02x}"
-        raise InputError(f"{path}, row {row}: expected UTF-8 text, got {found}; save it as 'CSV UTF-8'") from error
+        byte = f"byte 0x{data[error.start]:02x}"
+        raise InputError(f"{path}, row {row}: expected UTF-8 text, got {byte}; save it as 'CSV UTF-8'") from error
     if not text or text.isspace():
         raise InputError(f"{path}: expected a header and rows, got an empty file")
     if "\r" in text:
@@ -181,12 +181,12 @@ def _layout(path: Path, text: str, columns: Mapping[str, str], required: tuple[s
         if in_file not in header:
             raise InputError(f"{path}, row {row}: expected a column {in_file!r} (for {signal}) in the header, {found}")
     time, units_per_minute = times[0]
-    runs = _numbered_runs(path, text, header.index(RUN)) if RUN in header and RUN not in columns.values() else None
+    runs = _run_column(path, text, header.index(RUN)) if RUN in header and RUN not in columns.values() else None
     return _Layout(len(header), row, time, units_per_minute, signals, runs)
 
 
-def _numbered_runs(path: Path, text: str, position: int) -> NDArray[np.intp] | None:
-    """The number of each row's run; None if the column holds anything but runs that are counted from 1."""
+def _run_column(path: Path, text: str, position: int) -> NDArray[np.intp] | None:
+    """Number of each row's run; None if the column does not count up from 1."""
     rows = _rows(path, text)
     next(rows)  # the header
     cells = [cells[position].strip() if position < len(cells) else "" for _, cells in rows]
@@ -198,10 +198,10 @@ def _numbered_runs(path: Path, text: str, position: int) -> NDArray[np.intp] | N
 
 
 def _runs(path: Path, layout: _Layout, times: NDArray[np.float64]) -> NDArray[np.intp] | None:
-    """The run of each row, from 1; None if there is one.
+    """Number of each row's run, from 1; None for one run.
 
     Raises:
-        InputError: the time steps back so often that the rows are in no order.
+        InputError: the time steps back too often for rows in time order.
     """
     starts = np.diff(times, prepend=times[0]) < 0
     if layout.runs is not None:
@@ -209,7 +209,7 @@ def _runs(path: Path, layout: _Layout, times: NDArray[np.float64]) -> NDArray[np
         back, starts = starts & ~numbered, starts | numbered
     else:
         back = starts
-    if np.count_nonzero(back) > LARGEST_SHARE_BACK * times.size:
+    if np.count_nonzero(back) > MAX_SHARE_BACK * times.size:
         raise InputError(
             f"{path}, column {layout.time.name!r}: expected rows in time order, the time steps back before "
             f"{np.count_nonzero(back)} of {times.size} rows; sort the rows by time"
@@ -217,8 +217,8 @@ def _runs(path: Path, layout: _Layout, times: NDArray[np.float64]) -> NDArray[np
     return 1 + np.cumsum(starts) if starts.any() else None
 
 
-def _parsed_at_once(text: str, layout: _Layout) -> NDArray[np.float64] | None:
-    """Shape (rows, 1 + signals); None if anything at all is unusual."""
+def _parse_fast(text: str, layout: _Layout) -> NDArray[np.float64] | None:
+    """Parse with NumPy, shape (rows, 1 + signals); None if anything is unusual."""
     body = "".join(text.split("\n", layout.header_lines)[layout.header_lines :])
     if not body or body.isspace():
         return None
@@ -238,13 +238,13 @@ def _parsed_at_once(text: str, layout: _Layout) -> NDArray[np.float64] | None:
     still = np.diff(times) == 0
     if layout.runs is not None and layout.runs.size == times.size:
         still &= np.diff(layout.runs) == 0
-    if not (regular and possible and _can_be(times, layout.units_per_minute).all() and not still.any()):
+    if not (regular and possible and _is_valid_time(times, layout.units_per_minute).all() and not still.any()):
         return None
     return values
 
 
-def _parsed_by_row(path: Path, text: str, layout: _Layout) -> NDArray[np.float64]:
-    """As `_parsed_at_once`, a row at a time."""
+def _parse_rows(path: Path, text: str, layout: _Layout) -> NDArray[np.float64]:
+    """Parse row by row, shape (rows, 1 + signals)."""
     rows = _rows(path, text)
     next(rows)  # the header
     parsed: list[list[float]] = []
@@ -271,7 +271,7 @@ def _parsed_by_row(path: Path, text: str, layout: _Layout) -> NDArray[np.float64
             after = "" if not parsed else f" after {previous!r}, that of the row before"
             found = cells[layout.time.position]
             raise InputError(f"{path}, row {row}, column {layout.time.name!r}: expected a time{after}, got {found!r}")
-        if not _can_be(np.array(time), layout.units_per_minute):
+        if not _is_valid_time(np.array(time), layout.units_per_minute):
             most = f"{LONGEST_MIN * layout.units_per_minute:.3g}"
             raise InputError(
                 f"{path}, row {row}, column {layout.time.name!r}: expected a time within 146 years of its zero "
@@ -284,14 +284,14 @@ def _parsed_by_row(path: Path, text: str, layout: _Layout) -> NDArray[np.float64
     return np.array(parsed)
 
 
-def _can_be(times: NDArray[np.float64], units_per_minute: float) -> NDArray[np.bool_]:
-    """Whether times can be those of a record, each for itself."""
+def _is_valid_time(times: NDArray[np.float64], units_per_minute: float) -> NDArray[np.bool_]:
+    """True for each time in the range of a record's."""
     with np.errstate(over="ignore"):
         return np.asarray(np.abs(times) <= LONGEST_MIN * units_per_minute)
 
 
 def _number(cell: str) -> float | None:
-    """The finite number in a cell; NaN if it is empty, None if it holds anything else."""
+    """Finite number in a cell; NaN if it is empty, None if it holds anything else."""
     text = cell.strip()
     if not text:
         return math.nan
@@ -305,7 +305,7 @@ def _number(cell: str) -> float | None:
 
 
 def _rows(path: Path, text: str) -> Iterator[tuple[int, list[str]]]:
-    """The rows that hold anything, each with the number of its last line."""
+    """Yield rows that are not blank, each with the number of its last line."""
     reader = csv.reader(io.StringIO(text), strict=True)
     while True:
         try:

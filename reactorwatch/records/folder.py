@@ -1,4 +1,4 @@
-"""A folder that is to be written into."""
+"""Output folders."""
 
 import os
 import shutil
@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import cannot_write, replacing
+from reactorwatch.records.atomic import atomic_write, wrap_write_errors
 from reactorwatch.records.output import check_folder_name
 
 
@@ -15,15 +15,15 @@ def make_folder(folder: Path, option: str = "", *, may_exist: bool = True) -> Pa
     """Make a folder, and those that it is in.
 
     Args:
-        folder: its path.
-        option: of the command line that names it, such as `--out`, to be told with it; empty: none does.
-        may_exist: whether it may be there already.
+        folder: path of the folder.
+        option: option of the command line that names it, such as `--out`, for messages; empty: none.
+        may_exist: accept an existing folder.
 
     Returns:
         The folder.
 
     Raises:
-        InputError: it cannot be made, or has the name of a file.
+        InputError: the folder cannot be made, or has the name of a file.
     """
     if option:
         check_folder_name(folder, option)
@@ -36,13 +36,13 @@ def make_folder(folder: Path, option: str = "", *, may_exist: bool = True) -> Pa
 
 
 @contextmanager
-def filling(folder: Path, option: str = "") -> Iterator[Path]:
-    """A folder beside `folder` to write files to, which are moved there when the block ends.
+def fill_folder(folder: Path, option: str = "") -> Iterator[Path]:
+    """Yield a temporary folder; when the block ends, its files are moved to `folder`.
 
-    When the block raises, `folder` is as it was, or not there if it was not, and nothing is left beside it.
+    When the block raises, `folder` is unchanged and the temporary folder is removed.
 
     Args:
-        folder: its path; made if it is not there.
+        folder: path of the folder; made if it does not exist.
         option: as for `make_folder`.
 
     Raises:
@@ -60,8 +60,8 @@ def filling(folder: Path, option: str = "") -> Iterator[Path]:
         for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
             target = folder / file.relative_to(temporary)
             make_folder(target.parent)
-            with replacing(target) as place, cannot_write(target):
-                file.replace(place)
+            with atomic_write(target) as temporary_file, wrap_write_errors(target):
+                file.replace(temporary_file)
     except InputError as error:
         raise InputError(str(error).replace(str(temporary), str(folder))) from error.__cause__
     finally:

@@ -1,8 +1,7 @@
-"""The guard of every output: which file may be written, and what must not be lost by it.
+"""Checks of output files, before a command starts its work.
 
-Every command with an `-o` asks here before it starts its work. An output is never one of the files that are read, it
-takes the place of regular files only, and a file that is there and is not of the kind that its suffix says is
-replaced only with `--force`.
+An output is never one of the inputs, it replaces regular files only, and an existing file whose content does not match
+its suffix is replaced only with `--force`.
 """
 
 import re
@@ -11,37 +10,37 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.reading import files_of
+from reactorwatch.records.input_file import list_files
 
 _FILE_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,6}")
-"""A new folder has no such suffix: its name would be taken for that of a file of that kind."""
+"""A new folder has no such suffix, which looks like that of a file."""
 
 _HEAD_BYTES = 65_536
 _PARTS = 4
-"""Bytes of a UTF-8 character at most; the last one of a head may be cut off."""
+"""Most bytes of a UTF-8 character; the last one of a head may be incomplete."""
 
 
-def checked_output(path: Path, sources: Iterable[Path | None] = (), *, force: bool = False) -> Path:
+def check_output_file(path: Path, sources: Iterable[Path | None] = (), *, force: bool = False) -> Path:
     """Check that a file may be written.
 
     Args:
         path: the file.
         sources: files and folders that the command reads; a folder stands for the recordings in it, None for nothing.
-        force: replace a file that is there although it is of another kind than its suffix says.
+        force: replace a file although its content does not match its suffix.
 
     Returns:
         The path.
 
     Raises:
-        InputError: its folder does not exist, it is not a regular file, it is one of the sources, or it is a file of
-            another kind.
+        InputError: its folder does not exist, it is no regular file, it is one of the sources, or its content does not
+            match its suffix.
     """
     if not path.parent.is_dir():
         raise InputError(f"{path}: the folder {path.parent} does not exist; create it first")
     if not is_replaceable(path):
         return path
     refuse_source(path, sources)
-    if not force and not _is_of_its_kind(path):
+    if not force and not _matches_suffix(path):
         raise InputError(
             f"{path}: is there already and is not a {path.suffix} file by its content; "
             "name another file, or replace it with --force"
@@ -50,14 +49,14 @@ def checked_output(path: Path, sources: Iterable[Path | None] = (), *, force: bo
 
 
 def check_folder_name(folder: Path, option: str) -> None:
-    """Check that a name is not that of a file.
+    """Check that a folder's name is not that of a file.
 
     Args:
-        folder: its path.
-        option: of the command line that names it.
+        folder: path of the folder.
+        option: option of the command line that names it.
 
     Raises:
-        InputError: it is no folder, or does not exist and has the suffix of a file.
+        InputError: it is no folder, or a new one with the suffix of a file.
     """
     if folder.exists():
         if not folder.is_dir():
@@ -70,7 +69,7 @@ def check_folder_name(folder: Path, option: str) -> None:
         )
 
 
-def checked_folder(
+def check_output_folder(
     folder: Path,
     names: Iterable[str] = (),
     sources: Iterable[Path | None] = (),
@@ -78,20 +77,20 @@ def checked_folder(
     option: str = "--out",
     force: bool = False,
 ) -> Path:
-    """Check that files may be written into a folder, which may be there or not.
+    """Check that files may be written into a folder, which need not exist.
 
     Args:
         folder: the folder.
-        names: of the files that are written or deleted in it.
-        sources: as for `checked_output`.
-        option: of the command line that names the folder.
-        force: as for `checked_output`.
+        names: names of the files that are written or deleted in it.
+        sources: as for `check_output_file`.
+        option: option of the command line that names the folder.
+        force: as for `check_output_file`.
 
     Returns:
         The folder.
 
     Raises:
-        InputError: it is no folder, its name is that of a file, or as `checked_output` for one of the files.
+        InputError: it is no folder, has the name of a file, or as `check_output_file` for one of the files.
     """
     check_folder_name(folder, option)
     if not folder.exists():
@@ -99,19 +98,19 @@ def checked_folder(
     read = list(sources)
     for name in names:
         if (folder / name).parent.is_dir():
-            checked_output(folder / name, read, force=force)
+            check_output_file(folder / name, read, force=force)
     return folder
 
 
 def is_replaceable(path: Path) -> bool:
-    """Return whether there is a regular file at a path; False if there is nothing.
+    """True if a regular file is at a path, False if nothing is.
 
     Raises:
-        InputError: there is something else, such as a folder, a device, a pipe or a socket, be it through a link; or
-            the system does not say.
+        InputError: something else is there, such as a folder, a device, a pipe or a socket, perhaps through a link; or
+            the system refuses to tell.
     """
     try:
-        mode = mode_of(path)
+        mode = file_mode(path)
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError as error:
@@ -123,13 +122,13 @@ def is_replaceable(path: Path) -> bool:
     return True
 
 
-def mode_of(path: Path) -> int:
-    """The type and permissions of a file, that a link leads to."""
+def file_mode(path: Path) -> int:
+    """Type and permissions of a file, or of a link's target."""
     return path.stat().st_mode
 
 
 def refuse_source(path: Path, sources: Iterable[Path | None]) -> None:
-    """Refuse an output that is one of the files that are read, by the same name, through links, or by another name.
+    """Refuse an output that is one of the inputs, under any name.
 
     Raises:
         InputError: it is.
@@ -139,13 +138,13 @@ def refuse_source(path: Path, sources: Iterable[Path | None]) -> None:
     for source in sources:
         if source is None:
             continue
-        for file in files_of(source, ".mcap") if source.is_dir() else [source]:
+        for file in list_files(source, ".mcap") if source.is_dir() else [source]:
             if file.exists() and path.samefile(file):
                 raise InputError(f"{path}: is one of the files that are read ({file}); name another file")
 
 
-def _is_of_its_kind(path: Path) -> bool:
-    """Return whether an existing file begins as files of its suffix do; an empty file is of any kind."""
+def _matches_suffix(path: Path) -> bool:
+    """True if the start of an existing file matches its suffix; an empty file matches any."""
     fits = _KINDS.get(path.suffix.lower())
     try:
         with path.open("rb") as file:
@@ -156,7 +155,7 @@ def _is_of_its_kind(path: Path) -> bool:
 
 
 def _text(head: bytes) -> str | None:
-    """The text that a file begins with; None if it is no text."""
+    """Decode the start of a file; None if it is no text."""
     for cut in range(_PARTS if len(head) == _HEAD_BYTES else 1):
         try:
             text = head[: len(head) - cut].decode("utf-8-sig")
@@ -196,4 +195,4 @@ _KINDS: Mapping[str, Callable[[bytes], bool]] = {
     ".png": _starts_with(b"\x89PNG"),
     ".rrd": _starts_with(b"RRF"),
 }
-"""By suffix: whether the beginning of a file is that of its kind. A suffix that is not here is never overwritten."""
+"""Check of the start of a file, by suffix. Files with other suffixes are never overwritten."""

@@ -1,7 +1,7 @@
-"""A record: times and the columns measured at them. Pure.
+"""Record: times and the columns measured at them. Pure.
 
-Where the plant's clock steps back, or the plant was restarted, a record has several runs. Rows keep the order of their
-receipt, and times increase within each run.
+A record has several runs if the plant's clock stepped back or the plant was restarted. Rows keep the order of receipt,
+and times increase within each run.
 """
 
 from collections.abc import Mapping
@@ -16,32 +16,31 @@ from numpy.typing import NDArray
 MINUTE_NS = 60_000_000_000
 
 LARGEST_VALUE = 1e15
-"""A value of at least this size measures nothing, and its square would soon be more than a number can hold."""
+"""Values of at least this size are no measurements, and their squares would soon overflow."""
 
 LONGEST_MIN = 2.0**62 / MINUTE_NS
-"""From the zero of a record to any of its rows, 146 years: sums of times must still fit 64 bits of nanoseconds."""
+"""Largest time of a row, 146 years: sums of times must still fit 64 bits of nanoseconds."""
 
 SHIFT_NS = 1440 * MINUTE_NS
-"""A day: times before 1970 are stored and published later by whole days."""
+"""A day: times before 1970 are shifted by whole days to be stored and published."""
 
 GAP_ROWS = 20
-"""Sampling periods that `Record.continuous_min` leaves between two runs: after so long a gap no row is predicted from
-the rows before it."""
+"""Gap between two runs in `Record.continuous_min`, in sampling periods: no row is predicted across it."""
 
-MOST_SPANS = 5
-"""Runs whose times are named to people."""
+MAX_SPANS = 5
+"""Runs whose times are named in messages."""
 
 UNITS = {"qc": "l/min", "C": "mol/l", "T": "K"}
-"""The signals of the reactor, which is the process where none is named, and their units."""
+"""Units of the signals of the reactor, the default process."""
 
 
 def to_time_ns(minutes: float, zero_ns: int = 0) -> int:
-    """A plant time as nanoseconds, to the nearest microsecond so that decimal minutes come back exactly."""
+    """Convert minutes to nanoseconds, to the nearest microsecond, so that decimal minutes convert back exactly."""
     return zero_ns + round(minutes * 60e6) * 1000
 
 
 def to_minutes(time_ns: int, zero_ns: int = 0) -> float:
-    """Nanoseconds as minutes since a zero.
+    """Convert nanoseconds to minutes since a zero.
 
     >>> to_minutes(to_time_ns(0.3))
     0.3
@@ -49,10 +48,10 @@ def to_minutes(time_ns: int, zero_ns: int = 0) -> float:
     return (time_ns - zero_ns) / MINUTE_NS
 
 
-def clock_time(time_ns: int) -> str | None:
-    """A clock time as in ISO 8601, in UTC; None if it is beyond the years that can be written.
+def format_utc(time_ns: int) -> str | None:
+    """Format a time as ISO 8601 in UTC; None if its year has more than four digits.
 
-    >>> clock_time(1_772_352_000_250_000_000)
+    >>> format_utc(1_772_352_000_250_000_000)
     '2026-03-01T08:00:00.25Z'
     """
     seconds, rest = divmod(time_ns, 1_000_000_000)
@@ -65,18 +64,18 @@ def clock_time(time_ns: int) -> str | None:
 
 @dataclass(frozen=True)
 class Record:
-    """A measured run, or several one after the other.
+    """One or several measured runs.
 
     Attributes:
-        time_min: shape (rows,), increasing within each run.
-        columns: by signal name, each of shape (rows,), in the signal's unit; NaN where nothing was measured. The
-            input of row k is held over [t_k, t_k+1).
-        name: where it came from, for messages.
-        zero_ns: the time that its minutes count from, in nanoseconds since 1970-01-01 UTC; 0: not known.
+        time_min: times of the rows, shape (rows,), increasing within each run.
+        columns: values by signal name, each of shape (rows,), in the signal's unit; NaN: not measured. The input of row
+            k is held over [t_k, t_k+1).
+        name: name of the source, for messages.
+        zero_ns: time from which the minutes are counted, in nanoseconds since 1970-01-01 UTC; 0: unknown.
         first_row: number of the first row in the file, as a text editor counts lines; None: the rows are no lines.
-        runs: the run that each row is of, shape (rows,), counted from 1; None: there is one.
-        units: of the signals, by name; a signal whose unit is not known has none.
-        strays: samples that are in no row, because their number or time fits neither those before nor those after.
+        runs: number of each row's run, shape (rows,), counted from 1; None: one run.
+        units: units by signal name, without signals of unknown unit.
+        strays: count of samples in no row, because their number or time fits neither those before nor those after.
     """
 
     time_min: NDArray[np.float64]
@@ -97,19 +96,19 @@ class Record:
 
     @property
     def rows(self) -> int:
-        """How many rows it has."""
+        """Number of rows."""
         return int(self.time_min.size)
 
     @property
     def zero(self) -> str | None:
-        """The clock time that its minutes count from, as in ISO 8601; None: not known."""
-        return clock_time(self.zero_ns) if self.zero_ns else None
+        """Time from which the minutes are counted, as ISO 8601; None: unknown."""
+        return format_utc(self.zero_ns) if self.zero_ns else None
 
     @property
     def stored_zero_ns(self) -> int:
-        """The zero of its minutes where it is stored or published, which no time can be before 1970.
+        """Zero of the minutes in stored and published messages, whose times cannot be before 1970.
 
-        It is `zero_ns`; without clock time it is as many days after 1970 as the record starts before its own zero.
+        This is `zero_ns` or, without clock time, as many days after 1970 as the record starts before its own zero.
         """
         earliest_min = float(self.time_min.min(initial=0.0))
         if self.zero_ns or not -LONGEST_MIN < earliest_min < 0:
@@ -118,19 +117,19 @@ class Record:
 
     @property
     def run_starts(self) -> tuple[int, ...]:
-        """The first row of each run."""
+        """First row of each run."""
         if self.runs is None:
             return (0,)
         return (0, *(int(row) + 1 for row in np.flatnonzero(np.diff(self.runs))))
 
     @property
     def span_min(self) -> float:
-        """From the first row to the last, summed over the runs."""
-        return sum(float(run.time_min[-1] - run.time_min[0]) for run in self.each_run()) if self.rows else 0.0
+        """Minutes from the first row to the last, summed over the runs."""
+        return sum(float(run.time_min[-1] - run.time_min[0]) for run in self.split_runs()) if self.rows else 0.0
 
     @property
     def continuous_min(self) -> NDArray[np.float64]:
-        """Times that increase over all runs, shape (rows,): of each run, its own and its `run_shifts_min`."""
+        """Times that increase over all runs, shape (rows,): those of each run plus its `run_shifts_min`."""
         if self.runs is None:
             return self.time_min
         counts = np.diff([*self.run_starts, self.rows])
@@ -138,8 +137,8 @@ class Record:
 
     @property
     def run_shifts_min(self) -> tuple[float, ...]:
-        """Of each run, what `continuous_min` adds to its times so that it follows the run before; 0 for the first."""
-        runs = self.each_run()
+        """Minutes that `continuous_min` adds to each run's times so that it follows the run before; 0 for the first."""
+        runs = self.split_runs()
         steps = np.concatenate([np.diff(run.time_min) for run in runs])
         gap = GAP_ROWS * (float(np.median(steps)) if steps.size else 1.0)
         shifts = [0.0]
@@ -147,8 +146,8 @@ class Record:
             shifts.append(shifts[-1] + float(before.time_min[-1]) + gap - float(run.time_min[0]))
         return tuple(shifts)
 
-    def each_run(self) -> list["Record"]:
-        """Its runs, each as a record of its own."""
+    def split_runs(self) -> list["Record"]:
+        """Split into records of one run each."""
         if self.runs is None:
             return [self]
         starts = self.run_starts
@@ -164,26 +163,26 @@ class Record:
 
     @property
     def remarks(self) -> list[str]:
-        """What people have to know of its rows: several runs, samples that are left out."""
+        """Remarks on the rows for people: several runs, samples that are left out."""
         one = self.strays == 1
         strays = f"{self.strays} sample{'' if one else 's'} with a time or number that fits no other"
         left_out = [f"{strays} {'is' if one else 'are'} left out"] if self.strays else []
         return [*filter(None, [self.describe_runs()]), *left_out]
 
     def describe_runs(self) -> str:
-        """Its runs for people, on one line; empty where there is one."""
+        """Describe the runs on one line; empty for one run."""
         if self.runs is None:
             return ""
-        spans = [f"{run.time_min[0]:g} to {run.time_min[-1]:g}" for run in self.each_run()]
-        more = f" and {len(spans) - MOST_SPANS} more" if len(spans) > MOST_SPANS else ""
+        spans = [f"{run.time_min[0]:g} to {run.time_min[-1]:g}" for run in self.split_runs()]
+        more = f" and {len(spans) - MAX_SPANS} more" if len(spans) > MAX_SPANS else ""
         return (
             f"the plant's clock steps back, or the plant was restarted: {len(spans)} runs, "
-            f"{', '.join(spans[:MOST_SPANS])} min{more}"
+            f"{', '.join(spans[:MAX_SPANS])} min{more}"
         )
 
 
 def join_runs(runs: list[Record]) -> Record:
-    """One record of several runs of the same signals; all that is not in a row is that of the first."""
+    """Join runs of the same signals into one record; other attributes are those of the first."""
     if len(runs) == 1:
         return runs[0]
     numbers = np.repeat(np.arange(1, len(runs) + 1), [run.rows for run in runs])

@@ -1,24 +1,24 @@
-"""The clock that the loop of a node goes by: that of the machine, but it never runs backwards and never stands still.
+"""Clock of a node's loop: the machine's clock, but it never runs backwards and never stops.
 
-Pace, health, flushing and patience are all due at times of this clock. If the machine's clock is set forward, it
-follows at once: what is due is done. If it is set back, it goes on from where it was, somewhat slower than time, until
-the machine's has caught up; a node that followed would do nothing for as long as the clock was set back.
+All deadlines are times of this clock. If the machine's clock is set forward, this one follows at once. If it is set
+back, this one slews: it runs somewhat slower than time until the machine's clock has caught up; a node that followed
+would be idle for as long as the clock was set back.
 """
 
 import threading
 import time
 from collections.abc import Callable
 
-CATCHING_UP = 0.9
-"""Of the speed of time, while it is ahead of the machine's clock."""
+SLEW_RATE = 0.9
+"""Speed, relative to time, while this clock is ahead of the machine's."""
 
 
 class SteadyClock:
-    """May be read from any thread.
+    """A clock that may be read from any thread.
 
     Args:
         wall_ns: reads the machine's clock.
-        monotonic_ns: reads one that nobody sets.
+        monotonic_ns: reads a clock that cannot be set.
     """
 
     def __init__(
@@ -26,12 +26,12 @@ class SteadyClock:
     ) -> None:
         self._wall_ns, self._monotonic_ns = wall_ns, monotonic_ns
         self._lock = threading.Lock()
-        self._read_ns, self._told_ns = monotonic_ns(), wall_ns()
+        self._monotonic, self._now_ns = monotonic_ns(), wall_ns()
 
     def now_ns(self) -> int:
         """Nanoseconds since 1970-01-01 UTC."""
         with self._lock:
-            read_ns = self._monotonic_ns()
-            slow_ns = self._told_ns + int(CATCHING_UP * (read_ns - self._read_ns))
-            self._read_ns, self._told_ns = read_ns, max(self._wall_ns(), slow_ns)
-            return self._told_ns
+            monotonic = self._monotonic_ns()
+            slewed_ns = self._now_ns + int(SLEW_RATE * (monotonic - self._monotonic))
+            self._monotonic, self._now_ns = monotonic, max(self._wall_ns(), slewed_ns)
+            return self._now_ns

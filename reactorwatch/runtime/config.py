@@ -18,34 +18,34 @@ from typing import Any, Literal, TypeVar
 import msgspec
 
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.setting_rules import LAST_PORT, check_spans, check_values, checked_endpoint, choices
+from reactorwatch.runtime.setting_rules import LAST_PORT, check_endpoint, check_spans, check_values, valid_choices
 
 SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log")
-"""The tables that a file may hold."""
+"""Valid tables of a settings file."""
 
-LARGEST_FILE = 1_000_000
-"""Bytes of a settings file."""
+MAX_FILE_BYTES = 1_000_000
+"""Largest size of a settings file."""
 
 IDENTITY = ("ca", "certificate", "key")
-"""Files by which a node shows who it is, and knows the router."""
+"""Files with which a node authenticates itself and the router."""
 
 
 class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the bus is.
+    """Connection to the bus.
 
     Attributes:
-        endpoint: the router's address. Loopback unless asked otherwise.
-        routers: addresses of other routers that a router connects to, so that they form one bus; they may come later,
-            and come again. Of two routers it is enough that one names the other.
-        congestion: what a publisher does when the network cannot take more: throw away (`drop`), and send again what is
-            asked for; or wait (`block`), so that one stuck subscriber slows the others.
-        cache_messages: how many messages on each key a publisher keeps for those that have not heard them: what a
-            link may lose and get back. A message takes half a kilobyte.
-        history_s: how old what was published before may be to be told to a recorder that begins to listen, in seconds.
-        ca: file with the certificate of the site's authority (PEM); with it, a certificate and its key, the bus is
-            joined by mutual TLS: each side shows who it is. In a settings file, relative to that file's folder.
-        certificate: file with our own, likewise.
-        key: file with the private key that goes with it, likewise.
+        endpoint: the router's address, by default on loopback.
+        routers: addresses of other routers that a router connects to, so that they form one bus; they may start later,
+            and restart. Of two routers, one has to name the other.
+        congestion: behaviour of a publisher on a congested network: drop messages (`drop`) and resend those that are
+            queried; or wait (`block`), so that one stuck subscriber slows the others.
+        cache_messages: number of messages on each key that a publisher caches for recovery after a loss. A message
+            takes half a kilobyte.
+        history_s: age of the oldest earlier publications that a starting recorder receives, in seconds.
+        ca: file with the certificate of the site's authority (PEM). With it, a certificate and its key, the bus is
+            joined by mutual TLS. In a settings file, the path is relative to that file's folder.
+        certificate: file with the node's certificate (PEM), path as of `ca`.
+        key: file with the private key of that certificate (PEM), path as of `ca`.
     """
 
     endpoint: str = "tcp/127.0.0.1:7447"
@@ -59,7 +59,7 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         for endpoint in (self.endpoint, *self.routers):
-            checked_endpoint(endpoint)
+            check_endpoint(endpoint)
         if not 1 <= self.cache_messages <= 10_000_000:
             raise ValueError(f"cache_messages must be in [1, 10000000], got {self.cache_messages}")
         if not 0.0 < self.history_s <= 86_400.0:
@@ -79,12 +79,12 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class MetricsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Where a node shows what it counts, for Prometheus.
+    """Pages for Prometheus.
 
     Attributes:
-        port: of the plant's page; the monitor's is at the next one, the recorder's at the one after, so that one file
-            may be the settings of all. None: there are no pages.
-        address: of this machine, at which they are. Loopback unless asked otherwise.
+        port: port of the plant's page; the monitor's is the next one, the recorder's the one after, so that the nodes
+            can share one file. None: no pages.
+        address: address of this machine at which the pages are served, by default loopback.
     """
 
     port: int | None = None
@@ -102,7 +102,7 @@ class MetricsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LogConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a node says what happens to it, on standard error.
+    """Log of a node, on standard error.
 
     Attributes:
         format: `text`, a line for people; or `json`, an object a line.
@@ -114,14 +114,14 @@ class LogConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 Section = TypeVar("Section", bound=msgspec.Struct)
 
 _NO_CHOICE = "Invalid enum value"
-"""What msgspec says of a word that is none of those that are valid."""
+"""Start of msgspec's message for an invalid word."""
 
 
 def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
-    """The tables of a settings file; empty without a file.
+    """Read the tables of a settings file; empty without a file.
 
     Raises:
-        InputError: the file is not there, is not TOML, or holds a table of another name.
+        InputError: the file does not exist, is not TOML, or holds an unknown table.
     """
     if path is None:
         return {}
@@ -136,19 +136,19 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
             raise InputError(f"settings file {path}: {_unknown(name, SECTIONS, 'table')}")
     bus = tables.get("bus", {})
     for name in IDENTITY:
-        if isinstance(bus.get(name), str):  # so that a folder with settings and certificates can be moved as it is
+        if isinstance(bus.get(name), str):  # a folder with settings and certificates can be moved
             bus[name] = str(path.parent / bus[name])
     return tables
 
 
 def parse_toml(content: bytes) -> dict[str, dict[str, Any]]:
-    """The tables of a TOML document, with or without a byte order mark.
+    """Parse the tables of a TOML document, with or without a byte order mark.
 
     Raises:
-        InputError: it is not TOML, too large or too deep to be settings, or holds a value outside of its tables.
+        InputError: it is not TOML, too large or too deep to be settings, or holds a value outside of a table.
     """
-    if len(content) > LARGEST_FILE:
-        raise InputError(f"must be at most {LARGEST_FILE} bytes to be settings, got {len(content)}")
+    if len(content) > MAX_FILE_BYTES:
+        raise InputError(f"must be at most {MAX_FILE_BYTES} bytes to be settings, got {len(content)}")
     try:
         tables = tomllib.loads(content.decode("utf-8-sig"))
     except RecursionError as error:
@@ -162,14 +162,14 @@ def parse_toml(content: bytes) -> dict[str, dict[str, Any]]:
 
 
 def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], flags: dict[str, Any]) -> Section:
-    """One node's settings.
+    """Settings of one node: defaults < preset < file < flags.
 
     Args:
-        kind: the structure to fill; its defaults hold where nothing else is said. If it has `presets`, settings by
-            name, the key `preset` names one, which holds before the defaults.
-        name: the table of the file that it is filled from.
-        tables: what `read_settings` returned.
-        flags: what was said on the command line; None means not said.
+        kind: class of the settings, with their defaults. If it has `presets`, settings by name, the key `preset` names
+            one.
+        name: name of the table in the file.
+        tables: the tables from `read_settings`.
+        flags: values of the command line, by key; None: not given.
 
     Raises:
         InputError: an unknown key or preset, or a value that breaks a rule.
@@ -189,15 +189,17 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
             raise InputError(f"settings [{name}]: {_unknown(key, fields, 'key')}")
     try:
         check_values(values)
-        found = msgspec.convert(values, kind)
-        check_spans(found)
+        settings = msgspec.convert(values, kind)
+        check_spans(settings)
     except msgspec.ValidationError as error:
-        words = choices(kind, str(error).rpartition("`")[0].rpartition("`")[2]) if _NO_CHOICE in str(error) else ()
+        words = (
+            valid_choices(kind, str(error).rpartition("`")[0].rpartition("`")[2]) if _NO_CHOICE in str(error) else ()
+        )
         valid = f" (valid: {', '.join(words)})" if words else ""
         raise InputError(f"settings [{name}]: {error}{valid}") from error
     except (ValueError, OverflowError) as error:
         raise InputError(f"settings [{name}]: {error}") from error
-    return found
+    return settings
 
 
 def _unknown(name: str, valid: tuple[str, ...], what: str) -> str:

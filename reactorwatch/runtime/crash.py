@@ -1,7 +1,7 @@
-"""The guard of every process of this software: an error that nothing else dealt with ends in one line and an exit code.
+"""Last error handler of every process: an unhandled error ends in one line and an exit code.
 
-Input that cannot be used, and a file or disk that the system refuses, end with 2. Everything else is a fault of this
-software: it ends with 70, and the line names a file with the traceback.
+Unusable input, and a file or disk that the system refuses, end with 2. Everything else is a fault of this software: it
+ends with 70, and the line names a file with the traceback.
 """
 
 import errno
@@ -19,26 +19,26 @@ from reactorwatch.errors import InputError
 from reactorwatch.terminal import printable
 
 EXIT_CODE = 70
-"""EX_SOFTWARE of sysexits.h: no process of ours ends with it for another reason."""
+"""EX_SOFTWARE of sysexits.h, used for no other reason."""
 
 INTERRUPTED = 130
-"""Exit code of a process that Ctrl-C ended before it could end in order: 128 and the number of the signal."""
+"""Exit code of a process that Ctrl-C ended out of order: 128 and the number of the signal."""
 
 UNUSABLE = 2
-"""Exit code where something that was given cannot be used, or the system refuses a file."""
+"""Exit code for unusable input, or a file that the system refuses."""
 
 _NAMES = "EACCES EDQUOT EFBIG EIO EISDIR ELOOP EMFILE ENAMETOOLONG ENFILE ENOSPC ENOTDIR EPERM EROFS"
-_OF_THE_SYSTEM = frozenset(getattr(errno, name) for name in _NAMES.split(" "))
-"""Errors that say something about a file or a disk, and nothing about this software."""
+_SYSTEM_ERRORS = frozenset(getattr(errno, name) for name in _NAMES.split(" "))
+"""Errors of a file or a disk, not of this software."""
 
-_LONGEST_REASON = 200
+_MAX_REASON = 200
 
 
 def guard(name: str, run: Callable[[], int]) -> int:
     """Run a program to its end.
 
     Args:
-        name: of the program, with which its line begins.
+        name: name of the program, at the start of its line.
         run: the program, which returns its exit code.
 
     Returns:
@@ -49,25 +49,25 @@ def guard(name: str, run: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         return INTERRUPTED
     except InputError as error:
-        complain(name, str(error))
+        print_error(name, str(error))
         return UNUSABLE
-    except Exception as error:  # noqa: BLE001 (the one place that turns an unexpected error into a report)
-        if isinstance(error, OSError) and error.errno in _OF_THE_SYSTEM:
-            complain(name, f"{error.filename or 'standard output cannot be written'}: {error.strerror}")
+    except Exception as error:  # noqa: BLE001 (only here an unexpected error becomes a report)
+        if isinstance(error, OSError) and error.errno in _SYSTEM_ERRORS:
+            print_error(name, f"{error.filename or 'standard output cannot be written'}: {error.strerror}")
             return UNUSABLE
-        complain(name, report_crash(error))
+        print_error(name, report_crash(error))
         return EXIT_CODE
 
 
-def complain(name: str, text: str) -> None:
-    """Write one line to standard error, whatever is in it.
+def print_error(name: str, text: str) -> None:
+    """Write one line to standard error; line breaks and control characters are removed.
 
     Args:
-        name: of the program.
-        text: of the line.
+        name: name of the program.
+        text: text of the line.
     """
     line = " ".join(text.split())
-    with suppress(OSError):  # the exit code says it, too
+    with suppress(OSError):  # the exit code remains
         sys.stderr.write(printable(f"{name}: {line}") + "\n")
         sys.stderr.flush()
 
@@ -76,14 +76,14 @@ def report_crash(error: BaseException) -> str:
     """Write the report of an error.
 
     Args:
-        error: that the command could not deal with.
+        error: the unhandled error.
 
     Returns:
-        A line for people: the error, and the path of the report; where none can be written, the place in the code.
+        A line for people: the error, and the path of the report or, if none can be written, the line of the code.
     """
     reason = " ".join(f"{type(error).__name__}: {error}".split())
-    if len(reason) > _LONGEST_REASON:
-        reason = f"{reason[:_LONGEST_REASON]}…"
+    if len(reason) > _MAX_REASON:
+        reason = f"{reason[:_MAX_REASON]}…"
     path = _write(_report(error))
     if path is not None:
         where = f"please send {path}, which says where, and the files that it names"
@@ -105,7 +105,7 @@ def _report(error: BaseException) -> str:
 
 
 def _write(text: str) -> Path | None:
-    """The file in the system's folder for temporary files, which only its owner can read; None if it cannot be."""
+    """Write a file that only its owner can read, in the system's temporary folder; None if that fails."""
     with suppress(OSError):
         handle, name = tempfile.mkstemp(prefix="reactorwatch-crash-", suffix=".txt")
         path = Path(name)

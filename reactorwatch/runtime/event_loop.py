@@ -1,8 +1,8 @@
-"""The loop of every node: wait for a message, a command or the next moment something is due; hand it to the core.
+"""The event loop of every node: wait for a message, a command or a deadline, and hand it to the core.
 
-The core says what it wants published and when it wants to be woken; the loop alone reads the clock, listens to
-signals and touches the bus. It also publishes a record of each command and its answer (`audit`). Handlers of the bus
-run in its own threads and only put what came into the inbox.
+The core returns what to publish and the time of its next tick. Only the loop reads the clock, waits for signals and
+touches the bus. It also publishes a record of each command and its answer (`audit`). The bus calls handlers from its
+own threads; they only put items into the inbox.
 """
 
 import contextlib
@@ -22,64 +22,113 @@ from reactorwatch.runtime.clock import SteadyClock
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from reactorwatch.runtime.security.audit import audit
 
-LONGEST_WAIT_S = 3600.0
-LONGEST_LINGER = 10  # times linger_s: a bus that never falls silent does not keep a node from ending
-LARGEST_INBOX = (
-    100_000  # messages; beyond it the bus is made to wait, and with it who publishes faster than we can hear
-)
-LARGEST_INBOX_BYTES = 64 << 20  # of payload, likewise
-LOOK_AGAIN_S = 0.1
+MAX_WAIT_S = 3600.0
+MAX_DRAIN_FACTOR = 10
+"""Multiple of `drain_timeout_s` after which a node ends although messages still arrive."""
+MAX_INBOX_MESSAGES = 100_000
+MAX_INBOX_BYTES = 64 << 20  # of payload
+"""Beyond either the bus's thread is blocked, and with it the publishers that are too fast for the node."""
+POLL_S = 0.1
 _END = b"\0"  # no signal has this number
-BATCH = 256  # messages handled before the loop looks at the clock again
+BATCH = 256  # messages handled before the loop reads the clock again
 
 
 class Node(Protocol):
-    """What the loop drives: a core, or a core with the files it works on."""
+    """A core, or a core with its files, as the loop drives it."""
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        """Something was published on a key that the node listens to."""
+        """Handle a message on a subscribed key."""
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
-        """Somebody asked at one of the node's queryables; None: the answer is another's to give."""
+        """Handle a command; the reply is None if another node answers it."""
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """The moment named by `next_tick_ns` has come."""
+        """Handle the deadline that `next_tick_ns` named."""
 
     def next_tick_ns(self) -> int:
-        """When the node wants `on_tick` called next, by the clock that `now_ns` is read from."""
+        """Time of the next tick, by the clock that `now_ns` is read from."""
 
     @property
     def finished(self) -> bool:
-        """Whether the node has nothing left to do and the loop should end."""
+        """True if the node has nothing left to do and the loop ends."""
 
     def on_stop(self, now_ns: int) -> list[Publication]:
-        """The loop ends; last words."""
+        """Return the node's last publications; the loop ends."""
 
 
-class Token(NamedTuple):
-    """A liveliness token that came or went."""
+class _Token(NamedTuple):
+    """A liveliness token that appeared or disappeared."""
 
     key: str
     is_alive: bool
 
 
-class _Told:
-    """Stands in the inbox behind what was before."""
+class _HistoryEnd:
+    """Inbox item behind the last message published before the subscription."""
 
 
-_TOLD = _Told()
-_Item: TypeAlias = Encoded | list[Encoded] | Token | Gap | Request | _Told
+_HISTORY_END = _HistoryEnd()
+_Item: TypeAlias = Encoded | list[Encoded] | Gap | Request | _HistoryEnd | _Token
 
 
-class _Weight:
-    """Messages in an inbox, and the bytes of their payload, counted by several threads."""
+class _Inbox:
+    """Bounded queue between the bus's threads and the loop.
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._messages, self._bytes = 0, 0
+    `put` blocks while the queue is full, until the loop takes items out or ends.
+    """
 
-    def add(self, item: _Item, sign: int) -> None:
-        """Count an item that comes (1) or goes (-1)."""
+    def __init__(self, stop: "StopSignal") -> None:
+        self._items: SimpleQueue[_Item | None] = SimpleQueue()
+        self._lock, self._room = threading.Lock(), threading.Event()
+        self._messages = self._bytes = 0
+        self._stop, self._closed = stop, False
+        stop.call_on_set(self.wake)
+        stop.call_on_set(self._room.set)
+
+    def put(self, item: _Item) -> None:
+        """Append an item; called from threads of the bus."""
+        while self._is_full and not (self._stop.is_set or self._closed):
+            self._room.clear()
+            self._room.wait(POLL_S)
+        self._count(item, 1)
+        self._items.put(item)
+
+    def put_token(self, key: str, is_alive: bool) -> None:
+        """Append a change of a liveliness token; never blocks."""
+        self._items.put(_Token(key, is_alive))
+
+    def wake(self) -> None:
+        """Make a waiting `get` return None."""
+        self._items.put(None)
+
+    def get(self, timeout_s: float) -> _Item | None:
+        """Take the next item.
+
+        Raises:
+            Empty: none arrived in time.
+        """
+        item = self._items.get(timeout=timeout_s) if timeout_s > 0 else self._items.get_nowait()
+        if item is not None:
+            self._count(item, -1)
+        return item
+
+    def admit(self) -> None:
+        """Let blocked publishers check for room again."""
+        self._room.set()
+
+    def close(self) -> None:
+        """Block no publisher any more."""
+        self._closed = True
+
+    def __len__(self) -> int:
+        """Number of items."""
+        return self._items.qsize()
+
+    @property
+    def _is_full(self) -> bool:
+        return self._messages >= MAX_INBOX_MESSAGES or self._bytes >= MAX_INBOX_BYTES
+
+    def _count(self, item: _Item, sign: int) -> None:
         if isinstance(item, Encoded):
             messages, payload = 1, len(item.payload)
         elif isinstance(item, list):
@@ -90,43 +139,37 @@ class _Weight:
             self._messages += sign * messages
             self._bytes += sign * payload
 
-    @property
-    def is_full(self) -> bool:
-        """Whether there is no room for more."""
-        return self._messages >= LARGEST_INBOX or self._bytes >= LARGEST_INBOX_BYTES
-
 
 class StopSignal:
-    """Set once, by a signal or by another thread, and heard by a loop that waits."""
+    """Flag set once, by a signal or another thread, that wakes a waiting loop."""
 
     def __init__(self) -> None:
         self._set = False
-        self._wake: list[Callable[[], None]] = []
+        self._callbacks: list[Callable[[], None]] = []
 
     def set(self) -> None:
         """Ask the loop to end."""
         self._set = True
-        for wake in self._wake:
-            wake()
+        for callback in self._callbacks:
+            callback()
 
     @property
     def is_set(self) -> bool:
-        """Whether the loop was asked to end."""
+        """True once the loop was asked to end."""
         return self._set
 
-    def wakes(self, wake: Callable[[], None]) -> None:
-        """Have `wake` called when the signal is set."""
-        self._wake.append(wake)
+    def call_on_set(self, callback: Callable[[], None]) -> None:
+        """Register a function that `set` calls."""
+        self._callbacks.append(callback)
 
 
 @contextlib.contextmanager
 def stop_on_signals() -> Iterator[StopSignal]:
-    """A stop signal that SIGINT (Ctrl-C) and SIGTERM set, while the context lasts.
+    """Stop signal that SIGINT (Ctrl-C) and SIGTERM set, while the context lasts.
 
-    A handler of Python runs in the main thread between two of its instructions: whatever lock that thread holds just
-    then, and not before it has waited to the end if the signal came just before it began to wait. So the handler does
-    nothing; the interpreter writes the signal's number into a pipe at once (`signal.set_wakeup_fd`), and a thread that
-    reads it wakes the others.
+    Python runs a handler in the main thread, between two of its instructions: while that thread may hold any lock, and
+    only after a wait that began just before the signal has ended. So the handler does nothing. The interpreter writes
+    the signal's number into a pipe at once (`signal.set_wakeup_fd`), and a thread that reads the pipe sets the stop.
     """
     stop = StopSignal()
     source, sink = os.pipe()
@@ -156,130 +199,148 @@ def stop_on_signals() -> Iterator[StopSignal]:
         os.close(sink)
 
 
-def serve(
-    node: Node,
-    bus: Bus,
-    stop: StopSignal,
-    *,
-    subscriptions: tuple[str, ...] = (),
-    history_s: float = 0.0,
-    on_gap: Callable[[Gap, int], list[Publication]] | None = None,
-    on_told: Callable[[], None] | None = None,
-    on_messages: Callable[[list[Encoded], int], list[Publication]] | None = None,
-    tokens: tuple[str, ...] = (),
-    on_alive: Callable[[str, bool, int], list[Publication]] | None = None,
-    commands: tuple[str, ...] = (),
-    on_ready: Callable[[], None] | None = None,
-    linger_s: float = 0.0,
-    on_publish: Callable[[Publication], None] | None = None,
-) -> None:
-    """Run a node until it is finished or asked to stop.
+class EventLoop:
+    """Runs a node until it is finished or asked to stop.
 
     Args:
         node: the node.
         bus: an open bus; it stays open.
-        stop: ends the loop; what is in the inbox by then is still handled.
-        subscriptions: key expressions whose publications go to `node.on_message`.
-        history_s: whether those from before do, too, see `Bus.subscribe`.
-        on_gap: told, in its turn between the messages, what was published on them and never came, and what time it is.
-        on_told: called, in its turn between the messages, when those from before have all come.
-        on_messages: gets the publications instead, as many at a time as have come, in their order.
-        tokens: key expressions of liveliness tokens ...
-        on_alive: ... that it is told of: the token, whether it came or went, and what time it is.
-        commands: key expressions of queryables whose questions go to `node.on_command`.
-        on_ready: called once the node listens.
-        linger_s: after the end was asked for, go on until nothing has come for this long (at most ten times it).
-        on_publish: told of each thing that the node publishes, before the bus is, in the loop's own thread.
+        stop: ends the loop; items in the inbox by then are still handled.
+        drain_timeout_s: once asked to stop, the loop runs on until nothing has arrived for this long, for at most
+            `MAX_DRAIN_FACTOR` times as long.
+        on_publish: called with each publication of the node, in the loop's thread, before it is sent.
     """
-    inbox: SimpleQueue[_Item | None] = SimpleQueue()
-    clock = SteadyClock()
-    weight, room, ended = _Weight(), threading.Event(), threading.Event()
-    stop.wakes(lambda: inbox.put(None))
-    stop.wakes(room.set)
 
-    def receive(item: _Item) -> None:
-        while weight.is_full and not (stop.is_set or ended.is_set()):
-            room.clear()
-            room.wait(LOOK_AGAIN_S)
-        weight.add(item, 1)
-        inbox.put(item)
+    def __init__(
+        self,
+        node: Node,
+        bus: Bus,
+        stop: StopSignal,
+        *,
+        drain_timeout_s: float = 0.0,
+        on_publish: Callable[[Publication], None] | None = None,
+    ) -> None:
+        self._node, self._bus, self._stop = node, bus, stop
+        self._drain_timeout_s = drain_timeout_s
+        self._on_publish = on_publish
+        self._clock = SteadyClock()
+        self._inbox = _Inbox(stop)
+        self._on_batch: Callable[[list[Encoded], int], list[Publication]] | None = None
+        self._on_gap: Callable[[Gap, int], list[Publication]] | None = None
+        self._on_history_end: Callable[[], None] | None = None
+        self._on_token: Callable[[str, bool, int], list[Publication]] | None = None
 
-    for expression in subscriptions:
-        listen = bus.subscribe if on_messages is None else bus.gather
-        listen(
-            expression,
-            receive,
-            on_gap=receive if on_gap is not None else None,
-            history_s=history_s,
-            on_told=(lambda: receive(_TOLD)) if on_told is not None else None,
-        )
-    for expression in tokens:
-        bus.watch_alive(expression, lambda key, is_alive: inbox.put(Token(key, is_alive)))
-    for expression in commands:
-        bus.answer(expression, receive)
-    if on_ready is not None:
-        on_ready()
+    def subscribe(
+        self,
+        *key_expressions: str,
+        history_s: float = 0.0,
+        on_history_end: Callable[[], None] | None = None,
+        on_gap: Callable[[Gap, int], list[Publication]] | None = None,
+        on_batch: Callable[[list[Encoded], int], list[Publication]] | None = None,
+    ) -> None:
+        """Hand messages on these keys to `node.on_message`; to be called once.
 
-    def publish(publications: list[Publication]) -> None:
-        for publication in publications:
-            if on_publish is not None:
-                on_publish(publication)
-            bus.publish(encode(publication))
+        All handlers are called in the loop's thread, in the order of arrival.
 
-    def handle(item: _Item) -> None:
-        weight.add(item, -1)
-        if isinstance(item, Encoded):
-            publish(node.on_message(item, clock.now_ns()))
-        elif isinstance(item, list):
-            publish(on_messages(item, clock.now_ns()) if on_messages is not None else [])
-        elif isinstance(item, Token):
-            publish(on_alive(item.key, item.is_alive, clock.now_ns()) if on_alive is not None else [])
-        elif isinstance(item, _Told):
-            if on_told is not None:
-                on_told()
-        elif isinstance(item, Gap):
-            publish(on_gap(item, clock.now_ns()) if on_gap is not None else [])
-        else:
-            reply, publications = node.on_command(item.question, clock.now_ns())
-            if reply is None:
-                item.leave()
-                return
-            item.reply(reply)
-            record = audit(item.question, reply, clock.now_ns())
-            publish(publications if record is None else [*publications, record])
+        Args:
+            key_expressions: the keys.
+            history_s: age of the oldest earlier publication to receive, see `Bus.subscribe`.
+            on_history_end: called when all earlier publications have been handled.
+            on_gap: called with messages that were published and never arrived, and the time.
+            on_batch: called instead of `node.on_message`, with all messages that have arrived, and the time.
+        """
+        self._on_batch, self._on_gap, self._on_history_end = on_batch, on_gap, on_history_end
+        subscribe = self._bus.subscribe if on_batch is None else self._bus.subscribe_batched
+        for expression in key_expressions:
+            subscribe(
+                expression,
+                self._inbox.put,
+                on_gap=self._inbox.put if on_gap is not None else None,
+                history_s=history_s,
+                on_history_end=(lambda: self._inbox.put(_HISTORY_END)) if on_history_end is not None else None,
+            )
 
-    while not (stop.is_set or node.finished):
-        wait_s = (node.next_tick_ns() - clock.now_ns()) / 1e9
+    def subscribe_liveliness(
+        self, *key_expressions: str, on_token: Callable[[str, bool, int], list[Publication]]
+    ) -> None:
+        """Call `on_token` with a liveliness token, whether it appeared, and the time; to be called once."""
+        self._on_token = on_token
+        for expression in key_expressions:
+            self._bus.subscribe_liveliness(expression, self._inbox.put_token)
+
+    def accept_commands(self, *key_expressions: str) -> None:
+        """Hand commands on these keys to `node.on_command`."""
+        for expression in key_expressions:
+            self._bus.declare_queryable(expression, self._inbox.put)
+
+    def run(self) -> None:
+        """Run to the end."""
+        while not (self._stop.is_set or self._node.finished):
+            self._run_once()
+            self._inbox.admit()
+        self._inbox.close()
+        self._drain()
+        self._publish(self._node.on_stop(self._clock.now_ns()))
+
+    def _run_once(self) -> None:
+        """Tick if it is due; otherwise wait for items, and handle up to `BATCH` messages."""
+        wait_s = (self._node.next_tick_ns() - self._clock.now_ns()) / 1e9
         if wait_s <= 0:
-            publish(node.on_tick(clock.now_ns()))
-            wait_s = 0.0
+            self._publish(self._node.on_tick(self._clock.now_ns()))
         handled = 0
         while handled < BATCH:
             try:
-                item = inbox.get(timeout=min(wait_s, LONGEST_WAIT_S)) if wait_s > 0 else inbox.get_nowait()
+                item = self._inbox.get(min(wait_s, MAX_WAIT_S))
             except Empty:
-                break
+                return
             if item is None:
-                break
-            handle(item)
+                return
+            self._handle(item)
             handled += len(item) if isinstance(item, list) else 1
             wait_s = 0.0
-        room.set()
-    ended.set()
-    deadline = time.monotonic() + LONGEST_LINGER * linger_s
-    remaining = 0
-    while True:  # what was on its way when the end was asked for is not thrown away
-        try:
-            item = inbox.get(timeout=max(0.0, min(linger_s, deadline - time.monotonic())))
-        except Empty:
-            break
-        if item is not None:
-            handle(item)
-        if time.monotonic() >= deadline:
-            remaining = inbox.qsize()
-            break
-    for _ in range(remaining):
-        item = inbox.get_nowait()
-        if item is not None:
-            handle(item)
-    publish(node.on_stop(clock.now_ns()))
+
+    def _drain(self) -> None:
+        """Handle messages that were on their way when the stop was requested."""
+        deadline = time.monotonic() + MAX_DRAIN_FACTOR * self._drain_timeout_s
+        while (left_s := deadline - time.monotonic()) > 0:
+            try:
+                item = self._inbox.get(min(self._drain_timeout_s, left_s))
+            except Empty:
+                return
+            if item is not None:
+                self._handle(item)
+        for _ in range(len(self._inbox)):
+            item = self._inbox.get(0.0)
+            if item is not None:
+                self._handle(item)
+
+    def _handle(self, item: _Item) -> None:
+        now_ns = self._clock.now_ns()
+        if isinstance(item, Encoded):
+            self._publish(self._node.on_message(item, now_ns))
+        elif isinstance(item, list):
+            self._publish(self._on_batch(item, now_ns) if self._on_batch is not None else [])
+        elif isinstance(item, _Token):
+            self._publish(self._on_token(item.key, item.is_alive, now_ns) if self._on_token is not None else [])
+        elif isinstance(item, _HistoryEnd):
+            if self._on_history_end is not None:
+                self._on_history_end()
+        elif isinstance(item, Gap):
+            self._publish(self._on_gap(item, now_ns) if self._on_gap is not None else [])
+        else:
+            self._answer(item, now_ns)
+
+    def _answer(self, request: Request, now_ns: int) -> None:
+        reply, publications = self._node.on_command(request.question, now_ns)
+        if reply is None:
+            request.decline()
+            return
+        request.reply(reply)
+        record = audit(request.question, reply, self._clock.now_ns())
+        self._publish(publications if record is None else [*publications, record])
+
+    def _publish(self, publications: list[Publication]) -> None:
+        for publication in publications:
+            if self._on_publish is not None:
+                self._on_publish(publication)
+            self._bus.publish(encode(publication))

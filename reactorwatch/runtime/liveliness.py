@@ -1,4 +1,4 @@
-"""Waiting for others to be there: a node shows a liveliness token once it listens."""
+"""Wait for other nodes: a node shows a liveliness token once it is subscribed."""
 
 import threading
 from collections.abc import Collection
@@ -11,7 +11,7 @@ from reactorwatch.runtime.event_loop import StopSignal
 
 log = structlog.get_logger()
 
-SAY_AGAIN_S = 30.0
+LOG_INTERVAL_S = 30.0
 
 
 def wait_alive(bus: Bus, plant: str, nodes: Collection[str], stop: StopSignal, waiting: str) -> bool:
@@ -19,13 +19,13 @@ def wait_alive(bus: Bus, plant: str, nodes: Collection[str], stop: StopSignal, w
 
     Args:
         bus: an open bus.
-        plant: its name.
-        nodes: their names.
-        stop: ends the waiting.
-        waiting: who waits, for the log, which is told now and every half minute.
+        plant: name of the plant.
+        nodes: names of the nodes.
+        stop: ends the wait.
+        waiting: name of the waiting node, for a line in the log now and every half minute.
 
     Returns:
-        Whether they are there; False if a stop was asked for first.
+        True once they are all alive; False if a stop was requested first.
     """
     changed = threading.Event()
     alive: set[str] = set()
@@ -36,13 +36,13 @@ def wait_alive(bus: Bus, plant: str, nodes: Collection[str], stop: StopSignal, w
             (alive.add if is_alive else alive.discard)(topic.name)
             changed.set()
 
-    stop.wakes(changed.set)
+    stop.call_on_set(changed.set)
     if nodes:
-        bus.watch_alive(keys.all_of(plant, keys.ALIVE), on_token)
+        bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token)
     while True:
-        changed.clear()  # before looking: what changes from here on wakes the wait below
+        changed.clear()  # before the check: a later change wakes the wait below
         missing = [node for node in nodes if node not in alive]
         if stop.is_set or not missing:
             return not stop.is_set
         log.info("waiting", node=waiting, for_=", ".join(missing))
-        changed.wait(SAY_AGAIN_S)
+        changed.wait(LOG_INTERVAL_S)

@@ -1,7 +1,7 @@
-"""What a node says while it runs: one line an event, to standard error.
+"""Log of a node: one line an event, on standard error.
 
-For people a line of text; for programs that collect logs an object, in which the time is that of UTC to the microsecond
-(ISO 8601), `event` says what happened, `level` how bad it is, and every other key is a field of that event.
+A line is text for people, or a JSON object for programs that collect logs: the time is UTC to the microsecond (ISO
+8601), `event` names the event, `level` its severity, and every other key is a field of that event.
 """
 
 import logging
@@ -13,14 +13,14 @@ from structlog.typing import EventDict, Processor
 
 from reactorwatch.terminal import printable
 
-_OF_MANY_LINES = frozenset({"exception", "stack"})
-"""Fields that are tracebacks of ours."""
+_MULTILINE = frozenset({"exception", "stack"})
+"""Fields with tracebacks."""
 
 
 def _escape(_logger: object, _method: str, event: EventDict) -> EventDict:
-    """Texts of a line for people, as a terminal may have them; a JSON renderer escapes by itself."""
+    """Make texts of a line safe for a terminal; the JSON renderer escapes by itself."""
     return {
-        printable(name): printable(value) if isinstance(value, str) and name not in _OF_MANY_LINES else value
+        printable(name): printable(value) if isinstance(value, str) and name not in _MULTILINE else value
         for name, value in event.items()
     }
 
@@ -29,8 +29,8 @@ def configure(level: int = logging.INFO, *, as_json: bool = False) -> None:
     """Send the log to standard error.
 
     Args:
-        level: what is less is not said.
-        as_json: an object a line; else coloured for people on a terminal, plain `key=value` elsewhere.
+        level: the least severe level that is logged.
+        as_json: write a JSON object a line; else coloured for people on a terminal, plain `key=value` elsewhere.
     """
     form: list[Processor] = [
         structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),

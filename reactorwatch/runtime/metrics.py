@@ -1,12 +1,12 @@
-"""What a node counts, as a page that Prometheus scrapes: the only file that knows of it (`reactorwatch[metrics]`).
+"""A node's counts as a page that Prometheus scrapes: the only file that imports its client (`reactorwatch[metrics]`).
 
-The numbers are those of the newest `Health` that the node has published, with the states of its alarms and the room on
-its disk. Names keep Prometheus' conventions (https://prometheus.io/docs/practices/naming): a prefix, base units at the
-end, `_total` for what only ever grows. Samples that are missing are a gauge: one that turns up late is missing no more,
-and a counter that falls is taken for a restart.
+The numbers are those of the newest `Health` that the node has published, with the states of its alarms and the free
+space of its disk. Names keep Prometheus' conventions (https://prometheus.io/docs/practices/naming): a prefix, base
+units at the end, `_total` for counters. Missing samples are a gauge: one that arrives late is missing no more, and
+Prometheus takes a falling counter for a restart.
 
-The loop of the node tells what is published (`Metrics.of`); a scrape reads it in a thread of the server's own,
-from references that are replaced as a whole. A node of many plants has one page of all (`FleetMetrics`).
+The node's loop passes each publication on (`Metrics.observe`); a scrape reads, in a thread of the server, references
+that are replaced as a whole. A node of many plants has one page for all (`FleetMetrics`).
 """
 
 from collections import Counter
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 log = structlog.get_logger()
 
 PREFIX = "reactorwatch"
-PORT_AFTER = {"plant": 0, "monitor": 1, "recorder": 2}
-"""Where each node's page is, counted from the port of the settings, which may be those of all."""
+PORT_OFFSET = {"plant": 0, "monitor": 1, "recorder": 2}
+"""Offset of each node's port from that of the settings, which several nodes may share."""
 
-MOST_SHOWN = 1000
-"""Plants of a fleet that are on its page: a thousand are 1.5 MB, and a sixth of a second of a core at each scrape."""
+MAX_PLANTS = 1000
+"""Plants of a fleet on its page: a thousand are 1.5 MB, and a sixth of a second of a core at each scrape."""
 
 COUNTERS = {
     "received": ("messages_received", "Messages that came"),
@@ -43,7 +43,7 @@ COUNTERS = {
     "rows": ("rows", "Complete rows that were judged"),
     "incomplete_rows": ("rows_incomplete", "Rows that were given up because a signal was missing"),
 }
-"""By field of `Health`: the name without prefix and `_total`, and what it counts."""
+"""Name without prefix and `_total`, and description, by field of `Health`."""
 
 _STATES = {
     name: name.removeprefix("ALARM_STATE_").lower()
@@ -52,18 +52,18 @@ _STATES = {
 }
 
 
-def port_of(config: MetricsConfig, node: str) -> int | None:
-    """The port of a node's page; None: it has none."""
-    return None if config.port is None else config.port + PORT_AFTER[node]
+def page_port(config: MetricsConfig, node: str) -> int | None:
+    """Port of a node's page; None: it has none."""
+    return None if config.port is None else config.port + PORT_OFFSET[node]
 
 
 class Metrics:
-    """The page, as Prometheus' library asks for it.
+    """The page of a node, a collector of Prometheus' library.
 
     Args:
-        plant: that the node is of.
-        node: its name.
-        free_bytes: the room on its disk; None: it writes nothing.
+        plant: name of the node's plant.
+        node: name of the node.
+        free_bytes: returns the free space of its disk; None: it writes no files.
     """
 
     def __init__(self, plant: str, node: str, free_bytes: Callable[[], int] | None = None) -> None:
@@ -72,12 +72,12 @@ class Metrics:
         self._health: Health | None = None
         self._by_state: Counter[int] | None = None
 
-    def of(self, alarms: Callable[[], Iterable[Alarm] | None] | None = None) -> Callable[[Publication], None]:
-        """What is to be told of each thing that the node publishes.
+    def observe(self, alarms: Callable[[], Iterable[Alarm] | None] | None = None) -> Callable[[Publication], None]:
+        """Return a function to be called with each publication of the node.
 
         Args:
-            alarms: the node's alarms as they are, asked for in the thread that tells; it returns None if they are as
-                they were. None: it has none.
+            alarms: returns the node's alarms, or None if they have not changed; called in the thread of the caller.
+                None: the node has no alarms.
         """
 
         def published(publication: Publication) -> None:
@@ -86,14 +86,14 @@ class Metrics:
                 self._health = message
             elif not isinstance(message, Alarm):
                 return
-            found = alarms() if alarms is not None else None
-            if found is not None:
-                self._by_state = Counter(alarm.state for alarm in found)
+            changed = alarms() if alarms is not None else None
+            if changed is not None:
+                self._by_state = Counter(alarm.state for alarm in changed)
 
         return published
 
     def collect(self) -> "Iterator[Metric]":
-        """The page; what is not known yet is left out."""
+        """Yield the metrics; those not known yet are left out."""
         from prometheus_client.metrics_core import GaugeMetricFamily
 
         if self._health is not None:
@@ -151,48 +151,48 @@ class Metrics:
 
 
 class FleetMetrics:
-    """The pages of many plants as one.
+    """The page of a node of many plants.
 
     Args:
-        node: its name.
+        node: name of the node.
     """
 
     def __init__(self, node: str) -> None:
         self._node = node
         self._pages: dict[str, tuple[Metrics, Callable[[Publication], None]]] = {}  # by plant
 
-    def watch(self, plant: str, alarms: Callable[[], Iterable[Alarm] | None]) -> None:
-        """From now on a plant is on the page, if there are not too many.
+    def add_plant(self, plant: str, alarms: Callable[[], Iterable[Alarm] | None]) -> None:
+        """Add a plant to the page, unless there are `MAX_PLANTS`.
 
         Args:
-            plant: its name.
-            alarms: as for `Metrics.of`.
+            plant: name of the plant.
+            alarms: as for `Metrics.observe`.
         """
-        if len(self._pages) < MOST_SHOWN:
+        if len(self._pages) < MAX_PLANTS:
             page = Metrics(plant, self._node)
-            self._pages[plant] = page, page.of(alarms)
+            self._pages[plant] = page, page.observe(alarms)
 
-    def leave(self, plant: str) -> None:
-        """A plant is on the page no longer."""
+    def remove_plant(self, plant: str) -> None:
+        """Remove a plant from the page."""
         self._pages.pop(plant, None)
 
-    def published(self, publication: Publication) -> None:
-        """To be told of each thing that the node publishes."""
+    def on_publish(self, publication: Publication) -> None:
+        """Take the counts and alarm states from a publication of the node."""
         topic = keys.parse(publication.key)
-        found = self._pages.get(topic.plant) if topic is not None else None
-        if found is not None:
-            found[1](publication)
+        page = self._pages.get(topic.plant) if topic is not None else None
+        if page is not None:
+            page[1](publication)
 
     def collect(self) -> "Iterator[Metric]":
-        """The page: of each metric all plants together."""
-        together: dict[str, Metric] = {}
+        """Yield each metric with the samples of all plants."""
+        merged: dict[str, Metric] = {}
         for page, _ in list(self._pages.values()):
             for metric in page.collect():
-                if metric.name in together:
-                    together[metric.name].samples += metric.samples
+                if metric.name in merged:
+                    merged[metric.name].samples += metric.samples
                 else:
-                    together[metric.name] = metric
-        yield from together.values()
+                    merged[metric.name] = metric
+        yield from merged.values()
 
 
 class _Page(Protocol):
@@ -203,21 +203,21 @@ Page = TypeVar("Page", bound=_Page)
 
 
 @contextmanager
-def served(config: MetricsConfig, metrics: Page, node: str) -> Iterator[Page | None]:
-    """Serve the page while the context lasts, if the settings ask for it.
+def serve_metrics(config: MetricsConfig, metrics: Page, node: str) -> Iterator[Page | None]:
+    """Serve the page while the context lasts, if the settings name a port.
 
     Args:
         config: the settings.
         metrics: the page.
-        node: whose it is.
+        node: name of the node.
 
     Returns:
-        The page; None if it is not asked for.
+        The page; None without a port.
 
     Raises:
         InputError: Prometheus' library is not installed, or the port cannot be listened at.
     """
-    port = port_of(config, node)
+    port = page_port(config, node)
     if port is None:
         yield None
         return

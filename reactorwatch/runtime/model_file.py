@@ -1,4 +1,4 @@
-"""Extended models as files: what `diagnose` writes and `--model` takes."""
+"""Files of extended models, as `diagnose` writes and `--model` reads them."""
 
 import json
 from dataclasses import replace
@@ -8,14 +8,14 @@ from typing import Any
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 
 
 def read_extended_model(path: Path) -> ExtendedModel:
-    """The model in a file.
+    """Read the model in a file.
 
     Raises:
-        InputError: the file cannot be read, or holds no model; the text begins with its path.
+        InputError: the file cannot be read, or holds no model; the text starts with its path.
     """
     try:
         return parse_extended_model(path.read_bytes())
@@ -25,12 +25,12 @@ def read_extended_model(path: Path) -> ExtendedModel:
         raise InputError(f"model file {path}: {error}") from error
 
 
-def model_on_the_bus(path: str | None, zero_ns: int = 0) -> ProcessModel | None:
-    """The model in a file, its clock that of the samples: minutes since 1970-01-01 UTC. None if there is no file.
+def read_model_on_bus_clock(path: str | None, zero_ns: int = 0) -> ProcessModel | None:
+    """Read a model and set its clock to that of samples on the bus: minutes since 1970-01-01 UTC.
 
     Args:
-        path: of the file.
-        zero_ns: the time that its minutes count from, where it does not say.
+        path: path of the file; None: no model, and None is returned.
+        zero_ns: the time that its minutes count from, if the file does not give it.
 
     Raises:
         InputError: as `read_extended_model`.
@@ -42,10 +42,10 @@ def model_on_the_bus(path: str | None, zero_ns: int = 0) -> ProcessModel | None:
 
 
 def write_extended_model(path: Path, written: dict[str, Any]) -> None:
-    """Write the object that `ExtendedModel.to_object` gives; the file appears whole or not at all.
+    """Write the object from `ExtendedModel.to_object`; the file appears complete or not at all.
 
     Raises:
         InputError: the folder does not exist or cannot be written to.
     """
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""How a node begins as a process of its own: `python -m NODE [settings.toml]`."""
+"""Entry of a node's process: `python -m NODE [settings.toml]`."""
 
 import sys
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import msgspec
 
 from reactorwatch.runtime import logs
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
-from reactorwatch.runtime.crash import UNUSABLE, complain, guard
+from reactorwatch.runtime.crash import UNUSABLE, guard, print_error
 
 Config = TypeVar("Config", bound=msgspec.Struct)
 
@@ -18,17 +18,17 @@ def main(module: str, table: str, kind: type[Config], run: Callable[[Config, Bus
     """Read the settings file that the command line names, and run the node.
 
     Args:
-        module: the node's, for the usage line.
-        table: of the settings file that is the node's.
-        kind: the structure of its settings.
-        run: the node.
+        module: module of the node, for the usage line.
+        table: name of the node's table in the settings file.
+        kind: class of its settings.
+        run: runs the node.
 
     Returns:
         The exit code, see `crash`.
     """
     arguments = sys.argv[1:]
     if len(arguments) > 1:
-        complain(table, f"usage: python -m {module} [settings.toml]")
+        print_error(table, f"usage: python -m {module} [settings.toml]")
         return UNUSABLE
     logs.configure()
 

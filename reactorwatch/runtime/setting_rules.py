@@ -1,4 +1,4 @@
-"""Rules that hold for every setting of every node, beside those that each structure has for its own."""
+"""Rules for every setting of every node, in addition to those of each structure."""
 
 import math
 import re
@@ -9,26 +9,26 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 import msgspec
 
 PROTOCOLS = ("tcp", "tls", "udp", "ws")
-"""Of an endpoint."""
+"""Protocols of an endpoint."""
 
 LAST_PORT = 65535
 
-LONGEST_S = 2.0**62 / 1e9
+MAX_SPAN_S = 2.0**62 / 1e9
 """146 years: sums of times must still fit 64 bits of nanoseconds."""
 
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "days": 86_400.0}
-_MOST_BITS = 63
+_MAX_BITS = 63
 
 
 def check_values(values: object, name: str = "") -> None:
     """Check that numbers fit 64 bits and that texts can be names of files.
 
     Args:
-        values: of a table, as they were read: numbers, texts, lists and tables.
-        name: of the setting, for messages.
+        values: a value or table as read: numbers, texts, lists and tables.
+        name: name of the setting, for messages.
 
     Raises:
-        ValueError: one does not.
+        ValueError: a value breaks a rule.
     """
     if isinstance(values, dict):
         for key, value in values.items():
@@ -39,15 +39,15 @@ def check_values(values: object, name: str = "") -> None:
             check_values(value, name)
     elif isinstance(values, str) and "\0" in values:
         raise ValueError(f"{name} must not hold the character NUL, got {values!r}")
-    elif isinstance(values, int) and values.bit_length() > _MOST_BITS:
+    elif isinstance(values, int) and values.bit_length() > _MAX_BITS:
         raise ValueError(f"{name} must be a number of 64 bits, got one of {values.bit_length()}")
 
 
 def check_spans(settings: msgspec.Struct) -> None:
-    """Check that durations are ones; a setting's unit ends its name; where that is l/min, it is a flow.
+    """Check the range of durations, found by the unit at the end of a name; one in l/min is a flow.
 
     Raises:
-        ValueError: one is longer than 146 years and not infinite.
+        ValueError: a duration is finite and longer than 146 years.
     """
     for name, value in msgspec.structs.asdict(settings).items():
         if isinstance(value, msgspec.Struct):
@@ -55,18 +55,18 @@ def check_spans(settings: msgspec.Struct) -> None:
         seconds = _SECONDS.get(name.rpartition("_")[2])
         if seconds is None or name.endswith("_l_min") or not isinstance(value, float) or math.isinf(value):
             continue
-        if not abs(value) <= LONGEST_S / seconds:
-            raise ValueError(f"{name} must be at most {LONGEST_S / seconds:.3g}, which is 146 years, got {value:g}")
+        if not abs(value) <= MAX_SPAN_S / seconds:
+            raise ValueError(f"{name} must be at most {MAX_SPAN_S / seconds:.3g}, which is 146 years, got {value:g}")
 
 
-def checked_endpoint(endpoint: str) -> str:
-    """The address of a router, if it can be one.
+def check_endpoint(endpoint: str) -> str:
+    """Check that an endpoint is a protocol, a host and a port; returns it.
 
     Raises:
-        ValueError: it is not a protocol, a host and a port.
+        ValueError: it is not.
     """
-    protocol, slash, place = endpoint.partition("/")
-    host, colon, port = re.split(r"[?#]", place, maxsplit=1)[0].rpartition(":")
+    protocol, slash, address = endpoint.partition("/")
+    host, colon, port = re.split(r"[?#]", address, maxsplit=1)[0].rpartition(":")
     if not (slash and host and colon) or "/" in host:
         raise ValueError(f"endpoint must be like 'tcp/127.0.0.1:7447', got {endpoint!r}")
     if protocol not in PROTOCOLS:
@@ -78,15 +78,12 @@ def checked_endpoint(endpoint: str) -> str:
     return endpoint
 
 
-def choices(kind: object, path: str) -> tuple[str, ...]:
-    """The words that a setting takes.
+def valid_choices(kind: object, path: str) -> tuple[str, ...]:
+    """Valid words of a setting; empty if it is not a choice.
 
     Args:
-        kind: the structure of the settings.
-        path: of the setting as msgspec names it, such as `$.charts[0]`.
-
-    Returns:
-        The words; empty if it is no choice.
+        kind: class of the settings.
+        path: path of the setting in msgspec's form, such as `$.charts[0]`.
     """
     kinds = [kind]
     for name in re.findall(r"\.([A-Za-z_]\w*)", path):
@@ -105,7 +102,7 @@ def choices(kind: object, path: str) -> tuple[str, ...]:
 
 
 def _parts(kinds: list[Any]) -> Iterator[Any]:
-    """Types and, of unions and containers, what they are made of."""
+    """Yield types, and the arguments of unions and containers."""
     for kind in kinds:
         yield kind
         if get_origin(kind) in (Union, types.UnionType, tuple, list, dict):

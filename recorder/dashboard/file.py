@@ -10,7 +10,7 @@ from pathlib import Path
 
 import rerun as rr
 
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from recorder.columns.run import Run
 from recorder.dashboard.drawing import Drawing
 from recorder.dashboard.reading import read_time_plots
@@ -71,7 +71,7 @@ def write_views(drawn: Mapping[str, Sequence[View]], path: Path, zero_ns: int) -
 
 def _write(path: Path, onto: Callable[[Drawing], None]) -> None:
     recording = rr.RecordingStream(APPLICATION)
-    with replacing(path) as temporary, _copied_to(temporary) as pipe:
+    with atomic_write(path) as temporary, _copied_to(temporary) as pipe:
         recording.save(pipe)
         try:
             drawing = Drawing(recording)

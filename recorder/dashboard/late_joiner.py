@@ -43,12 +43,12 @@ def ask_for_past(bus: Bus, plant: str) -> Past:
     listed, answered = list[messages.Alarm](), set[str]()
     for node, command in COMMANDS.items():
         question = Encoded(keys.key(plant, keys.COMMAND, command), *encode_message(messages.ListAlarms()))
-        for reply in _decoded(bus.ask(question, ANSWER_WITHIN_S)):
+        for reply in _decoded(bus.query(question, ANSWER_WITHIN_S)):
             if isinstance(reply, messages.CommandReply):
                 listed += reply.alarms
                 answered.add(node)
     zero_ns: int | None = None
-    for message in bus.recall(keys.all_of(plant, keys.HEALTH)):
+    for message in bus.query_history(keys.all_keys(plant, keys.HEALTH)):
         said_ns = zero_of(message)
         zero_ns = zero_ns if said_ns is None else said_ns
     alarms = (encode(Publication(keys.key(plant, keys.ALARM, item.alarm), item)) for item in changes(listed))

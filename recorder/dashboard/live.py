@@ -26,7 +26,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.loopback import free_port
 from recorder.columns.run_reader import STRETCH, RunReader
 from recorder.dashboard.drawing import Drawing
@@ -96,15 +96,10 @@ def show(plant: str, bus_config: BusConfig, shown: Shown, say: Callable[[str], N
                 past = ask_for_past(bus, plant)
                 query = PastQuery(lambda: ask_for_past(bus, plant), past.answered)
                 dashboard = LiveDashboard(recording, lambda: process.poll() is not None, time.time_ns(), past, query)
-                serve(
-                    dashboard,
-                    bus,
-                    stop,
-                    subscriptions=(f"{keys.ROOT}/{plant}/**",),
-                    history_s=bus_config.history_s,
-                    tokens=(keys.all_of(plant, keys.ALIVE),),
-                    on_alive=dashboard.on_alive,
-                )
+                loop = EventLoop(dashboard, bus, stop)
+                loop.subscribe(f"{keys.ROOT}/{plant}/**", history_s=bus_config.history_s)
+                loop.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token=dashboard.on_alive)
+                loop.run()
                 recording.disconnect()
             finally:
                 bus.close()

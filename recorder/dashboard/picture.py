@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.loopback import free_port
 from recorder.dashboard.file import DIAGNOSIS
@@ -51,7 +51,7 @@ def render_png(rrd: Path, png: Path, width: int = 1600, height: int = 1000, dead
         InputError: there is no such dashboard, the viewer does not run on this machine, or it shows no plots in time.
     """
     deadline = time.monotonic() + deadline_s
-    with replacing(png) as temporary, _Studio.opened(rrd, width, height, deadline) as studio:
+    with atomic_write(png) as temporary, _Studio.opened(rrd, width, height, deadline) as studio:
         temporary.write_bytes(studio.picture(deadline))
 
 
@@ -83,7 +83,7 @@ def render_tabs(
                 studio.open_tab(tab)
                 picture = studio.picture(time.monotonic() + deadline_s, other_than=picture)
             path = folder / f"{named_after(title)}.png"
-            with replacing(path) as temporary:
+            with atomic_write(path) as temporary:
                 temporary.write_bytes(picture)
             found.append(path)
     return found

@@ -12,7 +12,7 @@ from google.protobuf.message import Message
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication
-from reactorwatch.contract.commands import command_in, signed
+from reactorwatch.contract.commands import check_signature, decode_command
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms
 from reactorwatch.errors import InputError
 
@@ -75,7 +75,7 @@ class OwnAlarms:
             return CommandReply(accepted=False, text=str(error)), []
 
     def _answer(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        _, command = command_in(question, COMMANDS)
+        _, command = decode_command(question, COMMANDS)
         if isinstance(command, ListAlarms):
             return CommandReply(accepted=True, text=f"{len(self._now)} alarms", alarms=self.now), []
         assert isinstance(command, AlarmCommand), "the catalogue holds no others"
@@ -87,7 +87,7 @@ class OwnAlarms:
         name = command.alarm
         if name not in self._now:
             raise InputError(f"no alarm {name!r} of the recorder (there are: {', '.join(self._now)})")
-        by, comment = signed(command.by, command.comment)
+        by, comment = check_signature(command.by, command.comment)
         after = {
             messages.ALARM_STATE_UNACKNOWLEDGED: messages.ALARM_STATE_ACKNOWLEDGED,
             messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED: messages.ALARM_STATE_NORMAL,

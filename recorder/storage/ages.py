@@ -14,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 import structlog
 
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 
 log = structlog.get_logger()
 
@@ -116,5 +116,5 @@ class Ages:
         since_ns = self._read_clock().since_ns
         now_ns = self._start_ns + since_ns - self._start.since_ns
         stored = _Stored(self._start.boot, since_ns, now_ns, self._seen)
-        with replacing(self._path) as temporary:
+        with atomic_write(self._path) as temporary:
             temporary.write_bytes(msgspec.json.encode(stored))

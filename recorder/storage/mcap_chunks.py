@@ -28,7 +28,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
-from reactorwatch.records.reading import reading
+from reactorwatch.records.input_file import wrap_read_errors
 from recorder.message import Entry
 from recorder.storage.chunk_data import chunk_data
 
@@ -59,7 +59,7 @@ def read_summary(path: Path) -> Summary:
     Raises:
         InputError: the file is not there, is no MCAP file, is cut off, or its index is damaged.
     """
-    with reading(path):
+    with wrap_read_errors(path):
         size = path.stat().st_size
         stream = path.open("rb")
     with stream:

@@ -21,7 +21,7 @@ from mcap.records import Attachment, Channel, Chunk, Header, Metadata, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.reading import reading
+from reactorwatch.records.input_file import wrap_read_errors
 from recorder.message import Entry
 from recorder.storage.chunk_data import chunk_data
 from recorder.storage.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, channel_of, read_summary
@@ -109,7 +109,7 @@ class Scan:
         self._schemas: dict[int, Schema] = {}
         self._indexed_bytes: dict[int, int] = {}  # the size of each chunk's content, by where the chunk begins
         self._sure: set[tuple[type, int]] = set()  # channels and schemas that a checksum vouches for
-        with reading(path), path.open("rb") as stream:
+        with wrap_read_errors(path), path.open("rb") as stream:
             self._size = os.fstat(stream.fileno()).st_size
             if not self._size:
                 raise InputError(f"{path}: expected an MCAP recording, got an empty file")

@@ -14,7 +14,7 @@ from mcap.well_known import MessageEncoding, SchemaEncoding
 from reactorwatch import __version__
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import encoding_of, message_type
-from reactorwatch.contract.sample_bytes import sample_number
+from reactorwatch.contract.sample_bytes import read_sequence
 from reactorwatch.errors import InputError
 from recorder.message import Entry
 from recorder.policy.room import MOST_CHANNELS
@@ -107,7 +107,7 @@ class RecordingWriter:
             channel = self._channels.get(name)
             if channel is None:
                 channel = self._channels[name] = self._register(entry, readable=readable)
-            number = sample_number(entry.payload) & MOST_MESSAGES if readable and entry.encoding == _SAMPLE else 0
+            number = read_sequence(entry.payload) & MOST_MESSAGES if readable and entry.encoding == _SAMPLE else 0
             self._writer.add_message(channel, entry.log_time_ns, entry.payload, entry.publish_time_ns, number)
         except OSError as error:
             raise self._failed(error) from error

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.output import refuse_source
 from recorder.storage.mcap_scan import Damage, Scan, profile_of
 from recorder.storage.mcap_writer import METADATA, RecordingWriter, own_metadata
@@ -72,7 +72,7 @@ def recover(path: Path, out: Path) -> Saved:
     scan = Scan(path)
     topics: Counter[str] = Counter()
     first_ns, last_ns = 2**64, 0
-    with replacing(out) as temporary:
+    with atomic_write(out) as temporary:
         with RecordingWriter(temporary, origin(path), profile=profile_of(path)) as writer:
             for stored in scan:
                 writer.copy(stored)

@@ -7,7 +7,7 @@ from pathlib import Path
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.output import refuse_source
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, to_time_ns
@@ -38,7 +38,7 @@ def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | N
         InputError: the record is malformed, or has times that a recording cannot hold; or the name cannot be a plant's.
     """
     try:
-        keys.checked_plant(plant)
+        keys.check_plant(plant)
     except ValueError as error:
         raise InputError(str(error)) from error
     refuse_source(mcap, (csv,))
@@ -50,7 +50,7 @@ def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | N
     _check_times(csv, record, zero_ns)
     received = ContinuousTime()
     with (
-        replacing(mcap) as temporary,
+        atomic_write(mcap) as temporary,
         RecordingWriter(temporary, {**metadata, ZERO_NS: str(zero_ns)}) as writer,
     ):
         for publication in samples_of(record, plant, zero_ns):
@@ -85,7 +85,7 @@ def _check_times(csv: Path, record: Record, zero_ns: int) -> None:
     for minutes in (float(record.time_min.min()), float(record.continuous_min.max())):
         if not 0 <= minutes + zero_ns / MINUTE_NS < LONGEST_MIN:
             raise InputError(f"{csv}: times must lie between 1970 and 2262 to be recorded, got {minutes:g} min")
-    for run in record.each_run():
+    for run in record.split_runs():
         times_ns = [to_time_ns(minutes, zero_ns) for minutes in run.time_min.tolist()]
         for row, (before, after) in enumerate(itertools.pairwise(times_ns)):
             if before >= after:

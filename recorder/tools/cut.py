@@ -16,7 +16,7 @@ from mcap.records import Attachment, Metadata
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.output import refuse_source
 from recorder.message import Entry
 from recorder.policy.latched import Head
@@ -97,7 +97,7 @@ def cut(
     found = _sources(sources, tolerant=tolerant)
     refuse_source(out, sources)
     count = 0
-    with replacing(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(found)) as writer:
+    with atomic_write(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(found)) as writer:
         for stored in _in_order(found, window.received_ns, tolerant=tolerant):
             if stored.repeated or not window.holds(stored):
                 continue
@@ -129,7 +129,7 @@ def merge(sources: Sequence[Path], out: Path, metadata: Mapping[str, str]) -> in
     found = _sources(sources)
     refuse_source(out, sources)
     count = 0
-    with replacing(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(found)) as writer:
+    with atomic_write(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(found)) as writer:
         for stored in _in_order(found):
             writer.copy(stored)
             count += 1

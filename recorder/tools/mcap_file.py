@@ -26,7 +26,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, decode, encoding_of
 from reactorwatch.errors import InputError
-from reactorwatch.records.reading import files_of
+from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import MINUTE_NS, UNITS, Record, join_runs
 from recorder.columns.measurement import measured
 from recorder.columns.run_splitter import RunSplitter
@@ -216,7 +216,7 @@ def _files(path: Path) -> list[_File]:
     if not path.is_dir():
         summary = read_summary(path)
         return [_File(path, summary, span_ns(summary), first=True)]
-    read = [(file, read_summary(file)) for file in files_of(path, ".mcap")]
+    read = [(file, read_summary(file)) for file in list_files(path, ".mcap")]
     if not read:
         raise InputError(f"{path}: holds no recording (.mcap)")
     spans = [(span_ns(summary), file, summary) for file, summary in read]

@@ -13,7 +13,7 @@ from typing import NamedTuple, cast
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.commands import command_in
+from reactorwatch.contract.commands import decode_command
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, to_time_ns
@@ -195,7 +195,7 @@ class Player:
     # --- within ----------------------------------------------------------------------------------------------
 
     def _obey(self, question: Encoded, now_ns: int) -> tuple[str, list[Publication]]:
-        name, command = command_in(question, COMMANDS)
+        name, command = decode_command(question, COMMANDS)
         assert isinstance(command, messages.ReplayCommand), "the catalogue holds no others"
         if name == "set_rate" and not command.rate > 0.0:
             raise InputError(f"rate must be positive, got {command.rate:g}")

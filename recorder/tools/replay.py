@@ -13,7 +13,7 @@ from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from reactorwatch.runtime.liveliness import wait_alive
 from recorder.config import ReplayConfig
 from recorder.tools.inspect import zero_ns_of
@@ -58,13 +58,14 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
     if bus is None:
         return 0
     try:
-        commands = tuple(keys.key(plant, keys.COMMAND, name) for plant in plants for name in COMMANDS)
         for plant in plants:
             wait_alive(bus, plant, config.wait_for, stop, NODE)
         log.info("replaying", file=config.file, plant=", ".join(plants), rate=config.rate)
         for plant in plants:
-            bus.announce(keys.key(plant, keys.ALIVE, NODE))
-        serve(player, bus, stop, commands=commands)
+            bus.declare_token(keys.key(plant, keys.ALIVE, NODE))
+        loop = EventLoop(player, bus, stop)
+        loop.accept_commands(*(keys.key(plant, keys.COMMAND, name) for plant in plants for name in COMMANDS))
+        loop.run()
     finally:
         bus.close()
     log.info("replayed", file=config.file, messages=player.published, to_the_end=player.finished)
@@ -86,7 +87,7 @@ def _opened(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterato
     if not config.plant:
         for plant in plants:
             try:
-                keys.checked_plant(plant)
+                keys.check_plant(plant)
             except ValueError as error:
                 raise InputError(f"{path}: {error}; choose the name by --plant") from error
     if config.plant and len(plants) > 1:

@@ -85,7 +85,7 @@ def wait_alive(bus: ZenohBus) -> WaitAlive:
             if not missing:
                 all_there.set()
 
-        bus.watch_alive(f"reactor/{plant}/alive/*", on_token)
+        bus.subscribe_liveliness(f"reactor/{plant}/alive/*", on_token)
         assert all_there.wait(PATIENCE_S), f"not alive within {PATIENCE_S:g} s: {sorted(missing)}"
 
     return wait

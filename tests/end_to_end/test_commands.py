@@ -187,7 +187,7 @@ def test_up_runs_until_ctrl_c_and_closes_its_files(endpoint: str, start: Start, 
     listener = connect(BusConfig(endpoint=endpoint), "test", StopSignal())
     assert listener is not None
     sampled = threading.Event()
-    listener.subscribe(keys.all_of("R-101", keys.SAMPLE), lambda _message: sampled.set())
+    listener.subscribe(keys.all_keys("R-101", keys.SAMPLE), lambda _message: sampled.set())
     assert sampled.wait(PATIENCE_S)
     listener.close()
     process.send_signal(signal.SIGINT)
@@ -205,7 +205,7 @@ def test_the_plant_obeys_commands_on_the_bus(bus: ZenohBus, endpoint: str, start
 
     def ask(name: str, message: SetInput | InjectFault) -> CommandReply:
         question = Encoded(keys.key("cstr", keys.COMMAND, name), *encode_message(message))
-        (answer,) = bus.ask(question, PATIENCE_S)
+        (answer,) = bus.query(question, PATIENCE_S)
         return CommandReply.FromString(answer.payload)
 
     assert ask("set_input", SetInput(signal="qc", value=95.0)).accepted

@@ -16,12 +16,12 @@ from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.metrics import PORT_AFTER
+from reactorwatch.runtime.metrics import PORT_OFFSET
 from tests.ports import three_free_ports
 
 from .conftest import PATIENCE_S, Start
 
-NODES = tuple(PORT_AFTER)
+NODES = tuple(PORT_OFFSET)
 ROOT = Path(__file__).parents[2]
 
 
@@ -49,11 +49,11 @@ def test_every_node_of_up_has_a_page_with_what_it_has_counted(endpoint: str, sta
         if set(heard) == set(NODES):
             all_heard.set()
 
-    listener.subscribe(keys.all_of("cstr", keys.HEALTH), listen)
+    listener.subscribe(keys.all_keys("cstr", keys.HEALTH), listen)
     assert all_heard.wait(PATIENCE_S)
     pages = {}
     for node in NODES:
-        with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER[node]}/metrics", timeout=PATIENCE_S) as answer:
+        with urlopen(f"http://{LOOPBACK}:{port + PORT_OFFSET[node]}/metrics", timeout=PATIENCE_S) as answer:
             families = text_string_to_metric_families(answer.read().decode())
             pages[node] = {
                 sample.name: sample.value
@@ -79,5 +79,5 @@ def test_the_example_names_the_pages_of_the_nodes() -> None:
     (job,) = example["scrape_configs"]
     (static,) = job["static_configs"]
     ports = [int(target.rpartition(":")[2]) for target in static["targets"]]
-    assert [port - ports[0] for port in ports] == list(PORT_AFTER.values())
+    assert [port - ports[0] for port in ports] == list(PORT_OFFSET.values())
     assert f"port = {ports[0]}" in (ROOT / "docs" / "deployment.md").read_text()

@@ -67,7 +67,7 @@ def test_up_lets_in_who_has_a_certificate_and_nobody_else(site: Path, tmp_path: 
         if heard == set(NODES):
             all_heard.set()
 
-    viewer.subscribe(keys.all_of("cstr", keys.HEALTH), listen)
+    viewer.subscribe(keys.all_keys("cstr", keys.HEALTH), listen)
     assert all_heard.wait(PATIENCE_S), heard
     stranger = zenoh.Config()
     endpoint = bus_of(site / "cstr" / "viewer" / "settings.toml").endpoint

@@ -45,7 +45,7 @@ def run_nodes(services: Services, bus: ZenohBus, outside: Callable[[str], Mappin
         replaced = outside(node)
         return [REACTORWATCH, *(replaced.get(word, word) for word in words)]
 
-    bus.subscribe(keys.all_of("cstr", keys.ESTIMATE), on_estimate)
+    bus.subscribe(keys.all_keys("cstr", keys.ESTIMATE), on_estimate)
     running = []
     try:
         for node in NODES:

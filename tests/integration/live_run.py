@@ -79,9 +79,9 @@ class LiveRun:
         self._first_ns: int | None = None
         self.now_min = self._judged_min = 0.0
         self._alive: set[str] = set()
-        self.bus.watch_alive(f"reactor/{PLANT}/alive/*", self._on_alive)
+        self.bus.subscribe_liveliness(f"reactor/{PLANT}/alive/*", self._on_alive)
         for kind in (keys.SAMPLE, keys.ESTIMATE, keys.ALARM, keys.HEALTH):
-            self.bus.subscribe(keys.all_of(PLANT, kind), self._on_message)
+            self.bus.subscribe(keys.all_keys(PLANT, kind), self._on_message)
 
     def start(self, node: str) -> "subprocess.Popen[bytes]":
         """Start a node, and wait until it is alive."""

@@ -46,7 +46,7 @@ class Control:
         self._settings.write_text(
             f'[bus]\nendpoint = "{endpoint}"\n[monitor]\nalarm_state_file = "{self.file}"\n', encoding="utf-8"
         )
-        bus.watch_alive("reactor/cstr/alive/monitor", self._on_alive)
+        bus.subscribe_liveliness("reactor/cstr/alive/monitor", self._on_alive)
         bus.subscribe("reactor/**", self._on_message)
 
     def monitor(self) -> subprocess.Popen[str]:

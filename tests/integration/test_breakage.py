@@ -127,7 +127,7 @@ def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun) -> None:
 
     run.start("recorder")
     run.start("monitor")
-    second.subscribe(keys.all_of(PLANT, keys.SAMPLE), publish_as_second)
+    second.subscribe(keys.all_keys(PLANT, keys.SAMPLE), publish_as_second)
     run.end(run.start("plant"))
     second.close()
     assert run.health.refused_by_reason["out_of_place"] > 300

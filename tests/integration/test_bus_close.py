@@ -24,7 +24,7 @@ def test_close_returns_after_the_last_batch_is_handled() -> None:
         bus.close()
         order.append("closed")
 
-    bus.gather(KEY, handle)
+    bus.subscribe_batched(KEY, handle)
     bus.publish(Encoded(KEY, b"1", ""))
     assert entered.wait(WITHIN_S)
     closing = threading.Thread(target=close)

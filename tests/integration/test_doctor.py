@@ -16,7 +16,7 @@ import msgspec
 import pytest
 
 from reactorwatch import __version__
-from reactorwatch.cli.doctor import NODES, Finding, examine
+from reactorwatch.cli.doctor import NODES, Finding, run_checks
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Health
@@ -55,7 +55,7 @@ def nodes(
     stopped = threading.Event()
 
     def speak(node: str, bus: ZenohBus) -> None:
-        bus.announce(keys.key("cstr", keys.ALIVE, node))
+        bus.declare_token(keys.key("cstr", keys.ALIVE, node))
         lateness_s = itertools.cycle(late_s)
         while not stopped.wait(every_s):
             bus.publish(health(node, next(lateness_s), version))
@@ -75,7 +75,7 @@ def wrong(
     config: BusConfig, folder: Path, timeout_s: float = WITHIN_S, plant: str = "cstr", room_mb: float = 0.0
 ) -> dict[str, Finding]:
     """What is wrong, by check."""
-    return {item.check: item for item in examine(config, plant, folder, room_mb, timeout_s, now()) if item.cure}
+    return {item.check: item for item in run_checks(config, plant, folder, room_mb, timeout_s, now()) if item.cure}
 
 
 def wrong_of_what_is_there(config: BusConfig, folder: Path, there: set[str]) -> dict[str, Finding]:
@@ -111,7 +111,7 @@ def test_what_the_doctor_says_is_heard_by_no_node(site: Site, tmp_path: Path) ->
     recorder.subscribe("reactor/cstr/**", heard.append)
     plant = site.join("cstr/plant")
     with nodes({node: site.join(f"cstr/{node}") for node in NODES}):
-        found = list(examine(settings(site.folder, "cstr/plant"), "cstr", tmp_path, 0.0, WITHIN_S, now()))
+        found = list(run_checks(settings(site.folder, "cstr/plant"), "cstr", tmp_path, 0.0, WITHIN_S, now()))
     assert Finding("heard", "what we publish comes through: sample, fault") in found
     plant.publish(Encoded("reactor/cstr/sample/T", b"measured", ""))
     site.leave(plant)
@@ -133,7 +133,7 @@ def test_a_router_of_another_authority_is_told(site: Site, tmp_path: Path) -> No
 
 def test_a_bus_open_to_all_is_told(tmp_path: Path) -> None:
     """The first check, before anything is called: the address is one set aside for documents."""
-    found = next(iter(examine(BusConfig(endpoint="tcp/192.0.2.1:7447"), "cstr", tmp_path, 0.0, 0.0, now())))
+    found = next(iter(run_checks(BusConfig(endpoint="tcp/192.0.2.1:7447"), "cstr", tmp_path, 0.0, 0.0, now())))
     assert found.check == "certificate"
     assert "certify" in found.cure
 
@@ -231,9 +231,9 @@ def test_two_monitors_of_one_plant_are_reported(site: Site, tmp_path: Path) -> N
     buses = {node: site.join(f"cstr/{node}") for node in NODES}
     other = site.join("cstr/monitor")
     with nodes(buses):
-        buses["monitor"].announce(keys.monitor_token("cstr", "a"))
+        buses["monitor"].declare_token(keys.monitor_token("cstr", "a"))
         assert wrong(settings(site.folder, "cstr/viewer"), tmp_path) == {}
-        other.announce(keys.monitor_token("cstr", "b"))
+        other.declare_token(keys.monitor_token("cstr", "b"))
         found = wrong(settings(site.folder, "cstr/viewer"), tmp_path)
     assert set(found) == {"monitors"}
     assert found["monitors"].found == "2 of them watch cstr: every alarm is raised as often"

@@ -153,7 +153,7 @@ def test_a_message_on_many_keys_at_once_is_taken_by_no_subscriber(
             last.set()
 
     if gathered:
-        site.router.gather("reactor/cstr/sample/**", on_messages)
+        site.router.subscribe_batched("reactor/cstr/sample/**", on_messages)
     else:
         site.router.subscribe("reactor/cstr/sample/**", lambda message: on_messages([message]))
     plant = site.join("cstr/plant")
@@ -226,13 +226,13 @@ def answered(site: Site, node: str, who: str, command: str, *, listened_to: bool
         request.reply(CommandReply(accepted=True))
 
     key = f"reactor/cstr/command/{command}"
-    site.join(f"cstr/{node}").answer(key, answer)
+    site.join(f"cstr/{node}").declare_queryable(key, answer)
     question = Encoded(key, *encode_message(AlarmCommand(alarm="shewhart/T", by=who)))
     engineer, latest = site.join("cstr/engineer"), time.monotonic() + WITHIN_S
-    while listened_to and not engineer.ask(question, WITHIN_S):
+    while listened_to and not engineer.query(question, WITHIN_S):
         assert time.monotonic() < latest, "an engineer may tell it everything, and is not answered"
     asked.clear()
-    replies = site.join(who).ask(question, WITHIN_S)
+    replies = site.join(who).query(question, WITHIN_S)
     assert bool(asked) == bool(replies)
     return bool(replies)
 
@@ -356,12 +356,14 @@ def test_who_is_alive_is_told_to_readers_of_the_plant_and_cannot_be_feigned(site
     alive: list[str] = []
     foreign: list[str] = []
     intruder = site.join("cstr/viewer")
-    intruder.announce("reactor/cstr/alive/monitor")
-    intruder.ask(Encoded("reactor/cstr/command/list_alarms", b"", ALARM), WITHIN_S)  # after which the token was judged
-    site.join("cstr/monitor").announce("reactor/cstr/alive/monitor")
-    site.join("cstr/plant").announce("reactor/cstr/alive/plant")
-    site.join("cstr/operator").watch_alive("reactor/cstr/alive/**", lambda key, _: alive.append(key))
-    site.join("other/operator").watch_alive("reactor/cstr/alive/**", lambda key, _: foreign.append(key))
+    intruder.declare_token("reactor/cstr/alive/monitor")
+    intruder.query(
+        Encoded("reactor/cstr/command/list_alarms", b"", ALARM), WITHIN_S
+    )  # after which the token was judged
+    site.join("cstr/monitor").declare_token("reactor/cstr/alive/monitor")
+    site.join("cstr/plant").declare_token("reactor/cstr/alive/plant")
+    site.join("cstr/operator").subscribe_liveliness("reactor/cstr/alive/**", lambda key, _: alive.append(key))
+    site.join("other/operator").subscribe_liveliness("reactor/cstr/alive/**", lambda key, _: foreign.append(key))
     site.close_readers()
     assert sorted(alive) == ["reactor/cstr/alive/monitor", "reactor/cstr/alive/plant"]
     assert not foreign
@@ -378,8 +380,8 @@ def test_two_monitors_of_a_plant_notice_each_other_and_cannot_be_feigned(site: S
 
         seen[name] = set()
         bus = site.join(who)
-        bus.watch_alive(keys.monitor_token("cstr", "*"), on_token)
-        bus.announce(keys.monitor_token("cstr", name))
+        bus.subscribe_liveliness(keys.monitor_token("cstr", "*"), on_token)
+        bus.declare_token(keys.monitor_token("cstr", name))
 
     watch("cstr/recorder", "feigned")
     watch("cstr/monitor", "a")
@@ -391,9 +393,9 @@ def test_two_monitors_of_a_plant_notice_each_other_and_cannot_be_feigned(site: S
 
 def test_an_answer_says_what_was_done(site: Site) -> None:
     """The whole way of a command and its reply, over TLS."""
-    site.join("cstr/monitor").answer(
+    site.join("cstr/monitor").declare_queryable(
         "reactor/cstr/command/acknowledge", lambda request: request.reply(CommandReply(accepted=True, text="seen"))
     )
     question = Encoded("reactor/cstr/command/acknowledge", *encode_message(AlarmCommand(alarm="a", by="Anna")))
-    (answer,) = site.join("cstr/operator").ask(question, WITHIN_S)
+    (answer,) = site.join("cstr/operator").query(question, WITHIN_S)
     assert decode(answer.payload, answer.encoding) == CommandReply(accepted=True, text="seen")

@@ -27,7 +27,7 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.metrics import PORT_AFTER
+from reactorwatch.runtime.metrics import PORT_OFFSET
 from tests.ports import three_free_ports
 from tests.running import WITHIN_S
 from tests.unit.monitor_node.fleets import QUICK, alone, run_of
@@ -92,7 +92,7 @@ def crew_of(bus: ZenohBus) -> Callable[[int], None]:
             (there.add if is_alive else there.discard)(key)
             changed.notify_all()
 
-    bus.watch_alive(f"{keys.ROOT}/{keys.FLEET}/**", on_token)
+    bus.subscribe_liveliness(f"{keys.ROOT}/{keys.FLEET}/**", on_token)
 
     def wait(count: int) -> None:
         with changed:
@@ -104,10 +104,10 @@ def crew_of(bus: ZenohBus) -> Callable[[int], None]:
 def test_plants_are_discovered_by_their_tokens_and_by_their_samples(bus_config: BusConfig, tmp_path: Path) -> None:
     with client(bus_config) as bus, monitor(bus_config, tmp_path, "1/1"):
         watchers, health = Watchers(), SimpleQueue[str]()
-        bus.watch_alive("reactor/*/alive/monitor", watchers.on_token)
+        bus.subscribe_liveliness("reactor/*/alive/monitor", watchers.on_token)
         bus.subscribe("reactor/*/health/monitor", lambda message: health.put(message.key))
         crew_of(bus)(1)
-        bus.announce("reactor/alpha/alive/plant")
+        bus.declare_token("reactor/alpha/alive/plant")
         watchers.wait_for({"alpha"})
         bus.publish(run_of("beta", 1, span_min=1.0)[0])
         watchers.wait_for({"alpha", "beta"})
@@ -129,11 +129,11 @@ def test_what_is_counted_of_each_plant_is_on_the_monitor_s_page(bus_config: BusC
         try:
             crew_of(bus)(1)
             for plant in PLANTS:
-                bus.announce(f"reactor/{plant}/alive/plant")
+                bus.declare_token(f"reactor/{plant}/alive/plant")
             told = set[str]()
             while len(told) < len(PLANTS):
                 told.add(health.get(timeout=WITHIN_S))
-            with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER['monitor']}/metrics", timeout=WITHIN_S) as answer:
+            with urlopen(f"http://{LOOPBACK}:{port + PORT_OFFSET['monitor']}/metrics", timeout=WITHIN_S) as answer:
                 page = answer.read().decode()
         finally:
             process.kill()
@@ -152,14 +152,14 @@ def test_one_monitor_answers_for_each_plant_and_another_takes_over_the_plants_of
         monitor(bus_config, tmp_path, "2/2") as second,
     ):
         watchers = Watchers()
-        bus.watch_alive("reactor/*/alive/monitor", watchers.on_token)
+        bus.subscribe_liveliness("reactor/*/alive/monitor", watchers.on_token)
         crew_are = crew_of(bus)
         crew_are(2)
         for plant in PLANTS:
-            bus.announce(f"reactor/{plant}/alive/plant")
+            bus.declare_token(f"reactor/{plant}/alive/plant")
         watchers.wait_for(set(PLANTS))
         for plant in PLANTS:
-            (answer,) = bus.ask(Encoded(f"reactor/{plant}/command/list_alarms", payload, encoding), WITHIN_S)
+            (answer,) = bus.query(Encoded(f"reactor/{plant}/command/list_alarms", payload, encoding), WITHIN_S)
             reply = decode(answer.payload, answer.encoding)
             assert isinstance(reply, CommandReply)
             assert "ewma/T" in [alarm.alarm for alarm in reply.alarms]
@@ -223,7 +223,7 @@ def test_what_is_told_again_and_again_waits_on_new_keys_if_there_were_many_latel
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.MOST_NEW_KEYS", 2)
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.NEW_KEYS_A_S", 0)
     heard: SimpleQueue[str] = SimpleQueue()
-    bus = bus_zenoh.connect(bus_config, "test", StopSignal(), passing=("health",))
+    bus = bus_zenoh.connect(bus_config, "test", StopSignal(), uncached=("health",))
     with client(bus_config) as listener:
         assert bus is not None
         listener.subscribe("reactor/*/*/monitor", lambda message: heard.put(message.key))

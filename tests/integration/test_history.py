@@ -50,7 +50,9 @@ def test_an_answer_that_does_not_come_in_time_is_asked_for_again(
         for message in PUBLISHED:
             publisher.publish(message)
         heard, complete = SimpleQueue[Encoded](), SimpleQueue[bool]()
-        late.subscribe("reactor/cstr/sample/**", heard.put, history_s=math.inf, on_told=lambda: complete.put(True))
+        late.subscribe(
+            "reactor/cstr/sample/**", heard.put, history_s=math.inf, on_history_end=lambda: complete.put(True)
+        )
         assert complete.get(timeout=PATIENCE_S)
         assert [heard.get(timeout=PATIENCE_S).payload for _ in PUBLISHED] == [item.payload for item in PUBLISHED]
         assert slow.asked == unanswered + 2

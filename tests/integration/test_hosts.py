@@ -32,7 +32,7 @@ from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 bus = connect(BusConfig(endpoint=sys.argv[1]), "plant", StopSignal())
-bus.announce("reactor/x/alive/plant")
+bus.declare_token("reactor/x/alive/plant")
 print("ready", flush=True)
 number = 0
 for line in sys.stdin:
@@ -53,8 +53,8 @@ def on_messages(messages):
         heard.append(int(message.payload))
         if len(heard) % int(sys.argv[2]) == 0:
             print("in order" if heard == list(range(len(heard))) else "out of order", len(heard), flush=True)
-bus.gather("reactor/*/sample/**", on_messages)
-bus.watch_alive("reactor/*/alive/plant", lambda key, alive: print("came" if alive else "went", flush=True))
+bus.subscribe_batched("reactor/*/sample/**", on_messages)
+bus.subscribe_liveliness("reactor/*/alive/plant", lambda key, alive: print("came" if alive else "went", flush=True))
 print("ready", flush=True)
 threading.Event().wait()
 """

@@ -73,8 +73,8 @@ def test_the_first_messages_on_keys_are_heard_though_the_router_was_gone_when_th
     seen: SimpleQueue[bool] = SimpleQueue()
     heard: SimpleQueue[str] = SimpleQueue()
     listener.subscribe("reactor/*/alarm/**", lambda message: heard.put(message.key))
-    publisher.watch_alive("reactor/known/alive/publisher", lambda _, is_alive: seen.put(is_alive))
-    publisher.announce("reactor/known/alive/publisher")
+    publisher.subscribe_liveliness("reactor/known/alive/publisher", lambda _, is_alive: seen.put(is_alive))
+    publisher.declare_token("reactor/known/alive/publisher")
     publisher.publish(Encoded("reactor/known/alarm/first", b"", ""))
     assert (heard.get(timeout=PATIENCE_S), seen.get(timeout=PATIENCE_S)) == ("reactor/known/alarm/first", True)
     router.kill()
@@ -113,7 +113,7 @@ def test_who_begins_to_listen_late_hears_what_was_before(tmp_path: Path, router:
         if len(heard) >= 2000 * SIGNALS:
             enough.set()
 
-    late.subscribe(keys.all_of("cstr", keys.SAMPLE), hear, history_s=60.0)
+    late.subscribe(keys.all_keys("cstr", keys.SAMPLE), hear, history_s=60.0)
     assert enough.wait(PATIENCE_S)
     publisher.close()
     late.close()
@@ -171,7 +171,7 @@ def test_a_handler_that_blocks_holds_up_neither_the_publisher_nor_another_listen
         hear("stuck", message)
         released.wait(PATIENCE_S)
 
-    everything = keys.all_of("cstr", keys.SAMPLE)
+    everything = keys.all_keys("cstr", keys.SAMPLE)
     stuck.subscribe(everything, hear_and_block)
     quick.subscribe(everything, lambda message: hear("quick", message))
     publisher = Publisher(bus, RATE_PER_S)

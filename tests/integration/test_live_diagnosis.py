@@ -30,7 +30,7 @@ def watched(record: Record, out: Path, run: Command) -> Diagnoses:
     config = DiagnosisConfig(out=str(out), window_min=100.0, after_min=25.0, tolerance={"T": 0.2, "C": 0.001})
     diagnoses = Diagnoses(config, run, lambda work: work())
     node = AfterAlarm(config, diagnoses.begin, lambda: diagnoses.busy)
-    samples, alarms = (keys.all_of("cstr", kind) for kind in (keys.SAMPLE, keys.ALARM))
+    samples, alarms = (keys.all_keys("cstr", kind) for kind in (keys.SAMPLE, keys.ALARM))
 
     def watch(item: Encoded) -> None:
         for said in monitor.on_message(item, 0):

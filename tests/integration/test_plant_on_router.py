@@ -35,7 +35,7 @@ class Operator:
         self.heard: list[tuple[str, Message]] = []
         self.alive: set[str] = set()
         self._changed = threading.Condition()
-        bus.watch_alive("reactor/**", self._on_alive)
+        bus.subscribe_liveliness("reactor/**", self._on_alive)
         bus.subscribe("reactor/**", self._on_message)
 
     def messages(self, key: str) -> list[Message]:
@@ -67,7 +67,7 @@ class Operator:
 
     def ask(self, name: str, message: Message) -> CommandReply:
         question = Encoded(f"reactor/cstr/command/{name}", *encode_message(message))
-        (answer,) = self.bus.ask(question, WITHIN_S)
+        (answer,) = self.bus.query(question, WITHIN_S)
         reply = decode(answer.payload, answer.encoding)
         assert isinstance(reply, CommandReply)
         return reply

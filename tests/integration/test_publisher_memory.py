@@ -5,7 +5,7 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import connect_now
-from reactorwatch.runtime.bus_zenoh.bus import EVERY_ROW, MOST_KEPT_OF_OTHERS
+from reactorwatch.runtime.bus_zenoh.bus import EVERY_ROW, MAX_CACHED_OF_OTHERS
 from reactorwatch.runtime.config import BusConfig
 
 PUBLISHED = 1000
@@ -27,7 +27,7 @@ def remembered(request: pytest.FixtureRequest) -> dict[str, int]:
         for number in range(PUBLISHED):
             for kind in KINDS:
                 buses[1].publish(Encoded(keys.key("cstr", kind, "T"), b"%d" % number, "text/plain"))
-        return {kind: len(buses[2].recall(keys.all_of("cstr", kind))) for kind in KINDS}
+        return {kind: len(buses[2].query_history(keys.all_keys("cstr", kind))) for kind in KINDS}
     finally:
         for bus in reversed(buses):
             bus.close()
@@ -38,4 +38,4 @@ def test_messages_that_do_not_come_with_every_row_are_kept_for_a_while_only(
     kind: str, remembered: dict[str, int]
 ) -> None:
     """Else figures of alarms and models would take more memory each minute of a day at the plant's own pace."""
-    assert remembered[kind] == (PUBLISHED if kind in EVERY_ROW else MOST_KEPT_OF_OTHERS)
+    assert remembered[kind] == (PUBLISHED if kind in EVERY_ROW else MAX_CACHED_OF_OTHERS)

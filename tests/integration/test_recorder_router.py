@@ -37,7 +37,7 @@ HEALTH_S = 0.2  # a machine busy with other tests may fall silent for long, so t
 
 def wait_alive(bus: ZenohBus) -> None:
     there = threading.Event()
-    bus.watch_alive(ALIVE, lambda _, alive: there.set() if alive else None)
+    bus.subscribe_liveliness(ALIVE, lambda _, alive: there.set() if alive else None)
     assert there.wait(WITHIN_S), "the recorder does not show that it is alive"
 
 
@@ -169,12 +169,12 @@ def test_a_stretch_is_replayed_under_another_name_and_can_be_paused_and_stepped(
     played = ReplayConfig(file=str(path), from_min=10.0, to_min=10.3, plant="twin", rate=0.1)
     with client(bus_config) as operator:
         alive = threading.Event()
-        operator.watch_alive("reactor/twin/alive/replay", lambda _, there: alive.set() if there else None)
+        operator.subscribe_liveliness("reactor/twin/alive/replay", lambda _, there: alive.set() if there else None)
         operator.subscribe("reactor/twin/sample/*", heard.put)
 
         def tell(command: str, **how: float) -> None:
             question = encode_message(messages.ReplayCommand(**how))  # type: ignore[arg-type]
-            (answer,) = operator.ask(Encoded(f"reactor/twin/command/{command}", *question), WITHIN_S)
+            (answer,) = operator.query(Encoded(f"reactor/twin/command/{command}", *question), WITHIN_S)
             assert messages.CommandReply.FromString(answer.payload).accepted
 
         def minutes(count: int) -> list[float]:

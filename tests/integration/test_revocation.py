@@ -54,7 +54,7 @@ def test_a_revoked_certificate_reads_nothing(tmp_path: Path) -> None:
         while not heard["viewer"]:
             number += 1
             plant.publish(Encoded(SAMPLE, str(number).encode(), ""))
-            plant.ask(Encoded("reactorwatch/nobody", b"", ""), 1.0)  # comes back when what was before it is through
+            plant.query(Encoded("reactorwatch/nobody", b"", ""), 1.0)  # comes back when what was before it is through
         if stolen is not None:
             stolen.close()
         assert heard["stolen"] == []

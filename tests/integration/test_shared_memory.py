@@ -52,7 +52,7 @@ def test_large_messages_of_other_processes_leave_no_mapped_memory(is_from_file: 
     router = from_settings(config, tmp_path) if is_from_file else bus_zenoh.router(config)
     bus = connect_now(config)
     came: SimpleQueue[Encoded] = SimpleQueue()
-    bus.subscribe_live("reactor/**", came.put)
+    bus.subscribe_uncached("reactor/**", came.put)
     command = [sys.executable, "-c", PUBLISHER, json.dumps([config.endpoint]), str(PAYLOAD_BYTES)]
     for _ in range(PUBLISHERS):
         with subprocess.Popen(command, stdin=subprocess.PIPE) as publisher:

@@ -31,10 +31,10 @@ def status_once(is_whole: Callable[[str], bool], *arguments: str) -> str:
 
 def test_a_viewer_sees_the_nodes_and_the_alarms_of_its_plant(site: Site) -> None:
     monitor, other = site.join("cstr/monitor"), site.join("other/plant")
-    other.announce("reactor/other/alive/plant")
-    monitor.announce("reactor/cstr/alive/monitor")
+    other.declare_token("reactor/other/alive/plant")
+    monitor.declare_token("reactor/cstr/alive/monitor")
     standing = Alarm(time_ns=1, alarm="ewma/T", state=AlarmState.ALARM_STATE_UNACKNOWLEDGED)
-    monitor.answer(
+    monitor.declare_queryable(
         "reactor/cstr/command/list_alarms",
         lambda request: request.reply(CommandReply(accepted=True, alarms=[standing])),
     )
@@ -56,8 +56,8 @@ def test_without_certificates_all_plants_are_shown() -> None:
     speaker = connect_now(config)
     try:
         for plant in ("a", "b"):
-            speaker.announce(f"reactor/{plant}/alive/plant")
-        assert not speaker.ask(Encoded("reactor/a/command/list_alarms", b"", ""), 5.0)  # the tokens are known by now
+            speaker.declare_token(f"reactor/{plant}/alive/plant")
+        assert not speaker.query(Encoded("reactor/a/command/list_alarms", b"", ""), 5.0)  # the tokens are known by now
         said = status_once(
             lambda text: "nobody" not in text and text.count("│ plant") == 2, "--endpoint", config.endpoint, "--once"
         )

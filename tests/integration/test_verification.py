@@ -259,7 +259,7 @@ def test_people_are_shown_a_table_and_the_first_differences(
     hour: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(hour, None, None, as_json=False) == 0
-    assert "are said again, value for value" in capsys.readouterr().out
+    assert "are reproduced, value for value" in capsys.readouterr().out
     target = first_after(hour, keys.key("cstr", keys.ESTIMATE, "T"), 25.0)
     tampered = rewritten(hour, tmp_path / "x.mcap", lambda e: None if e == target else e)
     assert run(tampered, None, None, as_json=False) == 1

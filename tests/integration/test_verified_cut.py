@@ -21,7 +21,7 @@ from reactorwatch.cli.verification import run
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import StopSignal, serve
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
@@ -39,15 +39,11 @@ OF_RECORDER = keys.key("cstr", keys.HEALTH, "recorder")
 
 def watch(bus_config: BusConfig, stop: StopSignal) -> None:
     with contextlib.closing(connected(bus_config)) as bus:
-        serve(
-            Monitor(MONITOR, time.time_ns()),
-            bus,
-            stop,
-            subscriptions=(keys.all_of("cstr", keys.SAMPLE),),
-            commands=tuple(keys.key("cstr", keys.COMMAND, name) for name in COMMANDS),
-            on_ready=lambda: bus.announce(keys.key("cstr", keys.ALIVE, "monitor")),
-            linger_s=0.5,
-        )
+        loop = EventLoop(Monitor(MONITOR, time.time_ns()), bus, stop, drain_timeout_s=0.5)
+        loop.subscribe(keys.all_keys("cstr", keys.SAMPLE))
+        loop.accept_commands(*(keys.key("cstr", keys.COMMAND, name) for name in COMMANDS))
+        bus.declare_token(keys.key("cstr", keys.ALIVE, "monitor"))
+        loop.run()
 
 
 class Counter:
@@ -95,7 +91,7 @@ def test_a_run_that_was_recorded_over_a_cut_link_is_exact(tmp_path: Path, capsys
                         published.wait(400)
                     published.wait(ROWS)
                 judged.wait(ROWS - FIRST_JUDGED)
-            bus.ask(Encoded(keys.key("cstr", keys.COMMAND, "nothing"), b"", ""), WITHIN_S)  # then all of it is here
+            bus.query(Encoded(keys.key("cstr", keys.COMMAND, "nothing"), b"", ""), WITHIN_S)  # then all of it is here
             assert heard.wait(said.count)
     assert run(path, None, None, as_json=True) == 0
     told = json.loads(capsys.readouterr().out.splitlines()[-1])

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 
 from reactorwatch.cli.alarm import _line
 from reactorwatch.cli.main import main
-from reactorwatch.cli.printing import say
+from reactorwatch.cli.printing import print_lines
 from reactorwatch.cli.progress import _unmarked
-from reactorwatch.cli.status import Board, _text
+from reactorwatch.cli.status import StatusBoard, _text
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import ALARM_STATE_UNACKNOWLEDGED, QUALITY_GOOD, Alarm, Sample
 from reactorwatch.runtime import logs
@@ -121,11 +121,11 @@ def test_no_command_sends_a_terminal_what_it_would_act_on(
 
 def test_alarms_and_status_from_the_bus_are_shown_and_not_sent(capsys: pytest.CaptureFixture[str]) -> None:
     alarm = Alarm(alarm=HOSTILE, state=ALARM_STATE_UNACKNOWLEDGED, text=HOSTILE, by=HOSTILE, comment=HOSTILE)
-    say(_line(alarm))
-    board = Board(0)
+    print_lines(_line(alarm))
+    board = StatusBoard(0)
     body = encode(Publication("reactor/x/alarm/T", alarm))
     board.on_message(Encoded(f"reactor/{HOSTILE.replace('/', '')}/alarm/T", body.payload, body.encoding))
-    say(*_text(board, as_json=False).split("\n"))
+    print_lines(*_text(board, as_json=False).split("\n"))
     shown = capsys.readouterr().out
     assert acted_on(shown) == []
     assert shown.splitlines()[0].count("\\u001b[2J") == 4

@@ -1,88 +1,88 @@
-"""Keys and messages as Zenoh has them, and as we have."""
+"""Conversion between Zenoh's keys and messages and this software's."""
 
 import re
 import struct
 
 import zenoh
 
-from reactorwatch.contract.codec import LARGEST_PAYLOAD, Encoded
-from reactorwatch.runtime.delivery.delivery import Numbered
+from reactorwatch.contract.codec import MAX_PAYLOAD, Encoded
+from reactorwatch.runtime.delivery.delivery import SequencedMessage
 from reactorwatch.runtime.delivery.streams import STREAM_PARTS
 
-LONGEST_ENCODING = 1000
-LONGEST_KEY = 1000
-"""Characters of a key whose messages are put in order. A key may have 65,535, and the names of streams are kept."""
+MAX_ENCODING = 1000
+MAX_KEY = 1000
+"""Characters of a key whose messages are put in order. A key may have 65,535, and names of streams are stored."""
 
-NUMBERED = struct.Struct("<QQ")  # who published a message, and its number in the stream
+SEQUENCE_ATTACHMENT = struct.Struct("<QQ")  # publisher, and sequence number in the stream
 
 
-def payload_of(payload: zenoh.ZBytes) -> bytes:
-    """A payload; one that is too large for any message of ours is cut to a size that still is, so that it is refused.
+def truncated_payload(payload: zenoh.ZBytes) -> bytes:
+    """Bytes of a payload; one that is too large is cut to a size that is still refused.
 
-    What waits for a node is counted in messages, and would otherwise be as large as a stranger likes.
+    A node's backlog is bounded in messages, and would otherwise be as large as a sender likes.
     """
     data = payload.to_bytes()
-    return data if len(data) <= LARGEST_PAYLOAD else data[: LARGEST_PAYLOAD + 1]
+    return data if len(data) <= MAX_PAYLOAD else data[: MAX_PAYLOAD + 1]
 
 
-class Reader:
-    """Reads what comes, in one thread.
+class SampleReader:
+    """Converts samples of one thread.
 
-    Nearly all comes with the same encoding, and to ask Zenoh for its text takes longer than to ask whether it is.
+    Nearly all have the same encoding, and comparing it is faster than converting it to text.
 
     Args:
-        encoding: that is expected first.
+        encoding: encoding expected first.
     """
 
     def __init__(self, encoding: zenoh.Encoding = zenoh.Encoding.ZENOH_BYTES) -> None:
-        self._encoding, self._text = encoding, encoding_text(encoding)
+        self._encoding, self._text = encoding, truncated_encoding(encoding)
 
     def read(self, sample: zenoh.Sample, now_ns: int) -> tuple[tuple[int, int] | None, Encoded]:
-        """A message, and before it its publisher and number, if it has them and its key is at most `LONGEST_KEY`."""
+        """Publisher and number, if the sample has them and its key is at most `MAX_KEY`; and the message."""
         encoding = sample.encoding
         if encoding != self._encoding:
-            self._encoding, self._text = encoding, encoding_text(encoding)
+            self._encoding, self._text = encoding, truncated_encoding(encoding)
         message = Encoded._make(
-            (str(sample.key_expr), payload_of(sample.payload), self._text, now_ns)
+            (str(sample.key_expr), truncated_payload(sample.payload), self._text, now_ns)
         )  # the fastest way
         attachment = sample.attachment
-        if attachment is None or len(message.key) > LONGEST_KEY:
+        if attachment is None or len(message.key) > MAX_KEY:
             return None, message
         name = attachment.to_bytes()
-        return NUMBERED.unpack(name) if len(name) == NUMBERED.size else None, message
+        return SEQUENCE_ATTACHMENT.unpack(name) if len(name) == SEQUENCE_ATTACHMENT.size else None, message
 
 
-def is_wild(key: str) -> bool:
-    """True for the key of a message that is on many keys at once.
+def has_wildcard(key: str) -> bool:
+    """True for the key of a message published on many keys at once.
 
-    Zenoh hands it to the subscribers of all of them, and a router's rules cannot tell it from one on a key of its own.
+    Zenoh hands it to the subscribers of all of them, and a router's rules treat it as one on a key of its own.
     """
     return "*" in key
 
 
-def encoding_text(encoding: zenoh.Encoding) -> str:
-    """What an encoding says; none of ours is as long as a stranger's may be."""
-    return str(encoding)[:LONGEST_ENCODING]
+def truncated_encoding(encoding: zenoh.Encoding) -> str:
+    """Text of an encoding; senders control its length, so it is cut."""
+    return str(encoding)[:MAX_ENCODING]
 
 
-def numbered(sample: zenoh.Sample, now_ns: int) -> Numbered | Encoded:
-    """A message that has come by itself, see `Reader`; with its number if it has one."""
-    who, message = Reader(sample.encoding).read(sample, now_ns)
-    return message if who is None else Numbered(*who, message)
+def parse_sample(sample: zenoh.Sample, now_ns: int) -> SequencedMessage | Encoded:
+    """Convert a single sample, see `SampleReader`; with its number if it has one."""
+    who, message = SampleReader(sample.encoding).read(sample, now_ns)
+    return message if who is None else SequencedMessage(*who, message)
 
 
-def spelled(key_expression: str) -> str:
-    """As Zenoh writes it: a `*` that is only a part of a part is `$*` there."""
+def zenoh_expression(key_expression: str) -> str:
+    """Key expression in Zenoh's syntax, where a `*` within a part is `$*`."""
     return "/".join(part if part in ("*", "**") else part.replace("*", "$*") for part in key_expression.split("/"))
 
 
-def is_of_whole_streams(key_expression: str) -> bool:
-    """Whether who listens to it hears all of any stream that it hears anything of."""
+def matches_whole_streams(key_expression: str) -> bool:
+    """True if the expression matches all keys of any stream of which it matches one."""
     *parts, last = key_expression.split("/")
     return last == "**" and len(parts) <= STREAM_PARTS
 
 
 def first_line(error: Exception) -> str:
-    """What Zenoh says, without the places in its source where it said so."""
+    """First line of Zenoh's error, without the lines of its source."""
     line = str(error).splitlines()[0] if str(error) else type(error).__name__
     return re.sub(r" at /\S+\.rs:\d+\.?", "", line).rstrip(". ")

@@ -1,7 +1,7 @@
-"""Log of what a router's access rules refuse, at most a line a second.
+"""Log of messages that a router's access rules refuse, at most a line a second.
 
-Zenoh writes each decision to standard output if its own log is asked for them, and has no other way to hear of them. So
-standard output is read by a thread here: refusals go to our log, all else goes on to where it went.
+Zenoh reports each decision only in its own log, on standard output. So a thread here reads standard output: refusals go
+to this software's log, all else is passed on.
 """
 
 import os
@@ -22,12 +22,12 @@ DECISIONS = "error,zenoh::net::routing::interceptor::access_control=trace"
 _COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
 _DECISION = re.compile(b"routing::interceptor::access_control")
 _REFUSAL = re.compile(rb"CertCommonName\(([^)]*)\).* is unauthorized to (?!Delete)(\w+) \(ingress\) on (\S+)")
-"""Not a Delete: whatever leaves the bus undeclares what it had, which looks like one, and no node publishes any."""
+"""Not a Delete: a client that disconnects undeclares its keys, which looks like one, and no node publishes any."""
 _LONGEST = 200
 
 
 class RefusalLog:
-    """Turns lines of Zenoh's log into lines of ours.
+    """Turns lines of Zenoh's log into lines of this software's.
 
     >>> refusals = RefusalLog()
     >>> line = (b"access_control: 2f on Interface(lo)+CertCommonName(cstr.plant)+Transport(Tls)+2f "
@@ -44,7 +44,7 @@ class RefusalLog:
         self._reported_ns: int | None = None
 
     def add(self, line: bytes) -> bool:
-        """Count a line if it is a refusal; returns whether it is a decision of the rules, refusal or not."""
+        """Count a line if it is a refusal; returns True for any decision of the rules."""
         refusal = _REFUSAL.search(line)
         if refusal is not None:
             who, what, key = (ascii(part.decode(errors="replace"))[1:-1][:_LONGEST] for part in refusal.groups())
@@ -53,7 +53,7 @@ class RefusalLog:
         return _DECISION.search(line) is not None or refusal is not None
 
     def report(self, now_ns: int) -> str | None:
-        """The line to log now; None if nothing was refused since the last one, or that was less than a second ago."""
+        """Line to log now; None if nothing was refused since the last one, or that was less than a second ago."""
         if self._text is None or (self._reported_ns is not None and 0 <= now_ns - self._reported_ns < LOG_EVERY_NS):
             return None
         line = f"{self._text}; {self._since} refusals since the last line, {self._total} in all"
@@ -63,7 +63,7 @@ class RefusalLog:
 
 @contextmanager
 def log_refusals() -> Iterator[None]:
-    """Log what the router of this process refuses, while the context lasts; begun before the router is opened."""
+    """Log refusals of this process's router while the context lasts; to be entered before the router is opened."""
     before = os.dup(1)
     source, sink = os.pipe()
     os.dup2(sink, 1)
@@ -93,12 +93,12 @@ def _read(source: int, before: int, ended: threading.Event) -> None:
         is_ready = bool(select([source], [], [], LOG_EVERY_NS / 1e9)[0])
         data = os.read(source, 1 << 16) if is_ready else b""
         *lines, rest = (rest + data).split(b"\n")
-        for line in lines:
-            if not refusals.add(_COLOUR.sub(b"", line)):
-                os.write(before, line + b"\n")
-        said = refusals.report(time.monotonic_ns())
-        if said is not None:
-            log.warning(said)
+        for output in lines:
+            if not refusals.add(_COLOUR.sub(b"", output)):
+                os.write(before, output + b"\n")
+        line = refusals.report(time.monotonic_ns())
+        if line is not None:
+            log.warning(line)
         if not data and (is_ready or ended.is_set()):
             os.write(before, rest)
             return

@@ -1,4 +1,4 @@
-"""Joining the bus, or being its router."""
+"""Connections to the bus, and its router."""
 
 import json
 import threading
@@ -15,14 +15,14 @@ from reactorwatch.runtime.bus_zenoh.bus import ZenohBus
 from reactorwatch.runtime.bus_zenoh.messages import first_line
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.heap import return_large_blocks
-from reactorwatch.runtime.security.identity import ROUTER_FILES, TLS, client_settings
+from reactorwatch.runtime.heap import release_large_blocks
+from reactorwatch.runtime.security.identity import ROUTER_FILES, TLS, client_tls
 
 log = structlog.get_logger()
 
 FIRST_RETRY_S = 0.1
-LONGEST_RETRY_S = 2.0
-SAY_AGAIN_S = 30.0
+MAX_RETRY_S = 2.0
+LOG_INTERVAL_S = 30.0
 STUCK_S = 1.0
 
 _SHARED_MEMORY = "transport/shared_memory/enabled"
@@ -30,59 +30,59 @@ _TRANSPORT = {
     "transport/link/tx/queue/congestion_control/block/wait_before_close": round(STUCK_S * 1e6),
     _SHARED_MEMORY: False,
 }
-"""Zenoh hands messages of more than 3 kB over in memory that both processes map. A session keeps the 18 MB of a process
-that has ended, and 2 MB beside it, for as long as it runs: each restart of a process would take 20 MB in all others."""
+"""Zenoh passes messages of more than 3 kB in shared memory. A session keeps the 18 MB of a process that has ended, and
+2 MB beside it, for as long as it runs: each restart of a process would take 20 MB in all others."""
 _RETRY = {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}
 
 
 def connect(
-    config: BusConfig, node: str, stop: StopSignal, *, passing: Collection[str] = (), crowded: bool = False
+    config: BusConfig, node: str, stop: StopSignal, *, uncached: Collection[str] = (), many_keys: bool = False
 ) -> ZenohBus | None:
-    """Join the bus as a client, waiting for its router as long as it takes.
+    """Connect to the bus as a client; wait for its router as long as it takes.
 
     Args:
-        config: where the router is.
-        node: who is waiting, for the log.
-        stop: ends the waiting.
-        passing: kinds of which nothing is remembered, nor counted, when we publish them: what is told again and again
-            of thousands of plants. Who is cut off misses them.
-        crowded: whether we publish, or show tokens, on keys of hundreds of plants. A session looks through those it has
-            for each message that comes (a hundred make it four times slower), so another one listens then.
+        config: address of the router.
+        node: name of the waiting node, for the log.
+        stop: ends the wait.
+        uncached: kinds published without cache and number: those repeated again and again for thousands of plants. A
+            subscriber that is cut off misses them.
+        many_keys: publish, and show tokens, from a second session, because a node publishes on keys of hundreds of
+            plants: a session searches its own for each message that arrives (a hundred make it four times slower).
 
     Returns:
-        The open bus; None if a stop was asked for before a router was there.
+        The open bus; None if a stop was requested before a router was there.
 
     Raises:
-        InputError: the endpoint is not one that Zenoh understands.
+        InputError: Zenoh does not understand the endpoint.
     """
     client = _client(config)
-    return_large_blocks()
+    release_large_blocks()
     woken = threading.Event()
-    stop.wakes(woken.set)
+    stop.call_on_set(woken.set)
     retry_s = FIRST_RETRY_S
-    said_at = -SAY_AGAIN_S
+    logged_at = -LOG_INTERVAL_S
     while not stop.is_set:
         try:
             session = zenoh.open(client)
-            voice = zenoh.open(client) if crowded else None
+            voice = zenoh.open(client) if many_keys else None
         except zenoh.ZError as error:
-            if time.monotonic() - said_at >= SAY_AGAIN_S:
-                said_at = time.monotonic()
+            if time.monotonic() - logged_at >= LOG_INTERVAL_S:
+                logged_at = time.monotonic()
                 log.info("waiting for a router", node=node, endpoint=config.endpoint, why=first_line(error))
             woken.wait(retry_s)
-            retry_s = min(2 * retry_s, LONGEST_RETRY_S)
+            retry_s = min(2 * retry_s, MAX_RETRY_S)
             continue
         log.info("connected", node=node, endpoint=config.endpoint)
-        return ZenohBus(session, config, passing, voice)
+        return ZenohBus(session, config, uncached, voice)
     return None
 
 
 def connect_now(config: BusConfig) -> ZenohBus:
-    """Join the bus as a client, if its router is there and lets us in.
+    """Connect to the bus as a client, once.
 
     Raises:
-        ConnectionError: it is not, or does not; with what Zenoh says.
-        InputError: the endpoint is not one that Zenoh understands.
+        ConnectionError: the router is not there, or refuses the client; with Zenoh's text.
+        InputError: Zenoh does not understand the endpoint.
     """
     try:
         return ZenohBus(zenoh.open(_client(config)), config)
@@ -97,18 +97,18 @@ def _client(config: BusConfig) -> zenoh.Config:
         "connect/retry": _RETRY,
         "connect/timeout_ms": 0,
         "scouting/multicast/enabled": False,
-        "timestamping/enabled": True,  # by which the age of what was published is known
+        "timestamping/enabled": True,  # they give the age of a message
         **_TRANSPORT,
-        **client_settings(config),
+        **client_tls(config),
     }
-    return _checked(settings, config.endpoint)
+    return _validate(settings, config.endpoint)
 
 
 def router(config: BusConfig) -> ZenohBus:
-    """Be the router, in this process, until the bus is closed.
+    """Run the router in this process until the bus is closed.
 
     Raises:
-        InputError: nothing can listen at the endpoint: it is malformed or taken, or needs a router's certificate.
+        InputError: the endpoint is malformed or taken, or needs a router's certificate.
     """
     if config.ca is not None:
         raise InputError(
@@ -127,9 +127,9 @@ def router(config: BusConfig) -> ZenohBus:
         "scouting/multicast/enabled": False,
         **_TRANSPORT,
     }
-    return_large_blocks()
+    release_large_blocks()
     try:
-        session = zenoh.open(_checked(settings, config.endpoint))
+        session = zenoh.open(_validate(settings, config.endpoint))
     except zenoh.ZError as error:
         raise InputError(
             f"no router can listen at {config.endpoint!r}: {first_line(error)}; "
@@ -139,15 +139,15 @@ def router(config: BusConfig) -> ZenohBus:
 
 
 def router_from_file(path: Path) -> ZenohBus:
-    """Be the router that a file of Zenoh's own settings describes, as `certify` writes it for a site.
+    """Run the router that a file of Zenoh's own settings describes, as `certify` writes it for a site.
 
     Args:
         path: the file, JSON5; files that it names are relative to its folder.
 
     Raises:
-        InputError: it cannot be read or makes no sense, or nothing can listen where it says.
+        InputError: the file cannot be read or is malformed, or its endpoint cannot be listened at.
     """
-    return_large_blocks()
+    release_large_blocks()
     try:
         config = zenoh.Config.from_file(str(path))
         config.insert_json5(_SHARED_MEMORY, "false")
@@ -160,16 +160,16 @@ def router_from_file(path: Path) -> ZenohBus:
         raise InputError(f"router settings {path}: {first_line(error)}") from error
 
 
-def _configured(settings: dict[str, Any]) -> zenoh.Config:
+def _zenoh_config(settings: dict[str, Any]) -> zenoh.Config:
     config = zenoh.Config()
     for path, value in settings.items():
         config.insert_json5(path, json.dumps(value))
     return config
 
 
-def _checked(settings: dict[str, Any], endpoint: str) -> zenoh.Config:
+def _validate(settings: dict[str, Any], endpoint: str) -> zenoh.Config:
     try:
-        return _configured(settings)
+        return _zenoh_config(settings)
     except zenoh.ZError as error:
         raise InputError(
             f"endpoint must be like 'tcp/127.0.0.1:7447', got {endpoint!r}: {first_line(error)}"

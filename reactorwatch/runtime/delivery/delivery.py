@@ -1,4 +1,4 @@
-"""Handing on what comes from a bus in the order of its publication; what waits too long is given up by a thread."""
+"""Ordered delivery of a subscription's messages; a thread gives up those that are missing too long."""
 
 import threading
 import time
@@ -7,21 +7,21 @@ from itertools import islice
 from typing import NamedTuple
 
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.runtime.delivery.reorder_buffer import Gap, InOrder
+from reactorwatch.runtime.delivery.reorder_buffer import Gap, ReorderBuffer
 from reactorwatch.runtime.delivery.streams import stream_of
 
-MOST_ASKED_FOR = 100
-"""Streams whose publishers are asked again at once: of more than that something is missing when a network broke down,
-and then there would be no end of it."""
+MAX_STREAMS_QUERIED = 100
+"""Streams whose publishers are queried again at once: with more than that the network broke down, and the queries would
+never end."""
 
 
-class Numbered(NamedTuple):
-    """A message as its publisher numbered it.
+class SequencedMessage(NamedTuple):
+    """A message with its publisher's numbering.
 
     Attributes:
-        publisher: who.
-        number: in its stream.
-        message: what; `received_ns` is when it came.
+        publisher: random number that the publisher drew when it started.
+        number: sequence number in the stream.
+        message: the message; `received_ns` is its time of arrival.
     """
 
     publisher: int
@@ -30,118 +30,120 @@ class Numbered(NamedTuple):
 
     @property
     def stream(self) -> str:
-        """What was counted."""
+        """The stream that the number counts."""
         return stream_of(self.message.key)
 
 
 class Delivery:
-    """Between a subscription and its handler; may be called from any thread.
+    """Ordered delivery from a subscription to its handler; may be called from any thread.
 
-    Nothing is handed on until `begin`.
+    Nothing is delivered before `start`.
 
-    Zenoh recovers what is missing of each key; but of a key that it has just begun to hear it was seen to leave out
-    some, and not to notice. So before anything is given up, its publisher is asked for it once more.
+    Zenoh recovers messages missing on each key; but on a key that it has just subscribed to it was seen to lose some
+    without noticing. So before anything is given up, its publisher is queried once more.
 
     Args:
-        handler: gets the messages that go on, as many at a time as there are.
-        on_gap: gets told what never came.
-        ask: what was published in a stream in the last so many seconds, as its publishers remember it.
+        handler: called with the messages, as many at a time as can be delivered.
+        on_gap: called with messages that never arrived.
+        query_stream: returns the messages published in a stream in the last so many seconds, from publishers' caches.
     """
 
     def __init__(
         self,
         handler: Callable[[list[Encoded]], None],
         on_gap: Callable[[Gap], None],
-        ask: Callable[[str, float], Iterable[Numbered]] = lambda _stream, _since_s: (),
+        query_stream: Callable[[str, float], Iterable[SequencedMessage]] = lambda _stream, _since_s: (),
     ) -> None:
         self._handler = handler
         self._on_gap = on_gap
-        self._ask = ask
-        self._order: InOrder[Encoded] = InOrder(gathering=True, size=lambda item: len(item.payload))
+        self._query_stream = query_stream
+        self._buffer: ReorderBuffer[Encoded] = ReorderBuffer(await_history=True, size=lambda item: len(item.payload))
         self._changed = threading.Condition()
         self._closed = False
         self._thread = threading.Thread(target=self._give_up_when_due, name="delivery", daemon=True)
         self._thread.start()
 
-    def receive(self, came: Iterable[tuple[int, int, Encoded]]) -> None:
-        """Take messages in, each `Numbered`, and hand on what may go on."""
+    def receive(self, arrived: Iterable[tuple[int, int, Encoded]]) -> None:
+        """Add messages, each as a `SequencedMessage`, and deliver those that are in order."""
         with self._changed:
-            order = self._order
-            waited, now_ns = order.due_ns(), time.monotonic_ns()
-            takes_next, going = order.takes_next, list[Encoded | Gap]()
-            for publisher, number, message in came:
+            buffer = self._buffer
+            previous_due_ns, now_ns = buffer.due_ns(), time.monotonic_ns()
+            accept_next, released = buffer.accept_next, list[Encoded | Gap]()
+            for publisher, number, message in arrived:
                 key = message.key
-                if takes_next(publisher, key, number, now_ns):
-                    going.append(message)
+                if accept_next(publisher, key, number, now_ns):
+                    released.append(message)
                 else:
-                    going += order.arrive(publisher, stream_of(key), key, number, message, now_ns)
-            self._hand_on(going)
-            if order.due_ns() != waited:
+                    released += buffer.push(publisher, stream_of(key), key, number, message, now_ns)
+            self._deliver(released)
+            if buffer.due_ns() != previous_due_ns:
                 self._changed.notify()
 
-    def tell_last(self, last: Numbered) -> None:
-        """Before the beginning: what a publisher has published last on a key."""
+    def set_last(self, last: SequencedMessage) -> None:
+        """Before `start`: record the last message that a publisher reports for a key."""
         with self._changed:
-            self._order.tell_last(last.publisher, last.stream, last.message.key, last.number)
+            self._buffer.set_last(last.publisher, last.stream, last.message.key, last.number)
 
-    def tell(self, came: Numbered) -> None:
-        """Before the beginning: what was published before and is wanted."""
+    def add_history(self, earlier: SequencedMessage) -> None:
+        """Before `start`: add a message that was published before the subscription."""
         with self._changed:
-            self._order.tell(came.publisher, came.stream, came.message.key, came.number, came.message)
+            self._buffer.add_history(
+                earlier.publisher, earlier.stream, earlier.message.key, earlier.number, earlier.message
+            )
 
-    def is_told(self) -> bool:
-        """Before the beginning: see `InOrder.is_told`."""
+    def history_complete(self) -> bool:
+        """Before `start`: see `ReorderBuffer.history_complete`."""
         with self._changed:
-            return self._order.is_told()
+            return self._buffer.history_complete()
 
-    def begin(self, on_told: Callable[[], None] | None = None) -> None:
-        """Hand on what has come until now, and from now on what comes.
+    def start(self, on_history_end: Callable[[], None] | None = None) -> None:
+        """Deliver the history and, after it, live messages.
 
         Args:
-            on_told: called between the two.
+            on_history_end: called between the two.
         """
         with self._changed:
-            self._hand_on(self._order.gathered(time.monotonic_ns()))
-            if on_told is not None:
-                on_told()
+            self._deliver(self._buffer.end_history(time.monotonic_ns()))
+            if on_history_end is not None:
+                on_history_end()
             self._changed.notify()
 
     def close(self) -> None:
-        """Hand on what waits, whatever is missing, and end."""
+        """Deliver all held messages, with gaps between them, and end the thread."""
         with self._changed:
             self._closed = True
             self._changed.notify()
         self._thread.join()
-        while (due_ns := self._order.due_ns()) is not None:
-            self._hand_on(self._order.overdue(due_ns))
+        while (due_ns := self._buffer.due_ns()) is not None:
+            self._deliver(self._buffer.release_overdue(due_ns))
 
-    def _hand_on(self, items: Iterable[Encoded | Gap]) -> None:
-        together: list[Encoded] = []
+    def _deliver(self, items: Iterable[Encoded | Gap]) -> None:
+        batch: list[Encoded] = []
         for item in items:
             if isinstance(item, Gap):
-                if together:
-                    self._handler(together)
-                    together = []
+                if batch:
+                    self._handler(batch)
+                    batch = []
                 self._on_gap(item._replace(noticed_ns=time.time_ns()))
             else:
-                together.append(item)
-        if together:
-            self._handler(together)
+                batch.append(item)
+        if batch:
+            self._handler(batch)
 
     def _give_up_when_due(self) -> None:
-        asked_ns = 0
+        queried_ns = 0
         while True:
             with self._changed:
-                now_ns, due_ns = time.monotonic_ns(), self._order.due_ns()
+                now_ns, due_ns = time.monotonic_ns(), self._buffer.due_ns()
                 while not self._closed and (due_ns is None or due_ns > now_ns):
                     self._changed.wait(None if due_ns is None else (due_ns - now_ns) / 1e9)
-                    now_ns, due_ns = time.monotonic_ns(), self._order.due_ns()
+                    now_ns, due_ns = time.monotonic_ns(), self._buffer.due_ns()
                 if self._closed:
                     return
-                waiting = self._order.waiting(now_ns)
-                if all(since_ns <= asked_ns for since_ns in waiting.values()):
-                    self._hand_on(self._order.overdue(now_ns))
+                overdue = self._buffer.overdue_streams(now_ns)
+                if all(since_ns <= queried_ns for since_ns in overdue.values()):
+                    self._deliver(self._buffer.release_overdue(now_ns))
                     continue
-                asked_ns = now_ns
-            for stream, since_ns in islice(waiting.items(), MOST_ASKED_FOR):
-                self.receive(list(self._ask(stream, (now_ns - since_ns) / 1e9)))
+                queried_ns = now_ns
+            for stream, since_ns in islice(overdue.items(), MAX_STREAMS_QUERIED):
+                self.receive(list(self._query_stream(stream, (now_ns - since_ns) / 1e9)))

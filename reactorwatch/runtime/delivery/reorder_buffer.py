@@ -1,25 +1,24 @@
-"""The order in which a node published, for whoever listens. Pure: it is told what time it is.
+"""Reorder buffer: restores the order of publication and reports gaps. Pure: the time is an argument.
 
-Zenoh keeps the order on each key. Across keys it does so as long as nothing is lost; but what is recovered after a cut,
-or told to a late listener, comes key by key: first all that is missing of one signal, then of the next. A row of
-samples would be taken apart by that, so a publisher numbers what it publishes. It does so in each *stream* by itself,
-which is all of one kind of one plant (`reactor/cstr/sample`) that one role may publish (see `streams`), so that a
-listener to one kind knows whether a number is missing or was none of its business.
+Zenoh keeps the order on each key. Across keys it does so as long as nothing is lost; but messages recovered after a
+cut, or sent to a late subscriber, arrive key by key: first all that is missing of one signal, then of the next. That
+would take rows of samples apart, so a publisher numbers its messages. It numbers each *stream* separately: all of one
+kind of one plant (`reactor/cstr/sample`) that one role may publish (see `streams`), so that a subscriber to one kind
+knows whether a number is missing or was on keys it does not subscribe to.
 
-A message goes on when all before it in its stream have. While a number is missing those after it wait, until it is
-lost, and told as a gap. It is lost for certain when every key of the stream has come to a later one, because each key
-keeps its order; only a key that was never heard before might still bring it, so that is waited for, too
-(`PATIENCE_NS`). While a key has not come so far, its recovery may still be under way, or it has fallen silent: that is
-waited for longer than Zenoh waits for the answer to a question (`RECOVERY_NS`). A number that comes again is passed
-over, and so is what was published before the first that went on. What comes after it was given up goes on at once,
-out of its place, rather than nowhere.
+A message is released when all before it in its stream have been. While a number is missing, those after it are held
+until it is lost and reported as a gap. It is certainly lost when every key of the stream has reached a later number,
+because each key keeps its order; only a key never seen before might still bring it, which is waited for
+(`TIMEOUT_NS`). While a key has not reached that far, its recovery may be under way, or it publishes nothing: that is
+waited for longer than Zenoh waits for the answer to a query (`RECOVERY_TIMEOUT_NS`). A repeated number is dropped, and
+so is one from before the first that was released. A message that arrives after it was given up is released at once,
+out of order.
 
-Who begins to listen asks every publisher for its last number, and perhaps for what was before; until he has been
-told, everything waits (`gathering`). He asks again where something is missing (`is_told`): while much is told, what
-comes live may be thrown away on the way, and Zenoh does not know that it is missing before it has heard the first of a
-key. So he knows what is of before his time, which a publisher may send him again,
-and what not. A stream of which he was told nothing begins with 0, or, if he hears another number first, when for a
-moment (`GATHER_NS`) nothing came that was older than what he had heard already.
+A new subscriber queries every publisher for its last number, and perhaps for its history; until that is complete all
+messages are held (`await_history`). It queries again while something is missing (`history_complete`): during a large
+history, live messages may be dropped on the way, and Zenoh does not notice before it has received the first of a key.
+The subscriber can then tell history from live messages. A stream without a known last number starts with 0 or, if
+another number arrives first, when nothing older has arrived for `START_WINDOW_NS`.
 """
 
 from bisect import bisect_right
@@ -29,31 +28,31 @@ from itertools import accumulate
 from operator import itemgetter
 from typing import Generic, NamedTuple
 
-from reactorwatch.runtime.delivery.stream_state import Item, Stream, Waiting
+from reactorwatch.runtime.delivery.stream_state import HoldState, Item, StreamState
 
-PATIENCE_NS = 5_000_000_000
-RECOVERY_NS = 15_000_000_000
-"""Zenoh gives a question up after 10 s; then it hands on what it has."""
-LOOK_AGAIN_NS = 250_000_000
-GATHER_NS = 500_000_000
-MOST_LOST = 100_000
-"""Runs of lost numbers of a stream that are remembered: what comes of them after all goes on."""
-MOST_STREAMS = 100_000
-"""That are remembered. A publisher that is started anew is another stream, so is each plant of a fleet."""
-STRANGE_NS = 60_000_000_000
-"""A stream that began with another number than 0, of which no last number was known and no second message came in this
-time, is forgotten: garbage makes a stream a message."""
+TIMEOUT_NS = 5_000_000_000
+RECOVERY_TIMEOUT_NS = 15_000_000_000
+"""Zenoh gives a query up after 10 s; then it releases what it has."""
+POLL_NS = 250_000_000
+START_WINDOW_NS = 500_000_000
+MAX_LOST_RANGES = 100_000
+"""Ranges of lost numbers of a stream that are remembered, so that a message in one can still be released."""
+MAX_STREAMS = 100_000
+"""Streams that are remembered. A restarted publisher is another stream, and so is each plant of a fleet."""
+ORPHAN_TIMEOUT_NS = 60_000_000_000
+"""Time after which a stream is evicted that started with another number than 0, without a known last number and without
+a second message: garbage makes one stream a message."""
 
 
 class Gap(NamedTuple):
-    """Messages that never came: what was given up at one time.
+    """Messages that never arrived and were given up together.
 
     Attributes:
-        stream: plant and kind, as the beginning of their keys.
-        publisher: who published them, a number that a node draws when it starts.
+        stream: plant and kind, as the start of their keys.
+        publisher: random number that the publisher drew when it started.
         first: number of the first of them in the stream.
-        last: number of the last; between them others may have come, of another key for instance.
-        messages: how many.
+        last: number of the last; between them others may have arrived, on another key for instance.
+        messages: count of missing messages.
         noticed_ns: when they were given up, by the clock of receipt.
     """
 
@@ -65,239 +64,239 @@ class Gap(NamedTuple):
     noticed_ns: int
 
 
-class InOrder(Generic[Item]):
-    """Lets messages through in the order of their numbers.
+class ReorderBuffer(Generic[Item]):
+    """Releases messages in the order of their numbers.
 
     Args:
-        gathering: whether everything waits, at first, until `gathered`.
-        size: of a message, in bytes; without it, none has any.
+        await_history: hold all messages until `end_history`.
+        size: size of a message in bytes; by default 0.
     """
 
-    def __init__(self, *, gathering: bool = False, size: Callable[[Item], int] = lambda _: 0) -> None:
+    def __init__(self, *, await_history: bool = False, size: Callable[[Item], int] = lambda _: 0) -> None:
         self._size = size
-        self._streams: dict[tuple[int, str], Stream[Item]] = {}
-        self._by_key: dict[str, Stream[Item]] = {}  # that went on last on a key
-        self._waiting: dict[tuple[int, str], Stream[Item]] = {}  # all in which something waits; perhaps others
-        self._gathering = gathering
-        self._unproven = deque[tuple[int, tuple[int, str]]]()  # when each stream was new; the oldest stand first
+        self._streams: dict[tuple[int, str], StreamState[Item]] = {}
+        self._by_key: dict[str, StreamState[Item]] = {}  # stream that a key's last released message was of
+        self._holding: dict[tuple[int, str], StreamState[Item]] = {}  # all streams with held messages; perhaps others
+        self._await_history = await_history
+        self._unconfirmed = deque[tuple[int, tuple[int, str]]]()  # when each stream was new, oldest first
 
-    def takes_next(self, publisher: int, key: str, number: int, now_ns: int) -> bool:
-        """Take a message in if it is the one that is expected, and nothing waits: it goes on. As nearly always."""
+    def accept_next(self, publisher: int, key: str, number: int, now_ns: int) -> bool:
+        """Accept a message if it is the expected one and none is held; True: release it. The usual case."""
         state = self._by_key.get(key)
-        if state is None or number != state.expected or publisher != state.publisher or state.waiting is not None:
+        if state is None or number != state.expected or publisher != state.publisher or state.hold is not None:
             return False
-        state.expected, state.heard_ns = number + 1, now_ns
+        state.expected, state.last_arrival_ns = number + 1, now_ns
         return True
 
-    def arrive(
-        self, publisher: int, stream: str, key: str, number: int, item: Item, now_ns: int
-    ) -> Iterator[Item | Gap]:
-        """Take a message in; yields what goes on because of it, and the gaps between."""
+    def push(self, publisher: int, stream: str, key: str, number: int, item: Item, now_ns: int) -> Iterator[Item | Gap]:
+        """Add a message; yields the messages that it releases, and the gaps between them."""
         name = publisher, stream
         state = self._streams.get(name)
         if state is None:
-            state = self._new(name, now_ns)
-            if not number and not self._gathering:
+            state = self._add_stream(name, now_ns)
+            if not number and not self._await_history:
                 state.expected = 0
-        state.heard_ns = now_ns
-        state.note(key, number)
-        if state.expected is None and not self._gathering and number <= state.before:
+        state.last_arrival_ns = now_ns
+        state.record_key(key, number)
+        if state.expected is None and not self._await_history and number <= state.last_before:
             return
-        if number == state.expected and not (state.waiting is not None and state.waiting.held):  # as nearly always
+        if number == state.expected and not (state.hold is not None and state.hold.held):  # the usual case
             state.expected = number + 1
-            state.settle()
+            state.drop_hold_state()
             if key in state.keys:
                 self._by_key[key] = state
             yield item
             return
         if state.expected is not None and number < state.expected:
-            if state.lost is not None and _take_out(state.lost, number):
-                yield item  # it was given up, and has come after all
+            if state.lost is not None and _remove_from_ranges(state.lost, number):
+                yield item  # given up before, and arrived after all
             return
-        yield from self._wait(name, state, number, item, now_ns)
+        yield from self._hold(name, state, number, item, now_ns)
 
-    def _wait(
-        self, name: tuple[int, str], state: Stream[Item], number: int, item: Item, now_ns: int
+    def _hold(
+        self, name: tuple[int, str], state: StreamState[Item], number: int, item: Item, now_ns: int
     ) -> Iterator[Item | Gap]:
-        """Keep a message for which something is missing; yields what goes on nevertheless."""
-        waiting = state.wait()
-        if self._gathering and waiting.is_full:
-            return  # it will be told as missing
-        if number not in waiting.held:
-            waiting.held[number] = now_ns, item
-            waiting.held_bytes += self._size(item)
-        if self._gathering:
+        """Hold a message while others before it are missing; yields the messages released nevertheless."""
+        hold = state.hold_state()
+        if self._await_history and hold.is_full:
+            return  # it will be reported as missing
+        if number not in hold.held:
+            hold.held[number] = now_ns, item
+            hold.held_bytes += self._size(item)
+        if self._await_history:
             return
-        patience_ns = GATHER_NS if state.expected is None else PATIENCE_NS
-        if waiting.due_ns is None or number < waiting.newest:  # something begins to be waited for, or is recovered
-            waiting.due_ns = now_ns + patience_ns
-            waiting.recovered_ns = now_ns
-            self._waiting[name] = state
-        waiting.newest = max(waiting.newest, number)
-        yield from self._contiguous(state, waiting)
-        if waiting.is_full:
-            yield from self._give_up(name, state, waiting, now_ns, now_ns, waiting.newest)
+        timeout_ns = START_WINDOW_NS if state.expected is None else TIMEOUT_NS
+        if hold.due_ns is None or number < hold.newest:  # the first message is held, or a missing one has arrived
+            hold.due_ns = now_ns + timeout_ns
+            hold.recovered_ns = now_ns
+            self._holding[name] = state
+        hold.newest = max(hold.newest, number)
+        yield from self._release_contiguous(state, hold)
+        if hold.is_full:
+            yield from self._give_up(name, state, hold, now_ns, now_ns, hold.newest)
 
-    def overdue(self, now_ns: int) -> Iterator[Item | Gap]:
-        """Yields what has waited for long enough."""
-        for name, state in list(self._waiting.items()):
-            waiting = state.waiting
-            if waiting is None or waiting.due_ns is None or now_ns < waiting.due_ns:
+    def release_overdue(self, now_ns: int) -> Iterator[Item | Gap]:
+        """Give up missing messages whose timeout is over; yields the gaps and the messages released."""
+        for name, state in list(self._holding.items()):
+            hold = state.hold
+            if hold is None or hold.due_ns is None or now_ns < hold.due_ns:
                 continue
-            silent_until_ns = waiting.recovered_ns + RECOVERY_NS
-            passed = waiting.newest if now_ns >= silent_until_ns else state.passed
-            if state.expected is None or state.expected < passed:
-                since_ns = now_ns if state.expected is None else now_ns - PATIENCE_NS
-                yield from self._give_up(name, state, waiting, since_ns, now_ns, passed)
+            recovery_end_ns = hold.recovered_ns + RECOVERY_TIMEOUT_NS
+            reached = hold.newest if now_ns >= recovery_end_ns else state.reached_by_all
+            if state.expected is None or state.expected < reached:
+                since_ns = now_ns if state.expected is None else now_ns - TIMEOUT_NS
+                yield from self._give_up(name, state, hold, since_ns, now_ns, reached)
             else:
-                waiting.due_ns = min(now_ns + LOOK_AGAIN_NS, silent_until_ns)
+                hold.due_ns = min(now_ns + POLL_NS, recovery_end_ns)
 
-    def tell_last(self, publisher: int, stream: str, key: str, number: int) -> None:
-        """While gathering: the number that a publisher has come to on one of its keys."""
+    def set_last(self, publisher: int, stream: str, key: str, number: int) -> None:
+        """Before `end_history`: record the last number that a publisher reports for one of its keys."""
         state = self._stream(publisher, stream)
-        state.note(key, number)
-        state.before = max(state.before, number)
+        state.record_key(key, number)
+        state.last_before = max(state.last_before, number)
 
-    def tell(self, publisher: int, stream: str, key: str, number: int, item: Item) -> None:
-        """While gathering: a message of before."""
-        self._stream(publisher, stream).wait().tell(key, number, item)
+    def add_history(self, publisher: int, stream: str, key: str, number: int, item: Item) -> None:
+        """Before `end_history`: add a message that was published before the subscription."""
+        self._stream(publisher, stream).hold_state().add_history(key, number, item)
 
-    def is_told(self) -> bool:
-        """While gathering: whether nothing is missing of what was before, nor between it and what has come since."""
+    def history_complete(self) -> bool:
+        """Before `end_history`: True if nothing is missing in the history, nor between it and live messages."""
         for state in self._streams.values():
-            waiting = state.waiting
-            if waiting is None or not waiting.told:
+            hold = state.hold
+            if hold is None or not hold.history:
                 continue
-            first = waiting.told_by_all
-            numbers = {number for number in (*waiting.told, *waiting.held) if number >= first}
-            if len(numbers) <= max(state.before, *numbers) - first:
+            first = hold.complete_from
+            numbers = {number for number in (*hold.history, *hold.held) if number >= first}
+            if len(numbers) <= max(state.last_before, *numbers) - first:
                 return False
         return True
 
-    def gathered(self, now_ns: int) -> Iterator[Item | Gap]:
-        """What was before has all been told; yields what goes on."""
-        self._gathering = False
+    def end_history(self, now_ns: int) -> Iterator[Item | Gap]:
+        """End the wait for history; yields the messages released."""
+        self._await_history = False
         for name, state in self._streams.items():
-            waiting = state.wait()
-            live = {number: came for number, came in waiting.held.items() if number > state.before}
-            waiting.held = {number: (now_ns, item) for number, item in waiting.told.items()} | live
-            waiting.told = {}
-            waiting.held_bytes = sum(self._size(item) for _, item in waiting.held.values())
-            for number in sorted(number for number in waiting.held if number < waiting.told_by_all):
-                yield self._released(waiting, number)
-            waiting.newest = max(waiting.held, default=state.before)
-            if waiting.held:
-                yield from self._give_up(name, state, waiting, now_ns, now_ns, waiting.newest)
-            elif state.before >= 0:
-                state.goes_on_from(state.before)
-            state.settle()
+            hold = state.hold_state()
+            live = {number: held for number, held in hold.held.items() if number > state.last_before}
+            hold.held = {number: (now_ns, item) for number, item in hold.history.items()} | live
+            hold.history = {}
+            hold.held_bytes = sum(self._size(item) for _, item in hold.held.values())
+            for number in sorted(number for number in hold.held if number < hold.complete_from):
+                yield self._release(hold, number)
+            hold.newest = max(hold.held, default=state.last_before)
+            if hold.held:
+                yield from self._give_up(name, state, hold, now_ns, now_ns, hold.newest)
+            elif state.last_before >= 0:
+                state.advance_to(state.last_before)
+            state.drop_hold_state()
 
-    def _stream(self, publisher: int, stream: str) -> Stream[Item]:
-        return self._streams.get((publisher, stream)) or self._new((publisher, stream), 0)
+    def due_ns(self) -> int | None:
+        """When to call `release_overdue`; None: nothing is held."""
+        if not self._holding:
+            return None
+        due = {name: state.hold.due_ns for name, state in self._holding.items() if state.hold is not None}
+        self._holding = {name: state for name, state in self._holding.items() if due.get(name) is not None}
+        return min((due_ns for due_ns in due.values() if due_ns is not None), default=None)
 
-    def _new(self, name: tuple[int, str], now_ns: int) -> Stream[Item]:
-        """Begin to remember a stream; forget what is due."""
-        while self._unproven and (now_ns - self._unproven[0][0] >= STRANGE_NS or len(self._streams) >= MOST_STREAMS):
-            _, oldest = self._unproven.popleft()
-            if (found := self._streams.get(oldest)) is not None and found.is_strange:
-                self._forget(oldest)
-        if len(self._streams) >= MOST_STREAMS:
-            idle = [(state.heard_ns, known) for known, state in self._streams.items() if state.waiting is None]
-            for _, longest_silent in sorted(idle)[: MOST_STREAMS // 10]:
-                self._forget(longest_silent)
-        state: Stream[Item] = Stream(*name)
+    def overdue_streams(self, now_ns: int) -> dict[str, int]:
+        """Streams with an overdue message, with the arrival time of the first message that is held because of it.
+
+        Streams with an unknown start are left out: nothing is missing there.
+        """
+        since: dict[str, int] = {}
+        for (_, stream), state in self._holding.items():
+            hold = state.hold
+            if hold is None or state.expected is None or not hold.held:
+                continue
+            if hold.due_ns is not None and hold.due_ns <= now_ns:
+                first_ns = min(arrival_ns for arrival_ns, _ in hold.held.values())
+                since[stream] = min(since.get(stream, first_ns), first_ns)
+        return since
+
+    def _stream(self, publisher: int, stream: str) -> StreamState[Item]:
+        return self._streams.get((publisher, stream)) or self._add_stream((publisher, stream), 0)
+
+    def _add_stream(self, name: tuple[int, str], now_ns: int) -> StreamState[Item]:
+        """Add a stream; evict orphans that timed out and, if there is no room, the longest idle ones."""
+        while self._unconfirmed and (
+            now_ns - self._unconfirmed[0][0] >= ORPHAN_TIMEOUT_NS or len(self._streams) >= MAX_STREAMS
+        ):
+            _, oldest = self._unconfirmed.popleft()
+            if (unconfirmed := self._streams.get(oldest)) is not None and unconfirmed.is_orphan:
+                self._evict(oldest)
+        if len(self._streams) >= MAX_STREAMS:
+            idle = [(state.last_arrival_ns, other) for other, state in self._streams.items() if state.hold is None]
+            for _, longest_idle in sorted(idle)[: MAX_STREAMS // 10]:
+                self._evict(longest_idle)
+        state: StreamState[Item] = StreamState(*name)
         self._streams[name] = state
-        self._unproven.append((now_ns, name))
+        self._unconfirmed.append((now_ns, name))
         return state
 
-    def _forget(self, name: tuple[int, str]) -> None:
+    def _evict(self, name: tuple[int, str]) -> None:
         state = self._streams.pop(name)
         for key in state.keys:
             if self._by_key.get(key) is state:
                 del self._by_key[key]
 
-    def _released(self, waiting: Waiting[Item], number: int) -> Item:
-        item = waiting.held.pop(number)[1]
-        waiting.held_bytes -= self._size(item)
+    def _release(self, hold: HoldState[Item], number: int) -> Item:
+        item = hold.held.pop(number)[1]
+        hold.held_bytes -= self._size(item)
         return item
 
-    def due_ns(self) -> int | None:
-        """When to ask for what is overdue; None: nothing waits."""
-        if not self._waiting:
-            return None
-        due = {name: state.waiting.due_ns for name, state in self._waiting.items() if state.waiting is not None}
-        self._waiting = {name: state for name, state in self._waiting.items() if due.get(name) is not None}
-        return min((due_ns for due_ns in due.values() if due_ns is not None), default=None)
-
-    def waiting(self, now_ns: int) -> dict[str, int]:
-        """The streams of which something is overdue, with when the first came that waits for it.
-
-        Not those of which nobody knows how they began: nothing is missing there.
-        """
-        found: dict[str, int] = {}
-        for (_, stream), state in self._waiting.items():
-            waiting = state.waiting
-            if waiting is None or state.expected is None or not waiting.held:
-                continue
-            if waiting.due_ns is not None and waiting.due_ns <= now_ns:
-                since_ns = min(came_ns for came_ns, _ in waiting.held.values())
-                found[stream] = min(found.get(stream, since_ns), since_ns)
-        return found
-
-    def _contiguous(self, state: Stream[Item], waiting: Waiting[Item]) -> Iterator[Item]:
-        while state.expected is not None and state.expected in waiting.held:
-            yield self._released(waiting, state.expected)
+    def _release_contiguous(self, state: StreamState[Item], hold: HoldState[Item]) -> Iterator[Item]:
+        while state.expected is not None and state.expected in hold.held:
+            yield self._release(hold, state.expected)
             state.expected += 1
-        if not waiting.held:
-            waiting.due_ns = None
-            state.settle()
+        if not hold.held:
+            hold.due_ns = None
+            state.drop_hold_state()
 
     def _give_up(
         self,
         name: tuple[int, str],
-        state: Stream[Item],
-        waiting: Waiting[Item],
+        state: StreamState[Item],
+        hold: HoldState[Item],
         since_ns: int,
         now_ns: int,
-        passed: int,
+        reached: int,
     ) -> Iterator[Item | Gap]:
-        """Do not wait for what is missing before what came until a moment: all of that was lost at once.
+        """Give up, as one gap, all that is missing before messages that arrived until `since_ns`.
 
-        What is missing beyond `passed`, the number that every key has come to, is still waited for.
+        Messages missing beyond `reached`, the number that every key has reached, are still waited for.
         """
         items: list[Item] = []
         lost: list[tuple[int, int]] = []
-        gathered = state.expected is None
-        numbers = sorted(waiting.held)
-        came_ns = [waiting.held[number][0] for number in numbers]
-        noticed_ns = list(accumulate(reversed(came_ns), min))[::-1]  # when the first came that is behind it, or it did
+        is_start = state.expected is None
+        numbers = sorted(hold.held)
+        arrival_ns = [hold.held[number][0] for number in numbers]
+        noticed_ns = list(accumulate(reversed(arrival_ns), min))[::-1]  # earliest arrival at or behind each number
         for number, known_ns in zip(numbers, noticed_ns, strict=True):
             if state.expected is not None and number > state.expected:
-                if gathered or known_ns > since_ns or number > passed:
-                    break  # what is missing here may still come
+                if is_start or known_ns > since_ns or number > reached:
+                    break  # the missing ones may still arrive
                 lost.append((state.expected, number - 1))
-            state.goes_on_from(number)
-            items.append(self._released(waiting, number))
-        waiting.due_ns = None
-        if waiting.held:
-            first_ns = min(came for came, _ in waiting.held.values())
-            waiting.due_ns = first_ns + PATIENCE_NS
-            self._waiting[name] = state
-            waiting.recovered_ns = max(waiting.recovered_ns, first_ns)
-        state.settle()
+            state.advance_to(number)
+            items.append(self._release(hold, number))
+        hold.due_ns = None
+        if hold.held:
+            first_ns = min(arrival for arrival, _ in hold.held.values())
+            hold.due_ns = first_ns + TIMEOUT_NS
+            self._holding[name] = state
+            hold.recovered_ns = max(hold.recovered_ns, first_ns)
+        state.drop_hold_state()
         if lost:
-            state.lost = [*(state.lost or ()), *lost][-MOST_LOST:]
+            state.lost = [*(state.lost or ()), *lost][-MAX_LOST_RANGES:]
             count = sum(last - first + 1 for first, last in lost)
             yield Gap(name[1], name[0], lost[0][0], lost[-1][1], count, now_ns)
         yield from items
 
 
-def _take_out(runs: list[tuple[int, int]], number: int) -> bool:
-    """Whether a number is in one of the runs, which are in order; it is no longer, then."""
-    place = bisect_right(runs, number, key=itemgetter(0)) - 1
-    if place < 0 or number > runs[place][1]:
+def _remove_from_ranges(ranges: list[tuple[int, int]], number: int) -> bool:
+    """Remove a number from sorted ranges; returns whether one of them held it."""
+    index = bisect_right(ranges, number, key=itemgetter(0)) - 1
+    if index < 0 or number > ranges[index][1]:
         return False
-    first, last = runs[place]
-    rest = [(first, number - 1), (number + 1, last)]
-    runs[place : place + 1] = [run for run in rest if run[0] <= run[1]]
+    first, last = ranges[index]
+    parts = [(first, number - 1), (number + 1, last)]
+    ranges[index : index + 1] = [part for part in parts if part[0] <= part[1]]
     return True

@@ -1,7 +1,7 @@
-"""What is remembered of a stream of numbered messages: see `in_order`.
+"""State of one stream of numbered messages: see `reorder_buffer`.
 
-There are tens of thousands of streams in a fleet, in nearly all of which nothing waits. So what is only wanted while
-something does is kept apart.
+A fleet has tens of thousands of streams, nearly all of which hold no message back. So the state that is needed only
+while messages are held is a separate object.
 """
 
 from dataclasses import dataclass, field
@@ -9,95 +9,95 @@ from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
 
-MOST_HELD = 1_000_000
-MOST_HELD_BYTES = 256 << 20
-"""Messages of a stream that may wait, and their payload; with more, what is missing is given up."""
-MOST_KEYS = 1000
-"""Keys of a stream that are remembered."""
+MAX_HELD = 1_000_000
+MAX_HELD_BYTES = 256 << 20
+"""Messages of a stream that may be held, and their payload; beyond either, missing messages are given up."""
+MAX_KEYS = 1000
+"""Keys of a stream that are tracked."""
 
 
 @dataclass(slots=True)
-class Waiting(Generic[Item]):
-    """What is remembered of a stream as long as not all goes on as it comes."""
+class HoldState(Generic[Item]):
+    """State of a stream while messages are held back."""
 
-    told: dict[int, Item] = field(default_factory=dict)  # of what was before
-    told_from: dict[str, int] = field(default_factory=dict)  # the first of each key
-    held: dict[int, tuple[int, Item]] = field(default_factory=dict)  # with when it came
+    history: dict[int, Item] = field(default_factory=dict)  # published before the subscription, by number
+    history_from: dict[str, int] = field(default_factory=dict)  # first number of the history, by key
+    held: dict[int, tuple[int, Item]] = field(default_factory=dict)  # arrival time and message, by number
     held_bytes: int = 0
     newest: int = 0
-    due_ns: int | None = None  # when to look whether to wait no longer; None: nothing waits
-    recovered_ns: int = 0  # when something that was missing came last, or it began to be missing
-    reached: dict[str, int] = field(default_factory=dict)  # the newest number that came of a key, if it is not old
+    due_ns: int | None = None  # when to check whether to hold no longer; None: nothing is held
+    recovered_ns: int = 0  # when a missing message arrived last, or the first one was found missing
+    reached: dict[str, int] = field(default_factory=dict)  # newest number by key, unless it is below the expected one
 
-    def tell(self, key: str, number: int, item: Item) -> None:
-        """Note a message of before, if there is room."""
-        if len(self.told) < MOST_HELD:
-            self.told[number] = item
-            self.told_from[key] = min(self.told_from.get(key, number), number)
+    def add_history(self, key: str, number: int, item: Item) -> None:
+        """Store a message published before the subscription, if there is room."""
+        if len(self.history) < MAX_HELD:
+            self.history[number] = item
+            self.history_from[key] = min(self.history_from.get(key, number), number)
 
     @property
     def is_full(self) -> bool:
-        """Whether more waits than there is room for."""
-        return len(self.held) > MOST_HELD or self.held_bytes > MOST_HELD_BYTES
+        """True if more is held than there is room for."""
+        return len(self.held) > MAX_HELD or self.held_bytes > MAX_HELD_BYTES
 
     @property
-    def told_by_all(self) -> int:
-        """From where on what was before was told of every key: of one less is remembered than of another."""
-        return max(self.told_from.values(), default=0)
+    def complete_from(self) -> int:
+        """First number from which the history holds every key: publishers cache fewer messages of some keys."""
+        return max(self.history_from.values(), default=0)
 
 
 @dataclass(slots=True)
-class Stream(Generic[Item]):
-    """A stream."""
+class StreamState(Generic[Item]):
+    """Position in a stream."""
 
     publisher: int
     name: str
     expected: int | None = None
-    begun: int = -1  # the number that went on first
-    before: int = -1  # the last number when the listening began
-    heard_ns: int = 0  # when something came last
+    first: int = -1  # number of the first message released
+    last_before: int = -1  # last number published before the subscription
+    last_arrival_ns: int = 0
     keys: tuple[str, ...] = ()
-    waiting: Waiting[Item] | None = None
-    lost: list[tuple[int, int]] | None = None  # (first, last)
+    hold: HoldState[Item] | None = None
+    lost: list[tuple[int, int]] | None = None  # (first, last) of each range
 
-    def note(self, key: str, number: int) -> None:
-        """A key has come to a number."""
+    def record_key(self, key: str, number: int) -> None:
+        """Record that a key has reached a number."""
         if key not in self.keys:
-            if len(self.keys) >= MOST_KEYS:
+            if len(self.keys) >= MAX_KEYS:
                 return
             self.keys = (*self.keys, key)
         if self.expected is None or number >= self.expected:
-            reached = self.wait().reached
+            reached = self.hold_state().reached
             reached[key] = max(reached.get(key, number), number)
 
     @property
-    def passed(self) -> int:
-        """The number that every key has come to; -1 if one of them has not come beyond what is expected."""
-        waiting = self.wait()
-        return min((waiting.reached.get(key, -1) for key in self.keys), default=waiting.newest)
+    def reached_by_all(self) -> int:
+        """Number that every key has reached; -1 if a key has not passed the expected one."""
+        hold = self.hold_state()
+        return min((hold.reached.get(key, -1) for key in self.keys), default=hold.newest)
 
     @property
-    def is_strange(self) -> bool:
-        """Whether one number came, of which nobody knows what it followed."""
-        return self.waiting is None and self.before < 0 < self.begun and self.expected == self.begun + 1
+    def is_orphan(self) -> bool:
+        """True if a single message arrived, and its predecessor is unknown."""
+        return self.hold is None and self.last_before < 0 < self.first and self.expected == self.first + 1
 
-    def wait(self) -> Waiting[Item]:
-        """What is remembered as long as something waits."""
-        if self.waiting is None:
-            self.waiting = Waiting()
-        return self.waiting
+    def hold_state(self) -> HoldState[Item]:
+        """The state for held messages, made if there is none."""
+        if self.hold is None:
+            self.hold = HoldState()
+        return self.hold
 
-    def settle(self) -> None:
-        """Forget what is only wanted as long as something waits, if nothing does."""
-        waiting = self.waiting
-        if waiting is None or waiting.held or waiting.told or self.expected is None:
+    def drop_hold_state(self) -> None:
+        """Drop the state for held messages if none is held."""
+        hold = self.hold
+        if hold is None or hold.held or hold.history or self.expected is None:
             return
-        waiting.reached = {key: number for key, number in waiting.reached.items() if number >= self.expected}
-        if not waiting.reached:
-            self.waiting = None
+        hold.reached = {key: number for key, number in hold.reached.items() if number >= self.expected}
+        if not hold.reached:
+            self.hold = None
 
-    def goes_on_from(self, number: int) -> None:
-        """All up to a number has gone on, or is given up."""
+    def advance_to(self, number: int) -> None:
+        """Mark all messages up to a number as released or lost."""
         if self.expected is None:
-            self.begun = number
+            self.first = number
         self.expected = number + 1

@@ -1,10 +1,9 @@
-"""The streams in which publishers number their messages.
+"""Streams: the groups of keys in which publishers number their messages.
 
-A publisher numbers what it publishes on the keys of a stream, and a subscriber takes a number that has passed for a
-repetition. So a number may count only among messages that one and the same role may publish: a holder of another
-role's certificate, which publishes on keys of its own with the publisher's name and its next numbers, would otherwise
-have the publisher's messages dropped. The access rules (`access`) say which role publishes on a key, and a stream is
-all of one kind of one plant that one role may publish.
+A subscriber drops a number that it has already seen as a repetition. So numbers must be counted among messages that
+only one role may publish: otherwise the holder of another role's certificate could publish on its own keys with the
+publisher's name and next numbers, and have the publisher's messages dropped. The access rules (`acl`) define which role
+publishes on a key; a stream is all of one kind of one plant that one role may publish.
 """
 
 from functools import lru_cache
@@ -14,20 +13,20 @@ from reactorwatch.runtime.security.acl import ROLES, Role
 
 STREAM_PARTS = 3
 """Parts of a key that a stream has in common: root, plant and kind."""
-MOST_CACHED = 1000
-"""Names below a plant whose role is kept: all plants have the same ones, and made-up names push each other out."""
+MAX_CACHED = 1000
+"""Names below a plant whose role is cached: all plants have the same ones, and made-up names evict each other."""
 
 _KEY_SPACES = sorted(
     ((expression, role) for role in ROLES for expression in role.key_space),
     key=lambda item: item[0].count("/"),
     reverse=True,
 )
-"""The narrowest first: the recorder's own alarms are among the keys that the monitor's expression names."""
+"""Narrowest first: the monitor's expression also matches the recorder's own alarms."""
 
 
-@lru_cache(maxsize=MOST_CACHED)
+@lru_cache(maxsize=MAX_CACHED)
 def role_of_key(name: str) -> Role | None:
-    """The role that may publish on a key; None if no role may.
+    """Role that may publish on a key; None if no role may.
 
     Args:
         name: the key below its plant.
@@ -41,7 +40,7 @@ def role_of_key(name: str) -> Role | None:
 
 
 def stream_of(key: str) -> str:
-    """The stream that a key is in: root, plant and kind; and the role, where it does not publish all of the kind.
+    """Stream of a key: root, plant and kind, and the role where it does not publish all of the kind.
 
     >>> stream_of("reactor/cstr/chart/ewma/T"), stream_of("reactor/cstr/alarm/recording/disk")
     ('reactor/cstr/chart', 'reactor/cstr/alarm/@recorder')
@@ -57,7 +56,7 @@ def stream_of(key: str) -> str:
 
 
 def keys_of(stream: str) -> str:
-    """A key expression that holds all keys of a stream, and perhaps those of other roles.
+    """Key expression that matches all keys of a stream, and perhaps those of other roles.
 
     >>> keys_of("reactor/cstr/alarm/@recorder")
     'reactor/cstr/alarm/**'

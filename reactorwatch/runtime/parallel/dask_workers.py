@@ -1,9 +1,9 @@
 """Jobs on a Dask cluster (https://distributed.dask.org), the only file that knows of it: `reactorwatch[cluster]`.
 
-The workers see the files under the same names as we do, and have this software in the same version; `DaskWorkers` holds
-the latter. That a worker which dies costs a retry is what Dask's scheduler does by itself: it gives the job to another,
-`distributed.scheduler.allowed-failures` times (3, unless the cluster is told otherwise). But it suspects all jobs that
-wait at the worker as well, so one that is given up gets a last chance when it has the cluster to itself.
+The workers see the files under the same paths as this process, and have the same version of this software, which
+`DaskExecutor` checks. Dask's scheduler retries the job of a dead worker by itself,
+`distributed.scheduler.allowed-failures` times (3 by default). But it also counts the death for every job that waits at
+that worker, so a job that it gives up gets a last run when it has the cluster to itself.
 """
 
 import time
@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from reactorwatch import __version__
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.parallel.jobs import Failed, attempt, died, fault, one_line
+from reactorwatch.runtime.parallel.jobs import Failed, internal_error, one_line, run_job, worker_died
 
 CONNECT_WITHIN_S = 10.0
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
@@ -24,14 +24,14 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
-class DaskWorkers:
-    """The workers of a cluster.
+class DaskExecutor:
+    """Runs jobs on the workers of a cluster.
 
     Args:
-        address: of its scheduler, such as `tcp://127.0.0.1:8786`.
+        address: address of its scheduler, such as `tcp://127.0.0.1:8786`.
 
     Raises:
-        InputError: Dask is not installed, or the address is none.
+        InputError: Dask is not installed, or the address is malformed.
     """
 
     def __init__(self, address: str) -> None:
@@ -43,8 +43,10 @@ class DaskWorkers:
             raise InputError(f"--scheduler must be an address like tcp://127.0.0.1:8786, got {address!r}")
         self._address = address
 
-    def outcomes(self, work: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failed]]:
-        """As `Workers` has it.
+    def map_unordered(
+        self, work: Callable[[Job], Result], jobs: Sequence[Job]
+    ) -> Iterator[tuple[int, Result | Failed]]:
+        """See `Executor`.
 
         Raises:
             InputError: there is no scheduler, it has no workers, or they have another version of this software.
@@ -53,42 +55,43 @@ class DaskWorkers:
 
         with _client(self._address) as client:
             _check_workers(client, self._address)
-            numbers = {client.submit(attempt, work, job, pure=False): number for number, job in enumerate(jobs)}
-            suspected: list[int] = []
-            for future in self._as_done(client, list(numbers)):
-                number = numbers.pop(future)
+            indices = {client.submit(run_job, work, job, pure=False): index for index, job in enumerate(jobs)}
+            suspects: list[int] = []
+            for future in self._as_completed(client, list(indices)):
+                index = indices.pop(future)
                 if isinstance(future.exception(), KilledWorker):
-                    suspected.append(number)
+                    suspects.append(index)
                 else:
-                    yield number, _outcome(future)
-            for number in suspected:
-                (alone,) = self._as_done(client, [client.submit(attempt, work, jobs[number], pure=False)])
+                    yield index, _outcome(future)
+            for index in suspects:
+                (alone,) = self._as_completed(client, [client.submit(run_job, work, jobs[index], pure=False)])
                 error = alone.exception()
-                yield number, died(error.allowed_failures + 1) if isinstance(error, KilledWorker) else _outcome(alone)
+                killed = isinstance(error, KilledWorker)
+                yield index, worker_died(error.allowed_failures + 1) if killed else _outcome(alone)
 
-    def _as_done(self, client: Any, futures: list[Any]) -> Iterator[Any]:
-        """Futures as they are done.
+    def _as_completed(self, client: Any, futures: list[Any]) -> Iterator[Any]:
+        """Yield futures as they complete.
 
         Raises:
-            InputError: the cluster has lost all its workers, and nothing starts others.
+            InputError: the cluster has lost all its workers, and no others start.
         """
         from distributed import as_completed
 
-        left = set(futures)
-        while left:
+        pending = set(futures)
+        while pending:
             try:
-                for future in as_completed(list(left), loop=client.loop, timeout=WORKERS_WITHIN_S):
-                    left.discard(future)
+                for future in as_completed(list(pending), loop=client.loop, timeout=WORKERS_WITHIN_S):
+                    pending.discard(future)
                     yield future
-            except TimeoutError:  # also where jobs just take long
+            except TimeoutError:  # also if jobs just take long
                 _wait_for_workers(client, self._address)
 
 
 def _outcome(future: Any) -> Any:
-    """What came of a job whose worker lives."""
+    """Result of a job whose worker lives."""
     error = future.exception()
-    if error is not None:  # not of the job, whose errors are outcomes: it could not be sent, or not be read
-        return fault(error)
+    if error is not None:  # no error of the job, those are results: it could not be sent or read
+        return internal_error(error)
     return future.result()
 
 
@@ -109,11 +112,11 @@ def _check_workers(client: Any, address: str) -> None:
     deadline_s = time.monotonic() + WORKERS_WITHIN_S
     while not versions and time.monotonic() < deadline_s:
         _wait_for_workers(client, address)
-        asked = client.run(_asks_for_version(), on_error="return")
-        # A worker that died meanwhile costs a retry of its jobs; if all did, others are being started.
-        versions = {worker: version for worker, version in asked.items() if not isinstance(version, OSError)}
+        replies = client.run(_version_query(), on_error="return")
+        # A worker that died meanwhile costs a retry of its jobs; if all did, others are starting.
+        versions = {worker: version for worker, version in replies.items() if not isinstance(version, OSError)}
         if not versions:
-            time.sleep(ASK_AGAIN_S)  # the scheduler still knows those that died
+            time.sleep(ASK_AGAIN_S)  # the scheduler still lists dead workers
     for worker, version in versions.items():
         if isinstance(version, Exception):
             raise version
@@ -135,8 +138,8 @@ def _wait_for_workers(client: Any, address: str) -> None:
         ) from error
 
 
-def _asks_for_version() -> Callable[[], str | None]:
-    """A function that is sent as it is, and not by its name: a worker that cannot find a name never answers."""
+def _version_query() -> Callable[[], str | None]:
+    """Function that is pickled by value: a worker that cannot find a function by its name never answers."""
 
     def version() -> str | None:
         try:

@@ -1,12 +1,12 @@
-"""Many jobs of one kind, here or elsewhere: one seam for whoever has a function and a list of what to do it with.
+"""Run one function over many inputs, serially, in processes, or on Dask.
 
-A job is the argument of a plain function; both are sent to wherever the work is done, so both can be pickled and the
-function is found by its name. Who does the work is a `Workers`: this process (`Here`), processes on this machine
-(`process_pool`), or a Dask cluster (`dask_workers`). All of them keep three promises:
+A job is the argument of a plain function; both are pickled, and the function is found by its name. An `Executor` runs
+the jobs: in this process (`SerialExecutor`), in processes of this machine (`process_pool`), or on a Dask cluster
+(`dask_workers`). Each makes three promises:
 
-- a job that fails is an answer, `Failed`, and no other job knows of it;
-- a worker that dies costs a retry of the job that it was at. A job that does so again and again is a `Failed`, too;
-- the answers do not depend on who does the work, nor on how many: `in_order` puts them into the order of the jobs.
+- a job that fails has the result `Failed`, and does not affect others;
+- a worker that dies costs a retry of its job. A job that kills several workers is a `Failed`, too;
+- the results do not depend on the executor or its size: `in_job_order` puts them into the order of the jobs.
 """
 
 import traceback
@@ -18,7 +18,7 @@ from typing import Protocol, TypeVar
 from reactorwatch.errors import InputError
 
 RETRIES = 2
-"""Of a job whose worker died: one that does so three times will do so a fourth time."""
+"""Retries of a job whose worker died: a job that kills three workers would kill a fourth."""
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -26,96 +26,100 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Failed:
-    """A job that came to no result.
+    """A job without a result.
 
     Attributes:
-        reason: one line.
-        ours: whether it is a fault of ours, and not of what was given.
+        reason: one line of text.
+        is_internal: True for an error of this software, False for unusable input.
     """
 
     reason: str
-    ours: bool = False
+    is_internal: bool = False
 
 
-class Workers(Protocol):
-    """Who does jobs."""
+class Executor(Protocol):
+    """Runs jobs."""
 
-    def outcomes(self, work: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failed]]:
-        """What came of each job, with its number, as they are done; who stops asking stops the work.
+    def map_unordered(
+        self, work: Callable[[Job], Result], jobs: Sequence[Job]
+    ) -> Iterator[tuple[int, Result | Failed]]:
+        """Yield each result with the index of its job, as jobs end; closing the iterator stops the work.
 
         Args:
-            work: of a module that the workers can import.
+            work: a function of a module that the workers can import.
             jobs: its arguments.
         """
 
 
-class Here:
-    """This process, one job after the other."""
+class SerialExecutor:
+    """Runs jobs one after the other in this process."""
 
-    def outcomes(self, work: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failed]]:
-        """As `Workers` has it."""
+    def map_unordered(
+        self, work: Callable[[Job], Result], jobs: Sequence[Job]
+    ) -> Iterator[tuple[int, Result | Failed]]:
+        """See `Executor`."""
         for number, job in enumerate(jobs):
-            yield number, attempt(work, job)
+            yield number, run_job(work, job)
 
 
-def attempt(work: Callable[[Job], Result], job: Job) -> Result | Failed:
-    """Do a job; an error is its outcome and not that of the worker."""
+def run_job(work: Callable[[Job], Result], job: Job) -> Result | Failed:
+    """Run a job; an error is its result, and does not end the worker."""
     try:
         return work(job)
     except InputError as error:
         return Failed(one_line(error))
-    except Exception as error:  # noqa: BLE001 # whatever it is, it must not stop the others
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{Path(place.filename).name}, line {place.lineno}"
-        return fault(error, f" ({where})")
+    except Exception as error:  # noqa: BLE001 # no error of a job may stop the others
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        return internal_error(error, f" ({Path(frame.filename).name}, line {frame.lineno})")
 
 
-def fault(error: BaseException, where: str = "") -> Failed:
-    """What is said of a job that ended as none should."""
-    return Failed(f"a fault of ours: {type(error).__name__}: {one_line(error)}{where}", ours=True)
+def internal_error(error: BaseException, where: str = "") -> Failed:
+    """Result of a job that ended with an unexpected error."""
+    return Failed(f"internal error: {type(error).__name__}: {one_line(error)}{where}", is_internal=True)
 
 
-def died(times: int) -> Failed:
-    """What is said of a job that its workers died of, so many times."""
+def worker_died(times: int) -> Failed:
+    """Result of a job at which workers died."""
     return Failed(f"given up: {times} workers died at it; is there too little memory?")
 
 
 def one_line(error: BaseException) -> str:
-    """The text of an error."""
+    """Text of an error on one line."""
     return " ".join(str(error).split())
 
 
-def in_order(outcomes: Iterator[tuple[int, Result | Failed]]) -> Iterator[Result | Failed]:
-    """The outcomes in the order of the jobs, each as soon as those before it are there."""
-    waiting: dict[int, Result | Failed] = {}
-    turn = 0
-    for number, outcome in outcomes:
-        waiting[number] = outcome
-        while turn in waiting:
-            yield waiting.pop(turn)
-            turn += 1
+def in_job_order(outcomes: Iterator[tuple[int, Result | Failed]]) -> Iterator[Result | Failed]:
+    """Yield results in the order of their jobs, each as soon as those before it are there."""
+    early: dict[int, Result | Failed] = {}
+    position = 0
+    for index, outcome in outcomes:
+        early[index] = outcome
+        while position in early:
+            yield early.pop(position)
+            position += 1
 
 
-def workers(processes: int | None = None, scheduler: str | None = None) -> Workers:
-    """Who does the work.
+def choose_executor(processes: int | None = None, scheduler: str | None = None) -> Executor:
+    """Choose an executor.
 
     Args:
-        processes: on this machine; None: one for each of its cores that we may use. One: this process.
-        scheduler: of a Dask cluster that does it instead, such as `tcp://127.0.0.1:8786`.
+        processes: number of processes on this machine; None: one for each core that this process may use. One: this
+            process.
+        scheduler: address of a Dask cluster's scheduler, such as `tcp://127.0.0.1:8786`; None: this machine.
 
     Raises:
-        InputError: both are given, no process is to do it, or there is no such cluster.
+        InputError: both are given, there are no processes, or there is no such cluster.
     """
     if scheduler is not None:
         if processes is not None:
             raise InputError("--jobs is for this machine, and --scheduler for a cluster; give one of them")
-        from reactorwatch.runtime.parallel.dask_workers import DaskWorkers
+        from reactorwatch.runtime.parallel.dask_workers import DaskExecutor
 
-        return DaskWorkers(scheduler)
-    from reactorwatch.runtime.parallel.process_pool import LocalWorkers, cores
+        return DaskExecutor(scheduler)
+    from reactorwatch.runtime.parallel.process_pool import ProcessExecutor, available_cores
 
     if processes is None:
-        processes = cores()
+        processes = available_cores()
     if processes < 1:
         raise InputError(f"--jobs must be at least 1, got {processes}")
-    return Here() if processes == 1 else LocalWorkers(processes)
+    return SerialExecutor() if processes == 1 else ProcessExecutor(processes)

@@ -1,11 +1,11 @@
-"""Jobs in processes on this machine: each does one job at a time and tells its answer over a pipe of its own.
+"""Pool of processes on this machine: each runs one job at a time and returns the result over its own pipe.
 
-The pool of the standard library breaks as a whole when one of its processes dies, and cannot say which job that
-was at. Here a pipe that ends says both, so the others go on and that one job is tried again by a new process.
+The standard library's pool breaks as a whole when one of its processes dies, and does not name the job. Here the end of
+a pipe identifies both, so the others continue and a new process retries that job.
 
 Processes are spawned and not forked: a fork copies locks that the threads of the linear algebra hold. Each has one
-thread of linear algebra, unless the environment says otherwise: the matrices are small, and threads would wait for each
-other longer than they work.
+thread of linear algebra, unless the environment sets another number: the matrices are small, and threads would wait for
+each other longer than they work.
 """
 
 import os
@@ -13,17 +13,17 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar, cast
 
-from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, attempt, died, fault
+from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, internal_error, run_job, worker_died
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-"""What the libraries of linear algebra read as they are loaded."""
+"""Environment variables that libraries of linear algebra read when they are loaded."""
 
 END_WITHIN_S = 5.0
 
@@ -33,8 +33,8 @@ Result = TypeVar("Result")
 _SPAWN = get_context("spawn")
 
 
-def cores() -> int:
-    """How many cores this process may use."""
+def available_cores() -> int:
+    """Number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
@@ -45,34 +45,37 @@ class _Worker:
     number: int
 
 
-class LocalWorkers:
-    """Processes that are there while there are jobs.
+class ProcessExecutor:
+    """Runs jobs in processes, which live while there are jobs.
 
     Args:
-        processes: how many at most.
-        retries: of a job whose process died.
+        processes: the largest number of processes.
+        retries: retries of a job whose process died.
     """
 
     def __init__(self, processes: int, retries: int = RETRIES) -> None:
         self._processes = processes
         self._retries = retries
 
-    def outcomes(self, work: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[tuple[int, Result | Failed]]:
-        """As `Workers` has it."""
-        left = deque(range(len(jobs)))
+    def map_unordered(
+        self, work: Callable[[Job], Result], jobs: Sequence[Job]
+    ) -> Iterator[tuple[int, Result | Failed]]:
+        """See `Executor`."""
+        queue = deque(range(len(jobs)))
         deaths = [0] * len(jobs)
         running: dict[Connection[Any, Any], _Worker] = {}
 
-        def give(worker: _Worker) -> None:
-            worker.number = left.popleft()
-            worker.pipe.send(jobs[worker.number])
+        def assign(worker: _Worker) -> None:
+            worker.number = queue.popleft()
+            with suppress(BrokenPipeError, ConnectionResetError):  # a dead worker is found when its result is read
+                worker.pipe.send(jobs[worker.number])
 
         try:
-            while left or running:
-                while left and len(running) < self._processes:
-                    worker = _started(work)
+            while queue or running:
+                while queue and len(running) < self._processes:
+                    worker = _start(work)
                     running[worker.pipe] = worker
-                    _tell(worker, give)
+                    assign(worker)
                 for pipe in wait(list(running)):
                     worker = running[cast("Connection[Any, Any]", pipe)]
                     try:
@@ -82,13 +85,13 @@ class LocalWorkers:
                         _end(worker)
                         deaths[worker.number] += 1
                         if deaths[worker.number] > self._retries:
-                            yield worker.number, died(deaths[worker.number])
+                            yield worker.number, worker_died(deaths[worker.number])
                         else:
-                            left.appendleft(worker.number)
+                            queue.appendleft(worker.number)
                         continue
                     number = worker.number
-                    if left:
-                        _tell(worker, give)
+                    if queue:
+                        assign(worker)
                     else:
                         del running[worker.pipe]
                         _end(worker)
@@ -100,22 +103,14 @@ class LocalWorkers:
                 _end(worker)
 
 
-def _tell(worker: _Worker, give: Callable[[_Worker], None]) -> None:
-    """Give a worker its next job; that it is dead shows when its answer is read."""
-    try:
-        give(worker)
-    except (BrokenPipeError, ConnectionResetError):
-        return
-
-
-def _started(work: Callable[[Any], Any]) -> _Worker:
+def _start(work: Callable[[Any], Any]) -> _Worker:
     for name in THREADS:
         os.environ.setdefault(name, "1")
     ours, theirs = _SPAWN.Pipe()
     process = _SPAWN.Process(target=_do_jobs, args=(work, theirs), daemon=True)
     with _without_interrupts():
         process.start()
-    theirs.close()  # so that our end sees the pipe end with the process
+    theirs.close()  # so that the pipe ends with the process
     return _Worker(process, ours, -1)
 
 
@@ -130,37 +125,37 @@ def _end(worker: _Worker) -> None:
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """What is started meanwhile does not hear Ctrl-C, which the terminal sends to all: we end it.
+    """Block SIGINT while a process is started; the new process inherits the mask, and this one raises it afterwards.
 
-    We hear it afterwards: a process that is half told what to do would complain. The mask is what the new process
-    inherits, and the handler is for us, because another of our threads may be the one that is told.
+    The terminal sends Ctrl-C to all processes, and a worker that has only half of its job would print an error; its
+    parent ends it instead. The handler is for this process, because the signal may reach another of its threads.
     """
-    resource_tracker.ensure_running()  # by the first process otherwise, and it lets the signal through again
-    heard: list[int] = []
+    resource_tracker.ensure_running()  # the first start would do this otherwise, and unblocks the signal
+    received: list[int] = []
     in_main = threading.current_thread() is threading.main_thread()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    handler = signal.signal(signal.SIGINT, lambda number, _frame: heard.append(number)) if in_main else None
+    handler = signal.signal(signal.SIGINT, lambda number, _frame: received.append(number)) if in_main else None
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         if in_main:
             signal.signal(signal.SIGINT, handler if handler is not None else signal.SIG_DFL)
-        if heard:
+        if received:
             signal.raise_signal(signal.SIGINT)
 
 
 def _do_jobs(work: Callable[[Job], Result], pipe: "Connection[Any, Any]") -> None:
-    """What a worker does until nobody is there to tell."""
+    """Run jobs until the pipe ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         while True:
-            outcome = attempt(work, pipe.recv())
+            outcome = run_job(work, pipe.recv())
             try:
                 pipe.send(outcome)
             except OSError:
                 raise
-            except Exception as error:  # noqa: BLE001 # what cannot be pickled, of whatever kind
-                pipe.send(fault(error))
+            except Exception as error:  # noqa: BLE001 # pickling raises errors of any kind
+                pipe.send(internal_error(error))
     except (EOFError, OSError):
         return

@@ -1,13 +1,13 @@
-"""Who may say what on the bus: the roles, and the access rules that a router enforces for them.
+"""Access control: roles, and the rules that a router enforces for them.
 
-Everyone has a certificate, and its common name says the plant and the role: `cstr.monitor`. What a rule does not allow
-is refused, silently, so that who is refused sees nothing but silence (`reactorwatch doctor` tells the difference).
+Each client has a certificate whose common name holds plant and role: `cstr.monitor`. A message that no rule allows is
+refused silently (`reactorwatch doctor` finds refusals).
 
-A router looks at each message twice, when it comes in and when it goes out. Speaking is allowed where it comes in;
-hearing is allowed at both: a subscription that is wider than the rule is not let in, and nothing of another plant goes
-out. What publishers remember is asked for below `@adv`, which no `**` reaches, and has keys of its own in each rule.
+A router checks each message at ingress and at egress. Publishing is allowed at ingress; reading is allowed at both: a
+subscription wider than the rule is refused, and no message of another plant goes out. Publishers' caches are queried
+below `@adv`, which no `**` matches, and have keys of their own in each rule.
 
-Source of the words: https://zenoh.io/docs/manual/access-control
+Source of the terms: https://zenoh.io/docs/manual/access-control
 """
 
 import re
@@ -18,32 +18,32 @@ from typing import Any
 
 from reactorwatch.contract import keys
 
-MEMORY = "@adv/**"
-"""Below a key: where Zenoh's publishers answer for what they remember of it."""
-NOBODY = f"{keys.ROOT}watch/nobody"
-"""A key that no queryable answers: a question to it comes back when all before it is through. Everyone may ask it."""
+CACHE_SUFFIX = "@adv/**"
+"""Part below a key at which Zenoh's publishers answer queries of their caches."""
+NO_QUERYABLE = f"{keys.ROOT}watch/nobody"
+"""Key without a queryable: a query of it ends when all messages before it have arrived. Every role may query it."""
 
 PLANT_COMMANDS = ("set_input", "inject_fault", "clear_fault", "pause", "resume", "step", "set_rate")
-"""What the plant, or a replay in its place, is told."""
-OF_THE_PLANT = ("acknowledge", "shelve", "unshelve", "comment")
-ALARM_COMMANDS = (*OF_THE_PLANT, keys.ACKNOWLEDGE_RECORDER)
-"""What an operator does with alarms, those of the plant and the recorder's own."""
+"""Commands of the plant, or a replay in its place."""
+PLANT_ALARM_COMMANDS = ("acknowledge", "shelve", "unshelve", "comment")
+ALARM_COMMANDS = (*PLANT_ALARM_COMMANDS, keys.ACKNOWLEDGE_RECORDER)
+"""Commands of an operator for alarms of the plant and of the recorder."""
 ALARM_ENGINEERING = ("suppress", "unsuppress", "take_out_of_service", "return_to_service")
-"""What needs more than an operator: alarms that nobody then sees until somebody brings them back."""
+"""Commands of an engineer: they hide alarms until a second command shows them again."""
 LISTS = ("list_alarms", keys.LIST_RECORDER_ALARMS)
-"""Questions that change nothing."""
+"""Commands that change nothing."""
 
 
 @dataclass(frozen=True)
 class Role:
-    """What the holder of a certificate may do beyond reading its plant.
+    """Rights of the holder of a certificate, beyond reading its plant.
 
     Attributes:
         name: the second part of the common name.
-        nodes: the nodes that run with it, each of which says that it is alive and how it does.
-        publishes: below the plant's key, such as `sample/**`.
-        answers: the commands it listens to, and keeps a record of.
-        asks: the commands it may give.
+        nodes: names of the nodes with this role; each shows a liveliness token and publishes its health.
+        publishes: key expressions below the plant's key, such as `sample/**`.
+        answers: names of the commands that it executes, and publishes a record of.
+        asks: names of the commands that it may give.
     """
 
     name: str
@@ -54,14 +54,14 @@ class Role:
 
     @property
     def key_space(self) -> tuple[str, ...]:
-        """Key expressions, below the plant's key, of all that it may publish."""
+        """Key expressions, below the plant's key, of all that the role may publish."""
         health = (f"{keys.HEALTH}/{node}" for node in self.nodes)
         audit = (f"{keys.AUDIT}/{command}" for command in self.answers)
         return (*self.publishes, *health, *audit)
 
 
 PROOF = "@doctor/**"
-"""Below a kind: where `doctor` publishes to see whether it is heard; nobody else hears it, for no `**` reaches it."""
+"""Part below a kind on which `doctor` publishes to test its rights; no other subscriber matches it."""
 
 ROLES = (
     Role("plant", ("plant", "replay"), (f"{keys.SAMPLE}/**", f"{keys.FAULT}/**"), answers=PLANT_COMMANDS),
@@ -72,7 +72,7 @@ ROLES = (
             *(f"{kind}/**" for kind in (keys.ESTIMATE, keys.MODEL, keys.CHART, keys.ALARM, keys.RECONSTRUCTION)),
             f"{keys.ALARM_KPIS}/monitor",
         ),
-        answers=(*OF_THE_PLANT, *ALARM_ENGINEERING, "list_alarms"),
+        answers=(*PLANT_ALARM_COMMANDS, *ALARM_ENGINEERING, "list_alarms"),
     ),
     Role(
         "recorder",
@@ -84,10 +84,10 @@ ROLES = (
     Role("engineer", asks=(*LISTS, *ALARM_COMMANDS, *ALARM_ENGINEERING, *PLANT_COMMANDS)),
     Role("viewer"),
 )
-"""Everyone that a certificate can be made for, but the router."""
+"""All roles with certificates, except the router."""
 
 REVOKED = "revoked"
-"""The subject of certificates that may do nothing: Zenoh 1.10 reads no revocation lists of certificates."""
+"""Subject of the rules for revoked certificates: Zenoh 1.10 reads no certificate revocation lists."""
 SERIAL_BYTES = 4
 _SERIAL = re.compile(rf"\.[0-9a-f]{{{2 * SERIAL_BYTES}}}$")
 NO_NAMES: Mapping[str, str] = MappingProxyType({})
@@ -96,12 +96,12 @@ EVERY_MESSAGE = (
     *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
 )
 
-HEAR_IN = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
-HEAR_OUT = ("put", "delete", "reply", "liveliness_token", "declare_queryable", "declare_subscriber")
+READ_INGRESS = ("declare_subscriber", "declare_liveliness_subscriber", "liveliness_query")
+READ_EGRESS = ("put", "delete", "reply", "liveliness_token", "declare_queryable", "declare_subscriber")
 
 
 def common_name(plant: str, role: str) -> str:
-    """What a certificate calls its holder.
+    """Common name of a holder's certificate.
 
     >>> common_name("cstr", "viewer")
     'cstr.viewer'
@@ -110,18 +110,18 @@ def common_name(plant: str, role: str) -> str:
 
 
 def kinds_of(role: Role) -> tuple[str, ...]:
-    """What a role publishes, by kind: the first part of its keys, such as `sample`."""
+    """Kinds that a role publishes: the first part of its keys, such as `sample`."""
     return tuple(dict.fromkeys(key.split("/")[0] for key in role.publishes))
 
 
-def role_of(name: str) -> tuple[str, Role] | None:
-    """The plant and the role that a common name says; None if it says none.
+def parse_common_name(name: str) -> tuple[str, Role] | None:
+    """Plant and role in a common name; None if it is malformed.
 
-    >>> role_of("line.2.viewer")[0]
+    >>> parse_common_name("line.2.viewer")[0]
     'line.2'
-    >>> role_of("line.2.viewer.0f3a9c21")[0]
+    >>> parse_common_name("line.2.viewer.0f3a9c21")[0]
     'line.2'
-    >>> role_of("router") is None
+    >>> parse_common_name("router") is None
     True
     """
     plant, _, word = _SERIAL.sub("", name).rpartition(".")
@@ -131,25 +131,25 @@ def role_of(name: str) -> tuple[str, Role] | None:
 def access_control(
     plants: tuple[str, ...], names: Mapping[str, str] = NO_NAMES, revoked: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """A router's settings `access_control`: nothing is allowed but what the roles of these plants may do.
+    """A router's settings `access_control`, which allow only the rights of these plants' roles.
 
-    A key is published on by one role alone (see `streams`): where a role's expression also names keys of another, these
-    are denied to it, which goes before what is allowed.
+    Only one role publishes on a key (see `streams`): where a role's expression also matches keys of another, a rule
+    denies them, which takes precedence.
 
     Args:
-        plants: their names.
-        names: the common name of a holder's certificates, by `plant/role`; those not named have `common_name`.
-        revoked: common names of certificates that may do nothing. The list is in the settings under `subjects`.
+        plants: names of the plants.
+        names: common names of holders' certificates, by `plant/role`, where they differ from `common_name`.
+        revoked: common names of certificates without any rights, listed in the settings under `subjects`.
     """
-    rules: list[dict[str, Any]] = [_rule("everyone", "ask nobody", ("ingress",), ("query",), [NOBODY])]
+    rules: list[dict[str, Any]] = [_rule("everyone", "ask nobody", ("ingress",), ("query",), [NO_QUERYABLE])]
     subjects, policies = [], []
     for plant in plants:
         root = f"{keys.ROOT}/{plant}"
         monitors = keys.monitor_token(plant, "*")
-        everything = [f"{root}/**", f"{root}/**/{MEMORY}", f"{root}/*/{PROOF}", monitors, keys.FLEET_TOKENS]
+        everything = [f"{root}/**", f"{root}/**/{CACHE_SUFFIX}", f"{root}/*/{PROOF}", monitors, keys.FLEET_TOKENS]
         reading = [
-            _rule(plant, "hear", ("ingress",), HEAR_IN, everything),
-            _rule(plant, "be told", ("egress",), HEAR_OUT, everything),
+            _rule(plant, "hear", ("ingress",), READ_INGRESS, everything),
+            _rule(plant, "be told", ("egress",), READ_EGRESS, everything),
             _rule(plant, "ask what is remembered", ("ingress",), ("query",), everything[1:2]),
         ]
         rules += reading
@@ -158,15 +158,15 @@ def access_control(
             asks = [f"{root}/{keys.COMMAND}/{command}" for command in role.asks]
             own = [_rule(name, "ask", ("ingress",), ("query",), asks)]
             if role.nodes:
-                said = [f"{root}/{expression}" for expression in role.key_space]
-                memory = [f"{key}/{MEMORY}" for key in said]
+                published = [f"{root}/{expression}" for expression in role.key_space]
+                caches = [f"{key}/{CACHE_SUFFIX}" for key in published]
                 proofs = [f"{root}/{kind}/{PROOF}" for kind in kinds_of(role)]
                 answers = [f"{root}/{keys.COMMAND}/{command}" for command in role.answers]
                 alive = [f"{root}/{keys.ALIVE}/{node}" for node in role.nodes]
                 alive += [monitors] if role.name == "monitor" else []
                 own += [
-                    _rule(name, "publish", ("ingress",), ("put", "reply"), [*said, *memory, *proofs]),
-                    _rule(name, "remember", ("ingress",), ("declare_queryable", "liveliness_token"), memory),
+                    _rule(name, "publish", ("ingress",), ("put", "reply"), [*published, *caches, *proofs]),
+                    _rule(name, "remember", ("ingress",), ("declare_queryable", "liveliness_token"), caches),
                     _rule(name, "answer", ("ingress",), ("declare_queryable", "reply"), answers),
                     _rule(name, "be alive", ("ingress",), ("liveliness_token",), alive),
                     _rule(name, "be asked", ("egress",), ("query",), [*everything[1:2], *answers]),
@@ -180,7 +180,7 @@ def access_control(
                             "leave to others",
                             ("ingress",),
                             ("put", "delete", "reply", "declare_queryable", "liveliness_token"),
-                            [*others, *(f"{key}/{MEMORY}" for key in others)],
+                            [*others, *(f"{key}/{CACHE_SUFFIX}" for key in others)],
                             permission="deny",
                         )
                     )
@@ -189,7 +189,7 @@ def access_control(
             used = [rules[0], *reading, *own]
             policies.append({"rules": [rule["id"] for rule in used], "subjects": [name]})
     if revoked:
-        nothing = _rule(REVOKED, "nothing", ("ingress", "egress"), EVERY_MESSAGE, ["**", f"**/{MEMORY}"])
+        nothing = _rule(REVOKED, "nothing", ("ingress", "egress"), EVERY_MESSAGE, ["**", f"**/{CACHE_SUFFIX}"])
         rules.append({**nothing, "permission": "deny"})
         subjects.append({"id": REVOKED, "cert_common_names": list(revoked)})
         policies.append({"rules": [nothing["id"]], "subjects": [REVOKED]})
@@ -203,7 +203,7 @@ def access_control(
 
 
 def key_space_of_others(role: Role) -> tuple[str, ...]:
-    """Key expressions of other roles that lie within a role's own expressions; no other role may publish there.
+    """Key expressions of other roles within a role's own expressions, on which it may not publish.
 
     >>> [key_space_of_others(role) for role in ROLES if role.name == "monitor"]
     [('alarm/recording/**',)]

@@ -1,7 +1,7 @@
-"""The record of what nodes were told to do: by whom, what, and what came of it. Nodes publish it; recorders keep it.
+"""Audit records of commands: sender, command and reply. Nodes publish them; recorders store them.
 
-Who gave a command is what the command says. That somebody with the right to give it did is what the router's access
-rules see to; which person it was, they cannot.
+The sender's name is the one in the command. The router's access rules ensure that a client with the right to give it
+did; they cannot identify the person.
 """
 
 from google.protobuf import text_format
@@ -12,12 +12,12 @@ from reactorwatch.contract.messages_pb2 import Audit, CommandReply, ListAlarms
 
 
 def audit(question: Encoded, reply: CommandReply, now_ns: int) -> Publication | None:
-    """The record of a command and its answer; None for a question that changes nothing, or on no key of ours.
+    """Make the record of a command and its reply; None for a command that changes nothing, or on an unknown key.
 
     Args:
-        question: the command as it came.
-        reply: what the node answered.
-        now_ns: when.
+        question: the encoded command.
+        reply: the node's reply.
+        now_ns: time of the reply.
     """
     topic = keys.parse(question.key)
     if topic is None or topic.kind != keys.COMMAND:
@@ -25,7 +25,7 @@ def audit(question: Encoded, reply: CommandReply, now_ns: int) -> Publication | 
     try:
         command = decode(question.payload, question.encoding)
     except DecodeError:
-        command = None  # the answer says what was wrong with it
+        command = None  # the reply holds the error
     if isinstance(command, ListAlarms):
         return None
     record = Audit(

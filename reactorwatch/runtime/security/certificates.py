@@ -1,8 +1,7 @@
-"""The certificates of a site: its own authority, and one certificate for each who joins its bus.
+"""Certificates of a site: its own authority, and one certificate for each client of its bus.
 
-Keys are P-256, signatures ECDSA with SHA-256, names as RFC 5280 wants them. A holder of a certificate that is not the
-router's can call but not be called: its extended key usage is that of a client alone, so that a stolen viewer's
-certificate makes no false router.
+Keys are P-256, signatures ECDSA with SHA-256, names as in RFC 5280. Only the router's certificate is one of a server:
+the extended key usage of the others is that of a client, so that a stolen viewer's certificate makes no false router.
 """
 
 import datetime
@@ -18,7 +17,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from reactorwatch.errors import InputError
 
 CLOCK_MARGIN = datetime.timedelta(minutes=5)
-"""Certificates are valid from a little before they are made, for the clocks of a site are not all the same."""
+"""Certificates are valid from this long before they are made, because the clocks of a site differ."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +28,7 @@ class Identity:
     key: ec.EllipticCurvePrivateKey
 
     def write(self, certificate: Path, key: Path) -> None:
-        """Write both as PEM; the key for its owner's eyes alone, from the first byte on."""
+        """Write both as PEM; only its owner can read the file of the key, from the first byte on."""
         key.touch(mode=0o600)
         key.write_bytes(
             self.key.private_bytes(
@@ -39,17 +38,17 @@ class Identity:
         certificate.write_bytes(self.certificate.public_bytes(serialization.Encoding.PEM))
 
 
-def authority(name: str, now: datetime.datetime, days: float) -> Identity:
-    """A new authority, which signs itself.
+def make_authority(name: str, now: datetime.datetime, days: float) -> Identity:
+    """Make an authority with a self-signed certificate.
 
     Args:
         name: its common name.
-        now: from when on it is valid.
-        days: for how long.
+        now: time from which it is valid.
+        days: days for which it is valid.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     builder = (
-        _builder(name, _named(name), key.public_key(), now, days)
+        _builder(name, _x509_name(name), key.public_key(), now, days)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs_certificates=True), critical=True)
     )
@@ -57,14 +56,14 @@ def authority(name: str, now: datetime.datetime, days: float) -> Identity:
 
 
 def issue(by: Identity, name: str, now: datetime.datetime, days: float, hosts: tuple[str, ...] = ()) -> Identity:
-    """A new certificate, signed by an authority.
+    """Issue a certificate signed by an authority.
 
     Args:
         by: the authority.
-        name: the common name, which the router's access rules go by.
-        now: from when on it is valid.
-        days: for how long; never longer than the authority's.
-        hosts: names and addresses that a router is called at; none for who only calls.
+        name: the common name, which the router's access rules refer to.
+        now: time from which it is valid.
+        days: days for which it is valid; cut at the end of the authority's certificate.
+        hosts: host names and addresses of a router; empty for a client.
     """
     key = ec.generate_private_key(ec.SECP256R1())
     usage = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
@@ -83,10 +82,10 @@ def issue(by: Identity, name: str, now: datetime.datetime, days: float, hosts: t
 
 
 def read_certificate(path: Path) -> x509.Certificate:
-    """A certificate from a PEM file.
+    """Read a certificate from a PEM file.
 
     Raises:
-        InputError: the file cannot be read, or holds none.
+        InputError: the file cannot be read, or holds no certificate.
     """
     try:
         return x509.load_pem_x509_certificate(path.read_bytes())
@@ -97,10 +96,10 @@ def read_certificate(path: Path) -> x509.Certificate:
 
 
 def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    """A private key from a PEM file.
+    """Read a private key from a PEM file.
 
     Raises:
-        InputError: the file cannot be read, or holds none of ours.
+        InputError: the file cannot be read, or holds no elliptic curve's key without a password.
     """
     try:
         key = serialization.load_pem_private_key(path.read_bytes(), None)
@@ -113,8 +112,8 @@ def read_key(path: Path) -> ec.EllipticCurvePrivateKey:
     return key
 
 
-def common_name_of(certificate: x509.Certificate) -> str:
-    """Who holds it, as access rules know them; empty if it does not say."""
+def read_common_name(certificate: x509.Certificate) -> str:
+    """Common name of a certificate's holder; empty if it has none."""
     names = certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(names[0].value) if names else ""
 
@@ -124,7 +123,7 @@ def _builder(
 ) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
-        .subject_name(_named(name))
+        .subject_name(_x509_name(name))
         .issuer_name(signer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
@@ -134,7 +133,7 @@ def _builder(
     )
 
 
-def _named(name: str) -> x509.Name:
+def _x509_name(name: str) -> x509.Name:
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
 
 

@@ -1,4 +1,4 @@
-"""How a client shows who it is, in Zenoh's settings for TLS."""
+"""Zenoh's settings for mutual TLS."""
 
 from typing import Any
 
@@ -6,11 +6,11 @@ from reactorwatch.runtime.config import BusConfig
 
 TLS = "transport/link/tls"
 ROUTER_FILES = ("root_ca_certificate", "listen_certificate", "listen_private_key")
-"""Of a router's settings for TLS, those that name a file."""
+"""Keys of a router's TLS settings whose values are files."""
 
 
-def client_settings(config: BusConfig) -> dict[str, Any]:
-    """What a client shows of itself, and wants to see of the router; empty without certificates."""
+def client_tls(config: BusConfig) -> dict[str, Any]:
+    """TLS settings of a client; empty without certificates."""
     if config.ca is None:
         return {}
     return {

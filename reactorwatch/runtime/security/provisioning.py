@@ -1,7 +1,7 @@
-"""A site on disk: a folder for each who joins its bus, to be copied to the machine that it is for, as it is.
+"""Provisioning of a site: a folder for each client of its bus, to be copied to the client's machine unchanged.
 
-SITE/authority/             the authority's private key, which signs new certificates, and site.json, where the
-                            router is: belongs off line
+SITE/authority/             the authority's private key, which signs new certificates, and site.json with the router's
+                            address: belongs off line
 SITE/router/                certificate, key, the authority's certificate, and router.json5, Zenoh's settings
 SITE/cstr/monitor/          certificate, key, the authority's certificate, and settings.toml for --config
 SITE/cstr/viewer/ ...
@@ -21,14 +21,14 @@ from cryptography.hazmat.primitives import serialization
 
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.runtime.security.acl import ROLES, SERIAL_BYTES, access_control, common_name
 from reactorwatch.runtime.security.certificates import (
     Identity,
-    authority,
-    common_name_of,
     issue,
+    make_authority,
     read_certificate,
+    read_common_name,
     read_key,
 )
 from reactorwatch.runtime.security.site_register import Register, read_register
@@ -36,16 +36,16 @@ from reactorwatch.runtime.security.site_register import Register, read_register
 AUTHORITY, ROUTER = "authority", "router"
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 ROUTER_SETTINGS, SETTINGS = "router.json5", "settings.toml"
-PLACE = "site.json"
-FILES = (CA, CERTIFICATE, KEY, ROUTER_SETTINGS, SETTINGS, PLACE)
+REGISTER_FILE = "site.json"
+FILES = (CA, CERTIFICATE, KEY, ROUTER_SETTINGS, SETTINGS, REGISTER_FILE)
 DEFAULT_ENDPOINT = "tls/127.0.0.1:7447"
 AUTHORITY_DAYS = 3650.0
 
 
-LONGEST_DAYS = 3650.0
-LONGEST_NAME = 64
+MAX_DAYS = 3650.0
+MAX_COMMON_NAME = 64
 """Letters of a certificate's common name (RFC 5280, ub-common-name)."""
-LONGEST_PLANT = LONGEST_NAME - max(len(common_name("", role.name)) for role in ROLES) - 2 * SERIAL_BYTES - 1
+MAX_PLANT_NAME = MAX_COMMON_NAME - max(len(common_name("", role.name)) for role in ROLES) - 2 * SERIAL_BYTES - 1
 
 Write = Callable[[Path], None]
 """Writes the files of an identity into a folder."""
@@ -62,30 +62,31 @@ def make_site(
     renew_days: float | None = None,
     revoke: Sequence[str] = (),
 ) -> list[Path]:
-    """Make what is missing of a site: its authority, the router, and every role of every plant.
+    """Make the missing parts of a site: its authority, the router, and every role of every plant.
 
-    What is complete stays as it is, but for the router's settings, which allow the plants that the site then has. A
-    folder with a file missing or damaged is completed. A plant is removed by deleting its folder.
+    Complete folders stay unchanged, except for the router's settings, which allow the plants of the site. A folder with
+    a missing or damaged file is completed. A plant is removed by deleting its folder.
 
     Args:
         folder: the site's folder; made if it does not exist.
         plants: names of plants to add. A new site without any gets `cstr`.
-        endpoint: where the nodes call the router, `tls/HOST:PORT`; the router's certificate is for that host. None: as
-            before, or this machine's loopback.
-        listen: where the router listens, of the same form. None: as before, or where it is called.
-        days: for how long certificates are valid.
-        now: the time from which they are valid.
-        renew_days: certificates that end within so many days are made again. None: none is.
-        revoke: holders, such as `cstr/monitor`, whose certificates so far the router is to refuse; each gets a new one.
+        endpoint: address at which nodes connect to the router, `tls/HOST:PORT`; the router's certificate is for that
+            host. None: as before, or this machine's loopback.
+        listen: address at which the router listens, of the same form. None: as before, or `endpoint`.
+        days: days for which new certificates are valid.
+        now: time from which new certificates are valid.
+        renew_days: certificates that end within this many days are renewed. None: none is.
+        revoke: holders, such as `cstr/monitor`, whose present certificates the router is to refuse; each gets a new
+            one.
 
     Returns:
         The folders that were made, completed or given a new certificate.
 
     Raises:
-        InputError: the folder cannot be written, its authority is missing or damaged, or an argument cannot be used.
+        InputError: the folder cannot be written, its authority is missing or damaged, or an argument is invalid.
     """
     _check(plants, days)
-    there = _plants_in(folder)
+    there = _find_plants(folder)
     plants = tuple(sorted({*there, *plants}))
     if not plants and not (folder / AUTHORITY).is_dir():
         plants = ("cstr",)
@@ -95,21 +96,21 @@ def make_site(
             raise InputError(
                 f"--revoke {holder}: is no PLANT/ROLE of this site (valid: {', '.join(holders) or 'none'})"
             )
-    _check_places(folder, holders)
-    register = _register_of(folder, there, endpoint, listen)
+    _check_paths(folder, holders)
+    register = _update_register(folder, there, endpoint, listen)
     try:
-        ca, made = _authority(folder / AUTHORITY, now, is_old=_is_old(folder, there))
+        ca, made = _load_authority(folder / AUTHORITY, now, is_old=_has_certificates(folder, there))
         for holder in revoke:
             register.revoke(holder)
-        register.write(folder / AUTHORITY / PLACE)
+        register.write(folder / AUTHORITY / REGISTER_FILE)
         until = now + datetime.timedelta(days=renew_days) if renew_days is not None else now
         issuer = _Issuer(ca, now, days, until)
-        host = _host(register.endpoint)
+        host = _parse_host(register.endpoint)
         hosts = tuple(dict.fromkeys((host, "localhost", "127.0.0.1")))
         if issuer.complete(folder / ROUTER, ROUTER, hosts):
             made.append(folder / ROUTER)
         rules = access_control(plants, register.names, register.revoked)
-        with replacing(folder / ROUTER / ROUTER_SETTINGS) as part:
+        with atomic_write(folder / ROUTER / ROUTER_SETTINGS) as part:
             part.write_text(_router_settings(rules, register.listen), encoding="utf-8")
         for holder in holders:
             settings = _settings(holder.partition("/")[0], register.endpoint)
@@ -123,90 +124,92 @@ def make_site(
 def _check(plants: tuple[str, ...], days: float) -> None:
     for plant in plants:
         try:
-            keys.checked_plant(plant)
+            keys.check_plant(plant)
         except ValueError as error:
             raise InputError(f"--plant: {error}") from error
         if plant in (AUTHORITY, ROUTER):
             raise InputError(f"--plant {plant}: is the name of another folder of the site; choose another")
-        if len(plant) > LONGEST_PLANT:
+        if len(plant) > MAX_PLANT_NAME:
             raise InputError(
-                f"--plant {plant}: a plant of a site has at most {LONGEST_PLANT} letters, because certificates hold "
-                f"{LONGEST_NAME}, got {len(plant)}"
+                f"--plant {plant}: a plant of a site has at most {MAX_PLANT_NAME} letters, because certificates hold "
+                f"{MAX_COMMON_NAME}, got {len(plant)}"
             )
-    if not 1.0 <= days <= LONGEST_DAYS:
-        raise InputError(f"--days must be in [1, {LONGEST_DAYS:g}], got {days:g}")
+    if not 1.0 <= days <= MAX_DAYS:
+        raise InputError(f"--days must be in [1, {MAX_DAYS:g}], got {days:g}")
 
 
-def _check_places(folder: Path, holders: list[str]) -> None:
-    """Check, before anything is written, that every folder and file of a site can be one.
+def _check_paths(folder: Path, holders: list[str]) -> None:
+    """Check, before anything is written, that every path of a site is free or of its kind.
 
     Raises:
-        InputError: something else is in the place of one.
+        InputError: a path is taken by something else.
     """
     for name in (AUTHORITY, ROUTER, *holders):
         home = folder / name
-        for place in (folder, home.parent, home):
-            if (place.exists() or place.is_symlink()) and not place.is_dir():
-                raise InputError(f"{place}: is no folder, and a site has one there; move it out of the site")
+        for path in (folder, home.parent, home):
+            if (path.exists() or path.is_symlink()) and not path.is_dir():
+                raise InputError(f"{path}: is no folder, and a site has one there; move it out of the site")
         for file in (home / name for name in FILES):
             if file.exists() and not file.is_file():
                 raise InputError(f"{file}: is no regular file, and a site has one there; move it out of the site")
 
 
-def _plants_in(folder: Path) -> list[str]:
-    """Names of the plants that have a folder in a site.
+def _find_plants(folder: Path) -> list[str]:
+    """Names of the plants with a folder in a site.
 
     Raises:
         InputError: a folder of another name holds a role.
     """
-    found = []
+    plants = []
     for holder in sorted(folder.glob("*/*")):
         plant = holder.parent.name
         if holder.is_dir() and holder.name in {role.name for role in ROLES} and plant not in (AUTHORITY, ROUTER):
             try:
-                found.append(keys.checked_plant(plant))
+                plants.append(keys.check_plant(plant))
             except ValueError as error:
                 raise InputError(f"{holder.parent}: is no plant's folder; move it out of the site: {error}") from error
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(plants))
 
 
-def _is_old(folder: Path, there: list[str]) -> bool:
-    """Whether a site has certificates, which then are of an authority that exists somewhere."""
+def _has_certificates(folder: Path, there: list[str]) -> bool:
+    """True if a site has certificates, and so an authority that exists somewhere."""
     holders = [folder / ROUTER, *(folder / plant / role.name for plant in there for role in ROLES)]
     return any((holder / CERTIFICATE).exists() for holder in holders)
 
 
-def _register_of(folder: Path, there: list[str], endpoint: str | None, listen: str | None) -> Register:
-    """The notes of the site with the addresses that are given.
+def _update_register(folder: Path, there: list[str], endpoint: str | None, listen: str | None) -> Register:
+    """The register of the site with the given addresses.
 
     Raises:
-        InputError: the site's authority or its notes are missing, or an address is none.
+        InputError: the site's authority or its register is missing, or an address is malformed.
     """
     home = folder / AUTHORITY
-    is_old = _is_old(folder, there)
+    is_old = _has_certificates(folder, there)
     if is_old and not (home / KEY).exists():
         raise InputError(
             f"{home}: the site's authority is not there, and its private key signs all certificates; put that folder "
-            "back, or begin a new site in another folder"
+            "back, or start a new site in another folder"
         )
-    before = read_register(home / PLACE)
+    before = read_register(home / REGISTER_FILE)
     if before is None and is_old and (endpoint is None or listen is None):
-        raise InputError(f"{home / PLACE}: is missing, and says where the router is; give --endpoint and --listen")
+        raise InputError(
+            f"{home / REGISTER_FILE}: is missing, and says where the router is; give --endpoint and --listen"
+        )
     if before is None:
         called = endpoint or DEFAULT_ENDPOINT
         before = Register(called, listen or called)
     register = Register(endpoint or before.endpoint, listen or before.listen, before.names, before.revoked)
     for address in (register.endpoint, register.listen):
-        _host(address)
+        _parse_host(address)
     return register
 
 
-def _authority(folder: Path, now: datetime.datetime, *, is_old: bool) -> tuple[Identity, list[Path]]:
-    """The authority of a site, made if the site is new; and the folders made."""
+def _load_authority(folder: Path, now: datetime.datetime, *, is_old: bool) -> tuple[Identity, list[Path]]:
+    """Load the authority of a site, or make that of a new site; returns it with the folders made."""
     if (folder / CA).exists() or is_old:
         return Identity(read_certificate(folder / CA), read_key(folder / KEY)), []
-    ca = authority(f"reactorwatch {now:%Y-%m-%d}", now, AUTHORITY_DAYS)
-    _place(folder, lambda new: ca.write(new / CA, new / KEY), mode=0o700)
+    ca = make_authority(f"reactorwatch {now:%Y-%m-%d}", now, AUTHORITY_DAYS)
+    _install(folder, lambda new: ca.write(new / CA, new / KEY), mode=0o700)
     return ca, [folder]
 
 
@@ -215,9 +218,9 @@ class _Issuer:
 
     Args:
         ca: the authority.
-        now: the time from which new certificates are valid.
-        days: for how long.
-        until: certificates that end before this are made again.
+        now: time from which new certificates are valid.
+        days: days for which new certificates are valid.
+        until: certificates that end before this time are renewed.
     """
 
     def __init__(self, ca: Identity, now: datetime.datetime, days: float, until: datetime.datetime) -> None:
@@ -229,13 +232,13 @@ class _Issuer:
         self._ca_pem = ca.certificate.public_bytes(serialization.Encoding.PEM)
 
     def complete(self, folder: Path, name: str, hosts: tuple[str, ...] = (), settings: str = "") -> bool:
-        """Make what is missing or has to be new in a folder; False if nothing was.
+        """Make the missing, damaged and outdated files of a folder; returns False if there are none.
 
         Args:
-            folder: the holder's.
-            name: the common name of its certificate.
-            hosts: of a router.
-            settings: for `settings.toml`, which is not replaced.
+            folder: folder of the holder.
+            name: common name of its certificate.
+            hosts: host names and addresses of a router.
+            settings: text of `settings.toml`, which is not replaced.
         """
         is_new = not self._is_valid(folder, name)
         if not is_new and (folder / CA).is_file() and (not settings or (folder / SETTINGS).is_file()):
@@ -248,7 +251,7 @@ class _Issuer:
             if settings and not (folder / SETTINGS).exists():
                 (new / SETTINGS).write_text(settings, encoding="utf-8")
 
-        _place(folder, write)
+        _install(folder, write)
         return True
 
     def _is_valid(self, folder: Path, name: str) -> bool:
@@ -258,11 +261,11 @@ class _Issuer:
         except (InputError, ValueError, TypeError, InvalidSignature):
             return False
         is_pair = key.public_key() == certificate.public_key()
-        return is_pair and common_name_of(certificate) == name and certificate.not_valid_after_utc > self._until
+        return is_pair and read_common_name(certificate) == name and certificate.not_valid_after_utc > self._until
 
 
-def _place(folder: Path, write: Write, mode: int = 0o777) -> None:
-    """Have files written into a new folder beside `folder`, then put them into it; a new folder appears complete."""
+def _install(folder: Path, write: Write, mode: int = 0o777) -> None:
+    """Write files to a temporary folder and move them into `folder`; a new folder appears complete."""
     new = folder.with_name(f".{folder.name}.new")
     if new.is_symlink() or new.is_file():
         new.unlink()
@@ -278,7 +281,7 @@ def _place(folder: Path, write: Write, mode: int = 0o777) -> None:
 
 
 def _router_settings(rules: dict[str, Any], listen: str) -> str:
-    """For `zenohd --config` and `reactorwatch router`; files are relative to the folder they are in."""
+    """Settings for `zenohd --config` and `reactorwatch router`; files are relative to their folder."""
     tls = {
         "root_ca_certificate": CA,
         "listen_certificate": CERTIFICATE,
@@ -305,13 +308,13 @@ def _router_settings(rules: dict[str, Any], listen: str) -> str:
 
 
 def _settings(plant: str, endpoint: str) -> str:
-    """For `--config`: where the router is, the files of the identity, and the plant."""
+    """Settings for `--config`: the router's address, the files of the identity, and the plant."""
     tables = {
         "bus": {"endpoint": endpoint, "ca": CA, "certificate": CERTIFICATE, "key": KEY},
         "plant": {"name": plant},
         "monitor": {"plant": plant},
         "replay": {"plant": plant},
-        # a subscription to more than may be read would be refused as a whole
+        # a subscription wider than the rights would be refused as a whole
         "recorder": {"plant": plant, "key_expression": f"{keys.ROOT}/{plant}/**"},
     }
     return tomli_w.dumps(tables)
@@ -321,8 +324,8 @@ _ADDRESS = re.compile(r"tls/(?P<host>[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<por
 LAST_PORT = 65535
 
 
-def _host(endpoint: str) -> str:
-    """The host of an address.
+def _parse_host(endpoint: str) -> str:
+    """Host of an address.
 
     Raises:
         InputError: it is no address for TLS.

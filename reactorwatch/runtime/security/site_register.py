@@ -1,4 +1,4 @@
-"""The authority's own notes on its site, `SITE/authority/site.json`."""
+"""Register of a site, stored with its authority: `SITE/authority/site.json`."""
 
 import secrets
 from pathlib import Path
@@ -6,15 +6,15 @@ from pathlib import Path
 import msgspec
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.runtime.security.acl import SERIAL_BYTES, common_name
 
 
 class Register(msgspec.Struct, forbid_unknown_fields=True):
-    """Where the router of a site is, and under which names certificates are valid.
+    """Addresses of a site's router, and valid common names of its certificates.
 
     Attributes:
-        endpoint: the address at which nodes call the router.
+        endpoint: the address at which nodes connect to the router.
         listen: the address at which it listens.
         names: common names of certificates by holder, such as `cstr/monitor`, where earlier ones were revoked.
         revoked: common names that the router refuses, oldest first.
@@ -26,12 +26,12 @@ class Register(msgspec.Struct, forbid_unknown_fields=True):
     revoked: list[str] = []
 
     def name_of(self, holder: str) -> str:
-        """The common name of a holder's certificates."""
+        """Common name of a holder's certificates."""
         plant, _, role = holder.partition("/")
         return self.names.get(holder) or common_name(plant, role)
 
     def revoke(self, holder: str) -> str:
-        """Revoke all certificates of a holder so far; returns the name that they had."""
+        """Revoke all present certificates of a holder; returns their common name."""
         name = self.name_of(holder)
         plant, _, role = holder.partition("/")
         self.revoked.append(name)
@@ -39,13 +39,13 @@ class Register(msgspec.Struct, forbid_unknown_fields=True):
         return name
 
     def write(self, path: Path) -> None:
-        """Write it, whole or not at all."""
-        with replacing(path) as part:
+        """Write the file, completely or not at all."""
+        with atomic_write(path) as part:
             part.write_bytes(msgspec.json.encode(self) + b"\n")
 
 
 def read_register(path: Path) -> Register | None:
-    """The notes of a site; None if there are none.
+    """Read the register of a site; None if there is none.
 
     Raises:
         InputError: the file cannot be read.

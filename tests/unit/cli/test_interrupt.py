@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 from llvmlite.binding import ExecutionEngine
 
-from reactorwatch.cli.interrupt import _CALLBACKS, handled, raise_until_handled
+from reactorwatch.cli.interrupt import _CALLBACKS, clear_interrupt, raise_until_handled
 
 
 @pytest.fixture(autouse=True)
@@ -14,7 +14,7 @@ def handlers() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGALRM)}
     raise_until_handled()
     yield
-    handled()
+    clear_interrupt()
     for number, handler in before.items():
         signal.signal(number, handler)
 
@@ -30,7 +30,7 @@ def test_an_interrupt_that_was_dropped_is_raised_again() -> None:
 def test_an_interrupt_that_was_handled_is_not_raised_again() -> None:
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)
-    handled()
+    clear_interrupt()
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 

@@ -23,7 +23,7 @@ def measured() -> Record:
 def identified(measured: Record, **options: object) -> dict[str, object]:
     settings: dict[str, object] = {"output": "T", "model": "arx", "order": 3, "delay": 1}
     settings |= {"recursive": False, "report_rows": False, "as_json": True} | options
-    said: dict[str, object] = json.loads(identification.one(measured, **settings))  # type: ignore[arg-type]
+    said: dict[str, object] = json.loads(identification.fit(measured, **settings))  # type: ignore[arg-type]
     return said
 
 

@@ -233,9 +233,9 @@ def test_only_regular_files_are_replaced(
         out.mkdir()
     elif kind == "device":  # a file that the system calls a device, as none may be touched here
         out.touch()
-        real = output.mode_of
+        real = output.file_mode
         monkeypatch.setattr(
-            output, "mode_of", lambda path: stat.S_IFCHR | 0o666 if path.name == case.out else real(path)
+            output, "file_mode", lambda path: stat.S_IFCHR | 0o666 if path.name == case.out else real(path)
         )
     else:
         pipe = out if kind == "pipe" else folder / "pipe"
@@ -306,7 +306,7 @@ def test_a_file_of_another_kind_than_its_name_says_is_kept_unless_force_is_given
         else:
             existing.write_bytes(content)
         assert "replace it with --force" in refuse(line(case, case.out), monkeypatch, capsys)
-        assert output.checked_output(existing, force=True) == existing
+        assert output.check_output_file(existing, force=True) == existing
         existing.unlink()
 
 

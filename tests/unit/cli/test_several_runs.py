@@ -14,7 +14,7 @@ from plant_node.record import simulate_record
 from plant_node.scenario import HeldRecord
 from reactorwatch.cli import identification
 from reactorwatch.cli.reports import backtest_object, backtest_text
-from reactorwatch.cli.simulation import free_run, report
+from reactorwatch.cli.simulation import report, simulate_along
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
@@ -36,8 +36,8 @@ def cut(record: Record, back_min: float) -> Record:
 
 def test_each_run_is_simulated_from_its_own_first_row(whole: Record, tmp_path: Path) -> None:
     record = cut(whole, 60.05)
-    simulated = free_run(record, cstr(), ["coolant_flow:step:-0.05@75min"])
-    alone = [free_run(run, cstr(), ["coolant_flow:step:-0.05@75min"]) for run in record.each_run()]
+    simulated = simulate_along(record, cstr(), ["coolant_flow:step:-0.05@75min"])
+    alone = [simulate_along(run, cstr(), ["coolant_flow:step:-0.05@75min"]) for run in record.split_runs()]
     assert np.array_equal(simulated.columns["T"], join_runs(alone).columns["T"])
     assert np.array_equal(simulated.time_min, record.time_min)
     assert simulated.runs is not None
@@ -47,10 +47,10 @@ def test_each_run_is_simulated_from_its_own_first_row(whole: Record, tmp_path: P
 
 def test_a_run_of_one_row_is_simulated_as_that_row(whole: Record) -> None:
     runs = 1 + (np.arange(ROWS) >= 500) + (np.arange(ROWS) >= 501)
-    simulated = free_run(replace(whole, runs=runs), cstr(), [])
+    simulated = simulate_along(replace(whole, runs=runs), cstr(), [])
     assert simulated.rows == ROWS
     assert simulated.columns["T"][500] == whole.columns["T"][500]
-    whole_run = free_run(whole, cstr(), [])
+    whole_run = simulate_along(whole, cstr(), [])
     assert np.array_equal(simulated.columns["T"][:500], whole_run.columns["T"][:500])
 
 
@@ -63,7 +63,7 @@ def test_no_row_is_identified_from_rows_of_another_run(whole: Record, model: str
         runs = 1 + (np.arange(ROWS) >= row)
         record = replace(whole, time_min=whole.time_min - back_min * (runs - 1), runs=runs)
         settings = {"order": 2, "delay": 1, "recursive": False, "report_rows": False, "as_json": True}
-        return json.loads(identification.one(record, "T", model, **settings))  # type: ignore[arg-type]
+        return json.loads(identification.fit(record, "T", model, **settings))  # type: ignore[arg-type]
 
     after_a_gap = identified(-50.0)
     assert identified(60.0) == after_a_gap

@@ -15,7 +15,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli import identification
 from reactorwatch.cli.backtest_jobs import _units
-from reactorwatch.cli.read_record import tape
+from reactorwatch.cli.read_record import open_messages
 from reactorwatch.process import MODELS
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv
@@ -47,7 +47,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def watched(path: Path, **options: object) -> Backtest:
     config = MonitorConfig(training_min=20.0, isolation=False, **options)  # type: ignore[arg-type]
-    return run(tape(path, "cstr", COLUMNS, _units(config)).messages, config)
+    return run(open_messages(path, "cstr", COLUMNS, _units(config)).messages, config)
 
 
 def test_the_units_of_the_reactor_are_those_of_its_equations() -> None:
@@ -71,7 +71,7 @@ def test_where_the_process_is_named_columns_have_the_units_of_its_signals(rig: P
     write_extended_model(tmp_path / "m.json", {"format": "reactorwatch.model.v1", "model": "cstr", "effects": []})
     named = _units(MonitorConfig(model=str(tmp_path / "m.json")))
     assert named == UNITS
-    recorded = read_run(tape(rig, "cstr", COLUMNS, named).messages)
+    recorded = read_run(open_messages(rig, "cstr", COLUMNS, named).messages)
     assert recorded.units == UNITS
 
 
@@ -98,10 +98,10 @@ def test_units_go_into_recordings_and_drawings_and_back(rig: Path, tmp_path: Pat
 def test_identification_speaks_of_the_unit_that_is_known(rig: Path) -> None:
     measured = read_csv(rig, COLUMNS)
     settings = {"order": 2, "delay": 1, "recursive": False, "report_rows": False, "as_json": False}
-    assert "C (degC) from" in identification.one(measured, "C", "arx", **settings)  # type: ignore[arg-type]
-    assert "T (unit not known) from" in identification.one(measured, "T", "arx", **settings)  # type: ignore[arg-type]
+    assert "C (degC) from" in identification.fit(measured, "C", "arx", **settings)  # type: ignore[arg-type]
+    assert "T (unit not known) from" in identification.fit(measured, "T", "arx", **settings)  # type: ignore[arg-type]
     own = replace(measured, units=UNITS)
-    assert "T (K) from" in identification.one(own, "T", "arx", **settings)  # type: ignore[arg-type]
+    assert "T (K) from" in identification.fit(own, "T", "arx", **settings)  # type: ignore[arg-type]
 
 
 @given(

@@ -2,7 +2,7 @@
 
 from google.protobuf.message import Message
 
-from reactorwatch.cli.status import Board, _text
+from reactorwatch.cli.status import StatusBoard, _text
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Priority, Sample
 
@@ -19,7 +19,7 @@ def alarm(name: str, state: AlarmState, priority: Priority = Priority.PRIORITY_L
 
 
 def test_a_rate_is_samples_over_the_last_ten_whole_seconds() -> None:
-    board = Board(START_NS)
+    board = StatusBoard(START_NS)
     for tenth in range(300):  # three samples each tenth of a second
         for signal in ("qc", "C", "T"):
             board.on_message(said(f"a/sample/{signal}", Sample(time_ns=1), tenth / 10))
@@ -29,20 +29,20 @@ def test_a_rate_is_samples_over_the_last_ten_whole_seconds() -> None:
 
 
 def test_the_second_in_which_listening_began_is_not_counted() -> None:
-    board = Board(START_NS + S // 2)
+    board = StatusBoard(START_NS + S // 2)
     for tenth in range(5, 40):
         board.on_message(said("a/sample/T", Sample(time_ns=1), tenth / 10))
     assert board.plant("a", START_NS + 3 * S)["samples_per_s"] == 10.0
 
 
 def test_without_a_whole_second_there_is_no_rate() -> None:
-    board = Board(START_NS)
+    board = StatusBoard(START_NS)
     board.on_message(said("a/sample/T", Sample(time_ns=1)))
     assert board.plant("a", START_NS + S // 2)["samples_per_s"] is None
 
 
 def test_plants_are_told_apart() -> None:
-    board = Board(START_NS)
+    board = StatusBoard(START_NS)
     board.on_token("reactor/b/alive/plant", True)
     board.on_message(said("a/health/plant", Health(time_ns=START_NS)))
     assert board.plants == ["a", "b"]
@@ -51,7 +51,7 @@ def test_plants_are_told_apart() -> None:
 
 
 def test_a_node_that_goes_is_not_there() -> None:
-    board = Board(START_NS)
+    board = StatusBoard(START_NS)
     board.on_message(said("a/health/plant", Health(time_ns=START_NS, phase="running")))
     board.on_token("reactor/a/alive/plant", True)
     board.on_token("reactor/a/alive/plant", False)
@@ -61,7 +61,7 @@ def test_a_node_that_goes_is_not_there() -> None:
 
 
 def test_alarms_in_sight_are_shown_the_most_urgent_first() -> None:
-    board = Board(START_NS)
+    board = StatusBoard(START_NS)
     for number, (state, priority) in enumerate(
         [
             (AlarmState.ALARM_STATE_UNACKNOWLEDGED, Priority.PRIORITY_LOW),
@@ -76,20 +76,20 @@ def test_alarms_in_sight_are_shown_the_most_urgent_first() -> None:
 
 
 def test_what_was_published_is_newer_than_what_was_listed() -> None:
-    board = Board(START_NS)
+    board = StatusBoard(START_NS)
     board.on_message(said("a/alarm/x/T", alarm("x/T", AlarmState.ALARM_STATE_ACKNOWLEDGED)))
     board.on_alarms("a", [alarm("x/T", AlarmState.ALARM_STATE_UNACKNOWLEDGED)])
     assert [item["state"] for item in board.plant("a", START_NS)["alarms"]] == ["acknowledged"]
 
 
 def test_what_comes_from_the_bus_is_shown_as_it_is() -> None:
-    board = Board(START_NS)
+    board = StatusBoard(START_NS)
     board.on_message(said("a/health/plant", Health(time_ns=START_NS, phase="[/b]")))
     board.on_token("reactor/a/alive/plant", True)
     assert "[/b]" in _text(board, as_json=False)
 
 
 def test_bytes_that_are_no_message_are_passed_over() -> None:
-    board = Board(START_NS)
+    board = StatusBoard(START_NS)
     board.on_message(Encoded("reactor/a/health/plant", b"\xff", "text/plain", START_NS))
     assert board.plants == []

@@ -11,11 +11,11 @@ import pytest
 from monitor_node.config import MonitorConfig
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.cli.backtest_jobs import answer, jobs_of
-from reactorwatch.cli.options import span_ns
-from reactorwatch.cli.read_record import process_model, record, tape
+from reactorwatch.cli.backtest_jobs import make_jobs, run_job
+from reactorwatch.cli.options import parse_span_ns
+from reactorwatch.cli.read_record import load_process_model, open_messages, record
 from reactorwatch.cli.recordings import cut
-from reactorwatch.cli.simulation import free_run
+from reactorwatch.cli.simulation import simulate_along
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.model import cstr
@@ -49,8 +49,8 @@ def written(folder: Path, leaking: Record, origin_min: float) -> tuple[Path, Pat
 
 def watched(path: Path, model: Path | None = None) -> dict[str, Any]:
     settings = MonitorConfig(training_min=20.0, isolation=False, model=None if model is None else str(model))
-    (job,) = jobs_of([path], settings, None, {}, as_json=True, elsewhere=False)
-    said: dict[str, Any] = msgspec.json.decode(answer(job).said)
+    (job,) = make_jobs([path], settings, None, {}, as_json=True, elsewhere=False)
+    said: dict[str, Any] = msgspec.json.decode(run_job(job).text)
     return said
 
 
@@ -83,7 +83,7 @@ def test_a_model_with_a_deviation_at_a_minute_of_the_file_has_it_there(leaking: 
     for path in (csv, mcap):
         assert watched(path, model)["alarms"] == []
         measured = record(path)
-        simulated = free_run(measured, process_model(model, measured), [])
+        simulated = simulate_along(measured, load_process_model(model, measured), [])
         assert np.sqrt(np.mean((simulated.columns["T"] - measured.columns["T"]) ** 2)) < 0.5
 
 
@@ -98,7 +98,7 @@ def test_a_diagnosis_gives_the_onset_in_the_minutes_of_the_file(
 
 def test_a_drawing_and_a_look_count_the_minutes_of_the_file(leaking: Record, tmp_path: Path) -> None:
     for path in written(tmp_path, leaking, -ONSET_MIN):
-        recording = tape(path)
+        recording = open_messages(path)
         shown = read_run(recording.messages)
         assert recording.zero_ns is not None
         assert (shown.span_ns[0] - recording.zero_ns) / 60e9 == -ONSET_MIN
@@ -114,4 +114,4 @@ def test_a_cut_begins_and_ends_at_minutes_of_the_file(leaking: Record, tmp_path:
     cut(mcap, tmp_path / "cut.mcap", end="-5min")
     assert read_record(tmp_path / "cut.mcap").time_min[[0, -1]].tolist() == [-ONSET_MIN, -5.0]
     assert watched(mcap)["alarms"]
-    assert span_ns("-1.5h", "--from") == -5400 * 10**9
+    assert parse_span_ns("-1.5h", "--from") == -5400 * 10**9

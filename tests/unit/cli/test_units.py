@@ -51,7 +51,7 @@ def remarks_of(record: Record, folder: Path) -> dict[str, str]:
     path, found = folder / "a.csv", {}
     write_csv(path, record)
     job = backtest_jobs.Job(path, path, LEARNING, None, {}, as_json=True, among=False)
-    found["backtest"] = backtest_jobs.answer(job).remark
+    found["backtest"] = backtest_jobs.run_job(job).remark
     for command in (["identify"], ["simulate", "-o", str(folder / "out.csv")], ["diagnose"]):
         result = CliRunner().invoke(app, [*command, str(path)])
         found[command[0]] = str(result.exception) if isinstance(result.exception, InputError) else result.stderr

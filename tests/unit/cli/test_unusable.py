@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from reactorwatch.cli.batch import files_named
+from reactorwatch.cli.batch import expand_files
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_BAD, QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
@@ -68,21 +68,21 @@ def test_a_replay_of_nothing_says_from_where_to_where(
 def test_a_folder_that_is_called_like_a_file_does_not_end_a_pattern(folder: Path) -> None:
     (folder / "a.csv").mkdir()
     (folder / "b.csv").touch()
-    assert files_named([Path("[ab].csv")]) == [Path("b.csv")]
+    assert expand_files([Path("[ab].csv")]) == [Path("b.csv")]
     (folder / "a.csv" / "in.csv").touch()
-    assert files_named([Path("[ab].csv")]) == [Path("a.csv/in.csv"), Path("b.csv")]
+    assert expand_files([Path("[ab].csv")]) == [Path("a.csv/in.csv"), Path("b.csv")]
     (folder / "c.csv").mkdir()
     with pytest.raises(InputError, match=r"c\.csv: holds no record"):
-        files_named([Path("c.csv")])
+        expand_files([Path("c.csv")])
     with pytest.raises(InputError, match="no file is called like this"):
-        files_named([Path("[c].csv")])
+        expand_files([Path("[c].csv")])
 
 
 def test_suffixes_in_capitals_are_suffixes(folder: Path) -> None:
     (folder / "in").mkdir()
     (folder / "in" / "A.CSV").touch()
     (folder / "in" / "B.Csv").touch()
-    assert files_named([Path("in")]) == [Path("in/A.CSV"), Path("in/B.Csv")]
+    assert expand_files([Path("in")]) == [Path("in/A.CSV"), Path("in/B.Csv")]
     (folder / "bad.mcap").rename(folder / "in" / "C.MCAP")
-    assert files_named([Path("in")]) == [Path("in/A.CSV"), Path("in/B.Csv"), Path("in/C.MCAP")]
+    assert expand_files([Path("in")]) == [Path("in/A.CSV"), Path("in/B.Csv"), Path("in/C.MCAP")]
     assert recordings_in(Path("in")) == [Path("in/C.MCAP")]

@@ -128,7 +128,7 @@ def test_the_generated_classes_are_those_of_the_proto_file(tmp_path: Path) -> No
 @pytest.mark.parametrize("name", ["", "a/b", "*", "-x", "a" * 65, "a b", "$", ".a"])
 def test_a_plant_name_that_could_break_a_key_is_refused(name: str) -> None:
     with pytest.raises(ValueError, match="plant name must be"):
-        keys.checked_plant(name)
+        keys.check_plant(name)
 
 
 @pytest.mark.parametrize("name", ["cstr", "R-101", "site_2.line-3", "9"])

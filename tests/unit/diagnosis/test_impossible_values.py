@@ -8,8 +8,8 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from reactorwatch.cli.diagnosis import Asked, case_of
-from reactorwatch.cli.simulation import free_run
+from reactorwatch.cli.diagnosis import DiagnosisOptions, load_case
+from reactorwatch.cli.simulation import simulate_along
 from reactorwatch.diagnosis.record_checks import run_of
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cascaded_tanks.model import tanks
@@ -66,9 +66,9 @@ def test_of_a_file_the_row_is_its_line(signal: str, rows: list[int], tmp_path: P
     write_csv(path, spoiled(sound("qc"), signal, rows, -999.0))
     line = next(number for number, text in enumerate(path.read_text().split("\n"), start=1) if "-999" in text)
     with pytest.raises(InputError, match=rf"a\.csv, row {line} \(.*\), column '{signal}': .* got -999"):
-        case_of(path, None, Asked())
+        load_case(path, None, DiagnosisOptions())
     with pytest.raises(InputError, match=rf"row {line} \(.*\), column '{signal}': .* got -999"):
-        free_run(read_csv(path), cstr(), [])
+        simulate_along(read_csv(path), cstr(), [])
 
 
 @pytest.mark.parametrize("signal", sorted(MODELS))
@@ -83,4 +83,4 @@ def test_where_lines_are_no_rows_the_time_is_told_alone(tmp_path: Path) -> None:
     lines = path.read_text().split("\n")
     path.write_text("\n".join([*lines[:2], "", *lines[2:]]))
     with pytest.raises(InputError, match=r"a\.csv, at 0\.2 min, column 'T'"):
-        case_of(path, None, Asked())
+        load_case(path, None, DiagnosisOptions())

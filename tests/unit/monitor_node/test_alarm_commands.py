@@ -23,7 +23,7 @@ from reactorwatch.contract.messages_pb2 import (
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
-from reactorwatch.runtime.security.command_rate import ONE_NAME
+from reactorwatch.runtime.security.command_rate import PER_NAME
 
 from .samples import PLANT, leaking_run, samples
 
@@ -47,7 +47,7 @@ class Room:
         self.node = MonitorNode(config, 0)
         self.said: list[Publication] = []
         self._operator = MemoryBus(Exchange())
-        self._operator.answer(f"reactor/{PLANT}/command/*", self._answer)
+        self._operator.declare_queryable(f"reactor/{PLANT}/command/*", self._answer)
         self.hear(messages)
 
     def hear(self, messages: list[Encoded]) -> list[Publication]:
@@ -58,7 +58,7 @@ class Room:
         """A person asks."""
         self.said.clear()
         question = Encoded(f"reactor/{PLANT}/command/{name}", *encode_message(message))
-        (answer,) = self._operator.ask(question, 1.0)
+        (answer,) = self._operator.query(question, 1.0)
         reply = decode(answer.payload, answer.encoding)
         assert isinstance(reply, CommandReply)
         return reply
@@ -169,7 +169,7 @@ def test_a_flood_of_commands_is_refused_counted_and_written_nowhere(
     monkeypatch.setattr("os.fsync", stored.append)
     replies = [room.ask("comment", by_anna(comment=f"number {number}")) for number in range(3000)]
     obeyed = [reply for reply in replies if reply.accepted]
-    assert len(stored) == len(obeyed) == ONE_NAME.at_once
+    assert len(stored) == len(obeyed) == PER_NAME.at_once
     assert {reply.text for reply in replies if not reply.accepted} == {
         "too many commands by 'Anna': 30 at once and 5 a second are taken; try again in a second"
     }

@@ -23,7 +23,9 @@ from reactorwatch.kalman.ekf_step import row_code, row_function, walk_function
 from reactorwatch.kalman.initial_state import corrected_function
 from reactorwatch.kalman.step_budget import A_SEARCH
 from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.event_loop import EventLoop
 
 from .faulty import SENSORS
 from .samples import leaking_run, samples
@@ -141,7 +143,9 @@ def test_a_monitor_prepares_part_by_part_once_it_listens_and_then_no_more(monkey
             prepared.append(part)
             yield
 
-    def serve(node: monitor_main.MonitorNode, *_: object, **__: object) -> None:
+    def run(loop: EventLoop) -> None:
+        node = loop._node
+        assert isinstance(node, monitor_main.MonitorNode)
         assert prepared == []
         for parts in (1, 2, 3, 3, 3):
             now_ns = max(node.next_tick_ns(), node._prepare_ns)
@@ -150,13 +154,9 @@ def test_a_monitor_prepares_part_by_part_once_it_listens_and_then_no_more(monkey
             assert len(prepared) == parts
         assert node.next_tick_ns() > now_ns + 10**9  # health: nothing else is due
 
-    class Closed:
-        def close(self) -> None:
-            """Nothing is open."""
-
     monkeypatch.setattr(stage, "preparation", preparation)
-    monkeypatch.setattr(monitor_main, "serve", serve)
-    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_: Closed())
+    monkeypatch.setattr(EventLoop, "run", run)
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", lambda *_: MemoryBus(Exchange()))
     monitor_main.run(MonitorConfig(), BusConfig())
     assert prepared == [0, 1, 2]
 

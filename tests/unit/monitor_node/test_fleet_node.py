@@ -19,7 +19,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.metrics import FleetMetrics
-from reactorwatch.runtime.security.command_rate import ONE_NAME
+from reactorwatch.runtime.security.command_rate import PER_NAME
 from tests.running import WITHIN_S
 
 from .fleets import PLANTS, QUICK, fleet, row_by_row, run_of
@@ -158,7 +158,7 @@ def test_a_flood_of_commands_is_refused_and_leaves_quiet_plants_quiet(
     question = Encoded("reactor/a/command/comment", *encode_message(command))
     replies = [bench.node.on_command(question, bench.now_ns)[0] for _ in range(3000)]
     refused = [reply for reply in replies if reply is not None and "too many commands" in reply.text]
-    assert len(refused) == 3000 - ONE_NAME.at_once
+    assert len(refused) == 3000 - PER_NAME.at_once
     assert bench.node.monitor("a").refusals.by_reason["too_many_commands"] == len(refused)
     for _ in range(101):
         bench.tick()
@@ -176,7 +176,7 @@ def test_the_counts_and_alarms_of_each_plant_are_on_the_page_as_long_as_it_is_wa
     bench.node.on_messages(run, bench.now_ns)
     bench.now_ns += int(QUICK.health_period_s * 1e9)
     for publication in bench.node.on_tick(bench.now_ns):
-        metrics.published(publication)
+        metrics.on_publish(publication)
     shown = {metric.name: metric.samples for metric in metrics.collect()}
     (rows,) = shown["reactorwatch_rows"]
     assert (rows.labels, rows.value) == ({"plant": plant, "node": "monitor"}, len(run) // 3)

@@ -26,7 +26,7 @@ class CutOff(MemoryBus):
         self.seen.append("router" if found else "no router")
         return found
 
-    def recall(self, key_expression: str) -> list[Encoded]:
+    def query_history(self, key_expression: str) -> list[Encoded]:
         self.seen.append(key_expression)
         self.asked.set()
         return []

@@ -11,7 +11,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.runtime.bus_zenoh.bus import most_kept
+from reactorwatch.runtime.bus_zenoh.bus import cache_size
 
 from .fleets import fleet, of_plant
 from .samples import leaking_run, samples
@@ -105,7 +105,7 @@ def test_all_that_publishers_keep_in_full_is_published_with_every_row() -> None:
     time_min, columns = leaking_run(0.0, 1.0, (training_rows + watched_rows) / 10, seed=4)
     for number, message in enumerate(samples(time_min, columns)):
         counts.update(told.key for told in monitor.on_message(message, number * 10**9))
-    kept = {key for key in counts if most_kept(key, CACHE_MESSAGES) == CACHE_MESSAGES}
+    kept = {key for key in counts if cache_size(key, CACHE_MESSAGES) == CACHE_MESSAGES}
     chart = partial(keys.key, "cstr", keys.CHART)
     assert {chart("ewma/T"), chart("shewhart/T"), keys.key("cstr", keys.ESTIMATE, "T")} <= kept
     assert {chart("parameters/T"), keys.key("cstr", keys.MODEL, "T")} <= counts.keys() - kept

@@ -4,7 +4,7 @@ from itertools import combinations_with_replacement
 
 import pytest
 
-from monitor_node.__main__ import MonitorNode, announce
+from monitor_node.__main__ import MonitorNode, declare_tokens
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import PATIENCE_NS
@@ -33,11 +33,11 @@ class Process:
             plants, _, shard = kind.partition(" ")
             self.node = FleetNode(QUICK, FleetConfig(plants=plants, shard=shard), self.bus, start_ns)
         for expression in self.node.tokens:
-            self.bus.watch_alive(expression, lambda token, is_alive: self.on_token(token, is_alive=is_alive))
+            self.bus.subscribe_liveliness(expression, lambda token, is_alive: self.on_token(token, is_alive=is_alive))
         if isinstance(self.node, MonitorNode):
-            announce(self.node, self.bus)
+            declare_tokens(self.node, self.bus)
         else:
-            self.bus.announce(self.node.crew.token)
+            self.bus.declare_token(self.node.crew.token)
 
     def on_token(self, token: str, *, is_alive: bool) -> None:
         self.node.on_alive(token, is_alive, SECOND_NS)
@@ -51,7 +51,7 @@ def start(*kinds: str) -> tuple[list[Process], MemoryBus]:
     """Start a plant and monitors, and let the time pass after which a shard without a monitor counts as gone."""
     exchange = Exchange()
     plant, processes = MemoryBus(exchange), [Process(kind, exchange, at) for at, kind in enumerate(kinds)]
-    plant.announce(keys.key(PLANT, keys.ALIVE, "plant"))
+    plant.declare_token(keys.key(PLANT, keys.ALIVE, "plant"))
     for process in processes:
         process.node.on_tick(PATIENCE_NS)
     return processes, plant
@@ -68,8 +68,8 @@ def test_each_of_two_monitors_of_a_plant_reports_the_other_once(
 ) -> None:
     """Two with the same plants and the same shard are one crew instead, of which one stands by."""
     (first, second), plant = start(*kinds)
-    plant.announce(keys.key(PLANT, keys.ALIVE, "replay"))
-    plant.announce(keys.key("other", keys.ALIVE, "plant"))
+    plant.declare_token(keys.key(PLANT, keys.ALIVE, "replay"))
+    plant.declare_token(keys.key("other", keys.ALIVE, "plant"))
     is_crew = kinds[0] == kinds[1] != SINGLE
     assert (first.watches(), second.watches()) == (True, not is_crew)
     told = lines(capsys, NOTICED)

@@ -257,7 +257,7 @@ def test_served_on_a_bus_it_publishes_its_record_and_then_leaves() -> None:
     heard: list[Encoded] = []
     alive: list[tuple[str, bool]] = []
     listener.subscribe("reactor/**", heard.append)
-    listener.watch_alive("reactor/**", lambda key, is_alive: alive.append((key, is_alive)))
+    listener.subscribe_liveliness("reactor/**", lambda key, is_alive: alive.append((key, is_alive)))
     serve_plant(PlantNode(plant_from(config), config, lambda text: None), config, bus, StopSignal())
     bus.close()
     expected = simulate_record(config)
@@ -280,17 +280,17 @@ def test_it_waits_for_the_nodes_it_was_told_of_and_serves_commands_while_it_runs
     exchange = Exchange()
     operator, bus, monitor = MemoryBus(exchange), MemoryBus(exchange), MemoryBus(exchange)
     stop, plant_alive, first_sample, leak_told = StopSignal(), *(threading.Event() for _ in range(3))
-    operator.watch_alive("reactor/cstr/alive/plant", lambda key, is_alive: plant_alive.set())
+    operator.subscribe_liveliness("reactor/cstr/alive/plant", lambda key, is_alive: plant_alive.set())
     operator.subscribe("reactor/cstr/sample/*", lambda message: first_sample.set())
     operator.subscribe("reactor/cstr/fault/coolant_flow", lambda message: leak_told.set())
     node = PlantNode(plant_from(config), config, lambda text: None)
     with running(lambda: serve_plant(node, config, bus, stop), stop):
         assert plant_alive.wait(WITHIN_S)
         assert not first_sample.is_set()
-        monitor.announce("reactor/cstr/alive/monitor")
+        monitor.declare_token("reactor/cstr/alive/monitor")
         assert first_sample.wait(WITHIN_S)
         question = InjectFault(specification="coolant_flow:step:-0.05")
-        operator.ask(Encoded("reactor/cstr/command/inject_fault", *encode_message(question)), 1.0)
+        operator.query(Encoded("reactor/cstr/command/inject_fault", *encode_message(question)), 1.0)
         assert leak_told.wait(WITHIN_S)
 
 
@@ -301,7 +301,7 @@ def test_asked_to_stop_while_it_waits_it_stops() -> None:
     stop, alive = StopSignal(), threading.Event()
     heard: list[Encoded] = []
     operator.subscribe("reactor/**", heard.append)
-    operator.watch_alive("reactor/cstr/alive/plant", lambda key, is_alive: alive.set())
+    operator.subscribe_liveliness("reactor/cstr/alive/plant", lambda key, is_alive: alive.set())
     node = PlantNode(plant_from(config), config, lambda text: None)
     with running(lambda: serve_plant(node, config, bus, stop), stop):
         assert alive.wait(WITHIN_S)

@@ -47,7 +47,7 @@ HEALTH = messages.Health(node="monitor", heard_from_ns={"T": ZERO_NS + 1, "C": Z
 class Remembering(MemoryBus):
     """A bus whose publishers remember the monitor's report."""
 
-    def recall(self, key_expression: str) -> list[Encoded]:
+    def query_history(self, key_expression: str) -> list[Encoded]:
         assert key_expression == "reactor/cstr/health/**"
         return [encode(Publication("reactor/cstr/health/monitor", HEALTH))]
 
@@ -60,7 +60,7 @@ def past(monkeypatch: pytest.MonkeyPatch) -> Past:
     def answer(request: Request) -> None:
         request.reply(messages.CommandReply(accepted=True, alarms=LISTED))
 
-    MemoryBus(exchange).answer(keys.key("cstr", keys.COMMAND, "list_alarms"), answer)
+    MemoryBus(exchange).declare_queryable(keys.key("cstr", keys.COMMAND, "list_alarms"), answer)
     return ask_for_past(Remembering(exchange), "cstr")
 
 

@@ -11,7 +11,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, decode, encode
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-from reactorwatch.runtime.event_loop import StopSignal, serve
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal
 from recorder.__main__ import begin, files_for
 from recorder.config import RecorderConfig
 from recorder.files import RecordingFiles
@@ -44,7 +44,10 @@ def test_all_that_is_published_is_in_the_file_in_order_and_health_is_in_it_once(
 
     def run() -> None:
         with writer:
-            serve(node, MemoryBus(exchange), stop, subscriptions=(keys.EVERYTHING,), on_ready=ready.set)
+            loop = EventLoop(node, MemoryBus(exchange), stop)
+            loop.subscribe(keys.EVERYTHING)
+            ready.set()
+            loop.run()
 
     plant = MemoryBus(exchange)
     published = [encode(publication) for publication in golden.publications()]
@@ -100,6 +103,8 @@ def test_the_file_is_closed_when_the_loop_ends_by_an_exception(tmp_path: Path) -
     stop = StopSignal()
     message = encode(next(golden.publications()))
     node, writer = node_on(tmp_path / "run.mcap", time.time_ns())
+    loop = EventLoop(node, Broken(Exchange()), stop)
+    loop.subscribe(keys.EVERYTHING)
     with pytest.raises(ConnectionError), writer:
-        serve(node, Broken(Exchange()), stop, subscriptions=(keys.EVERYTHING,))
+        loop.run()
     assert next(read_messages(tmp_path / "run.mcap")).payload == message.payload

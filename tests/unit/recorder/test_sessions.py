@@ -55,8 +55,8 @@ def test_no_sample_is_missing_where_none_is(folder: Path) -> None:
 def test_a_record_has_every_row_in_its_run(folder: Path, tmp_path: Path) -> None:
     record = read_record(folder)
     assert record.rows == 3 * ROWS
-    assert [run.rows for run in record.each_run()] == [ROWS] * 3
-    for number, run in enumerate(record.each_run()):
+    assert [run.rows for run in record.split_runs()] == [ROWS] * 3
+    for number, run in enumerate(record.split_runs()):
         assert np.allclose(np.diff(run.time_min), 0.1)
         assert np.array_equal(run.columns["T"], number + np.arange(ROWS) / 1000)
     assert export_csv(folder, tmp_path / "runs.csv").rows == 3 * ROWS

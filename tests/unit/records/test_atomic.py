@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.atomic import is_full, replacing
+from reactorwatch.records.atomic import atomic_write, is_disk_full
 
 
 def test_the_new_file_takes_the_place_of_the_old_when_the_block_ends(tmp_path: Path) -> None:
     path = tmp_path / "run.csv"
     path.write_text("old")
-    with replacing(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("new")
         assert path.read_text() == "old"
     assert path.read_text() == "new"
@@ -36,14 +36,14 @@ def test_an_exception_leaves_the_old_file_and_nothing_beside_it(
     path.write_text("old")
 
     def fail() -> None:
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text("half")
             temporary.with_name(f"{temporary.name}.part").write_text("of a writer with a name of its own")
             raise error
 
     with pytest.raises(raised, match=said) as caught:
         fail()
-    assert is_full(caught.value) == is_full(error)
+    assert is_disk_full(caught.value) == is_disk_full(error)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -60,14 +60,14 @@ def test_an_exception_leaves_the_old_file_and_nothing_beside_it(
 def test_where_nothing_can_be_written_it_says_so_before_the_work(tmp_path: Path, name: str, said: str) -> None:
     (tmp_path / "a_file").write_text("")
     (tmp_path / "a_folder").mkdir()
-    with pytest.raises(InputError, match=said), replacing(tmp_path / name):
+    with pytest.raises(InputError, match=said), atomic_write(tmp_path / name):
         pytest.fail("the block must not run")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
 def test_a_folder_without_permission_is_an_input_error(tmp_path: Path) -> None:
     tmp_path.chmod(0o500)
-    with pytest.raises(InputError, match="Permission denied"), replacing(tmp_path / "run.csv"):
+    with pytest.raises(InputError, match="Permission denied"), atomic_write(tmp_path / "run.csv"):
         pytest.fail("the block must not run")
 
 
@@ -78,7 +78,7 @@ def test_a_link_stays_and_the_file_that_it_leads_to_is_replaced(tmp_path: Path) 
     link.symlink_to(file)
     dangling.symlink_to(tmp_path / "folder" / "later.csv")
     for path in (link, dangling):
-        with replacing(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text("new")
         assert path.is_symlink()
         assert path.read_text() == "new"
@@ -90,6 +90,6 @@ def test_what_is_no_regular_file_is_never_replaced(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "pipe")
     (tmp_path / "round").symlink_to(tmp_path / "round")
     for name, said in (("pipe", "no regular file"), ("link", "no regular file"), ("round", "symbolic links")):
-        with pytest.raises(InputError, match=said), replacing(tmp_path / name):
+        with pytest.raises(InputError, match=said), atomic_write(tmp_path / name):
             pytest.fail("the block must not run")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "pipe", "round"]

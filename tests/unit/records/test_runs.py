@@ -32,7 +32,7 @@ def test_runs_come_back_from_a_csv_as_they_were(
     write_csv(path, record)
     found = read_csv(path)
     assert (",run\n" in path.read_text()) == (len(times) > 1)
-    assert [item.time_min.tolist() for item in found.each_run()] == [[item / 10 for item in one] for one in times]
+    assert [item.time_min.tolist() for item in found.split_runs()] == [[item / 10 for item in one] for one in times]
     assert np.array_equal(found.columns["C"], record.columns["C"])
 
 

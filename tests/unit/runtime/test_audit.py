@@ -18,7 +18,7 @@ from reactorwatch.contract.messages_pb2 import (
     ShelveAlarm,
 )
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-from reactorwatch.runtime.event_loop import StopSignal, serve
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal
 from reactorwatch.runtime.security.audit import audit
 from tests.running import WITHIN_S, running
 
@@ -89,7 +89,7 @@ class Obedient:
 
 
 def test_a_node_s_loop_publishes_the_record_after_the_answer() -> None:
-    exchange, stop, ready, recorded = Exchange(), StopSignal(), threading.Event(), threading.Event()
+    exchange, stop, recorded = Exchange(), StopSignal(), threading.Event()
     heard: list[Encoded] = []
 
     def on_record(message: Encoded) -> None:
@@ -97,10 +97,10 @@ def test_a_node_s_loop_publishes_the_record_after_the_answer() -> None:
         recorded.set()
 
     MemoryBus(exchange).subscribe("reactor/cstr/audit/**", on_record)
-    bus, command = MemoryBus(exchange), "reactor/cstr/command/pause"
-    with running(lambda: serve(Obedient(), bus, stop, commands=(command,), on_ready=ready.set), stop):
-        assert ready.wait(WITHIN_S)
-        MemoryBus(exchange).ask(asked("pause", ReplayCommand(by="Anna")), WITHIN_S)
+    loop = EventLoop(Obedient(), MemoryBus(exchange), stop)
+    loop.accept_commands("reactor/cstr/command/pause")
+    with running(loop.run, stop):
+        MemoryBus(exchange).query(asked("pause", ReplayCommand(by="Anna")), WITHIN_S)
         assert recorded.wait(WITHIN_S)
     record = decode(heard[0].payload, heard[0].encoding)
     assert isinstance(record, Audit)

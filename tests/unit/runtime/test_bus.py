@@ -53,26 +53,26 @@ def test_a_question_is_answered_by_who_listens_there() -> None:
     def reply(request: Request) -> None:
         request.reply(CommandReply(accepted=True, text=request.question.key))
 
-    server.answer("reactor/cstr/command/*", reply)
-    (answer,) = client.ask(Encoded("reactor/cstr/command/set_input", b"", ""), 1.0)
+    server.declare_queryable("reactor/cstr/command/*", reply)
+    (answer,) = client.query(Encoded("reactor/cstr/command/set_input", b"", ""), 1.0)
     assert CommandReply.FromString(answer.payload).text == "reactor/cstr/command/set_input"
-    assert client.ask(Encoded("reactor/other/command/set_input", b"", ""), 1.0) == []
+    assert client.query(Encoded("reactor/other/command/set_input", b"", ""), 1.0) == []
 
 
 def test_who_does_not_answer_within_the_time_is_not_waited_for_longer() -> None:
     exchange = Exchange()
     server, client = MemoryBus(exchange), MemoryBus(exchange)
-    server.answer("a/*", lambda request: None)
-    server.answer("a/b", lambda request: request.reply(CommandReply(accepted=True, text="here")))
-    (answer,) = client.ask(Encoded("a/b", b"", ""), 0.01)
+    server.declare_queryable("a/*", lambda request: None)
+    server.declare_queryable("a/b", lambda request: request.reply(CommandReply(accepted=True, text="here")))
+    (answer,) = client.query(Encoded("a/b", b"", ""), 0.01)
     assert CommandReply.FromString(answer.payload).text == "here"
 
 
 def test_a_token_is_seen_by_those_who_come_late_and_goes_with_its_bus() -> None:
     exchange, seen = Exchange(), list[tuple[str, bool]]()
     node, watcher = MemoryBus(exchange), MemoryBus(exchange)
-    node.announce("reactor/cstr/alive/monitor")
-    watcher.watch_alive("reactor/cstr/alive/*", lambda key, alive: seen.append((key, alive)))
+    node.declare_token("reactor/cstr/alive/monitor")
+    watcher.subscribe_liveliness("reactor/cstr/alive/*", lambda key, alive: seen.append((key, alive)))
     node.close()
     assert seen == [("reactor/cstr/alive/monitor", True), ("reactor/cstr/alive/monitor", False)]
 
@@ -80,15 +80,15 @@ def test_a_token_is_seen_by_those_who_come_late_and_goes_with_its_bus() -> None:
 def test_who_leaves_the_answer_to_others_is_not_waited_for() -> None:
     exchange = Exchange()
     server, client = MemoryBus(exchange), MemoryBus(exchange)
-    server.answer("a/*", lambda request: request.leave())
-    server.answer("a/b", lambda request: request.reply(CommandReply(accepted=True, text="here")))
-    assert len(client.ask(Encoded("a/b", b"", ""), 3600.0)) == 1
+    server.declare_queryable("a/*", lambda request: request.decline())
+    server.declare_queryable("a/b", lambda request: request.reply(CommandReply(accepted=True, text="here")))
+    assert len(client.query(Encoded("a/b", b"", ""), 3600.0)) == 1
 
 
 def test_a_token_can_be_withdrawn() -> None:
     exchange, seen = Exchange(), list[tuple[str, bool]]()
     node, watcher = MemoryBus(exchange), MemoryBus(exchange)
-    node.announce("reactor/x/alive/monitor")
-    watcher.watch_alive("reactor/*/alive/*", lambda key, alive: seen.append((key, alive)))
-    node.withdraw("reactor/x/alive/monitor")
+    node.declare_token("reactor/x/alive/monitor")
+    watcher.subscribe_liveliness("reactor/*/alive/*", lambda key, alive: seen.append((key, alive)))
+    node.undeclare_token("reactor/x/alive/monitor")
     assert seen == [("reactor/x/alive/monitor", True), ("reactor/x/alive/monitor", False)]

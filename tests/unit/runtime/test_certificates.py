@@ -18,10 +18,10 @@ from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.security.acl import ROLES, access_control
 from reactorwatch.runtime.security.certificates import (
     Identity,
-    authority,
-    common_name_of,
     issue,
+    make_authority,
     read_certificate,
+    read_common_name,
     read_key,
 )
 from reactorwatch.runtime.security.provisioning import make_site
@@ -33,7 +33,7 @@ ENDPOINT = "tls/bus.example:7447"
 
 @pytest.fixture(scope="module")
 def ca() -> Identity:
-    return authority("site", NOW, 100.0)
+    return make_authority("site", NOW, 100.0)
 
 
 def policy(ca: Identity, days: float = 1.0) -> PolicyBuilder:
@@ -62,7 +62,7 @@ def test_who_only_calls_has_a_client_s_certificate_by_its_name(ca: Identity) -> 
     viewer = issue(ca, "a.viewer", NOW, 10.0).certificate
     usage = viewer.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
     assert list(usage) == [ExtendedKeyUsageOID.CLIENT_AUTH]
-    assert common_name_of(viewer) == "a.viewer"
+    assert read_common_name(viewer) == "a.viewer"
 
 
 def test_a_folder_holds_a_certificate_with_its_key_and_the_settings_to_use_them(tmp_path: Path) -> None:

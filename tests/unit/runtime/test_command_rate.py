@@ -4,58 +4,58 @@ import pytest
 
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, ListAlarms
-from reactorwatch.runtime.security.command_rate import ALL, MOST_NAMES, ONE_NAME, CommandRate, sender_of
+from reactorwatch.runtime.security.command_rate import ALL, MAX_NAMES, PER_NAME, CommandRateLimiter, sender_name
 
 SECOND = 1_000_000_000
 
 
-def count_obeyed(rate: CommandRate, names: list[str], now_ns: int = 0) -> int:
+def count_obeyed(rate: CommandRateLimiter, names: list[str], now_ns: int = 0) -> int:
     """Number of the commands that are obeyed."""
-    return sum(rate.refusal(name, now_ns) is None for name in names)
+    return sum(rate.check(name, now_ns) is None for name in names)
 
 
 @pytest.mark.parametrize(
     ("names", "at_once"),
-    [(["Anna"] * 3000, ONE_NAME.at_once), ([str(n) for n in range(3000)], ALL.at_once), ([""] * 3000, ALL.at_once)],
+    [(["Anna"] * 3000, PER_NAME.at_once), ([str(n) for n in range(3000)], ALL.at_once), ([""] * 3000, ALL.at_once)],
     ids=["one name", "made-up names", "questions"],
 )
 def test_of_a_flood_as_many_are_taken_as_may_come_at_once(names: list[str], at_once: float) -> None:
-    assert count_obeyed(CommandRate(), names) == at_once
+    assert count_obeyed(CommandRateLimiter(), names) == at_once
 
 
 def test_over_a_minute_the_rate_is_taken() -> None:
-    rate = CommandRate()
+    rate = CommandRateLimiter()
     obeyed = sum(count_obeyed(rate, ["Anna"] * 50, second * SECOND) for second in range(60))
-    assert obeyed == ONE_NAME.at_once + 59 * ONE_NAME.per_s
+    assert obeyed == PER_NAME.at_once + 59 * PER_NAME.per_s
 
 
 def test_one_person_s_flood_does_not_refuse_another_s_command() -> None:
-    rate = CommandRate()
-    assert count_obeyed(rate, ["Anna"] * 3000) == ONE_NAME.at_once
+    rate = CommandRateLimiter()
+    assert count_obeyed(rate, ["Anna"] * 3000) == PER_NAME.at_once
     assert count_obeyed(rate, ["Ben"]) == 1
 
 
 def test_questions_do_not_refuse_commands() -> None:
-    rate = CommandRate()
+    rate = CommandRateLimiter()
     count_obeyed(rate, [""] * 3000)
     assert count_obeyed(rate, ["Ben"]) == 1
 
 
 def test_a_clock_that_is_set_back_fills_no_bucket_and_ends_the_refusals() -> None:
-    rate = CommandRate()
+    rate = CommandRateLimiter()
     count_obeyed(rate, ["Anna"] * 3000, 1000 * SECOND)
     assert count_obeyed(rate, ["Anna"], 0) == 0
     assert count_obeyed(rate, ["Anna"], SECOND) == 1
 
 
 def test_made_up_names_take_no_memory() -> None:
-    rate = CommandRate()
-    for number in range(3 * MOST_NAMES):
-        rate.refusal(str(number), number * SECOND)
-    assert len(rate._names) == MOST_NAMES
+    rate = CommandRateLimiter()
+    for number in range(3 * MAX_NAMES):
+        rate.check(str(number), number * SECOND)
+    assert len(rate._names) == MAX_NAMES
 
 
 def test_the_sender_is_the_name_in_the_command() -> None:
-    assert sender_of(Encoded("k", *encode_message(AlarmCommand(alarm="x", by=" Anna ")))) == "Anna"
-    assert sender_of(Encoded("k", *encode_message(ListAlarms()))) == ""
-    assert sender_of(Encoded("k", b"?", "text/plain")) == ""
+    assert sender_name(Encoded("k", *encode_message(AlarmCommand(alarm="x", by=" Anna ")))) == "Anna"
+    assert sender_name(Encoded("k", *encode_message(ListAlarms()))) == ""
+    assert sender_name(Encoded("k", b"?", "text/plain")) == ""

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.crash import EXIT_CODE, complain
+from reactorwatch.runtime.crash import EXIT_CODE, print_error
 
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis_node")
@@ -70,5 +70,5 @@ def test_an_error_within_a_process_of_ours_is_one_line(
 
 
 def test_a_complaint_is_one_line_whatever_is_in_it(capsys: pytest.CaptureFixture[str]) -> None:
-    complain("recorder", "a\nb\x1b[31m\udcff")
+    print_error("recorder", "a\nb\x1b[31m\udcff")
     assert capsys.readouterr().err == "recorder: a b\\u001b[31m\\udcff\n"

@@ -8,16 +8,16 @@ import pytest
 
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.delivery import reorder_buffer
-from reactorwatch.runtime.delivery.delivery import Delivery, Numbered
+from reactorwatch.runtime.delivery.delivery import Delivery, SequencedMessage
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from tests.running import WITHIN_S
 
 SECOND = 10**9
 
 
-def message(number: int) -> Numbered:
+def message(number: int) -> SequencedMessage:
     sample = Encoded("reactor/x/sample/T", str(number).encode(), "", time.time_ns())
-    return Numbered(1, number, sample)
+    return SequencedMessage(1, number, sample)
 
 
 def each(heard: "SimpleQueue[Encoded | Gap]") -> Callable[[list[Encoded]], None]:
@@ -37,10 +37,10 @@ def taken(heard: "SimpleQueue[Encoded | Gap]") -> list[str]:
 
 
 def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reorder_buffer, "PATIENCE_NS", 1_000_000)
+    monkeypatch.setattr(reorder_buffer, "TIMEOUT_NS", 1_000_000)
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     delivery = Delivery(each(heard), heard.put)
-    delivery.begin()
+    delivery.start()
     for number in (0, 3):
         delivery.receive([message(number)])
     items = [heard.get(timeout=WITHIN_S) for _ in range(3)]
@@ -52,16 +52,16 @@ def test_a_thread_of_its_own_gives_up_what_never_comes(monkeypatch: pytest.Monke
 
 
 def test_what_is_missing_is_asked_for_before_it_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reorder_buffer, "PATIENCE_NS", 1_000_000)
+    monkeypatch.setattr(reorder_buffer, "TIMEOUT_NS", 1_000_000)
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     asked: list[tuple[str, float]] = []
 
-    def ask(stream: str, since_s: float) -> list[Numbered]:
+    def ask(stream: str, since_s: float) -> list[SequencedMessage]:
         asked.append((stream, since_s))
         return [message(number) for number in (0, 1, 3)]
 
     delivery = Delivery(each(heard), heard.put, ask)
-    delivery.begin()
+    delivery.start()
     delivery.receive([message(0)])
     delivery.receive([message(3)])
     items = [heard.get(timeout=WITHIN_S) for _ in range(4)]
@@ -80,7 +80,7 @@ def test_what_is_missing_is_asked_for_before_it_is_given_up(monkeypatch: pytest.
 def test_what_waits_is_handed_on_when_the_bus_is_closed() -> None:
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     delivery = Delivery(each(heard), heard.put)
-    delivery.begin()
+    delivery.start()
     for number in (0, 3):
         delivery.receive([message(number)])
     delivery.close()
@@ -91,12 +91,12 @@ def test_nothing_goes_on_before_it_is_known_what_was_before() -> None:
     heard: SimpleQueue[Encoded | Gap] = SimpleQueue()
     delivery = Delivery(each(heard), heard.put)
     delivery.receive([message(9)])
-    delivery.tell_last(message(8))
-    delivery.tell(message(7))
-    assert not delivery.is_told()
-    delivery.tell(message(8))
-    assert delivery.is_told()
+    delivery.set_last(message(8))
+    delivery.add_history(message(7))
+    assert not delivery.history_complete()
+    delivery.add_history(message(8))
+    assert delivery.history_complete()
     assert taken(heard) == []
-    delivery.begin()
+    delivery.start()
     assert taken(heard) == ["7", "8", "9"]
     delivery.close()

@@ -17,7 +17,7 @@ class Counts(ctypes.Structure):
 library = ctypes.CDLL(None)
 library.mallinfo2.restype = Counts
 if sys.argv[1] == "limited":
-    assert heap.return_large_blocks()
+    assert heap.release_large_blocks()
 for _ in range(3):
     before = library.mallinfo2().field4  # hblkhd: bytes of blocks that were taken one by one
     block = bytes({2 * LARGE_BYTES})

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, Here, Workers, in_order, workers
-from reactorwatch.runtime.parallel.process_pool import THREADS, LocalWorkers, cores
+from reactorwatch.runtime.parallel.jobs import RETRIES, Executor, Failed, SerialExecutor, choose_executor, in_job_order
+from reactorwatch.runtime.parallel.process_pool import THREADS, ProcessExecutor, available_cores
 from tests.cluster import dask_cluster
 from tests.unit.runtime.work import deadly, linear_algebra_threads, picky, square, unspeakable
 
@@ -29,61 +29,61 @@ def mortal_cluster() -> Iterator[str]:
 
 
 @pytest.fixture(params=["here", "one process", "two processes", "cluster"])
-def anyone(request: pytest.FixtureRequest) -> Workers:
+def anyone(request: pytest.FixtureRequest) -> Executor:
     """Each kind of workers in turn."""
     if request.param == "cluster":
-        return workers(None, request.getfixturevalue("cluster"))
+        return choose_executor(None, request.getfixturevalue("cluster"))
     if request.param == "here":
-        return Here()
-    return LocalWorkers(1 if request.param == "one process" else 2)
+        return SerialExecutor()
+    return ProcessExecutor(1 if request.param == "one process" else 2)
 
 
 @pytest.fixture(params=["two processes", "cluster"])
-def elsewhere(request: pytest.FixtureRequest) -> Workers:
+def elsewhere(request: pytest.FixtureRequest) -> Executor:
     """Each kind of workers that can die without us."""
     if request.param == "cluster":
-        return workers(None, request.getfixturevalue("mortal_cluster"))
-    return LocalWorkers(2)
+        return choose_executor(None, request.getfixturevalue("mortal_cluster"))
+    return ProcessExecutor(2)
 
 
-def test_answers_are_those_of_the_function_in_the_order_of_the_jobs(anyone: Workers) -> None:
-    assert list(in_order(anyone.outcomes(square, range(12)))) == [number**2 for number in range(12)]
+def test_answers_are_those_of_the_function_in_the_order_of_the_jobs(anyone: Executor) -> None:
+    assert list(in_job_order(anyone.map_unordered(square, range(12)))) == [number**2 for number in range(12)]
 
 
-def test_a_job_that_fails_is_told_in_a_line_and_the_others_are_done(anyone: Workers) -> None:
-    first, bad, broken, last = in_order(anyone.outcomes(picky, range(4)))
+def test_a_job_that_fails_is_told_in_a_line_and_the_others_are_done(anyone: Executor) -> None:
+    first, bad, broken, last = in_job_order(anyone.map_unordered(picky, range(4)))
     assert (first, last) == (0, 3)
     assert bad == Failed("x must not be 1, got 1")
     assert isinstance(broken, Failed)
-    assert broken.ours
-    assert broken.reason.startswith("a fault of ours: ZeroDivisionError: by x - 2 (work.py, line ")
+    assert broken.is_internal
+    assert broken.reason.startswith("internal error: ZeroDivisionError: by x - 2 (work.py, line ")
 
 
-def test_no_jobs_have_no_outcomes(anyone: Workers) -> None:
-    assert list(anyone.outcomes(square, [])) == []
+def test_no_jobs_have_no_outcomes(anyone: Executor) -> None:
+    assert list(anyone.map_unordered(square, [])) == []
 
 
-def test_a_worker_that_dies_costs_a_retry(elsewhere: Workers, tmp_path: Path) -> None:
+def test_a_worker_that_dies_costs_a_retry(elsewhere: Executor, tmp_path: Path) -> None:
     jobs = [(number, str(tmp_path), int(number == 2)) for number in range(6)]
-    assert list(in_order(elsewhere.outcomes(deadly, jobs))) == list(range(6))
+    assert list(in_job_order(elsewhere.map_unordered(deadly, jobs))) == list(range(6))
     assert (tmp_path / "deaths-2").read_text() == "x"
 
 
 def test_a_job_that_its_workers_always_die_of_is_given_up_and_the_others_are_done(
-    elsewhere: Workers, tmp_path: Path
+    elsewhere: Executor, tmp_path: Path
 ) -> None:
     jobs = [(number, str(tmp_path), 99 * int(number == 1)) for number in range(6)]
-    found = list(in_order(elsewhere.outcomes(deadly, jobs)))
+    found = list(in_job_order(elsewhere.map_unordered(deadly, jobs)))
     given_up = found.pop(1)
     assert found == [0, 2, 3, 4, 5]
     assert isinstance(given_up, Failed)
     assert given_up.reason.startswith("given up: ")
-    if isinstance(elsewhere, LocalWorkers):
+    if isinstance(elsewhere, ProcessExecutor):
         assert (tmp_path / "deaths-1").read_text() == "x" * (1 + RETRIES)
 
 
 def test_a_result_that_cannot_be_sent_is_a_failure(tmp_path: Path) -> None:
-    found = list(in_order(LocalWorkers(2).outcomes(unspeakable, range(3))))
+    found = list(in_job_order(ProcessExecutor(2).map_unordered(unspeakable, range(3))))
     assert (found[0], found[2]) == (0, 2)
     assert isinstance(found[1], Failed)
 
@@ -91,12 +91,12 @@ def test_a_result_that_cannot_be_sent_is_a_failure(tmp_path: Path) -> None:
 def test_each_process_has_one_thread_of_linear_algebra(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in THREADS:
         monkeypatch.delenv(name, raising=False)
-    assert list(LocalWorkers(1).outcomes(linear_algebra_threads, [0])) == [(0, "1")]
+    assert list(ProcessExecutor(1).map_unordered(linear_algebra_threads, [0])) == [(0, "1")]
 
 
 def test_who_stops_asking_leaves_no_process_behind() -> None:
     before = set(multiprocessing.active_children())  # of a cluster that other tests have, they come and go
-    outcomes = LocalWorkers(2).outcomes(square, range(100))
+    outcomes = ProcessExecutor(2).map_unordered(square, range(100))
     next(outcomes)
     own = {child for child in set(multiprocessing.active_children()) - before if "Dask" not in child.name}
     assert own
@@ -112,16 +112,16 @@ def test_outcomes_wait_for_those_before_them() -> None:
             seen.append(number)
             yield number, "abcd"[number]
 
-    order = in_order(done())
+    order = in_job_order(done())
     assert next(order) == "a"
     assert seen == [2, 0]
     assert [*order] == ["b", "c", "d"]
 
 
 def test_one_process_is_this_one_and_by_default_there_is_one_a_core() -> None:
-    assert isinstance(workers(1), Here)
-    assert isinstance(workers(2), LocalWorkers)
-    assert isinstance(workers(), Here if cores() == 1 else LocalWorkers)
+    assert isinstance(choose_executor(1), SerialExecutor)
+    assert isinstance(choose_executor(2), ProcessExecutor)
+    assert isinstance(choose_executor(), SerialExecutor if available_cores() == 1 else ProcessExecutor)
 
 
 @pytest.mark.parametrize(
@@ -136,14 +136,14 @@ def test_what_cannot_be_is_told_in_a_line(processes: int | None, scheduler: str 
     if scheduler == "here":
         pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
     with pytest.raises(InputError) as told:
-        workers(processes, scheduler)
+        choose_executor(processes, scheduler)
     assert str(told.value) == said
 
 
 def test_without_dask_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"^--scheduler needs Dask: pip install 'reactorwatch\[cluster\]'$"):
-        workers(None, "tcp://127.0.0.1:8786")
+        choose_executor(None, "tcp://127.0.0.1:8786")
 
 
 @pytest.mark.parametrize(
@@ -153,9 +153,9 @@ def test_without_dask_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_workers_with_another_version_or_none_are_told(
     cluster: str, theirs: str | None, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers._asks_for_version", lambda: lambda: theirs)
+    monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers._version_query", lambda: lambda: theirs)
     with pytest.raises(InputError, match=said):
-        list(workers(None, cluster).outcomes(square, range(2)))
+        list(choose_executor(None, cluster).map_unordered(square, range(2)))
 
 
 def test_a_cluster_without_workers_is_told_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -163,11 +163,11 @@ def test_a_cluster_without_workers_is_told_with_the_cure(monkeypatch: pytest.Mon
     with dask_cluster(0) as address:
         said = f"has no workers; start some with: dask worker {address} --nthreads 1"
         with pytest.raises(InputError, match=said):
-            list(workers(None, address).outcomes(square, range(2)))
+            list(choose_executor(None, address).map_unordered(square, range(2)))
 
 
 def test_a_scheduler_that_is_not_there_is_told_by_its_address(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
     monkeypatch.setattr("reactorwatch.runtime.parallel.dask_workers.CONNECT_WITHIN_S", 0.2)
     with pytest.raises(InputError, match=r"^--scheduler tcp://127\.0\.0\.1:1: cannot be reached: "):
-        list(workers(None, "tcp://127.0.0.1:1").outcomes(square, range(2)))
+        list(choose_executor(None, "tcp://127.0.0.1:1").map_unordered(square, range(2)))

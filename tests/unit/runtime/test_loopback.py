@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from reactorwatch.runtime.loopback import LOOPBACK, free_port, keep
+from reactorwatch.runtime.loopback import LOOPBACK, free_port, reserve_port
 from tests.ports import three_free_ports
 
 
@@ -20,7 +20,7 @@ def test_a_port_is_kept_from_who_asks_for_any_and_can_be_had_by_name() -> None:
 
 def test_a_port_that_somebody_listens_at_is_not_kept() -> None:
     with socket.create_server((LOOPBACK, 0)) as server, pytest.raises(OSError, match="in use"):
-        keep(server.getsockname()[1])
+        reserve_port(server.getsockname()[1])
 
 
 def test_three_free_ports_are_kept_for_whoever_asked_first() -> None:

@@ -12,7 +12,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import MetricsConfig, section
 from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.metrics import PORT_AFTER, FleetMetrics, Metrics, served
+from reactorwatch.runtime.metrics import PORT_OFFSET, FleetMetrics, Metrics, serve_metrics
 from tests.ports import three_free_ports
 from tests.running import WITHIN_S
 
@@ -49,7 +49,7 @@ def page(port: int, node: str = "monitor") -> dict[str, float]:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     from prometheus_client.parser import text_string_to_metric_families
 
-    with urlopen(f"http://{LOOPBACK}:{port + PORT_AFTER[node]}/metrics", timeout=WITHIN_S) as answer:
+    with urlopen(f"http://{LOOPBACK}:{port + PORT_OFFSET[node]}/metrics", timeout=WITHIN_S) as answer:
         text = answer.read().decode()
     found = {}
     for family in text_string_to_metric_families(text):
@@ -75,9 +75,9 @@ def alarms() -> list[Alarm]:
 def tell(port: int, alarms: list[Alarm]) -> Iterator[Told]:
     """Publishes as the monitor, whose page is served."""
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    with served(MetricsConfig(port=port), Metrics("R-101", "monitor", lambda: 5_000_000), "monitor") as metrics:
+    with serve_metrics(MetricsConfig(port=port), Metrics("R-101", "monitor", lambda: 5_000_000), "monitor") as metrics:
         assert metrics is not None
-        told = metrics.of(lambda: alarms)
+        told = metrics.observe(lambda: alarms)
         yield lambda message: told(Publication("key", message))
 
 
@@ -136,15 +136,15 @@ def test_the_page_of_a_fleet_has_the_counts_and_alarms_of_each_plant_that_is_wat
 ) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     found: dict[str, list[Alarm] | None] = {"a": alarms, "b": alarms[1:], "c": alarms}
-    with served(MetricsConfig(port=port), FleetMetrics("monitor"), "monitor") as metrics:
+    with serve_metrics(MetricsConfig(port=port), FleetMetrics("monitor"), "monitor") as metrics:
         assert metrics is not None
         for plant in found:
-            metrics.watch(plant, lambda plant=plant: found[plant])  # type: ignore[misc]
-            metrics.published(Publication(f"reactor/{plant}/health/monitor", HEALTH))
-        metrics.published(Publication("reactor/nobody/health/monitor", HEALTH))
-        metrics.leave("c")
+            metrics.add_plant(plant, lambda plant=plant: found[plant])  # type: ignore[misc]
+            metrics.on_publish(Publication(f"reactor/{plant}/health/monitor", HEALTH))
+        metrics.on_publish(Publication("reactor/nobody/health/monitor", HEALTH))
+        metrics.remove_plant("c")
         found["a"] = None  # as they were
-        metrics.published(Publication("reactor/a/health/monitor", Health(received=1001)))
+        metrics.on_publish(Publication("reactor/a/health/monitor", Health(received=1001)))
         shown = page(port)
     received = {name: value for name, value in shown.items() if "messages_received_total" in name}
     assert received == {
@@ -164,15 +164,15 @@ def test_the_page_of_a_fleet_has_so_many_plants_and_one_that_leaves_makes_room(
     port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    monkeypatch.setattr("reactorwatch.runtime.metrics.MOST_SHOWN", 2)
-    with served(MetricsConfig(port=port), FleetMetrics("monitor"), "monitor") as metrics:
+    monkeypatch.setattr("reactorwatch.runtime.metrics.MAX_PLANTS", 2)
+    with serve_metrics(MetricsConfig(port=port), FleetMetrics("monitor"), "monitor") as metrics:
         assert metrics is not None
         for plant in "abc":
-            metrics.watch(plant, lambda: None)
-        metrics.leave("a")
-        metrics.watch("d", lambda: None)
+            metrics.add_plant(plant, lambda: None)
+        metrics.remove_plant("a")
+        metrics.add_plant("d", lambda: None)
         for plant in "abcd":
-            metrics.published(Publication(f"reactor/{plant}/health/monitor", HEALTH))
+            metrics.on_publish(Publication(f"reactor/{plant}/health/monitor", HEALTH))
         rows = [name for name in page(port) if name.startswith("reactorwatch_rows_total")]
     assert rows == [f'reactorwatch_rows_total{{node="monitor",plant="{plant}"}}' for plant in "bd"]
 
@@ -182,19 +182,19 @@ def test_a_disk_that_is_gone_leaves_its_number_out(port: int) -> None:
         raise FileNotFoundError
 
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    with served(MetricsConfig(port=port), Metrics("R-101", "recorder", gone), "recorder"):
+    with serve_metrics(MetricsConfig(port=port), Metrics("R-101", "recorder", gone), "recorder"):
         assert not any("disk" in name for name in page(port, "recorder"))
 
 
 def test_nothing_is_served_unless_asked() -> None:
-    with served(MetricsConfig(), Metrics("R-101", "plant"), "plant") as metrics:
+    with serve_metrics(MetricsConfig(), Metrics("R-101", "plant"), "plant") as metrics:
         assert metrics is None
 
 
 def test_the_page_goes_with_the_node(port: int) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     for _ in range(2):  # the port is free again, too
-        with served(MetricsConfig(port=port), Metrics("R-101", "plant"), "plant"):
+        with serve_metrics(MetricsConfig(port=port), Metrics("R-101", "plant"), "plant"):
             assert page(port, "plant")
     with pytest.raises(OSError, match="refused"):
         page(port, "plant")
@@ -203,7 +203,7 @@ def test_the_page_goes_with_the_node(port: int) -> None:
 def test_a_port_that_is_taken_is_told_with_the_node_and_the_address(port: int) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     with socket.create_server((LOOPBACK, port + 1)):
-        metrics = served(MetricsConfig(port=port), Metrics("R-101", "monitor"), "monitor")
+        metrics = serve_metrics(MetricsConfig(port=port), Metrics("R-101", "monitor"), "monitor")
         said = rf"\[metrics\] port {port}: the monitor cannot listen at 127\.0\.0\.1:{port + 1}: "
         with pytest.raises(InputError, match=said), metrics:
             pass
@@ -211,7 +211,7 @@ def test_a_port_that_is_taken_is_told_with_the_node_and_the_address(port: int) -
 
 def test_without_the_library_the_cure_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
-    metrics = served(MetricsConfig(port=9464), Metrics("R-101", "monitor"), "monitor")
+    metrics = serve_metrics(MetricsConfig(port=9464), Metrics("R-101", "monitor"), "monitor")
     with pytest.raises(InputError, match=r"pip install 'reactorwatch\[metrics\]'"), metrics:
         pass
 

@@ -16,7 +16,7 @@ from plant_node.config import PlantConfig
 from reactorwatch.cli.supervise import diagnosis_settings
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, section
-from reactorwatch.runtime.setting_rules import LONGEST_S, PROTOCOLS, checked_endpoint, choices
+from reactorwatch.runtime.setting_rules import MAX_SPAN_S, PROTOCOLS, check_endpoint, valid_choices
 from recorder.__main__ import black_box_for
 from recorder.config import RecorderConfig, ReplayConfig
 
@@ -79,7 +79,7 @@ SPANS = [(table, name) for table, name in KEYS if re.search(r"(?<!_l)_(s|min|h|d
 @pytest.mark.parametrize(("table", "name"), SPANS)
 def test_no_duration_is_longer_than_146_years(table: str, name: str) -> None:
     given_file = {"file": "run.csv"} if table == "replay" else {}
-    for value in (LONGEST_S * 1.001, 1e300):
+    for value in (MAX_SPAN_S * 1.001, 1e300):
         with pytest.raises(InputError, match=f"{name} must be"):
             section(TABLES[table], table, {table: {**given_file, name: value}}, {})
 
@@ -97,7 +97,7 @@ def test_no_duration_is_longer_than_146_years(table: str, name: str) -> None:
     ],
 )
 def test_an_error_on_a_choice_lists_the_valid_words(table: str, name: str, path: str, word: str) -> None:
-    assert word in choices(TABLES[table], path)
+    assert word in valid_choices(TABLES[table], path)
     value: Any = {"charts": ["foo"], "priorities": {"T": "foo"}}.get(name, "foo")
     with pytest.raises(InputError, match=rf"settings \[{table}\]: .*\(valid: .*\b{word}\b.*\)"):
         section(TABLES[table], table, {table: {name: value}}, {})
@@ -107,7 +107,7 @@ def test_an_error_on_a_choice_lists_the_valid_words(table: str, name: str, path:
 @pytest.mark.parametrize("host", ["127.0.0.1", "router.example", "[::1]"])
 def test_endpoints_of_every_protocol_are_taken(protocol: str, host: str) -> None:
     for port in (1, 7447, 65535):
-        assert checked_endpoint(f"{protocol}/{host}:{port}") == f"{protocol}/{host}:{port}"
+        assert check_endpoint(f"{protocol}/{host}:{port}") == f"{protocol}/{host}:{port}"
 
 
 @pytest.mark.parametrize("key", ["endpoint", "routers"])

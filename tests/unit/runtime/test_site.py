@@ -12,9 +12,9 @@ from cryptography.x509.verification import PolicyBuilder, Store
 
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import BusConfig, read_settings, section
-from reactorwatch.runtime.security.acl import ROLES, access_control, role_of
-from reactorwatch.runtime.security.certificates import common_name_of, read_certificate, read_key
-from reactorwatch.runtime.security.provisioning import LONGEST_PLANT, make_site
+from reactorwatch.runtime.security.acl import ROLES, access_control, parse_common_name
+from reactorwatch.runtime.security.certificates import read_certificate, read_common_name, read_key
+from reactorwatch.runtime.security.provisioning import MAX_PLANT_NAME, make_site
 
 NOW = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 DAY = datetime.timedelta(days=1)
@@ -140,7 +140,7 @@ def test_the_last_plant_that_is_removed_stays_removed(site: Path) -> None:
 @pytest.mark.parametrize(
     ("plants", "endpoint", "listen"),
     [
-        *((("a" * length,), ENDPOINT, None) for length in (LONGEST_PLANT + 1, 64, 65)),
+        *((("a" * length,), ENDPOINT, None) for length in (MAX_PLANT_NAME + 1, 64, 65)),
         *(((name,), ENDPOINT, None) for name in ("ü", "a/b", "", "a b", "a\n", '"', "authority", "..")),
         *((("a",), address, None) for address in ("tls/ü:7447", 'tls/a":7447', "tls/a b:1", "tls/a:0", "tls/a:65536")),
         *((("a",), address, None) for address in ("tls/a\n:1", "tls/[::1:1", "tls/:1", "tls//:1", "tls/a:x", "x")),
@@ -162,7 +162,7 @@ def test_days_that_cannot_be_get_one_line(tmp_path: Path, days: float) -> None:
         make_site(tmp_path / "site", ("a",), ENDPOINT, None, days, NOW)
 
 
-@pytest.mark.parametrize("plant", ["a" * LONGEST_PLANT, "A.b-c_1", "0"])
+@pytest.mark.parametrize("plant", ["a" * MAX_PLANT_NAME, "A.b-c_1", "0"])
 @pytest.mark.parametrize("endpoint", ["tls/[::1]:7447", "tls/bus_1.example:1"])
 def test_settings_are_toml_with_the_names_as_given(tmp_path: Path, plant: str, endpoint: str) -> None:
     make_site(tmp_path, (plant,), endpoint, None, 90.0, NOW)
@@ -202,11 +202,11 @@ def test_certificates_are_renewed_before_they_end_and_keep_their_names(site: Pat
 def test_a_revoked_certificate_is_on_the_routers_list_and_its_holder_has_another(site: Path) -> None:
     names = []
     for _ in range(2):
-        names.append(common_name_of(read_certificate(site / "a" / "monitor" / "certificate.pem")))
+        names.append(read_common_name(read_certificate(site / "a" / "monitor" / "certificate.pem")))
         assert make_site(site, (), None, None, 90.0, NOW, revoke=["a/monitor"]) == [site / "a" / "monitor"]
-    now = common_name_of(read_certificate(site / "a" / "monitor" / "certificate.pem"))
+    now = read_common_name(read_certificate(site / "a" / "monitor" / "certificate.pem"))
     assert len({now, *names}) == 3
-    assert role_of(now) == role_of("a.monitor")
+    assert parse_common_name(now) == parse_common_name("a.monitor")
     make_site(site, ("b",), None, None, 90.0, NOW)
     subjects = {item["id"]: item["cert_common_names"] for item in rules(site)["access_control"]["subjects"]}  # type: ignore[index]
     assert (subjects["a.monitor"], subjects["revoked"]) == ([now], names)

@@ -8,9 +8,9 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.keys import matches
-from reactorwatch.runtime.delivery.delivery import Delivery, Numbered
+from reactorwatch.runtime.delivery.delivery import Delivery, SequencedMessage
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from reactorwatch.runtime.delivery.streams import MOST_CACHED, keys_of, role_of_key, stream_of
+from reactorwatch.runtime.delivery.streams import MAX_CACHED, keys_of, role_of_key, stream_of
 from reactorwatch.runtime.security.acl import ROLES, access_control
 
 ROOT = "reactor/cstr"
@@ -82,10 +82,10 @@ def test_numbers_that_another_role_uses_up_suppress_no_message(intruder: str, *,
         if told_before:
             delivery.receive([(1, 0, Encoded(victim_key, b"", ""))])
             for publisher, number, message in forged:
-                delivery.tell_last(Numbered(publisher, number, message))
-            delivery.begin()
+                delivery.set_last(SequencedMessage(publisher, number, message))
+            delivery.start()
         else:
-            delivery.begin()
+            delivery.start()
             delivery.receive([(1, 0, Encoded(victim_key, b"", ""))])
         delivery.receive(forged)
         delivery.receive([(1, number, Encoded(victim_key, b"", "")) for number in range(1, 6)])
@@ -97,9 +97,9 @@ def test_numbers_that_another_role_uses_up_suppress_no_message(intruder: str, *,
 def test_of_keys_without_number_a_thousand_names_are_kept_and_of_plants_none() -> None:
     """A key may have 65,535 characters, and its sender chooses them."""
     role_of_key.cache_clear()
-    for number in range(2 * MOST_CACHED):
+    for number in range(2 * MAX_CACHED):
         assert stream_of(f"reactor/p{number}/sample/T") == f"reactor/p{number}/sample"
     assert role_of_key.cache_info().currsize == 1
-    for number in range(2 * MOST_CACHED):
+    for number in range(2 * MAX_CACHED):
         assert stream_of(f"reactor/cstr/sample/x{number}") == "reactor/cstr/sample"
-    assert role_of_key.cache_info().currsize == MOST_CACHED == 1000
+    assert role_of_key.cache_info().currsize == MAX_CACHED == 1000

@@ -1,4 +1,4 @@
-"""A file that is to be read, and may not be there."""
+"""Input files."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,8 +8,8 @@ from reactorwatch.errors import InputError
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
-    """While it is opened and read.
+def wrap_read_errors(path: Path) -> Iterator[None]:
+    """Turn the system's errors about a file that is read into an `InputError` of one line.
 
     Raises:
         InputError: there is no such file, or it cannot be read.
@@ -22,6 +22,6 @@ def reading(path: Path) -> Iterator[None]:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def files_of(folder: Path, suffix: str) -> list[Path]:
-    """The files in a folder whose names end in a suffix, be it in capitals, in the order of their names."""
+def list_files(folder: Path, suffix: str) -> list[Path]:
+    """List the files in a folder with a suffix, in any case, in the order of their names."""
     return sorted(path for path in folder.iterdir() if path.suffix.lower() == suffix and path.is_file())

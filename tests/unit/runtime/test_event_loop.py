@@ -11,7 +11,7 @@ import pytest
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply, Health
 from reactorwatch.runtime.bus import Exchange, MemoryBus
-from reactorwatch.runtime.event_loop import StopSignal, serve, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
 from tests.running import WITHIN_S, running
 
 FAR = 10**19
@@ -51,15 +51,11 @@ class Echo:
 
 
 def listening(node: Echo, exchange: Exchange) -> threading.Thread:
-    """The loop of a node that is finished some day; it hears already."""
-    ready = threading.Event()
-    thread = threading.Thread(
-        target=serve,
-        args=(node, MemoryBus(exchange), StopSignal()),
-        kwargs={"subscriptions": ("in/**",), "on_ready": ready.set},
-    )
+    """Start the loop of a node that finishes by itself; it is subscribed on return."""
+    loop = EventLoop(node, MemoryBus(exchange), StopSignal())
+    loop.subscribe("in/**")
+    thread = threading.Thread(target=loop.run)
     thread.start()
-    assert ready.wait(WITHIN_S)
     return thread
 
 
@@ -67,7 +63,7 @@ def test_a_node_that_is_finished_ends_the_loop_with_its_last_words() -> None:
     exchange, said = Exchange(), list[str]()
     MemoryBus(exchange).subscribe("out/*", lambda message: said.append(message.key))
     node = Echo(ticks=3)
-    serve(node, MemoryBus(exchange), StopSignal())
+    EventLoop(node, MemoryBus(exchange), StopSignal()).run()
     assert said == ["out/tick"] * 3 + ["out/stop"]
 
 
@@ -83,15 +79,15 @@ def test_every_message_is_handed_over_in_order() -> None:
 
 
 def test_a_question_is_answered_by_the_loop_of_the_node_while_who_asked_waits() -> None:
-    exchange, stop, ready = Exchange(), StopSignal(), threading.Event()
-    bus = MemoryBus(exchange)
-    with running(lambda: serve(Echo(), bus, stop, commands=("command/*",), on_ready=ready.set), stop):
-        assert ready.wait(WITHIN_S)
-        (answer,) = MemoryBus(exchange).ask(Encoded("command/say", b"heard", ""), WITHIN_S)
+    exchange, stop = Exchange(), StopSignal()
+    loop = EventLoop(Echo(), MemoryBus(exchange), stop)
+    loop.accept_commands("command/*")
+    with running(loop.run, stop):
+        (answer,) = MemoryBus(exchange).query(Encoded("command/say", b"heard", ""), WITHIN_S)
     assert CommandReply.FromString(answer.payload).text == "heard"
 
 
-@pytest.mark.parametrize(("bound", "most"), [("LARGEST_INBOX", 100), ("LARGEST_INBOX_BYTES", 100_000)])
+@pytest.mark.parametrize(("bound", "most"), [("MAX_INBOX_MESSAGES", 100), ("MAX_INBOX_BYTES", 100_000)])
 def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(
     bound: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,7 +115,7 @@ def test_who_publishes_faster_than_a_node_can_hear_is_made_to_wait(
 
 def test_a_stop_wakes_a_loop_that_waits_for_nothing() -> None:
     stop, node = StopSignal(), Echo()
-    thread = threading.Thread(target=serve, args=(node, MemoryBus(Exchange()), stop))
+    thread = threading.Thread(target=EventLoop(node, MemoryBus(Exchange()), stop).run)
     thread.start()
     stop.set()
     thread.join(WITHIN_S)
@@ -129,35 +125,29 @@ def test_a_stop_wakes_a_loop_that_waits_for_nothing() -> None:
 
 def test_what_arrived_before_the_stop_is_still_handled() -> None:
     exchange, stop, node = Exchange(), StopSignal(), Echo()
-    bus, speaker = MemoryBus(exchange), MemoryBus(exchange)
-
-    def arrive_and_stop() -> None:
-        for number in range(1000):
-            speaker.publish(Encoded(f"in/{number}", b"", ""))
-        stop.set()
-
-    serve(node, bus, stop, subscriptions=("in/**",), on_ready=arrive_and_stop)
+    loop, speaker = EventLoop(node, MemoryBus(exchange), stop), MemoryBus(exchange)
+    loop.subscribe("in/**")
+    for number in range(1000):
+        speaker.publish(Encoded(f"in/{number}", b"", ""))
+    stop.set()
+    loop.run()
     assert len(node.heard) == 1000
 
 
 def test_lingering_hears_what_comes_within_it() -> None:
     exchange, stop, node = Exchange(), StopSignal(), Echo()
-    bus, speaker = MemoryBus(exchange), MemoryBus(exchange)
-    said: list[threading.Thread] = []
-
-    def later() -> None:
-        thread = threading.Thread(target=lambda: speaker.publish(Encoded("in/late", b"", "")))
-        said.append(thread)
-        stop.set()
-        thread.start()
-
-    serve(node, bus, stop, subscriptions=("in/**",), on_ready=later, linger_s=1.0)
-    said[0].join()
+    loop = EventLoop(node, MemoryBus(exchange), stop, drain_timeout_s=1.0)
+    loop.subscribe("in/**")
+    thread = threading.Thread(target=lambda: MemoryBus(exchange).publish(Encoded("in/late", b"", "")))
+    stop.set()
+    thread.start()
+    loop.run()
+    thread.join()
     assert [message.key for message in node.heard] == ["in/late"]
 
 
 def test_a_node_that_is_finished_holds_nobody_up_who_still_publishes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("reactorwatch.runtime.event_loop.LARGEST_INBOX", 10)
+    monkeypatch.setattr("reactorwatch.runtime.event_loop.MAX_INBOX_MESSAGES", 10)
     exchange = Exchange()
     node, speaker = Echo(messages=5), MemoryBus(exchange)
     serving = listening(node, exchange)
@@ -175,7 +165,8 @@ def test_a_node_that_is_finished_holds_nobody_up_who_still_publishes(monkeypatch
 
 def test_a_bus_that_never_falls_silent_does_not_keep_a_node_from_ending() -> None:
     exchange, stop, node = Exchange(), StopSignal(), Echo()
-    bus, speaker = MemoryBus(exchange), MemoryBus(exchange)
+    loop, speaker = EventLoop(node, MemoryBus(exchange), stop, drain_timeout_s=0.01), MemoryBus(exchange)
+    loop.subscribe("in/**")
     ended = threading.Event()
 
     def chatter() -> None:
@@ -184,13 +175,10 @@ def test_a_bus_that_never_falls_silent_does_not_keep_a_node_from_ending() -> Non
             time.sleep(0)  # let the loop have its turn
 
     thread = threading.Thread(target=chatter)
-
-    def ready() -> None:
-        thread.start()
-        stop.set()
-
+    thread.start()
+    stop.set()
     try:
-        serve(node, bus, stop, subscriptions=("in/**",), on_ready=ready, linger_s=0.01)
+        loop.run()
     finally:
         ended.set()
         thread.join()
@@ -198,8 +186,7 @@ def test_a_bus_that_never_falls_silent_does_not_keep_a_node_from_ending() -> Non
 
 
 def test_a_question_is_answered_by_the_node() -> None:
-    exchange, stop, node, ready = Exchange(), StopSignal(), Echo(), threading.Event()
-    answered = threading.Event()
+    exchange, stop, answered = Exchange(), StopSignal(), threading.Event()
 
     class Question:
         question = Encoded("command/x", b"hello", "")
@@ -210,10 +197,10 @@ def test_a_question_is_answered_by_the_node() -> None:
             answered.set()
 
     asked = Question()
-    bus = MemoryBus(exchange)
-    with running(lambda: serve(node, bus, stop, commands=("command/*",), on_ready=ready.set), stop):
-        assert ready.wait(WITHIN_S)
-        exchange.answerers[0][2](asked)  # type: ignore[arg-type]
+    loop = EventLoop(Echo(), MemoryBus(exchange), stop)
+    loop.accept_commands("command/*")
+    with running(loop.run, stop):
+        exchange.queryables[0][2](asked)  # type: ignore[arg-type]
         assert answered.wait(WITHIN_S)
     assert asked.answer == CommandReply(accepted=True, text="hello")
 
@@ -230,7 +217,7 @@ def test_a_signal_that_comes_while_the_main_thread_holds_a_lock_still_wakes_who_
             woken.set()
 
     with stop_on_signals() as stop:
-        stop.wakes(wake)
+        stop.call_on_set(wake)
         with lock:
             signal.raise_signal(number)
             assert not woken.is_set()
@@ -248,7 +235,7 @@ def test_a_signal_that_the_waiting_main_thread_does_not_notice_stops_it(number: 
         signal.pthread_kill(threading.get_ident(), number)
 
     with stop_on_signals() as stop:
-        stop.wakes(woken.set)
+        stop.call_on_set(woken.set)
         taker = threading.Thread(target=take_the_signal)
         taker.start()
         waits.set()
@@ -264,33 +251,30 @@ def test_signals_are_handled_as_before_once_the_context_is_left() -> None:
     assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
 
 
-class Gathering(MemoryBus):
+class Batched(MemoryBus):
     """A bus that hands over whatever a test gives it."""
 
-    def gather(self, key_expression: str, handler: Callable[[list[Encoded]], None], **_others: Any) -> None:
+    def subscribe_batched(self, key_expression: str, handler: Callable[[list[Encoded]], None], **_others: Any) -> None:
         self.hand_over = handler
 
 
-@pytest.mark.parametrize(("bound", "most"), [("LARGEST_INBOX", 100), ("LARGEST_INBOX_BYTES", 100_000)])
+@pytest.mark.parametrize(("bound", "most"), [("MAX_INBOX_MESSAGES", 100), ("MAX_INBOX_BYTES", 100_000)])
 def test_messages_that_come_together_are_bounded_likewise(
     bound: str, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(f"reactorwatch.runtime.event_loop.{bound}", most)
     count, handled, ahead = 5000, [0], [0]
-    bus, stop, ready = Gathering(Exchange()), StopSignal(), threading.Event()
+    bus, stop = Batched(Exchange()), StopSignal()
 
-    def on_messages(messages: list[Encoded], _now_ns: int) -> list[Publication]:
+    def on_batch(messages: list[Encoded], _now_ns: int) -> list[Publication]:
         sum(range(20_000))
         handled[0] += len(messages)
         return []
 
-    thread = threading.Thread(
-        target=serve,
-        args=(Echo(), bus, stop),
-        kwargs={"subscriptions": ("in/**",), "on_messages": on_messages, "on_ready": ready.set},
-    )
+    loop = EventLoop(Echo(), bus, stop)
+    loop.subscribe("in/**", on_batch=on_batch)
+    thread = threading.Thread(target=loop.run)
     thread.start()
-    assert ready.wait(WITHIN_S)
     for number in range(0, count, 10):
         bus.hand_over([Encoded(f"in/{number}", bytes(1000), "")] * 10)
         ahead[0] = max(ahead[0], number + 10 - handled[0])
@@ -302,37 +286,29 @@ def test_messages_that_come_together_are_bounded_likewise(
 
 
 def test_messages_are_handed_over_together_in_their_order_and_tokens_as_they_come_and_go() -> None:
-    exchange, ready, stop = Exchange(), threading.Event(), StopSignal()
+    exchange, stop = Exchange(), StopSignal()
     node, speaker = Echo(), MemoryBus(exchange)
     heard, alive = list[str](), list[tuple[str, bool]]()
 
-    def on_messages(messages: list[Encoded], _now_ns: int) -> list[Publication]:
+    def on_batch(messages: list[Encoded], _now_ns: int) -> list[Publication]:
         heard.extend(message.key for message in messages)
         return []
 
-    def on_alive(token: str, is_alive: bool, _now_ns: int) -> list[Publication]:
+    def on_token(token: str, is_alive: bool, _now_ns: int) -> list[Publication]:
         alive.append((token, is_alive))
         if not is_alive:
             stop.set()
         return []
 
-    thread = threading.Thread(
-        target=serve,
-        args=(node, MemoryBus(exchange), stop),
-        kwargs={
-            "subscriptions": ("in/**",),
-            "on_messages": on_messages,
-            "tokens": ("alive/*",),
-            "on_alive": on_alive,
-            "on_ready": ready.set,
-        },
-    )
+    loop = EventLoop(node, MemoryBus(exchange), stop)
+    loop.subscribe("in/**", on_batch=on_batch)
+    loop.subscribe_liveliness("alive/*", on_token=on_token)
+    thread = threading.Thread(target=loop.run)
     thread.start()
-    assert ready.wait(WITHIN_S)
     for number in range(1000):
         speaker.publish(Encoded(f"in/{number}", b"", ""))
-    speaker.announce("alive/x")
-    speaker.withdraw("alive/x")
+    speaker.declare_token("alive/x")
+    speaker.undeclare_token("alive/x")
     thread.join(WITHIN_S)
     assert not thread.is_alive()
     assert heard == [f"in/{number}" for number in range(1000)]
