@@ -46,7 +46,7 @@ bench: $(READY) ## speed, as ratios measured in one run
 faults: $(READY) ## the watch on a bank of faults, against an oracle and the report's method: most of an hour
 	@$(BIN)/python benchmarks/fault_bank.py --write docs/fault_bank.md
 
-study: $(READY) ## the diagnosis on records with something hidden in them; writes its tables into docs/diagnosis.md: hours
+study: $(READY) ## the diagnosis on records with something hidden in them; writes its tables into docs/diagnosis_study.md: hours
 	@$(BIN)/python benchmarks/diagnosis_study.py --write
 
 kills: $(READY) ## kill a recorder fifty times under load, and count what is missing: three minutes
