@@ -6,8 +6,8 @@ diagnosis does not use (`tests/hidden_effect/`), diagnosed in parallel, and held
     python benchmarks/diagnosis_study.py [--quick] [--records N] [--jobs N] [--scheduler ADDRESS] [--classes NAME ...]
                                          [--seed N] [--json FILE] [--from FILE ...] [--write]
 
-`--write` writes the tables into docs/diagnosis_study.md. All classes take hours; one after the other, each with `--json`, they
-can be put together by `--from`.
+`--write` writes the tables into docs/diagnosis_study.md. All classes take hours; one after the other, each with
+`--json`, they can be put together by `--from`.
 """
 
 import argparse
@@ -42,12 +42,12 @@ the hidden causes in `tests/hidden_effect/catalogue.py`.
 
 {main}
 
-- *first*: exactly the hidden causes are named. *listed*: they are named, or among the alternatives. *list*: the number of
-  explanations listed. *wrong*: something is claimed that is not there.
+- *first*: exactly the hidden causes are named. *listed*: they are named, or among the alternatives. *list*: the number
+  of explanations listed. *wrong*: something is claimed that is not there.
 - *place*: the location is right. *curve*: error of the whole profile, whatever its name.
 - *held-out T*: the simulation error on rows that the fit did not see, over the noise that was drawn in those very rows
   (median / 90 %). Over the noise's standard deviation it scatters, because few rows are held out of a short record:
-  `/ its sd` is that ratio, *the truth's* the same of the plant itself, and *before* of the simulation without the cause.
+  `/ its sd` is that ratio, *the truth's* the same of the plant itself, *before* of the simulation without the cause.
 
 ### Confusion table
 
@@ -140,7 +140,8 @@ def section(found: dict[str, list[Judged]], seed: int) -> str:
     missed = failures(found)
     if missed:
         lines = "\n".join(f"- {line}" for line in missed)
-        text += f"\n<details><summary>Records whose cause was not named ({len(missed)})</summary>\n\n{lines}\n\n</details>\n"
+        summary = f"Records whose cause was not named ({len(missed)})"
+        text += f"\n<details><summary>{summary}</summary>\n\n{lines}\n\n</details>\n"
     return text
 
 
