@@ -4,16 +4,16 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-# bytecode is kept: without it each of the processes that tests start compiles every module again
+# keep bytecode: without it each process that tests start compiles every module again
 unexport PYTHONDONTWRITEBYTECODE
 # each has a target of its own
 LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py)
 READY := .venv/.ready
 
-help: ## what there is to make
+help: ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## / \t/' | expand -t 12
 
-setup: $(READY) ## create .venv with everything in it, and compile the numerical kernels
+setup: $(READY) ## create .venv, and compile the numerical kernels
 
 $(READY): pyproject.toml
 	@if command -v uv >/dev/null 2>&1; then \
@@ -27,13 +27,13 @@ $(READY): pyproject.toml
 	@$(BIN)/reactorwatch compile
 	@touch $@
 
-demo: $(READY) ## run a reactor with a fault in it, watch, record and draw it
+demo: $(READY) ## run a reactor with a fault, watch, record and draw it
 	@$(BIN)/reactorwatch demo
 
 test: $(READY) ## all tests
 	@$(BIN)/python -m pytest --numprocesses auto --dist loadgroup
 
-lint: $(READY) ## style, types, and who may import whom
+lint: $(READY) ## style, types, and layers of imports
 	@$(BIN)/ruff format --check .
 	@$(BIN)/ruff check .
 	@$(BIN)/mypy
@@ -43,10 +43,10 @@ bench: $(READY) ## speed, as ratios measured in one run
 	@for file in $(filter-out $(LONG_STUDIES),$(wildcard benchmarks/[a-z]*.py)); do \
 		echo "== $$file"; $(BIN)/python $$file || exit 1; done
 
-faults: $(READY) ## the watch on a bank of faults, against an oracle and the report's method: most of an hour
+faults: $(READY) ## detection delays on a bank of faults, beside an oracle and the report's method: most of an hour
 	@$(BIN)/python benchmarks/fault_bank.py --write docs/fault_bank.md
 
-study: $(READY) ## the diagnosis on records with something hidden in them; writes its tables into docs/diagnosis.md: hours
+study: $(READY) ## the diagnosis of hidden causes; writes its tables into docs/diagnosis_study.md: hours
 	@$(BIN)/python benchmarks/diagnosis_study.py --write
 
 kills: $(READY) ## kill a recorder fifty times under load, and count what is missing: three minutes
@@ -55,10 +55,10 @@ kills: $(READY) ## kill a recorder fifty times under load, and count what is mis
 cuts: $(READY) ## cut links and kill routers under load for up to 30 seconds, and count what is missing: five minutes
 	@$(BIN)/python benchmarks/link_cuts.py
 
-fuzz: $(READY) ## 200,000 strange messages, commands, states and settings: nothing falls over, no alarm; two minutes
+fuzz: $(READY) ## 200,000 random messages, commands, states and settings: no failure, no alarm; two minutes
 	@$(BIN)/python benchmarks/fuzz.py
 
-soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10 PLANTS=200 SEED=): what is missing or told twice
+soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10 PLANTS=200 SEED=): what is missing or repeated
 	@$(BIN)/python -m benchmarks.soak $(or $(MINUTES),10) $(or $(PLANTS),200) $(SEED)
 
 pictures: $(READY) ## the pictures of README and docs, and docs/study.md, from real runs

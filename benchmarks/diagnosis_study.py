@@ -6,8 +6,8 @@ diagnosis does not use (`tests/hidden_effect/`), diagnosed in parallel, and held
     python benchmarks/diagnosis_study.py [--quick] [--records N] [--jobs N] [--scheduler ADDRESS] [--classes NAME ...]
                                          [--seed N] [--json FILE] [--from FILE ...] [--write]
 
-`--write` puts the tables into docs/diagnosis.md. All classes take hours; one after the other, each with `--json`, they
-can be put together by `--from`.
+`--write` writes the tables into docs/diagnosis_study.md. All classes take hours; one after the other, each with
+`--json`, they can be put together by `--from`.
 """
 
 import argparse
@@ -31,27 +31,27 @@ from tests.hidden_effect.judge import Judged, failed, judge
 
 RECORDS, NOMINAL_RECORDS, QUICK_RECORDS = 96, 330, 13
 FIRST_SEED = 10_000_000
-PAGE = Path(__file__).parents[1] / "docs" / "diagnosis.md"
+PAGE = Path(__file__).parents[1] / "docs" / "diagnosis_study.md"
 BEGIN, END = "<!-- made by make study: begin -->", "<!-- made by make study: end -->"
 
-TEMPLATE = """## How well it finds what is hidden
+TEMPLATE = """## Results
 
 Made by `make study`, from seeds of {seed} on. Every record is drawn from a seed, made by equations and a solver that
-the diagnosis does not use, and held against the truth. The classes are in `benchmarks/hidden/classes.py`; how large
-what is hidden is, in `tests/hidden_effect/catalogue.py`.
+the diagnosis does not use, and compared with the truth. The classes are in `benchmarks/hidden/classes.py`, the sizes of
+the hidden causes in `tests/hidden_effect/catalogue.py`.
 
 {main}
 
-*first*: exactly what is hidden is named. *listed*: it is named, or among the alternatives. *list*: how many
-explanations are on it. *wrong*: something is claimed that is not there. *place*: the location is right. *curve*: of the
-whole course, whatever its profile is called. *held-out T*: the free run's error on rows that the fit did not see, over
-the noise that was drawn in those very rows (median / 90 %). Over the noise's standard deviation it scatters, whatever
-was found, because few rows are held out of a short record: `/ its sd` is that, *the truth's* the same of the plant
-itself, and *before* of the simulation that lacks the cause.
+- *first*: exactly the hidden causes are named. *listed*: they are named, or among the alternatives. *list*: the number
+  of explanations listed. *wrong*: something is claimed that is not there.
+- *place*: the location is right. *curve*: error of the whole profile, whatever its name.
+- *held-out T*: the simulation error on rows that the fit did not see, over the noise that was drawn in those very rows
+  (median / 90 %). Over the noise's standard deviation it scatters, because few rows are held out of a short record:
+  `/ its sd` is that ratio, *the truth's* the same of the plant itself, *before* of the simulation without the cause.
 
-### What each cause was called
+### Confusion table
 
-Over all classes in which one cause is hidden, or none.
+All classes with one hidden cause, or none.
 
 {confusion}
 """
@@ -140,7 +140,8 @@ def section(found: dict[str, list[Judged]], seed: int) -> str:
     missed = failures(found)
     if missed:
         lines = "\n".join(f"- {line}" for line in missed)
-        text += f"\n<details><summary>Where it was not named ({len(missed)})</summary>\n\n{lines}\n\n</details>\n"
+        summary = f"Records whose cause was not named ({len(missed)})"
+        text += f"\n<details><summary>{summary}</summary>\n\n{lines}\n\n</details>\n"
     return text
 
 

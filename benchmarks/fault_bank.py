@@ -44,7 +44,7 @@ HEAD = """# The watch on a bank of faults
 
 Sixteen faults in three sizes and twenty runs each, watched by the monitor as it is configured by default, by an oracle
 that knows the fault, and by the report's method (3 sigma on ARX and on OE residuals) with limits widened to the same
-rate of false alarms, and at its own. `make faults` makes this page anew; [watching](watching.md) says what it means.
+rate of false alarms, and at its own. `make faults` writes this page; [watching.md](watching.md) explains it.
 """
 
 Result = TypeVar("Result")

@@ -21,7 +21,7 @@ from monitor_node.replay.backtest import run as run_backtest
 from reactorwatch.cli.read_record import DEFAULT_PLANT
 from reactorwatch.cli.read_record import record as read_file
 from reactorwatch.cli.reports import backtest_object, backtest_text, priority_word
-from reactorwatch.cli.simulation import free_run
+from reactorwatch.cli.simulation import simulate_along
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
@@ -36,7 +36,7 @@ from reactorwatch.process import MODELS, effects_of
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.atomic import replacing
+from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.record import Record, to_minutes, to_time_ns
 from reactorwatch.runtime.model_file import read_extended_model
 from reactorwatch.spc.charts import catalogue as charts
@@ -111,7 +111,7 @@ def simulate(record: Record, process: ProcessLike = "cstr", faults: Sequence[str
     Raises:
         InputError: the record cannot drive the model, or a specification is malformed.
     """
-    return free_run(record, _model_of(process, record), list(faults))
+    return simulate_along(record, _model_of(process, record), list(faults))
 
 
 def identify(
@@ -185,7 +185,7 @@ class DiagnosisResult(Diagnosis):
 
         names = (self.record.name, "extended.json", "experiment.csv")
         page = as_page(self, self.model, effects_of(self.model), *names, on_the_bus=False)
-        with replacing(Path(file)) as temporary:
+        with atomic_write(Path(file)) as temporary:
             temporary.write_text(page, encoding="utf-8")
 
 

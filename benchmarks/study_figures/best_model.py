@@ -82,8 +82,8 @@ class ThirdOrder:
         """The count in words."""
         return (
             f"**Is the third order best?** Of {self.of} comparisons of the orders (record, output, ARX or OE) it has "
-            f"the best one-step fit in {self.one_step}, the lowest BIC in {self.bic}, the best free run in "
-            f"{self.best_run}; its free run is better than the next by more than {EQUAL_PERCENT} points in "
+            f"the best one-step fit in {self.one_step}, the lowest BIC in {self.bic}, the best simulation in "
+            f"{self.best_run}; its simulation is better than the next by more than {EQUAL_PERCENT} points in "
             f"{self.clearly}, worse than the best by as much in {self.worse}."
         )
 
@@ -127,10 +127,10 @@ def _why(
         return " and ".join(f"{gains[family, output]:+.2f} in {output}" for output in OUTPUTS)
 
     text = (
-        f"What the third order adds to the second's free run, in points: ARX with noise {said(with_noise, 'arx')}, "
-        f"without noise {said(without, 'arx')}; OE with noise {said(with_noise, 'oe')}, without "
-        f"{said(without, 'oe')}; where the plant is nearly linear ARX {said(nearly_linear, 'arx')}, OE "
-        f"{said(nearly_linear, 'oe')}."
+        f"What the third order adds to the second's simulation fit, in points: ARX with noise "
+        f"{said(with_noise, 'arx')}, without noise {said(without, 'arx')}; OE with noise "
+        f"{said(with_noise, 'oe')}, without {said(without, 'oe')}; where the plant is nearly linear ARX "
+        f"{said(nearly_linear, 'arx')}, OE {said(nearly_linear, 'oe')}."
     )
     helps_arx = all(with_noise["arx", output] > EQUAL_PERCENT for output in OUTPUTS)
     helps_else = any(gains["oe", output] > EQUAL_PERCENT for gains in (with_noise, without) for output in OUTPUTS)
@@ -150,7 +150,7 @@ def _bars(axes: Axes, selection: Selection, title: str) -> None:
         steps = [candidate.one_step_percent for candidate in of_family]
         bars = axes.bar(
             x, np.maximum(np.nan_to_num(runs, neginf=0.0), 0.0), 0.92 * width, color=_COLOURS[family],
-            label=f"{_TITLES[family]}, free run",
+            label=f"{_TITLES[family]}, simulation",
         )  # fmt: skip
         said = [f"{run:.0f}" if np.isfinite(run) else "away" for run in runs]
         axes.bar_label(bars, said, fontsize=8.5, label_type="center", color="white" if family == "arx" else "black")
@@ -166,7 +166,7 @@ def _bars(axes: Axes, selection: Selection, title: str) -> None:
 
 def _table(selections: list[Selection]) -> str:
     lines = [
-        "| model | order | C one step, % | C free run, % | C BIC | T one step, % | T free run, % | T BIC |",
+        "| model | order | C one step, % | C simulation, % | C BIC | T one step, % | T simulation, % | T BIC |",
         "|---|---|---|---|---|---|---|---|",
     ]
     for pair in zip(*(selection.candidates for selection in selections), strict=True):

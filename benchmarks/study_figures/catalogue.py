@@ -87,19 +87,19 @@ FIGURES: tuple[Figure, ...] = (
     ),
     Figure(
         14,
-        "ARX models of orders 1 to 3, one step ahead",
+        "ARX models of orders 1 to 3, one-step-ahead prediction",
         "Fits ARX models of order 1, 2 and 3 by least squares; the third order is said to be best.",
         model_fits.arx_one_step,
     ),
     Figure(
         15,
-        "ARX models of orders 1 to 3, running freely",
+        "ARX models of orders 1 to 3, simulation",
         "As figure 14, the models left to run on their own outputs; the third order is said to be best.",
         model_fits.arx_free_run,
     ),
     Figure(
         16,
-        "Output-error models of orders 1 to 3, running freely",
+        "Output-error models of orders 1 to 3, simulation",
         "Fits output-error models of order 1, 2 and 3; the third order is said to be best.",
         model_fits.oe_free_run,
     ),

@@ -57,7 +57,8 @@ def _draw(study: Study, drawing: Drawing, family: str, free: bool) -> Finding:
     legend_below(drawing, axes[0], 4)
     best = {output: max(ORDERS, key=lambda order: fits[order, output]) for output in OUTPUTS}
     if free:
-        head = f"| order | C | T | C after the first {_SETTLED_MIN:g} min | T likewise |\n|---|---|---|---|---|"
+        later = f"after the first {_SETTLED_MIN:g} min"
+        head = f"| order | C | T | C {later} | T {later} |\n|---|---|---|---|---|"
     else:
         head = "| order | C | T |\n|---|---|---|"
     tables = (fits, settled) if free else (fits,)
@@ -67,14 +68,14 @@ def _draw(study: Study, drawing: Drawing, family: str, free: bool) -> Finding:
     )
     text = (
         f"Fitted to the first half, shown and measured on the second: {study.source}. "
-        f"{'Free run' if free else 'One-step prediction'}, 100 % is perfect, 0 % is as good as the mean:\n\n"
+        f"{'Simulation' if free else 'One-step-ahead prediction'}, 100 % is perfect, 0 % is as good as the mean:\n\n"
         f"{head}\n{rows}\n\n"
         f"Best for C is order {best['C']}, by {_lead(fits, 'C'):.2f} points; for T order {best['T']}, by "
         f"{_lead(fits, 'T'):.2f}."
     )
     if free:
         text += (
-            " A free run starts from measured rows, whose errors show in its first minutes; without these the "
+            " A simulation starts from measured rows, whose errors show in its first minutes; without these the "
             f"third order is ahead of the best of the others by {_third_lead(settled, 'C'):+.2f} points for C and "
             f"{_third_lead(settled, 'T'):+.2f} for T."
         )

@@ -8,14 +8,14 @@ from benchmarks.study_figures.figure import Figure, Finding
 FOLDER = "study"
 """Of the pictures, beside the page."""
 
-_HEAD = """# The report's figures, made anew
+_HEAD = """# The report's figures, reproduced
 
 The work that this project starts from is a report on watching this reactor by its model. We do not have the report
 itself: its figures 4 to 20 are reproduced here by subject, from the description of that work, in the report's order,
 and the figure numbers are those of this study's own mapping.
 
 All numbers and pictures on this page were computed by one run of `reactorwatch reproduce -o DIR --seed {seed}`; no
-number that was found is typed in. {source}
+result is typed in. {source}
 """
 
 _OWN = "Every record in it is simulated by this software, so anyone can run it again."

@@ -19,7 +19,8 @@ from .given import Files
 from .machine import Machine
 from .pages import PAGES, ROOT, Block, blocks, inline_commands, words
 
-DOCUMENTS = [*PAGES, ROOT / "CHANGELOG.md", *sorted((ROOT / "docs" / "decisions").glob("*.md"))]
+DECISIONS = sorted((ROOT / "docs" / "decisions").glob("*.md"))
+DOCUMENTS = [*PAGES, ROOT / "CHANGELOG.md", ROOT / "tests" / "README.md", *DECISIONS]
 JOINS_THE_BUS = (
     *("up", "demo", "plant", "monitor", "record", "replay", "router"),
     *("view", "alive", "doctor", "status", "alarm", "playback"),

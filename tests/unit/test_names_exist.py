@@ -9,9 +9,11 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis", "benchmarks", "tests")
+PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis_node", "benchmarks", "tests")
 FOLDERS = (*PACKAGES, "docs", "deploy")
-DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")])
+DOCUMENTS = sorted(
+    [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "tests" / "README.md", *(ROOT / "docs").rglob("*.md")]
+)
 
 FILE = re.compile(r"(?<![\w./-])[\w./-]*\w\.(?:py|md|proto|service|yml)\b(?!\.)")
 """Endings of files of this repository; settings and recordings are the users'."""
