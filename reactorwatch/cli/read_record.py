@@ -113,10 +113,10 @@ def stands_for(folder: Path) -> list[Path]:
     Raises:
         InputError: there is neither in it.
     """
-    from recorder.storage.mcap_writer import NUMBER
+    from recorder.storage.mcap_writer import FILE_INDEX
     from recorder.tools.mcap_file import read_metadata
 
-    of_a_piece = {NUMBER, "cut", "merged"}
+    of_a_piece = {FILE_INDEX, "cut", "merged"}
     records, recordings = (files_of(folder, suffix) for suffix in (".csv", ".mcap"))
     if not records and not recordings:
         raise InputError(f"{folder}: holds no record (.csv) and no recording (.mcap)")
