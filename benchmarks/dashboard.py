@@ -24,7 +24,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
 from reactorwatch.records.record import UNITS
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter, read_messages
 
 SAMPLES = 1_000_000
@@ -71,7 +71,7 @@ def record(path: Path, publications: Iterator[Publication]) -> int:
     with RecordingWriter(path, {}) as writer:
         for number, publication in enumerate(publications, start=1):
             key, payload, encoding, _ = encode(publication)
-            writer.write(Entry(key, payload, encoding, number * 1000, publication.message.time_ns))
+            writer.write(RecordedMessage(key, payload, encoding, number * 1000, publication.message.time_ns))
     return number
 
 

@@ -31,10 +31,10 @@ from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
-from recorder.__main__ import begin, files_for
+from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.policy.rotation import Fsync
 from recorder.storage.part_file import PartFile
 from recorder.tools.mcap_file import RecordingWriter, read_messages, read_metadata, read_record
@@ -100,7 +100,7 @@ def through_a_router(folder: Path, sent: list[Encoded], rate_per_s: float | None
     return rate, sum("/sample/" in entry.key for entry in entries) / len(sent), longest_s
 
 
-def bare_write(path: Path, entries: list[Entry]) -> None:
+def bare_write(path: Path, entries: list[RecordedMessage]) -> None:
     """The library alone: one schema, a channel a key."""
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -121,7 +121,7 @@ def record(path: Path, sent: list[Encoded]) -> None:
         for number, message in enumerate(sent):
             kept = core.on_message(message, number)
             assert kept is not None
-            writer.write(kept.entry, readable=kept.readable)
+            writer.write(kept.recorded, readable=kept.is_readable)
 
 
 def exhaust(items: Iterable[Any]) -> None:
@@ -143,7 +143,7 @@ def rate_of(work: Any) -> float:
 def files(folder: Path) -> None:
     """Writing and reading, over the bare library."""
     sent = samples(MESSAGES)
-    entries = [Entry(*item[:3], number, number) for number, item in enumerate(sent)]
+    entries = [RecordedMessage(*item[:3], number, number) for number, item in enumerate(sent)]
     bare, ours = folder / "bare.mcap", folder / "ours.mcap"
 
     def write_ours() -> None:
@@ -188,8 +188,8 @@ def fsync(folder: Path) -> None:
         config = RecorderConfig(out=str(folder / f"{policy}.mcap"), fsync=policy)
         Timed.waits_s.clear()
         start = time.perf_counter()
-        with files_for(config, Timed) as recorded:
-            node = begin(config, recorded, 0)
+        with open_files(config, Timed) as recorded:
+            node = start_node(config, recorded, 0)
             for number, message in enumerate(sent):
                 node.on_message(message, number * step_ns)
         took_ms = (time.perf_counter() - start) * 1e3 / FSYNC_SECONDS

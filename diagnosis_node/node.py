@@ -24,7 +24,7 @@ from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, stop_on_signals
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.storage.mcap_writer import RecordingWriter
 
 log = structlog.get_logger()
@@ -79,7 +79,9 @@ class Diagnoses:
         about = {"plant": self._config.plant, "alarm": asked.alarm, "raised_ns": str(asked.raised_ns)}
         with atomic_write(folder / RECORDING) as temporary, RecordingWriter(temporary, about) as writer:
             for time_ns, item in asked.samples:
-                writer.write(Entry(item.key, item.payload, item.encoding, item.received_ns or time_ns, time_ns))
+                writer.write(
+                    RecordedMessage(item.key, item.payload, item.encoding, item.received_ns or time_ns, time_ns)
+                )
         return folder
 
     def _free_folder(self, raised_ns: int) -> Path:

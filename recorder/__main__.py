@@ -20,19 +20,19 @@ from reactorwatch.runtime.node_main import main
 from recorder.config import RecorderConfig
 from recorder.core import NODE, Recorder
 from recorder.files import RecordingFiles
-from recorder.node import Decisions, RecorderNode
+from recorder.node import Policies, RecorderNode
 from recorder.policy.black_box import BlackBox
-from recorder.policy.latched import Head
+from recorder.policy.channel_budget import ChannelBudget
+from recorder.policy.file_names import FileNames
+from recorder.policy.latched import LatchedMessages
 from recorder.policy.own_alarms import COMMANDS, PRIORITIES
 from recorder.policy.retention import DAY_NS, Limits
-from recorder.policy.room import Room
-from recorder.policy.rotation import Filing
-from recorder.policy.series import Series
+from recorder.policy.rotation import FlushAndRotation
 from recorder.storage.ages import BootClock, read_boot_clock
 from recorder.storage.part_file import PartFile
 
 HISTORY_MARGIN_NS = 10_000_000_000
-"""Between a message's publication, by which the bus knows how old it is, and its receipt, by which a file does."""
+"""Largest delay from publication, which dates a message on the bus, to receipt, which dates it in a file."""
 
 _MB = 1_000_000
 
@@ -42,16 +42,15 @@ def run(
     bus_config: BusConfig,
     metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
 ) -> None:
-    """Record until SIGINT (Ctrl-C) or SIGTERM; the file is closed on every way out.
+    """Record until SIGINT (Ctrl-C) or SIGTERM; the file is closed in every case.
 
     Args:
-        config: what is recorded, and where.
-        bus_config: where the bus is.
-        metrics_config: where its counts are shown.
+        config: settings of the recorder.
+        bus_config: settings of the bus.
+        metrics_config: settings of the metrics endpoint.
 
     Raises:
-        InputError: the folder cannot be made; the file exists already, or cannot be written; or the endpoint makes no
-            sense.
+        InputError: the folder cannot be made; the file exists or cannot be written; or the endpoint is invalid.
     """
     with stop_on_signals() as stop:
         record(config, bus_config, stop, metrics_config)
@@ -66,18 +65,16 @@ def record(
     """Record until `stop` is set.
 
     Returns:
-        The last file; None if no router was there before the stop, or the disk was full at the end.
+        The last file; None if no router was found before the stop, or the disk was full at the end.
 
     Raises:
         InputError: as `run`.
     """
-    # both before the waiting for a router
-    series = series_for(config)
-    if (
-        series.dated and not series.folder.suffix[1:].isalpha()
-    ):  # run.csv is a file of another kind, not a folder's name
-        make_folder(series.folder, "--out")
-    files = files_for(config)
+    # errors in the settings are raised before waiting for a router
+    names = file_names(config)
+    if names.dated and not names.folder.suffix[1:].isalpha():  # run.csv is a file of another kind, not a folder's name
+        make_folder(names.folder, "--out")
+    files = open_files(config)
     with serve_metrics(metrics_config, Metrics(config.plant, NODE, files.free_bytes), NODE) as metrics:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:
@@ -86,8 +83,8 @@ def record(
             start_ns = time.time_ns()
             with files:
                 history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
-                known = files.received_since(start_ns - history_ns)
-                node = begin(config, files, start_ns, known, known_until_ns=start_ns + history_ns)
+                fingerprints = files.fingerprints_since(start_ns - history_ns)
+                node = start_node(config, files, start_ns, fingerprints, fingerprints_until_ns=start_ns + history_ns)
                 on_publish = metrics.observe(node.alarms) if metrics is not None else None
                 loop = EventLoop(node, bus, stop, drain_timeout_s=config.linger_s, on_publish=on_publish)
                 loop.subscribe(config.key_expression, history_s=bus_config.history_s, on_gap=node.on_gap)
@@ -99,12 +96,12 @@ def record(
             bus.close()
 
 
-def files_for(
+def open_files(
     config: RecorderConfig,
     open_part: Callable[[Path], PartFile] = PartFile,
     read_clock: Callable[[], BootClock] = read_boot_clock,
 ) -> RecordingFiles:
-    """The files that the settings ask for.
+    """Recording files of the settings.
 
     Args:
         config: the settings.
@@ -114,7 +111,7 @@ def files_for(
     Raises:
         InputError: as `run`.
     """
-    about = {
+    metadata = {
         "plant": config.plant,
         "key_expression": config.key_expression,
         "configuration": tomli_w.dumps(msgspec.to_builtins(config)),
@@ -122,45 +119,26 @@ def files_for(
     }
     limits = Limits(config.keep_mb * _MB, config.keep_days * DAY_NS, config.keep_files)
     synced = config.fsync != "never"
-    return RecordingFiles(series_for(config), about, limits, synced=synced, open_part=open_part, read_clock=read_clock)
+    return RecordingFiles(
+        file_names(config), metadata, limits, synced=synced, open_part=open_part, read_clock=read_clock
+    )
 
 
-def begin(
+def start_node(
     config: RecorderConfig,
     files: RecordingFiles,
     start_ns: int,
-    known: Collection[int] = (),
-    known_until_ns: int = 0,
+    fingerprints: Collection[int] = (),
+    fingerprints_until_ns: int = 0,
 ) -> RecorderNode:
-    """Begin a file, and have done what a killed recorder left undone.
-
-    Returns:
-        The node that goes on from there; see `Recorder` for what is known.
-    """
-    black_box = black_box_for(config)
-    missed = files.missed_stretches(black_box, start_ns)
-    files.begin((), start_ns)
-    files.recover_left_behind()
-    for stretch in missed:
-        files.keep_for_good(stretch)
-    return node_for(config, files, start_ns, black_box, known, known_until_ns)
-
-
-def black_box_for(config: RecorderConfig) -> BlackBox:
-    """The black box that the settings ask for."""
-    return BlackBox(round(config.black_box_min * MINUTE_NS), own=tuple(PRIORITIES))
-
-
-def node_for(
-    config: RecorderConfig,
-    files: RecordingFiles,
-    start_ns: int,
-    black_box: BlackBox,
-    known: Collection[int] = (),
-    known_until_ns: int = 0,
-) -> RecorderNode:
-    """The node that writes to them; see `Recorder` for what is known."""
-    filing = Filing(
+    """Start a file, recover what a killed recorder left, and return the node; see `Recorder` for the fingerprints."""
+    black_box = build_black_box(config)
+    missed = files.find_missed_intervals(black_box, start_ns)
+    files.start_file((), start_ns)
+    files.recover_orphans()
+    for interval in missed:
+        files.save_black_box(interval)
+    rotation = FlushAndRotation(
         round(config.flush_period_s * 1e9),
         config.fsync,
         config.rotate_min * MINUTE_NS,
@@ -168,10 +146,10 @@ def node_for(
         start_ns,
     )
     own = [keys.key(config.plant, keys.ALARM, name) for name in PRIORITIES]
-    room = Room(config.most_keys, (*own, keys.key(config.plant, keys.HEALTH, NODE)))
+    channels = ChannelBudget(config.most_keys, (*own, keys.key(config.plant, keys.HEALTH, NODE)))
     return RecorderNode(
-        Recorder(config.plant, start_ns, known, known_until_ns),
-        Decisions(filing, Head(room.most_repeated), black_box, room),
+        Recorder(config.plant, start_ns, fingerprints, fingerprints_until_ns),
+        Policies(rotation, LatchedMessages(channels.max_latched), black_box, channels),
         files,
         health_period_ns=round(config.health_period_s * 1e9),
         start_ns=start_ns,
@@ -179,15 +157,20 @@ def node_for(
     )
 
 
-def series_for(config: RecorderConfig) -> Series:
-    """The names that the settings give to files."""
+def build_black_box(config: RecorderConfig) -> BlackBox:
+    """Black box of the settings."""
+    return BlackBox(round(config.black_box_min * MINUTE_NS), own=tuple(PRIORITIES))
+
+
+def file_names(config: RecorderConfig) -> FileNames:
+    """File names of the settings."""
     out = Path(config.out)
-    return Series.of(out, config.plant, is_folder=out.is_dir())
+    return FileNames.of(out, config.plant, is_folder=out.is_dir())
 
 
-def file_for(config: RecorderConfig, now: datetime) -> Path:
-    """The first of them."""
-    return series_for(config).first(now)
+def first_file(config: RecorderConfig, now: datetime) -> Path:
+    """Name of the first file."""
+    return file_names(config).first(now)
 
 
 if __name__ == "__main__":

@@ -5,40 +5,40 @@ import math
 import msgspec
 
 from reactorwatch.contract import keys
-from recorder.policy.room import MOST_KEYS
+from recorder.policy.channel_budget import MAX_KEYS
 from recorder.policy.rotation import Fsync
 
-LONGEST_FLUSH_S = 1.0
-FEWEST_KEYS = 100
+MAX_FLUSH_S = 1.0
+MIN_KEYS = 100
 
 
 class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is recorded, and where to.
+    """Settings of the recorder.
 
     Attributes:
-        plant: the plant that the recorder reports its health under, and that a file is named after.
-        out: the file, with the ending `.mcap`; or the folder for a file named `{plant}-{UTC time}.mcap`. A folder that
-            does not exist is made.
-        key_expression: what is recorded.
-        health_period_s: between two reports of health.
-        flush_period_s: between two moments at which all that was received is handed to the operating system: what a
-            recorder that is killed may lose. At most a second.
-        fsync: when to wait until what was handed over is on the disk, for the case that the machine loses its power:
-            `never`, after each `chunk` that was handed over, or once a `second`.
-        rotate_min: age of a file, in minutes, at which a new one is begun; inf: never.
-        rotate_mb: its size, likewise.
-        keep_mb: size of all files together beyond which the oldest is deleted; inf: never.
-        keep_days: age of a file since its end, in days in which the machine ran, beyond which it is deleted; inf:
-            never.
-        keep_files: number of files beyond which the oldest is deleted; inf: never.
-        most_keys: keys with messages of the product that a file has room for; a thousand take about 1.5 MB of
-            memory. Messages on more keys are not recorded; the alarm `recording/keys` says so.
-        black_box_min: minutes before and after each alarm that are kept in a file of their own, which is never
-            deleted; 0: none.
-        resume_mb: with a full disk, recording goes on when there is this much room again.
-        about: what else each file should say about its origin, such as the seed of a simulated plant.
-        linger_s: asked to stop, it goes on until nothing has come for this long, at most ten times as long: others
-            have last words too.
+        plant: plant that the recorder reports its health under and that files are named after.
+        out: the file, with the ending `.mcap`; or the folder for files named `{plant}-{UTC time}.mcap`, which is
+            created if it does not exist.
+        key_expression: keys to record.
+        health_period_s: time between two health reports.
+        flush_period_s: time between two flushes to the operating system, which is what a recorder that is killed may
+            lose. At most a second.
+        fsync: when to sync flushed data to the disk, against power loss: `never`, after each `chunk` that was flushed,
+            or once a `second`.
+        rotate_min: age of a file, in minutes, at which a new one is started; inf never starts one.
+        rotate_mb: size of a file, in megabytes, at which a new one is started; inf never starts one.
+        keep_mb: total size of all files, in megabytes, beyond which the oldest is deleted; inf deletes none.
+        keep_days: age of a file since its end, in days in which the machine ran, beyond which it is deleted; inf
+            deletes none.
+        keep_files: number of files beyond which the oldest is deleted; inf deletes none.
+        most_keys: largest number of keys of the product in a file; a thousand take about 1.5 MB of memory. Messages on
+            more keys are not recorded, and the alarm `recording/keys` is raised.
+        black_box_min: minutes before and after each alarm that are copied into a file of their own, which is never
+            deleted; 0 copies none.
+        resume_mb: free disk space, in megabytes, at which recording resumes after a full disk.
+        about: additional metadata of each file, such as the seed of a simulated plant.
+        linger_s: after a stop is requested, recording ends when no message has arrived for this long, at most after ten
+            times this long, so that the last messages of other nodes are recorded.
     """
 
     plant: str = "cstr"
@@ -52,7 +52,7 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     keep_mb: float = math.inf
     keep_days: float = math.inf
     keep_files: float = math.inf
-    most_keys: int = MOST_KEYS
+    most_keys: int = MAX_KEYS
     black_box_min: float = 10.0
     resume_mb: float = 50.0
     linger_s: float = 0.5
@@ -65,33 +65,33 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value!r}")
-        if self.flush_period_s > LONGEST_FLUSH_S:
-            raise ValueError(f"flush_period_s must be at most {LONGEST_FLUSH_S:g}, got {self.flush_period_s!r}")
+        if self.flush_period_s > MAX_FLUSH_S:
+            raise ValueError(f"flush_period_s must be at most {MAX_FLUSH_S:g}, got {self.flush_period_s!r}")
         for name in ("rotate_min", "rotate_mb", "keep_mb", "keep_days"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be positive, or inf, got {getattr(self, name)!r}")
         if not self.keep_files >= 1.0:
             raise ValueError(f"keep_files must be at least 1, or inf, got {self.keep_files!r}")
-        if not FEWEST_KEYS <= self.most_keys <= MOST_KEYS:
-            raise ValueError(f"most_keys must be in [{FEWEST_KEYS}, {MOST_KEYS}], got {self.most_keys!r}")
+        if not MIN_KEYS <= self.most_keys <= MAX_KEYS:
+            raise ValueError(f"most_keys must be in [{MIN_KEYS}, {MAX_KEYS}], got {self.most_keys!r}")
         for name in ("black_box_min", "resume_mb"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and not negative, got {getattr(self, name)!r}")
 
 
 class ReplayConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is played back, and how.
+    """Settings of the replay.
 
     Attributes:
         file: the recording, `.mcap`, or a record, `.csv`.
-        rate: plant time over clock time: 1 plays as the plant ran, 60 an hour in a minute, inf as fast as it goes.
-        from_min: where it begins, in minutes since the first sample; of a CSV file by its own time.
-        to_min: where it ends, likewise.
-        loop: whether it begins anew at the end.
-        plant: the plant's name on the bus; empty: as recorded (`cstr` for a CSV file).
-        everything: play estimates, charts, alarms and faults too, not the samples alone.
-        wait_for: nodes, by name, that must be alive before the first sample goes out.
-        columns: a CSV file's own names for its columns, where it has others.
+        rate: plant time over clock time: 1 plays in real time, 60 an hour in a minute, inf as fast as possible.
+        from_min: start, in minutes since the first sample; for a CSV file in its own time.
+        to_min: end, in the minutes of `from_min`.
+        loop: True to restart at the end.
+        plant: name of the plant on the bus; empty keeps the recorded name (`cstr` for a CSV file).
+        everything: True to play estimates, charts, alarms and faults too, not only samples.
+        wait_for: names of nodes that must be alive before the first sample is published.
+        columns: names of the columns in a CSV file, by signal, where they differ.
     """
 
     file: str

@@ -1,7 +1,6 @@
-"""The files of a recorder: the one that it writes, and those that it has written or found (see `remains`).
+"""Files of a recorder: the one being written, complete ones, and those left by a crashed recorder (see `orphans`).
 
-What is written, and when a file is flushed or a new one begun, is decided elsewhere (`filing`, `head`, `black_box`,
-`retention`); here it is done.
+The decisions when to flush, rotate, copy and delete are made in `recorder.policy`; this module carries them out.
 """
 
 import contextlib
@@ -20,18 +19,18 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.core import Kept, fingerprint
-from recorder.message import Entry
-from recorder.policy.black_box import BlackBox, Stretch
-from recorder.policy.retention import Finished, Limits, to_delete
-from recorder.policy.series import Series
+from recorder.core import ReceivedMessage, fingerprint
+from recorder.message import RecordedMessage
+from recorder.policy.black_box import AlarmInterval, BlackBox
+from recorder.policy.file_names import FileNames
+from recorder.policy.retention import CompleteRecording, Limits, select_deletions
 from recorder.storage.ages import Ages, BootClock, read_boot_clock
-from recorder.storage.background import Chores
+from recorder.storage.background import BackgroundTasks
 from recorder.storage.black_box_files import BlackBoxFiles
 from recorder.storage.gaps import GAP, to_metadata
-from recorder.storage.mcap_scan import Scan, Stored, Wanted
-from recorder.storage.mcap_writer import NUMBER, RecordingWriter, check_free, part_of
-from recorder.storage.orphans import damaged, make_whole, remains_of
+from recorder.storage.mcap_scan import RawMessage, Scan, Wanted
+from recorder.storage.mcap_writer import FILE_INDEX, RecordingWriter, check_free, part_of
+from recorder.storage.orphans import find_orphans, list_damaged, repair
 from recorder.storage.part_file import PART, PartFile
 from recorder.tools.cut import cut, received_between
 
@@ -39,23 +38,23 @@ log = structlog.get_logger()
 
 
 class RecordingFiles:
-    """What `RecorderNode` writes to. As a context, it is closed on every way out.
+    """Files that `RecorderNode` writes to; as a context manager, it is closed in every case.
 
     Args:
-        series: the names of the files.
-        metadata: what each of them says about its origin.
-        limits: of what is kept.
-        synced: whether a file that is complete is synced.
-        open_part: what opens the file that is written to.
-        read_clock: reads the clock since the machine's start, by which recordings are old.
+        names: names of the files.
+        metadata: metadata of each file.
+        limits: limits of retention.
+        synced: True to sync each file when it is completed.
+        open_part: opens the file that is written to.
+        read_clock: reads the time since boot, which ages the recordings.
 
     Raises:
-        InputError: there is no such folder; the file that was asked for by name exists, or is being written.
+        InputError: the folder does not exist, or the named file exists or is being written.
     """
 
     def __init__(
         self,
-        series: Series,
+        names: FileNames,
         metadata: Mapping[str, str],
         limits: Limits = Limits(),  # noqa: B008 (it is frozen)
         *,
@@ -63,142 +62,142 @@ class RecordingFiles:
         open_part: Callable[[Path], PartFile] = PartFile,
         read_clock: Callable[[], BootClock] = read_boot_clock,
     ) -> None:
-        self._series = series
+        self._names = names
         self._metadata = metadata
         self._limits = limits
         self._synced = synced
         self._open_part = open_part
         self._writer: RecordingWriter | None = None
-        self._black_boxes = BlackBoxFiles(series)
-        self._chores = Chores()
-        self._begun = 0
-        self._before = ""
+        self._black_boxes = BlackBoxFiles(names)
+        self._tasks = BackgroundTasks()
+        self._file_count = 0
+        self._previous = ""
         self._last_ns = 0
         self._abandoned: list[Path] = []
-        first = series.first(datetime.now(UTC))
-        self._left = [] if not series.folder.is_dir() else remains_of(series)
-        for copy in self._black_boxes.half_made():
+        first = names.first(datetime.now(UTC))
+        self._orphans = [] if not names.folder.is_dir() else find_orphans(names)
+        for copy in self._black_boxes.partial_copies():
             copy.unlink(missing_ok=True)
-        if not self._left:
+        if not self._orphans:
             check_free(first)
-        self._ages = Ages(series.folder / f".{series.stem}.ages", read_clock)
-        self._ages.see((path.name, path.stat().st_mtime_ns) for path in self._kept_for_a_time())
+        self._ages = Ages(names.folder / f".{names.stem}.ages", read_clock)
+        self._ages.update((path.name, path.stat().st_mtime_ns) for path in self._deletable())
 
     @property
     def path(self) -> Path | None:
-        """The name that the file being written will have; None if there is none."""
+        """Final name of the file being written; None if there is none."""
         return self._writer.path if self._writer is not None else None
 
     @property
     def size_bytes(self) -> int:
-        """Of the file that is being written."""
+        """Size of the file being written; 0 if there is none."""
         return self._writer.size_bytes if self._writer is not None else 0
 
-    def recover_left_behind(self) -> None:
-        """Have what a killed recorder left behind made whole, while recording goes on."""
-        for part in self._left:
-            self._chores.add(f"recovering {part}", partial(make_whole, part))
-        self._left = []
+    def recover_orphans(self) -> None:
+        """Repair files of a crashed recorder in the background."""
+        for part in self._orphans:
+            self._tasks.submit(f"recovering {part}", partial(repair, part))
+        self._orphans = []
 
-    def begin(self, head: Iterable[Entry], now_ns: int) -> Path:
-        """Begin a file, after the one before is complete.
+    def start_file(self, latched: Iterable[RecordedMessage], now_ns: int) -> Path:
+        """Complete the current file and start the next one.
 
         Args:
-            head: what it says first.
-            now_ns: what it may be named after.
+            latched: messages to repeat at its start.
+            now_ns: start time, for its name.
 
         Raises:
             InputError: a file cannot be written; see `abandon`.
         """
         self.complete()
-        folder = self._series.folder
+        folder = self._names.folder
         try:
-            if self._begun:
+            if self._file_count:
                 folder.mkdir(parents=True, exist_ok=True)  # it may have been deleted since
-            there = {path.name.removesuffix(PART) for path in folder.iterdir()}
+            existing = {path.name.removesuffix(PART) for path in folder.iterdir()}
         except OSError as error:
             raise InputError(f"folder {folder}: cannot be written to: {error.strerror}") from error
-        path = self._series.next(now_ns, there)
+        path = self._names.next(now_ns, existing)
         started = datetime.fromtimestamp(now_ns / 1e9, UTC).isoformat(timespec="milliseconds")
-        about = {**self._metadata, "started": started, NUMBER: str(self._begun + 1)}
-        if self._before:
-            about["after"] = self._before
-        self._writer = RecordingWriter(path, about, self._open_part)
-        self._begun += 1
-        self._before = path.name
-        for entry in head:
+        metadata = {**self._metadata, "started": started, FILE_INDEX: str(self._file_count + 1)}
+        if self._previous:
+            metadata["after"] = self._previous
+        self._writer = RecordingWriter(path, metadata, self._open_part)
+        self._file_count += 1
+        self._previous = path.name
+        for entry in latched:
             self._writer.write(entry)
         log.info("recording", file=str(path))
         for part in self._abandoned:
-            self._chores.add(f"recovering {part}", partial(make_whole, part))
+            self._tasks.submit(f"recovering {part}", partial(repair, part))
         self._abandoned = []
         return path
 
-    def write(self, kept: Kept) -> None:
+    def write(self, received: ReceivedMessage) -> None:
         """Append a message.
 
         Raises:
             WriteError: the file cannot be written; see `abandon`.
         """
-        assert self._writer is not None, "a file was begun"
-        self._writer.write(kept.entry, readable=kept.readable)
-        self._last_ns = kept.entry.log_time_ns
+        assert self._writer is not None, "a file was started"
+        self._writer.write(received.recorded, readable=received.is_readable)
+        self._last_ns = received.recorded.log_time_ns
 
     def write_gap(self, gap: Gap) -> None:
-        """Write that something was lost on the way.
+        """Record a gap in the messages of the bus.
 
         Raises:
             WriteError: the file cannot be written; see `abandon`.
         """
-        assert self._writer is not None, "a file was begun"
+        assert self._writer is not None, "a file was started"
         self._writer.add_metadata(GAP, to_metadata(gap))
         log.warning("lost on the way", stream=gap.stream, messages=gap.messages)
 
-    def received_since(self, from_ns: int) -> set[int]:
-        """Fingerprints of what the files that are there received since a moment, complete or left behind."""
-        return {fingerprint(stored.channel.topic, stored.payload) for stored in self._stored_since(from_ns)}
+    def fingerprints_since(self, from_ns: int) -> set[int]:
+        """Fingerprints of messages received since `from_ns`, in complete and in orphaned files."""
+        return {fingerprint(stored.channel.topic, stored.payload) for stored in self._messages_since(from_ns)}
 
-    def missed_stretches(self, black_box: BlackBox, now_ns: int) -> list[Stretch]:
-        """Have a black box go on where that of a killed recorder was, before what it left behind is recovered.
+    def find_missed_intervals(self, black_box: BlackBox, now_ns: int) -> list[AlarmInterval]:
+        """Restore a black box from recorded alarms, before orphans are recovered.
 
         Returns:
-            The stretches that are over and were never kept.
+            The intervals that have ended and were never copied.
         """
-        kept = self._black_boxes.spans()
-        over = []
-        for stored in self._stored_since(now_ns - black_box.reach_ns, is_alarm) if black_box.reach_ns else ():
+        saved = self._black_boxes.spans()
+        ended = []
+        for stored in self._messages_since(now_ns - black_box.longest_ns, is_alarm) if black_box.longest_ns else ():
             at_ns = stored.log_time_ns
-            if any(first_ns <= at_ns <= last_ns for first_ns, last_ns in kept):
+            if any(first_ns <= at_ns <= last_ns for first_ns, last_ns in saved):
                 continue
             try:
-                over.append(black_box.on_message(decode(stored.payload, stored.entry.encoding), at_ns))
+                ended.append(black_box.on_message(decode(stored.payload, stored.recorded.encoding), at_ns))
             except DecodeError:
                 continue
-        over.append(black_box.over(now_ns))
-        return [stretch for stretch in over if stretch is not None]
+        ended.append(black_box.pop_ended(now_ns))
+        return [interval for interval in ended if interval is not None]
 
-    def _stored_since(self, from_ns: int, wanted: Wanted | None = None) -> Iterator[Stored]:
-        """What the files that are there received since a moment; one file after the other, the oldest first."""
-        there = [(path.stat().st_mtime_ns, path) for path in (*self._finished(), *self._left)]
-        for _, path in sorted(item for item in there if item[0] >= from_ns):
+    def _messages_since(self, from_ns: int, wanted: Wanted | None = None) -> Iterator[RawMessage]:
+        """Messages received since `from_ns`, file by file, the oldest first."""
+        files = [(path.stat().st_mtime_ns, path) for path in (*self._complete_files(), *self._orphans)]
+        for _, path in sorted(item for item in files if item[0] >= from_ns):
             try:
                 scan = Scan(path, from_ns=from_ns, wanted=wanted)
             except InputError:
-                continue  # nothing is in it
-            yield from (stored for stored in scan if stored.log_time_ns >= from_ns and not stored.repeated)
+                continue  # it is empty
+            yield from (stored for stored in scan if stored.log_time_ns >= from_ns and not stored.latched)
 
     def flush(self) -> None:
-        """Hand over what was written; see `RecordingWriter.flush`."""
+        """Flush the file; see `RecordingWriter.flush`."""
         if self._writer is not None:
             self._writer.flush()
 
     def sync(self) -> None:
-        """Wait for the disk; see `RecordingWriter.sync`."""
+        """Sync the file; see `RecordingWriter.sync`."""
         if self._writer is not None:
             self._writer.sync()
 
     def complete(self) -> None:
-        """Make the file whole that is being written.
+        """Complete the file being written.
 
         Raises:
             WriteError: it cannot be written; see `abandon`.
@@ -212,12 +211,12 @@ class RecordingFiles:
         with contextlib.suppress(FileNotFoundError):  # it was deleted at once
             if self._last_ns:
                 os.utime(self._writer.path, ns=(self._last_ns, self._last_ns))
-            self._ages.note(self._writer.path.name, self._writer.path.stat().st_mtime_ns)
+            self._ages.add(self._writer.path.name, self._writer.path.stat().st_mtime_ns)
         log.info("recorded", file=str(self._writer.path))
         self._writer = None
 
     def abandon(self) -> None:
-        """Leave the file as it was last flushed; it is recovered as soon as another one was begun."""
+        """Leave the file as last flushed; it is recovered after the next one is started."""
         if self._writer is None:
             return
         self._writer.abandon()
@@ -227,24 +226,23 @@ class RecordingFiles:
         self._writer = None
 
     def free_bytes(self) -> int:
-        """The room that is left on the disk; of a folder that was deleted, where it would be made again."""
-        folder = self._series.folder.absolute()
-        there = next(path for path in (folder, *folder.parents) if path.is_dir())
-        return shutil.disk_usage(there).free
+        """Free space on the disk of the folder, which may have been deleted."""
+        folder = self._names.folder.absolute()
+        return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.is_dir())).free
 
-    def keep_for_good(self, stretch: Stretch) -> None:
-        """Have a stretch of time copied into a file of its own; flush before."""
-        self._chores.add(f"the black box of {stretch.alarm}", lambda: self._black_box(stretch))
+    def save_black_box(self, interval: AlarmInterval) -> None:
+        """Copy an interval into a file of its own, in the background; flush before."""
+        self._tasks.submit(f"the black box of {interval.alarm}", lambda: self._copy_black_box(interval))
 
-    def delete_oldest(self, needed_ns: int | None) -> None:
-        """Have what is beyond the limits deleted.
+    def delete_oldest(self, protected_ns: int | None) -> None:
+        """Delete recordings beyond the limits, in the background.
 
         Args:
-            needed_ns: what ended in this last span of time stays; None: nothing is needed.
+            protected_ns: recordings that ended within this time stay; None protects none.
         """
         if self._limits != Limits():
             now_ns = self._ages.now_ns()
-            self._chores.add("deleting old recordings", lambda: self._delete_oldest(now_ns, needed_ns))
+            self._tasks.submit("deleting old recordings", lambda: self._delete_oldest(now_ns, protected_ns))
 
     def __enter__(self) -> Self:
         return self
@@ -255,50 +253,50 @@ class RecordingFiles:
         try:
             self.complete()
         finally:
-            self._chores.finish()
+            self._tasks.finish()
 
-    def _finished(self) -> list[Path]:
-        if not self._series.folder.is_dir():
+    def _complete_files(self) -> list[Path]:
+        if not self._names.folder.is_dir():
             return []
-        return [path for path in self._series.folder.iterdir() if self._series.owns(path.name) and path.is_file()]
+        return [path for path in self._names.folder.iterdir() if self._names.owns(path.name) and path.is_file()]
 
-    def _kept_for_a_time(self) -> list[Path]:
-        """The files that the limits are of: recordings, and remains from which not all could be recovered."""
-        return [*self._finished(), *damaged(self._series)]
+    def _deletable(self) -> list[Path]:
+        """Files that the limits apply to: complete recordings and damaged orphans."""
+        return [*self._complete_files(), *list_damaged(self._names)]
 
-    def _black_box(self, stretch: Stretch) -> None:
-        path = self._black_boxes.new(stretch)
-        raised = datetime.fromtimestamp(stretch.raised_ns / 1e9, UTC)
-        about = {**self._metadata, "alarm": stretch.alarm, "raised": raised.isoformat(timespec="milliseconds")}
-        window = received_between(stretch.from_ns, stretch.to_ns)
+    def _copy_black_box(self, interval: AlarmInterval) -> None:
+        path = self._black_boxes.new(interval)
+        raised = datetime.fromtimestamp(interval.raised_ns / 1e9, UTC)
+        metadata = {**self._metadata, "alarm": interval.alarm, "raised": raised.isoformat(timespec="milliseconds")}
+        window = received_between(interval.from_ns, interval.to_ns)
         while True:
             writing = self.path
-            sources = [source for source in self._finished() if source.stat().st_mtime_ns >= stretch.from_ns]
+            sources = [source for source in self._complete_files() if source.stat().st_mtime_ns >= interval.from_ns]
             if writing is not None and writing not in sources:
                 sources.append(part_of(writing))
             try:
-                count = cut(sources, path, window, about, tolerant=True)
+                count = cut(sources, path, window, metadata, tolerant=True)
                 break
             except InputError:
                 if all(source.exists() for source in sources):
-                    raise  # else the file being written has got its name meanwhile
-        log.info("black box", file=str(path), alarm=stretch.alarm, messages=count)
+                    raise  # else the file being written was completed meanwhile
+        log.info("black box", file=str(path), alarm=interval.alarm, messages=count)
 
-    def _delete_oldest(self, now_ns: int, needed_ns: int | None) -> None:
-        writer = self._writer  # before the others are listed: what it writes may become one of them
-        there = [path for path in self._kept_for_a_time() if writer is None or path != writer.path]
-        stats = [(path, path.stat()) for path in there]
-        seen_ns = self._ages.see((path.name, stat.st_mtime_ns) for path, stat in stats)
-        finished = [Finished(path, stat.st_size, seen_ns[path.name], stat.st_mtime_ns) for path, stat in stats]
+    def _delete_oldest(self, now_ns: int, protected_ns: int | None) -> None:
+        writer = self._writer  # before the others are listed: its file may become one of them
+        paths = [path for path in self._deletable() if writer is None or path != writer.path]
+        stats = [(path, path.stat()) for path in paths]
+        seen_ns = self._ages.update((path.name, stat.st_mtime_ns) for path, stat in stats)
+        complete = [CompleteRecording(path, stat.st_size, seen_ns[path.name], stat.st_mtime_ns) for path, stat in stats]
         writing_bytes = writer.size_bytes if writer is not None else None
-        needed_since_ns = None if needed_ns is None else now_ns - needed_ns
-        for path in to_delete(finished, writing_bytes, self._limits, now_ns, needed_since_ns):
+        protected_since_ns = None if protected_ns is None else now_ns - protected_ns
+        for path in select_deletions(complete, writing_bytes, self._limits, now_ns, protected_since_ns):
             path.unlink()
             log.info("deleted", file=str(path), why="the limits of what is kept")
         self._ages.store()
 
 
 def is_alarm(topic: str) -> bool:
-    """Whether a topic is that of an alarm."""
+    """True for the topic of an alarm."""
     parsed = keys.parse(topic)
     return parsed is not None and parsed.kind == keys.ALARM

@@ -1,19 +1,19 @@
-"""What a recording holds, one message at a time."""
+"""A message of a recording."""
 
 from typing import NamedTuple
 
 
-class Entry(NamedTuple):
-    """A message as it came from the bus.
+class RecordedMessage(NamedTuple):
+    """A message as received from the bus.
 
     Attributes:
-        key: the key it was published on; the topic in the file.
+        key: key that it was published on; the topic in the file.
         payload: its bytes.
-        encoding: what the bytes claim to be, as on the bus.
-        log_time_ns: when it was received.
-        publish_time_ns: the time of the sample that it speaks of; that of receipt where it says none.
-        repeated: it was received before the file was begun, and is said again at the start of the file so that the
-            file opens by itself. Who reads the file before passes over it.
+        encoding: encoding that the publisher claimed.
+        log_time_ns: time of receipt.
+        publish_time_ns: time of the sample; the time of receipt where the message has none.
+        latched: True if it was received before the file was started and is repeated at its start, so that the file is
+            self-contained. A reader of the file before skips it.
     """
 
     key: str
@@ -21,4 +21,4 @@ class Entry(NamedTuple):
     encoding: str
     log_time_ns: int
     publish_time_ns: int
-    repeated: bool = False
+    latched: bool = False

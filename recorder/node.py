@@ -1,4 +1,4 @@
-"""The recorder as a node: its core, what decides about its files, and the files."""
+"""The recorder as a node: core, file policies and files."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,75 +7,75 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.core import Kept, Recorder
+from recorder.core import ReceivedMessage, Recorder
 from recorder.files import RecordingFiles
-from recorder.policy.black_box import BlackBox, Stretch
-from recorder.policy.latched import Head
-from recorder.policy.room import Room
-from recorder.policy.rotation import Filing
+from recorder.policy.black_box import AlarmInterval, BlackBox
+from recorder.policy.channel_budget import ChannelBudget
+from recorder.policy.latched import LatchedMessages
+from recorder.policy.rotation import FlushAndRotation
 from recorder.storage.mcap_writer import WriteError
 
 RETRY_NS = 2_000_000_000
-"""Between two looks for room on a full disk."""
+"""Time between two attempts to resume on a full disk."""
 
 
 @dataclass
-class Decisions:
-    """What decides about the files, without touching them."""
+class Policies:
+    """Policies for the files, without I/O."""
 
-    filing: Filing
-    head: Head
+    rotation: FlushAndRotation
+    latched: LatchedMessages
     black_box: BlackBox
-    room: Room
+    channels: ChannelBudget
 
 
 class RecorderNode:
-    """Writes what it receives; see `reactorwatch.runtime.event_loop.Node`.
+    """Records received messages; see `reactorwatch.runtime.event_loop.Node`.
 
-    Its reports of health go out on the bus and come back as everything else does, so they are not written here. The
-    last one alone is, because nobody listens any more when it would come back.
+    Its health reports are published and received like any message, so they are not written here. The exception is the
+    last one, which would arrive after the subscription ends.
 
     Args:
-        core: what it makes of messages.
-        decide: what decides about its files.
-        files: the files; one was begun.
-        health_period_ns: between two reports.
-        start_ns: the clock.
-        has_room: whether a full disk has room enough to go on.
+        core: decodes and counts messages.
+        policies: policies for the files.
+        files: the files; one was started.
+        health_period_ns: time between two health reports.
+        start_ns: clock reading at the start.
+        has_room: returns True if a full disk has enough room to resume.
     """
 
     def __init__(
         self,
         core: Recorder,
-        decide: Decisions,
+        policies: Policies,
         files: RecordingFiles,
         health_period_ns: int,
         start_ns: int,
         has_room: Callable[[], bool] = lambda: True,
     ) -> None:
         self._core = core
-        self._filing, self._head, self._black_box = decide.filing, decide.head, decide.black_box
-        self._room = decide.room
+        self._rotation, self._latched = policies.rotation, policies.latched
+        self._black_box, self._channels = policies.black_box, policies.channels
         self._files = files
         self._health_period_ns = health_period_ns
         self._next_health_ns = start_ns
-        self._next_try_ns = start_ns
+        self._next_retry_ns = start_ns
         self._has_room = has_room
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        """Write it, and do what is due with the file."""
-        kept = self._core.on_message(message, now_ns)
-        if kept is None:
+        """Write a message, and flush or rotate the file if due."""
+        received = self._core.on_message(message, now_ns)
+        if received is None:
             return []
-        told = self._write(kept, now_ns)
-        if kept.message is not None and self._room.has(kept.channel):
-            self._head.remember(kept.entry, kept.message)
-            over = self._black_box.on_message(kept.message, kept.entry.log_time_ns)
-            told += self._keep_for_good(over, now_ns)
-        return told
+        published = self._write(received, now_ns)
+        if received.message is not None and self._channels.has(received.channel):
+            self._latched.update(received.recorded, received.message)
+            ended = self._black_box.on_message(received.message, received.recorded.log_time_ns)
+            published += self._save_black_box(ended, now_ns)
+        return published
 
     def on_gap(self, gap: Gap, now_ns: int) -> list[Publication]:
-        """Write that something was lost on the way."""
+        """Record a gap in the messages of the bus."""
         self._core.on_gap(gap)
         if self._core.is_stopped:
             return []
@@ -86,109 +86,109 @@ class RecorderNode:
         return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """What people ask of its alarm, or do to it."""
+        """Execute a command about the recorder's alarms."""
         return self._core.on_command(question, now_ns)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """Flush the file, look for room on a full disk, keep a stretch for good, report health: each when it is due."""
-        told = self._try_again(now_ns) if self._core.is_stopped else self._see_to_file(now_ns)
-        told += self._keep_for_good(self._black_box.over(now_ns), now_ns)
+        """Flush, retry on a full disk, save a black box and report health, each when due."""
+        published = self._retry(now_ns) if self._core.is_stopped else self._flush_if_due(now_ns)
+        published += self._save_black_box(self._black_box.pop_ended(now_ns), now_ns)
         if now_ns >= self._next_health_ns:
             self._next_health_ns = now_ns + self._health_period_ns
-            told += self._core.see_to_room(now_ns)
-            told.append(self._core.health(now_ns))
-        return told
+            published += self._core.clear_keys_alarm(now_ns)
+            published.append(self._core.health(now_ns))
+        return published
 
     def alarms(self) -> list[Alarm]:
-        """Its alarms as they are."""
+        """The recorder's alarms in their present state."""
         return self._core.alarms
 
     def next_tick_ns(self) -> int:
-        """The next of these."""
-        file_ns = self._next_try_ns if self._core.is_stopped else self._filing.next_due_ns()
-        stretch_ns = self._black_box.next_due_ns
-        return min(self._next_health_ns, file_ns, *([] if stretch_ns is None else [stretch_ns]))
+        """Time of the next due action."""
+        file_ns = self._next_retry_ns if self._core.is_stopped else self._rotation.next_due_ns()
+        interval_ns = self._black_box.next_due_ns
+        return min(self._next_health_ns, file_ns, *([] if interval_ns is None else [interval_ns]))
 
     @property
     def finished(self) -> bool:
-        """It records until it is stopped."""
+        """False: it records until it is stopped."""
         return False
 
     def on_stop(self, now_ns: int) -> list[Publication]:
-        """Write and send the last report."""
+        """Record and publish the last health report."""
         last = self._core.health(now_ns, phase="stopped")
-        told = self.on_message(encode(last), now_ns)
-        told += self._keep_for_good(self._black_box.close(), now_ns)
-        return [*told, last]
+        published = self.on_message(encode(last), now_ns)
+        published += self._save_black_box(self._black_box.close(), now_ns)
+        return [*published, last]
 
-    def _keep_for_good(self, over: Stretch | None, now_ns: int) -> list[Publication]:
-        """Have a stretch copied that is over, after all of it was handed over."""
-        if over is None:
+    def _save_black_box(self, ended: AlarmInterval | None, now_ns: int) -> list[Publication]:
+        """Flush, then copy an interval that has ended."""
+        if ended is None:
             return []
-        told: list[Publication] = []
+        published: list[Publication] = []
         try:
             self._files.flush()
-            self._filing.flushed()
+            self._rotation.mark_flushed()
         except WriteError as error:
-            told = self._stop(error, now_ns)
-        self._files.keep_for_good(over)
-        return told
+            published = self._stop(error, now_ns)
+        self._files.save_black_box(ended)
+        return published
 
-    def _write(self, kept: Kept, now_ns: int) -> list[Publication]:
+    def _write(self, received: ReceivedMessage, now_ns: int) -> list[Publication]:
         if self._core.is_stopped:
-            self._core.unrecorded(1)
+            self._core.count_unrecorded(1)
             return []
         try:
-            crowded = self._room.needs_new_file(kept.channel, now_ns)
-            if crowded or self._filing.is_full(now_ns, self._files.size_bytes):
-                self._begin(kept.entry.log_time_ns, now_ns)
-            if not self._room.admit(kept.channel, now_ns):
-                return self._core.leave_out(kept, now_ns)
-            self._files.write(kept)
+            channels_full = self._channels.needs_new_file(received.channel, now_ns)
+            if channels_full or self._rotation.is_full(now_ns, self._files.size_bytes):
+                self._start_file(received.recorded.log_time_ns, now_ns)
+            if not self._channels.admit(received.channel, now_ns):
+                return self._core.reject_key(received, now_ns)
+            self._files.write(received)
         except InputError as error:
-            self._core.unrecorded(1)
+            self._core.count_unrecorded(1)
             return self._stop(error, now_ns)
-        self._filing.wrote(now_ns)
-        return self._see_to_file(now_ns)
+        self._rotation.count_message(now_ns)
+        return self._flush_if_due(now_ns)
 
-    def _begin(self, begun_ns: int, now_ns: int) -> None:
+    def _start_file(self, start_ns: int, now_ns: int) -> None:
         self._files.complete()
-        self._filing.flushed()
-        head = self._head.entries(begun_ns)
-        self._room.start(len(head))
-        self._files.begin(head, now_ns)
-        self._filing.began(now_ns)
-        self._files.delete_oldest(self._black_box.needed_ns(now_ns))
+        self._rotation.mark_flushed()
+        latched = self._latched.messages(start_ns)
+        self._channels.reset(len(latched))
+        self._files.start_file(latched, now_ns)
+        self._rotation.start_file(now_ns)
+        self._files.delete_oldest(self._black_box.protected_ns(now_ns))
 
-    def _see_to_file(self, now_ns: int) -> list[Publication]:
+    def _flush_if_due(self, now_ns: int) -> list[Publication]:
         try:
-            if self._filing.flush_is_due(now_ns):
+            if self._rotation.flush_is_due(now_ns):
                 self._files.flush()
-                self._filing.flushed()
-            if self._filing.sync_is_due(now_ns):
+                self._rotation.mark_flushed()
+            if self._rotation.sync_is_due(now_ns):
                 self._files.sync()
-                self._filing.synced(now_ns)
+                self._rotation.mark_synced(now_ns)
         except InputError as error:
             return self._stop(error, now_ns)
         return []
 
     def _stop(self, error: InputError, now_ns: int) -> list[Publication]:
-        """Leave the file as it is, for lack of room or worse; it is made whole when there is another one."""
-        self._core.unrecorded(self._filing.unflushed)
-        self._filing.began(now_ns)
+        """Abandon a file that cannot be written; it is recovered after the next one is started."""
+        self._core.count_unrecorded(self._rotation.unflushed)
+        self._rotation.start_file(now_ns)
         self._files.abandon()
-        self._next_try_ns = now_ns + RETRY_NS
+        self._next_retry_ns = now_ns + RETRY_NS
         return self._core.stop_recording(error.reason if isinstance(error, WriteError) else str(error), now_ns)
 
-    def _try_again(self, now_ns: int) -> list[Publication]:
-        if now_ns < self._next_try_ns:
+    def _retry(self, now_ns: int) -> list[Publication]:
+        if now_ns < self._next_retry_ns:
             return []
-        self._next_try_ns = now_ns + RETRY_NS
+        self._next_retry_ns = now_ns + RETRY_NS
         if not self._has_room():
-            self._files.delete_oldest(self._black_box.needed_ns(now_ns))
+            self._files.delete_oldest(self._black_box.protected_ns(now_ns))
             return []
         try:
-            self._begin(self._core.moment(now_ns), now_ns)
+            self._start_file(self._core.monotonic_ns(now_ns), now_ns)
         except InputError:
             self._files.abandon()
             return []

@@ -112,10 +112,10 @@ def expand_folder(folder: Path) -> list[Path]:
     Raises:
         InputError: the folder holds neither.
     """
-    from recorder.storage.mcap_writer import NUMBER
+    from recorder.storage.mcap_writer import FILE_INDEX
     from recorder.tools.mcap_file import read_metadata
 
-    one_recording = {NUMBER, "cut", "merged"}
+    one_recording = {FILE_INDEX, "cut", "merged"}
     records, recordings = (list_files(folder, suffix) for suffix in (".csv", ".mcap"))
     if not records and not recordings:
         raise InputError(f"{folder}: holds no record (.csv) and no recording (.mcap)")

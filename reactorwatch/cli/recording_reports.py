@@ -7,7 +7,7 @@ from typing import Any
 from reactorwatch.contract.messages_pb2 import Priority
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.terminal import printable_lines
-from recorder.storage.recover import Saved
+from recorder.storage.recover import RecoveryResult
 from recorder.tools.inspect import Look
 from recorder.tools.mcap_file import has_clock
 
@@ -15,7 +15,7 @@ MAX_LINES = 20
 """Gaps that are listed one by one for people."""
 
 
-def saved_object(saved: Saved, out: Path) -> dict[str, Any]:
+def saved_object(saved: RecoveryResult, out: Path) -> dict[str, Any]:
     """The object that `recover --json` prints."""
     return {
         "file": str(out),
@@ -28,7 +28,7 @@ def saved_object(saved: Saved, out: Path) -> dict[str, Any]:
     }
 
 
-def saved_text(saved: Saved, file: Path, out: Path) -> str:
+def saved_text(saved: RecoveryResult, file: Path, out: Path) -> str:
     """Format the output of `recover` for people."""
     span_s = (saved.last_ns - saved.first_ns) / 1e9
     return printable_lines(

@@ -32,10 +32,10 @@ def recover(
 
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import saved_object, saved_text
-    from recorder.storage.part_file import is_held
+    from recorder.storage.part_file import is_locked
     from recorder.storage.recover import recover as save
 
-    if is_held(check_input(file)):
+    if is_locked(check_input(file)):
         raise InputError(f"{file}: is still being written; stop its recorder first")
     out = check_output(out, ".mcap", (file,), force=force) if out is not None else _beside(file)
     with task(f"recovering {file.name}"):

@@ -33,9 +33,9 @@ from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, rea
 from reactorwatch.runtime.event_loop import stop_on_signals
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.model_file import read_extended_model
-from recorder.__main__ import file_for
+from recorder.__main__ import first_file
 from recorder.config import RecorderConfig
-from recorder.policy.series import ENDING
+from recorder.policy.file_names import ENDING
 
 log = structlog.get_logger()
 
@@ -162,7 +162,7 @@ def _write_settings(
     """Write the settings beside the recordings, under the same name; returns each node's file."""
     out = Path(recorder.out)
     make_folder(out.parent if out.suffix == ENDING and not out.is_dir() else out, "--out")
-    recording = file_for(recorder, datetime.now(UTC))
+    recording = first_file(recorder, datetime.now(UTC))
     if recording.exists():
         raise InputError(f"--out {out}: a recording of that name exists; choose another name, or a folder")
     settings = recording.with_suffix(".toml")

@@ -48,7 +48,7 @@ def run(file: Path, config: Path | None, plant: str | None, *, as_json: bool) ->
     monitor = _settings(file, metadata, config, one_plant_in(file, plant))
 
     def read() -> Iterator[Encoded]:
-        return (Encoded(*entry[:4]) for entry in read_messages(file, plant=monitor.plant) if not entry.repeated)
+        return (Encoded(*entry[:4]) for entry in read_messages(file, plant=monitor.plant) if not entry.latched)
 
     with task(f"verifying {file.name}"):
         try:

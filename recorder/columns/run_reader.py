@@ -38,7 +38,7 @@ from recorder.columns.run import (
     Snapshot,
 )
 from recorder.columns.run_splitter import ContinuousTime
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 
 STRETCH = 100_000
 """Messages; drawn they take some 20 MB for a moment."""
@@ -49,7 +49,7 @@ LISTED = "listed"
 """The event of alarms that were in their state when a list of alarms was asked for; since when is not known."""
 
 
-def read_run(recording: Iterable[Entry | Encoded]) -> Run:
+def read_run(recording: Iterable[RecordedMessage | Encoded]) -> Run:
     """The run that a recording tells of, in one piece.
 
     Args:
@@ -66,7 +66,7 @@ def read_run(recording: Iterable[Entry | Encoded]) -> Run:
 
 
 def stretches(
-    recording: Iterable[Entry | Encoded], messages_each: int = STRETCH, counted_from_ns: int | None = None
+    recording: Iterable[RecordedMessage | Encoded], messages_each: int = STRETCH, counted_from_ns: int | None = None
 ) -> Iterator[Run]:
     """The run that a recording tells of, in stretches; one at least.
 
@@ -108,7 +108,7 @@ class RunReader:
         self._seen: dict[str, Seen] = {}
         self._earlier = Earlier()
 
-    def take(self, entry: Entry | Encoded) -> None:
+    def take(self, entry: RecordedMessage | Encoded) -> None:
         """Take a message.
 
         Raises:

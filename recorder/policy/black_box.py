@@ -1,31 +1,31 @@
-"""Which stretches of time are kept for good: before and after each alarm. Pure.
+"""Time intervals around alarms that are kept permanently. Pure.
 
-All times are those of receipt. Alarms that come up before the time after the last one is over share a stretch, because
-they are of one story; one that goes on and on is ended, and the next alarm begins a new one.
+All times are times of receipt. An alarm that is raised before the current interval ends extends it, because both belong
+to one event. An interval has a largest length; the next alarm after it starts a new one.
 """
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from google.protobuf.message import Message
 
 from reactorwatch.contract import messages_pb2 as messages
 
-LONGEST = 10
-"""Times what is kept after an alarm: how long alarms may go on in one stretch."""
+MAX_MARGINS = 10
+"""Largest time from the first alarm to the end of an interval, in margins."""
 RAISED = "raised"
-"""The event of an alarm that comes up."""
+"""Event of an alarm that is raised."""
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """A stretch of time around one alarm, or several.
+class AlarmInterval:
+    """Time interval around one or several alarms.
 
     Attributes:
-        from_ns: where it begins.
-        to_ns: where it ends.
-        raised_ns: when the first of its alarms was received.
-        alarm: the first of them.
+        from_ns: start of the interval.
+        to_ns: end of the interval.
+        raised_ns: time of receipt of the first alarm.
+        alarm: name of the first alarm.
     """
 
     from_ns: int
@@ -35,61 +35,60 @@ class Stretch:
 
 
 class BlackBox:
-    """Follows the alarms of a plant.
+    """Derives the intervals to keep from a plant's alarms.
 
     Args:
-        around_ns: how much is kept before and after an alarm; 0: nothing is.
-        own: alarms of these names are the recorder's, and of no plant.
+        margin_ns: time kept before and after an alarm; 0 keeps nothing.
+        own: names of the recorder's own alarms, which start no interval.
     """
 
-    def __init__(self, around_ns: int, own: Collection[str] = ()) -> None:
-        self._around_ns = around_ns
+    def __init__(self, margin_ns: int, own: Collection[str] = ()) -> None:
+        self._margin_ns = margin_ns
         self._own = own
-        self._open: Stretch | None = None
+        self._open: AlarmInterval | None = None
 
-    def on_message(self, message: Message, received_ns: int) -> Stretch | None:
-        """Look at a message.
+    def on_message(self, message: Message, received_ns: int) -> AlarmInterval | None:
+        """Process a message.
 
         Returns:
-            A stretch that is over because this alarm begins a new one; most often None.
+            The interval that ended before this alarm started a new one; usually None.
         """
-        if not self._around_ns or not isinstance(message, messages.Alarm):
+        if not self._margin_ns or not isinstance(message, messages.Alarm):
             return None
         if message.event != RAISED or message.alarm in self._own:
             return None
-        over = self.over(received_ns)
-        around = Stretch(received_ns - self._around_ns, received_ns + self._around_ns, received_ns, message.alarm)
+        ended = self.pop_ended(received_ns)
+        end_ns = received_ns + self._margin_ns
         if self._open is None:
-            self._open = around
+            self._open = AlarmInterval(received_ns - self._margin_ns, end_ns, received_ns, message.alarm)
         else:
-            first = self._open
-            last_ns = min(around.to_ns, first.raised_ns + LONGEST * self._around_ns)
-            self._open = Stretch(first.from_ns, max(first.to_ns, last_ns), first.raised_ns, first.alarm)
-        return over
+            end_ns = min(end_ns, self._open.raised_ns + MAX_MARGINS * self._margin_ns)
+            self._open = replace(self._open, to_ns=max(self._open.to_ns, end_ns))
+        return ended
 
-    def over(self, now_ns: int) -> Stretch | None:
-        """The stretch that has come to its end, once; None if there is none."""
+    def pop_ended(self, now_ns: int) -> AlarmInterval | None:
+        """Return the interval that has ended, once; None if there is none."""
         if self._open is None or now_ns <= self._open.to_ns:
             return None
         return self.close()
 
-    def close(self) -> Stretch | None:
-        """The stretch that is under way, ended now; None if there is none."""
+    def close(self) -> AlarmInterval | None:
+        """End the current interval now and return it; None if there is none."""
         ended, self._open = self._open, None
         return ended
 
-    def needed_ns(self, now_ns: int) -> int | None:
-        """The last span of time of which nothing must be deleted: an alarm came, or may come now; None: all may be."""
-        if not self._around_ns:
+    def protected_ns(self, now_ns: int) -> int | None:
+        """Length of the most recent time of which nothing may be deleted, as an alarm needs it; None if all may be."""
+        if not self._margin_ns:
             return None
-        return max(self._around_ns, now_ns - self._open.from_ns if self._open is not None else 0)
+        return max(self._margin_ns, now_ns - self._open.from_ns if self._open is not None else 0)
 
     @property
-    def reach_ns(self) -> int:
-        """For how long an alarm may matter to the stretch that is under way: that of the longest."""
-        return (LONGEST + 1) * self._around_ns
+    def longest_ns(self) -> int:
+        """Largest length of an interval: older alarms cannot belong to the current one."""
+        return (MAX_MARGINS + 1) * self._margin_ns
 
     @property
     def next_due_ns(self) -> int | None:
-        """When a stretch ends, if nothing happens until then."""
+        """Time at which the current interval ends if no other alarm is raised."""
         return self._open.to_ns + 1 if self._open is not None else None

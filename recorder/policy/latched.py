@@ -1,46 +1,42 @@
-"""What a new file says first, so that it opens by itself: how things stand when it is begun. Pure.
+"""Latched messages repeated at the start of each file, so that every file is self-contained. Pure.
 
-Models and alarms are told when they change, and a file in which nothing changes would say nothing of them. So the last
-message of each is said again at its start, marked as such (`Entry.repeated`), with the time of its sample and with the
-time of the file's beginning as that of receipt.
+Models, alarms and faults are published when they change. A file in which none changes would not contain them. So the
+last message of each is repeated at the start of a file, marked as `RecordedMessage.latched`, with the time of its
+sample and with the start time of the file as its time of receipt.
 """
 
 from google.protobuf.message import Message
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.message import Entry
-from recorder.policy.room import MOST_KEYS
+from recorder.message import RecordedMessage
+from recorder.policy.channel_budget import MAX_KEYS
 
 
-class Head:
-    """The last message of each model, alarm and fault.
+class LatchedMessages:
+    """Last message of each model, alarm and fault.
 
     Args:
-        most: messages that are remembered; of more, the oldest are forgotten.
+        capacity: largest number of messages; beyond it the oldest is dropped.
     """
 
-    def __init__(self, most: int = MOST_KEYS // 2) -> None:
-        self._most = most
-        self._last: dict[tuple[str, tuple[str, bool, bool]], Entry] = {}
+    def __init__(self, capacity: int = MAX_KEYS // 2) -> None:
+        self._capacity = capacity
+        self._last: dict[tuple[str, tuple[str, bool, bool]], RecordedMessage] = {}
 
-    def remember(self, entry: Entry, message: Message) -> None:
-        """Look at an entry and what it holds."""
+    def update(self, recorded: RecordedMessage, message: Message) -> None:
+        """Process a recorded message and its decoded content."""
         if isinstance(message, messages.ModelSnapshot):
-            # models that share a key: the one that adapts, the one held since the training, the one that judges
-            name = (entry.key, (message.structure, message.reference, message.held))
+            # models that share a key: the adaptive one, the one held since the training, the reference
+            name = (recorded.key, (message.structure, message.reference, message.held))
         elif isinstance(message, messages.Alarm | messages.Fault):
-            name = (entry.key, ("", False, False))
+            name = (recorded.key, ("", False, False))
         else:
             return
         self._last.pop(name, None)
-        self._last[name] = entry
-        if len(self._last) > self._most:
+        self._last[name] = recorded
+        if len(self._last) > self._capacity:
             del self._last[next(iter(self._last))]
 
-    def entries(self, begun_ns: int) -> list[Entry]:
-        """What is to be said again, in the order in which it came.
-
-        Args:
-            begun_ns: when the file is begun.
-        """
-        return [entry._replace(log_time_ns=begun_ns, repeated=True) for entry in self._last.values()]
+    def messages(self, start_ns: int) -> list[RecordedMessage]:
+        """Messages to repeat in a file that starts at `start_ns`, in the order of receipt."""
+        return [item._replace(log_time_ns=start_ns, latched=True) for item in self._last.values()]

@@ -1,7 +1,7 @@
-"""The recorder's own alarms: it cannot write (`recording/disk`); no room for more keys (`recording/keys`). Pure.
+"""The recorder's own alarms: it cannot write (`recording/disk`), or a file has no free key (`recording/keys`). Pure.
 
-Their states are those of ISA-18.2 that a person needs: raised, acknowledged, returned before it was acknowledged,
-normal. Neither can be shelved or suppressed: a recorder that does not record everything should stay in sight.
+Their states are a subset of ISA-18.2: unacknowledged, acknowledged, returned unacknowledged, normal. Neither can be
+shelved or suppressed: an incomplete recording must stay visible.
 """
 
 from collections.abc import Mapping
@@ -22,21 +22,21 @@ PRIORITIES: Mapping[str, messages.Priority] = {
     DISK_ALARM: messages.PRIORITY_CRITICAL,
     KEYS_ALARM: messages.PRIORITY_HIGH,
 }
-"""The recorder's alarms and their priorities."""
+"""Priority by alarm."""
 COMMANDS: Mapping[str, type[Message]] = {
     keys.LIST_RECORDER_ALARMS: ListAlarms,
     keys.ACKNOWLEDGE_RECORDER: AlarmCommand,
 }
-"""The recorder's commands and what they carry."""
+"""Message type by command."""
 
 _ACTIVE = (messages.ALARM_STATE_UNACKNOWLEDGED, messages.ALARM_STATE_ACKNOWLEDGED)
 
 
 class OwnAlarms:
-    """The alarms and their states.
+    """States of the recorder's alarms.
 
     Args:
-        plant: the plant that they are published under.
+        plant: plant that the alarms are published under.
     """
 
     def __init__(self, plant: str) -> None:
@@ -48,11 +48,11 @@ class OwnAlarms:
 
     @property
     def now(self) -> list[messages.Alarm]:
-        """The alarms in their present state."""
+        """Alarms in their present state."""
         return list(self._now.values())
 
     def is_active(self, name: str) -> bool:
-        """True while an alarm is raised and has not cleared."""
+        """True from raised to cleared."""
         return self._now[name].state in _ACTIVE
 
     def raise_alarm(self, name: str, text: str, now_ns: int) -> Publication:
@@ -67,8 +67,8 @@ class OwnAlarms:
         state = messages.ALARM_STATE_NORMAL if acknowledged else messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED
         return self._change(name, "cleared", now_ns, state=state, cleared_ns=now_ns, text=text)
 
-    def obey(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Carry out a command: list the alarms or acknowledge one; the reply says why if it cannot be done."""
+    def execute(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
+        """Execute a command: list the alarms or acknowledge one. A refusal is a reply with the reason."""
         try:
             return self._answer(question, now_ns)
         except (InputError, DecodeError) as error:

@@ -1,6 +1,6 @@
-"""Which recordings are deleted, oldest first, so that those that are left keep within limits. Pure.
+"""Retention: select the oldest recordings for deletion until the others are within limits. Pure.
 
-All times are confirmed ones, see `ages`: no clock that is set deletes anything.
+All times are confirmed times (see `ages`): setting a clock deletes nothing.
 """
 
 from collections.abc import Iterable
@@ -12,14 +12,14 @@ from typing import NamedTuple
 DAY_NS = 86_400_000_000_000
 
 
-class Finished(NamedTuple):
-    """A recording that is whole.
+class CompleteRecording(NamedTuple):
+    """Complete recording on disk.
 
     Attributes:
         path: the file.
-        size_bytes: its size.
-        ended_ns: the confirmed time at which it was first seen whole.
-        modified_ns: the time that the file says it was modified at; it orders files that were first seen together.
+        size_bytes: size of the file.
+        ended_ns: confirmed time at which it was first seen complete.
+        modified_ns: modification time of the file, which orders files with equal `ended_ns`.
     """
 
     path: Path
@@ -30,12 +30,12 @@ class Finished(NamedTuple):
 
 @dataclass(frozen=True)
 class Limits:
-    """What may be kept, the file that is being written included; infinite: without limit.
+    """Limits on recordings, the one being written included; inf is no limit.
 
     Attributes:
-        size_bytes: of all together.
-        age_ns: of a recording, since its end.
-        files: how many.
+        size_bytes: total size.
+        age_ns: time since the end of a recording.
+        files: number of files.
     """
 
     size_bytes: float = inf
@@ -43,34 +43,31 @@ class Limits:
     files: float = inf
 
 
-def to_delete(
-    finished: Iterable[Finished],
+def select_deletions(
+    complete: Iterable[CompleteRecording],
     writing_bytes: int | None,
     limits: Limits,
     now_ns: int,
-    needed_since_ns: int | None = None,
+    protected_since_ns: int | None = None,
 ) -> list[Path]:
-    """What has to go.
+    """Select the recordings to delete, oldest first.
 
     Args:
-        finished: all recordings that are whole; the one that is being written is not among them and is never deleted.
-        writing_bytes: its size; None: none is being written.
-        limits: see there.
-        now_ns: the confirmed time.
-        needed_since_ns: what ended since then stays, whatever the limits say; None: nothing is needed.
-
-    Returns:
-        The files, oldest first.
+        complete: complete recordings, without the one that is being written, which is never deleted.
+        writing_bytes: size of the recording that is being written; None if there is none.
+        limits: the limits.
+        now_ns: confirmed time.
+        protected_since_ns: recordings that ended since then stay regardless of the limits; None protects none.
     """
-    by_age = sorted(finished, key=lambda item: (item.ended_ns, item.modified_ns, item.path))
-    left, size = len(by_age), sum(item.size_bytes for item in by_age)
+    by_age = sorted(complete, key=lambda item: (item.ended_ns, item.modified_ns, item.path))
+    count, size = len(by_age), sum(item.size_bytes for item in by_age)
     if writing_bytes is not None:
-        left, size = left + 1, size + writing_bytes
-    gone = []
+        count, size = count + 1, size + writing_bytes
+    deletions = []
     for item in by_age:
-        within = left <= limits.files and size <= limits.size_bytes and now_ns - item.ended_ns <= limits.age_ns
-        if within or (needed_since_ns is not None and item.ended_ns >= needed_since_ns):
+        within = count <= limits.files and size <= limits.size_bytes and now_ns - item.ended_ns <= limits.age_ns
+        if within or (protected_since_ns is not None and item.ended_ns >= protected_since_ns):
             break
-        gone.append(item.path)
-        left, size = left - 1, size - item.size_bytes
-    return gone
+        deletions.append(item.path)
+        count, size = count - 1, size - item.size_bytes
+    return deletions

@@ -1,9 +1,9 @@
 """Ages of recordings by a clock that cannot be set.
 
-The wall clock may be wrong when the machine starts, and may be set by years; it must not delete anything. So the age of
-a recording counts only the time that the clock since the machine's start confirms: the time in which the machine runs,
-with or without a recorder. It counts from the moment at which a recorder completed the file or found it, and goes on
-after a restart, by a small file beside the recordings.
+The wall clock may be wrong at boot and may be set by years; that must not delete a recording. So the age of a recording
+is the time confirmed by the clock since boot: the time in which the machine ran, with or without a recorder. It counts
+from the time at which a recorder completed or found the file. A small file beside the recordings carries it over a
+restart.
 """
 
 import time
@@ -22,11 +22,11 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 
 class BootClock(NamedTuple):
-    """A reading of the clock since the machine's start.
+    """Reading of the clock since boot.
 
     Attributes:
-        boot: names that start; empty: it has no name, and readings of two processes cannot be compared.
-        since_ns: the time since then, suspended or not.
+        boot: identifier of the boot; empty if unknown: readings of two processes then cannot be compared.
+        since_ns: time since boot, suspended or not.
     """
 
     boot: str
@@ -34,7 +34,7 @@ class BootClock(NamedTuple):
 
 
 def read_boot_clock() -> BootClock:
-    """Read the clock since the machine's start."""
+    """Read the clock since boot."""
     try:
         boot = _BOOT_ID.read_text(encoding="ascii").strip()
     except OSError:
@@ -42,24 +42,24 @@ def read_boot_clock() -> BootClock:
     return BootClock(boot, time.clock_gettime_ns(time.CLOCK_BOOTTIME))
 
 
-class _Seen(msgspec.Struct, frozen=True):
-    modified_ns: int  # by which a new file of an old name is another file
+class _FirstSeen(msgspec.Struct, frozen=True):
+    modified_ns: int  # a reused name with another modification time is another file
     seen_ns: int
 
 
-class _Stored(msgspec.Struct, frozen=True):
+class _StoredAges(msgspec.Struct, frozen=True):
     boot: str
     since_ns: int
     now_ns: int
-    seen: dict[str, _Seen]
+    seen: dict[str, _FirstSeen]
 
 
 class Ages:
-    """When recordings were first seen complete, on a time that only the clock since the machine's start moves on.
+    """Confirmed times at which recordings were first seen complete.
 
     Args:
-        path: the file beside the recordings.
-        read_clock: reads that clock.
+        path: file in which they are stored.
+        read_clock: reads the clock since boot.
     """
 
     def __init__(self, path: Path, read_clock: Callable[[], BootClock] = read_boot_clock) -> None:
@@ -67,10 +67,10 @@ class Ages:
         self._read_clock = read_clock
         self._start = read_clock()
         self._start_ns = 0
-        self._seen: dict[str, _Seen] = {}
-        self._noted: dict[str, _Seen] = {}
+        self._seen: dict[str, _FirstSeen] = {}
+        self._noted: dict[str, _FirstSeen] = {}
         try:
-            stored = msgspec.json.decode(path.read_bytes(), type=_Stored)
+            stored = msgspec.json.decode(path.read_bytes(), type=_StoredAges)
         except FileNotFoundError:
             return
         except (OSError, msgspec.MsgspecError) as error:
@@ -81,40 +81,40 @@ class Ages:
         self._seen = stored.seen
 
     def now_ns(self) -> int:
-        """The confirmed time."""
+        """Confirmed time."""
         return self._start_ns + self._read_clock().since_ns - self._start.since_ns
 
-    def note(self, name: str, modified_ns: int) -> None:
-        """Note that a recording was completed now; from any thread."""
-        self._noted[name] = _Seen(modified_ns, self.now_ns())
+    def add(self, name: str, modified_ns: int) -> None:
+        """Add a recording that was completed now; thread-safe."""
+        self._noted[name] = _FirstSeen(modified_ns, self.now_ns())
 
-    def see(self, modified_ns: Iterable[tuple[str, int]]) -> dict[str, int]:
-        """Note which recordings are there.
+    def update(self, modified_ns: Iterable[tuple[str, int]]) -> dict[str, int]:
+        """Replace the set of existing recordings.
 
         Args:
-            modified_ns: the name of each, and when its file says that it was modified.
+            modified_ns: name and modification time of each recording.
 
         Returns:
-            The confirmed time at which each was first seen, by name.
+            Confirmed time at which each was first seen, by name.
         """
         now_ns = self.now_ns()
         before, self._seen = self._seen, {}
         for name, modified in modified_ns:
             seen = self._noted.pop(name, before.get(name))
             if seen is None or seen.modified_ns != modified:
-                seen = _Seen(modified, now_ns)
+                seen = _FirstSeen(modified, now_ns)
             self._seen[name] = seen
         return {name: seen.seen_ns for name, seen in self._seen.items()}
 
     def store(self) -> None:
-        """Write the file, so that the next recorder goes on from here.
+        """Write the file, so that the next recorder resumes from it.
 
         Raises:
             OSError: it cannot be written.
-            InputError: the folder is gone.
+            InputError: the folder was deleted.
         """
         since_ns = self._read_clock().since_ns
         now_ns = self._start_ns + since_ns - self._start.since_ns
-        stored = _Stored(self._start.boot, since_ns, now_ns, self._seen)
+        stored = _StoredAges(self._start.boot, since_ns, now_ns, self._seen)
         with atomic_write(self._path) as temporary:
             temporary.write_bytes(msgspec.json.encode(stored))

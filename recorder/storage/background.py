@@ -1,4 +1,4 @@
-"""Work on files that may take a while: one after the other, in a thread of its own, while recording goes on."""
+"""Background thread for slow work on files, so that recording continues meanwhile."""
 
 import threading
 from collections.abc import Callable
@@ -10,38 +10,33 @@ from reactorwatch.errors import InputError
 
 log = structlog.get_logger()
 
-Chore = Callable[[], None]
+Task = Callable[[], None]
 
 
-class Chores:
-    """A queue of work. What fails is told in the log and is over: it never ends the recording."""
+class BackgroundTasks:
+    """Queue of tasks, run one after the other; a failed task is logged and never ends the recording."""
 
     def __init__(self) -> None:
-        self._queue: SimpleQueue[tuple[str, Chore] | None] = SimpleQueue()
+        self._queue: SimpleQueue[tuple[str, Task] | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
 
-    def add(self, name: str, chore: Chore) -> None:
-        """Do something when all that was added before is done.
-
-        Args:
-            name: what it is, for the log.
-            chore: the work.
-        """
+    def submit(self, name: str, task: Task) -> None:
+        """Queue a task; `name` describes it in the log."""
         if self._thread is None:
-            self._thread = threading.Thread(target=self._work, name="chores", daemon=True)
+            self._thread = threading.Thread(target=self._work, name="background tasks", daemon=True)
             self._thread.start()
-        self._queue.put((name, chore))
+        self._queue.put((name, task))
 
     def finish(self) -> None:
-        """Wait until all is done; nothing may be added afterwards."""
+        """Wait until all tasks are done; none may be submitted afterwards."""
         if self._thread is not None:
             self._queue.put(None)
             self._thread.join()
 
     def _work(self) -> None:
         while (item := self._queue.get()) is not None:
-            name, chore = item
+            name, task = item
             try:
-                chore()
+                task()
             except (InputError, OSError) as error:
                 log.warning(f"{name} failed", why=str(error))

@@ -1,8 +1,7 @@
-"""The content of a chunk of an MCAP file, never more of it than the file claims and the setting allows.
+"""Bounded decompression of MCAP chunks.
 
-A chunk of a few kilobytes may hold gigabytes when it is decompressed. So its claimed size is checked first; then it is
-decompressed in pieces, and refused as soon as a piece shows that it holds no record of the format, or more than it
-claims.
+A chunk of a few kilobytes may decompress to gigabytes. So its claimed size is checked first. Then it is decompressed in
+pieces, and refused as soon as a piece is no record of the format or exceeds the claimed size.
 """
 
 import os
@@ -15,21 +14,21 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk
 
 LARGEST_MB = "REACTORWATCH_LARGEST_CHUNK_MB"
-"""The environment variable that sets the largest chunk that is read."""
+"""Environment variable that sets the largest chunk that is read."""
 DEFAULT_LARGEST_MB = 32.0
 PIECE_BYTES = 4 << 20
 
 _MB = 1_000_000
 _RECORDS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE})
 _FIRST_PRIVATE = 0x80
-"""Opcodes from here on belong to other programs, whose records are passed over."""
+"""Opcodes from here on are private to other programs; their records are skipped."""
 
 
 def largest_chunk_bytes() -> int:
-    """The size of the largest chunk that is read, as it is set in the environment.
+    """Largest chunk that is read, from the environment.
 
     Raises:
-        ValueError: the setting is no positive number.
+        ValueError: the variable is not a positive number.
     """
     text = os.environ.get(LARGEST_MB, str(DEFAULT_LARGEST_MB))
     try:
@@ -42,15 +41,15 @@ def largest_chunk_bytes() -> int:
 
 
 def chunk_data(chunk: Chunk, indexed_bytes: int | None = None) -> bytes:
-    """The records in a chunk.
+    """Decompressed records of a chunk.
 
     Args:
-        chunk: the chunk as it stands in the file.
-        indexed_bytes: the size of its content as the file's index claims it; None: no index is known.
+        chunk: chunk record of the file.
+        indexed_bytes: uncompressed size in the file's index; None if there is no index.
 
     Raises:
-        ValueError: it is larger than the setting allows, not of the size that is claimed, or damaged. What the
-            decompressor raises is passed on.
+        ValueError: it is larger than the setting allows, not of the size that is claimed, or damaged. Errors of the
+            decompressor are passed on.
     """
     claimed, largest = chunk.uncompressed_size, largest_chunk_bytes()
     if claimed > largest:
@@ -76,7 +75,7 @@ def chunk_data(chunk: Chunk, indexed_bytes: int | None = None) -> bytes:
 
 
 def _pieces(chunk: Chunk, most_bytes: int) -> Iterator[bytes]:
-    """The content piece by piece, none of them empty; together no more than so many bytes."""
+    """Non-empty pieces of the content, together at most `most_bytes`."""
     match chunk.compression:
         case "zstd":
             with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:

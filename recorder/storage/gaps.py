@@ -1,8 +1,7 @@
-"""What never came, as a recording tells it: a metadata record for each gap. Pure.
+"""Metadata records of messages lost on the bus, one a gap. Pure.
 
-The bus numbers what a node publishes of one kind (`reactorwatch.runtime.delivery.reorder_buffer`). What was lost on the
-way and could not be recovered is among these numbers, so it is known how much is missing, of what, and from where to
-where.
+Publishers number their messages (`reactorwatch.runtime.delivery.reorder_buffer`), so the number and the range of lost
+messages is known.
 """
 
 from datetime import UTC, datetime
@@ -10,11 +9,11 @@ from datetime import UTC, datetime
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
 
 GAP = "reactorwatch.gap"
-"""The name of these records."""
+"""Name of the records."""
 
 
 def to_metadata(gap: Gap) -> dict[str, str]:
-    """The record of a gap."""
+    """Metadata record of a gap."""
     return {
         "stream": gap.stream,
         "publisher": f"{gap.publisher:016x}",
@@ -27,7 +26,7 @@ def to_metadata(gap: Gap) -> dict[str, str]:
 
 
 def from_metadata(metadata: dict[str, str]) -> Gap | None:
-    """The gap of a record; None if it tells of none."""
+    """Gap of a metadata record; None if it is not one of a gap."""
     try:
         return Gap(
             metadata["stream"],

@@ -1,8 +1,8 @@
-"""The index and the chunks of an MCAP file, read so that damage is told in one line.
+"""Reader of the index and the chunks of an MCAP file; damage raises a one-line error.
 
-The message records are taken out of a chunk here (`_messages_of`) and not by the library, which builds an object for
-each and, in order of receipt, sorts them all. That is left to it only where a file needs it: its messages are not in
-the order of receipt, or it has no chunks or no index, as other programs may write it.
+Messages are parsed here (`_messages_of`) and not by the library, which builds an object for each record. They are
+sorted only where the file needs it: messages out of the order of receipt, or no chunks or no index, as files of other
+programs may have it.
 """
 
 import heapq
@@ -29,17 +29,17 @@ from mcap.writer import MCAP0_MAGIC
 from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import wrap_read_errors
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.storage.chunk_data import chunk_data
 
 FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of the summary, of the summary offsets, CRC
 RECORD = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then the payload
 
-REPEATED = "reactorwatch.repeated"
-"""In the metadata of a channel: its messages are said again, see `Entry.repeated`."""
+LATCHED = "reactorwatch.repeated"
+"""Key in the metadata of a channel of latched messages, see `RecordedMessage.latched`."""
 
-# what reading damaged bytes raises, in the library and in what it stands on
+# raised for damaged bytes by the library and its dependencies
 DAMAGE = (
     McapError,
     struct.error,
@@ -54,10 +54,10 @@ DAMAGE = (
 
 
 def read_summary(path: Path) -> Summary:
-    """The index at the end of the file; empty if the file has none, which the format allows.
+    """Index at the end of the file; empty if the file has none, which the format allows.
 
     Raises:
-        InputError: the file is not there, is no MCAP file, is cut off, or its index is damaged.
+        InputError: the file does not exist, is no MCAP file, is cut off, or its index is damaged.
     """
     with wrap_read_errors(path):
         size = path.stat().st_size
@@ -70,39 +70,39 @@ def read_summary(path: Path) -> Summary:
             raise InputError(f"{path}: expected an MCAP recording, got another kind of file")
         tail = FOOTER.size + len(MCAP0_MAGIC)
         if size < len(MCAP0_MAGIC) + tail:
-            raise damaged(path, "is cut off")
+            raise damage_error(path, "is cut off")
         stream.seek(-tail, 2)
         end = stream.read()
         opcode, length, start, _, crc = FOOTER.unpack_from(end)
         if not end.endswith(MCAP0_MAGIC) or opcode != Opcode.FOOTER or length != FOOTER.size - RECORD.size:
-            raise damaged(path, "is cut off: the recorder was killed, or is still writing it")
+            raise damage_error(path, "is cut off: the recorder was killed, or is still writing it")
         if not start:
             return Summary()
         if start > size - tail:
-            raise damaged(path, "its index is damaged")
+            raise damage_error(path, "its index is damaged")
         stream.seek(start)
         summary = stream.read(size - tail - start) + end[: FOOTER.size - 4]
         if crc and zlib.crc32(summary) != crc:
-            raise damaged(path, "its index is damaged: the checksum differs")
+            raise damage_error(path, "its index is damaged: the checksum differs")
         stream.seek(0)
         try:
             return SeekingReader(stream, record_size_limit=size).get_summary() or Summary()
         except DAMAGE as error:
-            raise damaged(path, "its index is damaged", error) from error
+            raise damage_error(path, "its index is damaged", error) from error
 
 
 def is_in_order(summary: Summary) -> bool:
-    """Whether the index knows all that is in the chunks, and these follow each other in time."""
+    """True if every chunk is indexed and the chunks are in the order of receipt without overlap."""
     chunks = _chunks(summary)
-    follow = all(a.message_end_time <= b.message_start_time for a, b in itertools.pairwise(chunks))
-    return _is_indexed(summary) and follow
+    is_sorted = all(a.message_end_time <= b.message_start_time for a, b in itertools.pairwise(chunks))
+    return _is_indexed(summary) and is_sorted
 
 
 def span_ns(summary: Summary) -> tuple[int, int]:
-    """The times of receipt of the first and of the last message.
+    """Times of receipt of the first and of the last message.
 
     Returns:
-        Both 0 for a file without messages; from 0 to the end of time for one whose index does not say.
+        (0, 0) for a file without messages; (0, 2^64 - 1) if the index has no times.
     """
     if summary.statistics is not None:
         return summary.statistics.message_start_time, summary.statistics.message_end_time
@@ -112,13 +112,13 @@ def span_ns(summary: Summary) -> tuple[int, int]:
     return min(chunk.message_start_time for chunk in chunks), max(chunk.message_end_time for chunk in chunks)
 
 
-def entries(path: Path, summary: Summary, wanted: set[int]) -> Iterator[Entry]:
-    """The messages of the wanted channels, of a file that is in order.
+def ordered_messages(path: Path, summary: Summary, wanted: set[int]) -> Iterator[RecordedMessage]:
+    """Messages of the wanted channels in the order of receipt, of a file that `is_in_order`.
 
     Raises:
-        InputError: a chunk is damaged; when the reading comes there.
+        InputError: a chunk is damaged; raised when the iteration reaches it.
     """
-    channels = {number: channel_of(summary.channels[number], summary.schemas) for number in wanted}
+    channels = {number: keyed_channel(summary.channels[number], summary.schemas) for number in wanted}
     size = path.stat().st_size
     with path.open("rb") as stream:
         for index in _chunks(summary):
@@ -126,46 +126,47 @@ def entries(path: Path, summary: Summary, wanted: set[int]) -> Iterator[Entry]:
                 continue
             try:
                 data = _uncompressed(stream, index, size)
-                found = list(_messages_of(data, channels))
+                parsed = list(_messages_of(data, channels))
             except DAMAGE as error:
                 where = f"the chunk at byte {index.chunk_start_offset} cannot be read"
-                raise damaged(path, where, error) from error
-            found.sort(key=attrgetter("log_time_ns"))  # stable, and quick when there is nothing to do
-            yield from found
+                raise damage_error(path, where, error) from error
+            parsed.sort(key=attrgetter("log_time_ns"))  # stable, and fast if sorted already
+            yield from parsed
 
 
-def sorted_entries(path: Path, summary: Summary) -> Iterator[Entry]:
-    """All messages of any MCAP file, in the order of receipt. Without an index all of them are in memory at once.
+def sorted_messages(path: Path, summary: Summary) -> Iterator[RecordedMessage]:
+    """All messages of any MCAP file in the order of receipt; without an index, all are in memory at once.
 
     Raises:
-        InputError: the file is damaged; when the reading comes there.
+        InputError: the file is damaged; raised when the iteration reaches the damage.
     """
     with path.open("rb") as stream:
         try:
             if _is_indexed(summary):
                 yield from _sorted_chunks(stream, summary, path.stat().st_size)
             else:
-                yield from sorted(_walk(stream, path.stat().st_size), key=attrgetter("log_time_ns"))
+                yield from sorted(_unindexed_messages(stream, path.stat().st_size), key=attrgetter("log_time_ns"))
         except DAMAGE as error:
-            raise damaged(path, "cannot be read", error) from error
+            raise damage_error(path, "cannot be read", error) from error
 
 
-def _sorted_chunks(stream: IO[bytes], summary: Summary, size: int) -> Iterator[Entry]:
-    """The messages of chunks that overlap, each chunk read when the first of its messages is due."""
-    channels = {number: channel_of(channel, summary.schemas) for number, channel in summary.channels.items()}
-    waiting: list[tuple[int, int, int, Entry]] = []  # log time, chunk and number in it; so no two entries are compared
+def _sorted_chunks(stream: IO[bytes], summary: Summary, size: int) -> Iterator[RecordedMessage]:
+    """Messages of overlapping chunks, each chunk read when its first message is due."""
+    channels = {number: keyed_channel(channel, summary.schemas) for number, channel in summary.channels.items()}
+    # log time, chunk, position in it: unique, so that no two messages are compared
+    waiting: list[tuple[int, int, int, RecordedMessage]] = []
     for index in sorted(summary.chunk_indexes, key=attrgetter("message_start_time", "chunk_start_offset")):
         while waiting and waiting[0][0] < index.message_start_time:
             yield heapq.heappop(waiting)[-1]
-        found = _messages_of(_uncompressed(stream, index, size), channels, dict(summary.schemas))
-        for number, entry in enumerate(found):
-            heapq.heappush(waiting, (entry.log_time_ns, index.chunk_start_offset, number, entry))
+        parsed = _messages_of(_uncompressed(stream, index, size), channels, dict(summary.schemas))
+        for position, message in enumerate(parsed):
+            heapq.heappush(waiting, (message.log_time_ns, index.chunk_start_offset, position, message))
     while waiting:
         yield heapq.heappop(waiting)[-1]
 
 
-def _walk(stream: IO[bytes], size: int) -> Iterator[Entry]:
-    """The messages of a file without an index, from its front to its end."""
+def _unindexed_messages(stream: IO[bytes], size: int) -> Iterator[RecordedMessage]:
+    """Messages of a file without an index, in the order of the file."""
     schemas: dict[int, Schema] = {}
     channels: dict[int, KeyedChannel] = {}
     reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size)
@@ -176,15 +177,15 @@ def _walk(stream: IO[bytes], size: int) -> Iterator[Entry]:
             case Schema():
                 schemas[record.id] = record
             case Channel():
-                channels[record.id] = channel_of(record, schemas)
+                channels[record.id] = keyed_channel(record, schemas)
             case Message():
                 channel = channels[record.channel_id]
                 times = record.log_time, record.publish_time
-                yield Entry(channel.key, record.data, channel.encoding, *times, channel.repeated)
+                yield RecordedMessage(channel.key, record.data, channel.encoding, *times, channel.latched)
 
 
 def metadata_records(path: Path) -> list[Metadata]:
-    """What programs have written into the file about it.
+    """Metadata records of a file.
 
     Raises:
         InputError: as `read_summary`.
@@ -194,7 +195,7 @@ def metadata_records(path: Path) -> list[Metadata]:
         try:
             return list(SeekingReader(stream, record_size_limit=path.stat().st_size).iter_metadata())
         except DAMAGE as error:
-            raise damaged(path, "its metadata cannot be read", error) from error
+            raise damage_error(path, "its metadata cannot be read", error) from error
 
 
 def _chunks(summary: Summary) -> list[ChunkIndex]:
@@ -210,23 +211,23 @@ def _is_indexed(summary: Summary) -> bool:
 
 
 class KeyedChannel(NamedTuple):
-    """What the messages of a channel have in common; see `Entry`."""
+    """Fields that all messages of a channel share; see `RecordedMessage`."""
 
     key: str
     encoding: str
-    repeated: bool
+    latched: bool
 
 
-def channel_of(channel: Channel, schemas: Mapping[int, Schema]) -> KeyedChannel:
-    """What a channel record says.
+def keyed_channel(channel: Channel, schemas: Mapping[int, Schema]) -> KeyedChannel:
+    """Key, encoding and latched flag of a channel record.
 
     Raises:
-        KeyError: its schema is not among those given.
+        KeyError: its schema is not in `schemas`.
     """
     encoding = channel.message_encoding
     if encoding == MessageEncoding.Protobuf and channel.schema_id:
         encoding = PREFIX + schemas[channel.schema_id].name
-    return KeyedChannel(channel.topic, encoding, REPEATED in channel.metadata)
+    return KeyedChannel(channel.topic, encoding, LATCHED in channel.metadata)
 
 
 def _uncompressed(stream: IO[bytes], index: ChunkIndex, size: int) -> bytes:
@@ -239,16 +240,17 @@ def _uncompressed(stream: IO[bytes], index: ChunkIndex, size: int) -> bytes:
 
 def _messages_of(
     data: bytes, channels: dict[int, KeyedChannel], schemas: dict[int, Schema] | None = None
-) -> Iterator[Entry]:
-    """The messages in an uncompressed chunk: records of opcode, length and content, one after the other.
+) -> Iterator[RecordedMessage]:
+    """Messages of an uncompressed chunk, a sequence of records of opcode, length and content.
 
     Args:
         data: the chunk.
-        channels: channels by number; messages of others are passed over.
-        schemas: schemas by number; with them, what the chunk describes is learned. None: all is known.
+        channels: channels by number; messages of other channels are skipped.
+        schemas: schemas by number, to which those of the chunk are added, as its channels are to `channels`; None
+            ignores both.
 
     Raises:
-        ValueError: a record is of no kind that the format knows, or belongs to a channel that was not described.
+        ValueError: a record is of an unknown kind, or, with `schemas`, its channel is not described.
     """
     record, message = RECORD.unpack_from, MESSAGE.unpack_from
     at, end = 0, len(data)
@@ -260,7 +262,7 @@ def _messages_of(
             channel = channels.get(number)
             if channel is not None:
                 payload = data[at + MESSAGE.size : at + length]
-                yield Entry(channel.key, payload, channel.encoding, log_time, publish_time, channel.repeated)
+                yield RecordedMessage(channel.key, payload, channel.encoding, log_time, publish_time, channel.latched)
             elif schemas is not None:
                 raise ValueError(f"channel {number} is described nowhere")
         elif not opcode:
@@ -270,11 +272,11 @@ def _messages_of(
             schemas[schema.id] = schema
         elif schemas is not None and opcode == Opcode.CHANNEL:
             described = Channel.read(ReadDataStream(io.BytesIO(data[at : at + length])))
-            channels[described.id] = channel_of(described, schemas)
+            channels[described.id] = keyed_channel(described, schemas)
         at += length
 
 
-def damaged(path: Path, what: str, error: Exception | None = None) -> InputError:
-    """The line about a damaged file."""
+def damage_error(path: Path, what: str, error: Exception | None = None) -> InputError:
+    """Error for a damaged file, with the command that recovers it."""
     why = f" ({str(error) or type(error).__name__})" if error else ""
     return InputError(f"{path}: {what}{why}; `reactorwatch recover {path}` saves what is whole in it")

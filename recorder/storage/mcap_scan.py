@@ -1,9 +1,9 @@
-"""An MCAP file read from its front to its end, whatever has become of it.
+"""Sequential scan of an MCAP file that tolerates damage.
 
-The file needs no index and no end, so that one which is cut off, damaged or still being written is read as well. A
-record says how long it is, so a chunk whose contents are damaged is passed over by its length. Where a length itself is
-damaged, the next chunk is looked for: its compression is written out in it, and the lengths around that word have to
-agree with each other. What a chunk holds is taken only if its checksum agrees.
+The scan needs no index and no end, so it also reads a file that is cut off, damaged or still being written. A chunk
+with damaged content is skipped by its length. Where a length is damaged, the next chunk is searched for by the name of
+its compression and by the lengths around it, which must be consistent. The content of a chunk is used only if its
+checksum matches.
 """
 
 import io
@@ -22,28 +22,28 @@ from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import wrap_read_errors
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.storage.chunk_data import chunk_data
-from recorder.storage.mcap_chunks import DAMAGE, FOOTER, MESSAGE, RECORD, REPEATED, channel_of, read_summary
+from recorder.storage.mcap_chunks import DAMAGE, FOOTER, LATCHED, MESSAGE, RECORD, keyed_channel, read_summary
 
-FOREVER_NS = 2**64 - 1
+LATEST_NS = 2**64 - 1
 
 Wanted = Callable[[str], bool]
-"""Whether the messages of a topic are wanted."""
+"""Returns True for topics to read."""
 
-Described = TypeVar("Described", Channel, Schema)
+ChannelOrSchema = TypeVar("ChannelOrSchema", Channel, Schema)
 
-_CHUNK_TIMES = struct.Struct("<QQ")  # of its first and of its last message; then size, checksum and compression
+_CHUNK_TIMES = struct.Struct("<QQ")  # log times of the first and the last message
 _BEFORE_COMPRESSION = RECORD.size + 8 + 8 + 8 + 4 + 4  # bytes of a chunk before the name of its compression
 _NAME_LENGTH, _DATA_LENGTH = struct.Struct("<I"), struct.Struct("<Q")
-_INDEX = struct.Struct("<HI")  # channel of a message index, and the length of what follows
+_INDEX = struct.Struct("<HI")  # channel of a message index, length of the rest
 _CHECKSUM = struct.Struct("<I")
 _COMPRESSIONS = (b"zstd", b"lz4")
-_KNOWN = frozenset(Opcode)
+_OPCODES = frozenset(Opcode)
 
 
-class Stored(NamedTuple):
-    """A message as it is in a file, of whatever program; times are those of receipt and of the sample."""
+class RawMessage(NamedTuple):
+    """A message of a file, written by any program, with its channel and schema records."""
 
     channel: Channel
     schema: Schema | None
@@ -53,24 +53,24 @@ class Stored(NamedTuple):
     payload: bytes
 
     @property
-    def repeated(self) -> bool:
-        """See `recorder.message.Entry`."""
-        return REPEATED in self.channel.metadata
+    def latched(self) -> bool:
+        """True for a latched message, see `RecordedMessage`."""
+        return LATCHED in self.channel.metadata
 
     @property
-    def entry(self) -> Entry:
-        """The same as the recorder speaks of it."""
+    def recorded(self) -> RecordedMessage:
+        """The message as the recorder writes it."""
         schemas = {self.schema.id: self.schema} if self.schema is not None else {}
-        key, encoding, repeated = channel_of(self.channel, schemas)
-        return Entry(key, self.payload, encoding, self.log_time_ns, self.publish_time_ns, repeated)
+        key, encoding, repeated = keyed_channel(self.channel, schemas)
+        return RecordedMessage(key, self.payload, encoding, self.log_time_ns, self.publish_time_ns, repeated)
 
 
 class Damage(NamedTuple):
-    """A place of a file that could not be read; `cut_off` if it is merely the end, which is not there."""
+    """Unreadable part of a file; `is_end` if only the end of the file is missing."""
 
     at_byte: int
     what: str
-    cut_off: bool = False
+    is_end: bool = False
 
     def __str__(self) -> str:
         return f"{self.what} at byte {self.at_byte}"
@@ -81,22 +81,21 @@ class Scan:
 
     Args:
         path: the file.
-        from_ns: chunks that hold only what was received earlier are passed over.
-        to_ns: likewise, later.
-        wanted: topics that are read; None: all.
+        from_ns: chunks that were received entirely before this time are skipped.
+        to_ns: chunks that were received entirely after this time are skipped.
+        wanted: selects the topics to read; None reads all.
 
     Attributes:
-        damages: the places that could not be read; complete after the pass.
-        metadata: what programs wrote into the file about it; complete after the pass.
-        profile: that the file says its messages follow; known from the first message on.
-        orphans: messages of channels that are described nowhere any more.
-        whole: after the pass, whether the file has its end and no damage was seen.
+        damages: unreadable parts; complete after the pass.
+        metadata: metadata records; complete after the pass.
+        profile: MCAP profile of the file; set from the first message on.
+        orphans: number of messages whose channel is described nowhere.
 
     Raises:
-        InputError: there is no such file, it is empty, or nothing in it looks like a recording.
+        InputError: the file does not exist, is empty, or contains nothing of a recording.
     """
 
-    def __init__(self, path: Path, from_ns: int = 0, to_ns: int = FOREVER_NS, wanted: Wanted | None = None) -> None:
+    def __init__(self, path: Path, from_ns: int = 0, to_ns: int = LATEST_NS, wanted: Wanted | None = None) -> None:
         self.damages: list[Damage] = []
         self.metadata: list[Metadata] = []
         self.profile = ""
@@ -107,8 +106,8 @@ class Scan:
         self._ended = False
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, Schema] = {}
-        self._indexed_bytes: dict[int, int] = {}  # the size of each chunk's content, by where the chunk begins
-        self._sure: set[tuple[type, int]] = set()  # channels and schemas that a checksum vouches for
+        self._indexed_bytes: dict[int, int] = {}  # uncompressed size by offset of the chunk
+        self._verified: set[tuple[type, int]] = set()  # channels and schemas confirmed by a checksum
         with wrap_read_errors(path), path.open("rb") as stream:
             self._size = os.fstat(stream.fileno()).st_size
             if not self._size:
@@ -123,13 +122,13 @@ class Scan:
             self._start = self._size if chunk is None else chunk
 
     @property
-    def whole(self) -> bool:
-        """See above."""
+    def is_intact(self) -> bool:
+        """True after the pass if the file has its end and no damage was found."""
         return self._ended and not self.damages and not self.orphans
 
-    def __iter__(self) -> Iterator[Stored]:
-        """The messages in the order in which they are in the file."""
-        self._know_from_summary()
+    def __iter__(self) -> Iterator[RawMessage]:
+        """Messages in the order of the file."""
+        self._load_summary()
         at = self._start
         while at < self._size and not self._ended:
             opcode, end = self._record_at(at)
@@ -148,10 +147,10 @@ class Scan:
             at = end
         if not self._ended:
             unfinished = f", after {self._size - at} bytes of an unfinished record," if at < self._size else ""
-            self.damages.append(Damage(self._size, f"cut off{unfinished}", cut_off=True))
+            self.damages.append(Damage(self._size, f"cut off{unfinished}", is_end=True))
 
     def attachments(self) -> Iterator[Attachment]:
-        """The files that belong to the recording, after the pass; one that is damaged is a damage, and left out."""
+        """Attachments, after the pass; a damaged one is added to `damages` and skipped."""
         for start, end in self._attached:
             content = self._bytes[start:end]
             (checksum,) = _CHECKSUM.unpack(content[-_CHECKSUM.size :])
@@ -162,8 +161,8 @@ class Scan:
             except DAMAGE as error:
                 self.damages.append(Damage(start, f"an attachment ({error})"))
 
-    def _know_from_summary(self) -> None:
-        """Learn from an intact index what a damaged chunk may have described."""
+    def _load_summary(self) -> None:
+        """Read channels and schemas from an intact index, as a damaged chunk may have held their records."""
         try:
             summary = read_summary(self._path)
         except InputError:
@@ -171,11 +170,11 @@ class Scan:
         self._indexed_bytes = {chunk.chunk_start_offset: chunk.uncompressed_size for chunk in summary.chunk_indexes}
         self._channels.update(summary.channels)
         self._schemas.update(summary.schemas)
-        self._sure.update((Channel, number) for number in summary.channels)
-        self._sure.update((Schema, number) for number in summary.schemas)
+        self._verified.update((Channel, number) for number in summary.channels)
+        self._verified.update((Schema, number) for number in summary.schemas)
 
     def _record_at(self, at: int) -> tuple[int, int | None]:
-        """The opcode of a record and where it ends; None if that cannot be so."""
+        """Opcode and end of a record; the end is None if the record is implausible."""
         if at + RECORD.size > self._size:
             return 0, None
         opcode, length = RECORD.unpack_from(self._bytes, at)
@@ -196,16 +195,16 @@ class Scan:
                 possible = length >= _INDEX.size and _INDEX.unpack_from(self._bytes, content)[1] == length - _INDEX.size
         return opcode, end if possible else None
 
-    def _messages(self, opcode: int, start: int, end: int) -> Iterator[Stored]:
+    def _messages(self, opcode: int, start: int, end: int) -> Iterator[RawMessage]:
         match opcode:
             case Opcode.CHUNK:
                 first_ns, last_ns = _CHUNK_TIMES.unpack_from(self._bytes, start)
                 if last_ns >= self._from_ns and first_ns <= self._to_ns and self._may_be_wanted(end):
                     yield from self._in_chunk(start, end)
             case Opcode.MESSAGE:
-                yield from self._in_records(self._bytes[start - RECORD.size : end], sure=False)
+                yield from self._in_records(self._bytes[start - RECORD.size : end], verified=False)
             case Opcode.CHANNEL | Opcode.SCHEMA:
-                self._learn(opcode, self._bytes[start:end], sure=False)
+                self._register(opcode, self._bytes[start:end], verified=False)
             case Opcode.METADATA:
                 self.metadata.append(Metadata.read(_stream(self._bytes[start:end])))
             case Opcode.HEADER:
@@ -216,14 +215,14 @@ class Scan:
                 if self._bytes[end:] != MCAP0_MAGIC:
                     raise ValueError("the last bytes are not those of a recording")
                 self._ended = True
-            case _ if opcode not in _KNOWN:
+            case _ if opcode not in _OPCODES:
                 raise ValueError("of no known kind")
 
     def _may_be_wanted(self, at: int) -> bool:
-        """Whether a chunk has to be looked into, by the indexes of its messages, which follow it."""
+        """True unless the message indexes after a chunk show that it has no wanted topic."""
         if self._wanted is None:
             return True
-        known = False
+        is_indexed = False
         while at < self._size:
             opcode, end = self._record_at(at)
             if opcode != Opcode.MESSAGE_INDEX or end is None:
@@ -231,15 +230,15 @@ class Scan:
             channel = self._channels.get(_INDEX.unpack_from(self._bytes, at + RECORD.size)[0])
             if channel is None or self._wanted(channel.topic):
                 return True
-            known, at = True, end
-        return not known
+            is_indexed, at = True, end
+        return not is_indexed
 
-    def _in_chunk(self, start: int, end: int) -> list[Stored]:
+    def _in_chunk(self, start: int, end: int) -> list[RawMessage]:
         chunk = Chunk.read(_stream(self._bytes[start:end]))
         data = chunk_data(chunk, self._indexed_bytes.get(start - RECORD.size))
-        return list(self._in_records(data, sure=chunk.uncompressed_crc != 0))
+        return list(self._in_records(data, verified=chunk.uncompressed_crc != 0))
 
-    def _in_records(self, data: bytes, *, sure: bool) -> Iterator[Stored]:
+    def _in_records(self, data: bytes, *, verified: bool) -> Iterator[RawMessage]:
         at, channels, schemas = 0, self._channels, self._schemas
         while at < len(data):
             opcode, length = RECORD.unpack_from(data, at)
@@ -251,33 +250,33 @@ class Scan:
                 if channel is None or (channel.schema_id and schema is None):
                     self.orphans += 1
                 elif self._wanted is None or self._wanted(channel.topic):
-                    yield Stored(
+                    yield RawMessage(
                         channel, schema, sequence, log_time, publish_time, data[at + MESSAGE.size : at + length]
                     )
             elif not opcode:
                 raise ValueError("the chunk holds a record of kind 0, which the format does not know")
             elif opcode in (Opcode.CHANNEL, Opcode.SCHEMA):
-                self._learn(opcode, data[at : at + length], sure=sure)
+                self._register(opcode, data[at : at + length], verified=verified)
             at += length
 
-    def _learn(self, opcode: int, content: bytes, *, sure: bool) -> None:
-        """Know a channel or a schema; what a checksum vouches for stays."""
+    def _register(self, opcode: int, content: bytes, *, verified: bool) -> None:
+        """Register a channel or a schema; one confirmed by a checksum is not replaced by one that is not."""
         if opcode == Opcode.CHANNEL:
             channel = Channel.read(_stream(content))
-            self._keep(self._channels, channel.id, channel, sure=sure)
+            self._store(self._channels, channel.id, channel, verified=verified)
         else:
             schema = Schema.read(_stream(content))
-            self._keep(self._schemas, schema.id, schema, sure=sure)
+            self._store(self._schemas, schema.id, schema, verified=verified)
 
-    def _keep(self, known: dict[int, Described], number: int, item: Described, *, sure: bool) -> None:
+    def _store(self, known: dict[int, ChannelOrSchema], number: int, item: ChannelOrSchema, *, verified: bool) -> None:
         name = (type(item), number)
-        if known.get(number) != item and (sure or name not in self._sure):
-            known[number] = item  # one that is known already stays the same object
-        if sure:
-            self._sure.add(name)
+        if known.get(number) != item and (verified or name not in self._verified):
+            known[number] = item  # an equal one stays the same object
+        if verified:
+            self._verified.add(name)
 
     def _next_chunk(self, start: int) -> int | None:
-        """Where the next thing that can only be a chunk begins; None if there is none."""
+        """Offset of the next record that is consistent as a chunk; None if there is none."""
         nearest: int | None = None
         for name in _COMPRESSIONS:
             at = self._bytes.find(name, start + _BEFORE_COMPRESSION)
@@ -289,7 +288,7 @@ class Scan:
         return nearest
 
     def _is_chunk(self, at: int) -> bool:
-        """Whether the lengths of a record agree with each other as those of a chunk do."""
+        """True if the lengths within a record are consistent with a chunk."""
         opcode, length = RECORD.unpack_from(self._bytes, at)
         if opcode != Opcode.CHUNK or at + RECORD.size + length > self._size:
             return False
@@ -304,7 +303,7 @@ class Scan:
 
 
 def profile_of(path: Path) -> str:
-    """The profile that a file says its messages follow, damaged or not; it stands at the very beginning.
+    """MCAP profile of a file, damaged or not; it is in the first record.
 
     Raises:
         InputError: as `Scan`.

@@ -1,13 +1,13 @@
-"""The bytes of an MCAP file, record by record: https://mcap.dev/spec.
+"""Fast writer of MCAP records: https://mcap.dev/spec.
 
-The library's writer makes an object of each message and packs its fields one by one, which is most of what it takes
-to record a small message. Here a message is packed at once, and what is known of a whole chunk (its times, its index,
-the counts) is worked out when the chunk ends. All other records are the library's, and so is every byte: the same
-messages give the same file.
+The library's writer builds an object for each message and packs its fields one by one, which is most of the cost of
+recording a small message. Here a message is packed at once, and the data of a chunk (times, index, counts) are
+computed when the chunk ends. All other records are written by the library. The file is byte for byte that of the
+library's writer.
 
-Messages are gathered into chunks of a mebibyte, compressed with zstd, each followed by an index of its messages. A
-schema or channel stands in the chunk of its first message, as the format asks for, and outside of it, so that a damaged
-chunk does not leave the messages of all later ones without a name.
+Messages are collected in chunks of a mebibyte, compressed with zstd, each followed by an index of its messages. A
+schema or channel is written in the chunk of its first message, as the format requires, and outside of it, so that a
+damaged chunk does not leave later messages without a channel.
 """
 
 import struct
@@ -37,34 +37,34 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 
 CHUNK_BYTES = 1 << 20
-"""Of a chunk before it is compressed; it ends with the message that goes beyond."""
+"""Uncompressed size of a chunk, which ends with the message that exceeds it."""
 
 _MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length; channel, sequence, log time, publish time; then the payload
-_MESSAGE_HEAD = _MESSAGE.size - 9  # of what the length counts
+_MESSAGE_HEAD = _MESSAGE.size - 9  # the part that the length counts
 _INDEX = struct.Struct("<BQHI")  # opcode, length; channel, length of the pairs of log time and offset that follow
 _INDEX_HEAD = _INDEX.size - 9
 _PAIR = 16
-_SUMMED = struct.Struct("<BQQQ")  # of the footer: what its checksum covers
+_SUMMED = struct.Struct("<BQQQ")  # the part of the footer that its checksum covers
 
 
 class Sink(Protocol):
-    """What is written to."""
+    """Byte stream to write to."""
 
     def write(self, data: bytes) -> int:
         """Append bytes."""
 
     def tell(self) -> int:
-        """The bytes written so far."""
+        """Number of bytes written."""
 
     def flush(self) -> None:
-        """Hand them on."""
+        """Flush the bytes."""
 
 
 class McapStream:
     """Writes one file; the sink stays open.
 
     Args:
-        sink: where to; whatever it raises is passed on, and the file is then to be left as it is.
+        sink: destination; its errors are passed on, and nothing may be written afterwards.
     """
 
     def __init__(self, sink: Sink) -> None:
@@ -80,18 +80,18 @@ class McapStream:
         self._compressor = zstandard.ZstdCompressor()
 
     def start(self, library: str, profile: str = "") -> None:
-        """Write the beginning."""
+        """Write the magic bytes and the header."""
         self._sink.write(MCAP0_MAGIC + _bytes_of(Header(profile=profile, library=library)))
 
     def add_schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Describe a schema; returns its number."""
+        """Write a schema and return its number."""
         schema = Schema(data=data, encoding=encoding, id=len(self._schemas) + 1, name=name)
         self._schemas.append(schema)
         self._describe(schema)
         return schema.id
 
     def add_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
-        """Describe a channel; returns its number. The schema 0 is none."""
+        """Write a channel and return its number; `schema` 0 is none."""
         number = len(self._channels) + 1
         channel = Channel(id=number, topic=topic, message_encoding=encoding, metadata=metadata, schema_id=schema)
         self._channels.append(channel)
@@ -100,7 +100,7 @@ class McapStream:
 
     @property
     def channel_count(self) -> int:
-        """Channels described so far."""
+        """Number of channels."""
         return len(self._channels)
 
     def add_message(self, channel: int, log_time: int, payload: bytes, publish_time: int, sequence: int = 0) -> None:
@@ -117,14 +117,14 @@ class McapStream:
             self._end_chunk()
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
-        """Append what a program says about the file, outside of any chunk."""
+        """Append a metadata record, outside of any chunk."""
         offset = self._sink.tell()
         record = _bytes_of(Metadata(name=name, metadata=metadata))
         self._metadata.append(MetadataIndex(offset=offset, length=len(record), name=name))
         self._sink.write(record)
 
     def add_attachment(self, attachment: Attachment) -> None:
-        """Append a file that belongs to the recording, outside of any chunk."""
+        """Append an attachment, outside of any chunk."""
         offset = self._sink.tell()
         record = _bytes_of(attachment)
         self._attachments.append(
@@ -141,12 +141,12 @@ class McapStream:
         self._sink.write(record)
 
     def flush(self) -> None:
-        """End the chunk, if there is a message in it, and hand on all that was written."""
+        """End the chunk, if it has a message, and flush the sink."""
         self._end_chunk()
         self._sink.flush()
 
     def finish(self) -> None:
-        """Write the end: all descriptions once more, the counts, and where the chunks are."""
+        """Write the summary section and the footer."""
         self._end_chunk()
         self._sink.write(_bytes_of(DataEnd(0)))
         start = self._sink.tell()

@@ -1,4 +1,4 @@
-"""Writing recordings as MCAP files; the bytes are those of `mcap_stream`."""
+"""Writer of recordings as MCAP files, on top of `mcap_stream`."""
 
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -16,25 +16,25 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import encoding_of, message_type
 from reactorwatch.contract.sample_bytes import read_sequence
 from reactorwatch.errors import InputError
-from recorder.message import Entry
-from recorder.policy.room import MOST_CHANNELS
-from recorder.storage.mcap_chunks import REPEATED
-from recorder.storage.mcap_scan import Stored
+from recorder.message import RecordedMessage
+from recorder.policy.channel_budget import MAX_CHANNELS
+from recorder.storage.mcap_chunks import LATCHED
+from recorder.storage.mcap_scan import RawMessage
 from recorder.storage.mcap_stream import McapStream
-from recorder.storage.part_file import PART, PartFile, is_held
+from recorder.storage.part_file import PART, PartFile, is_locked
 
 METADATA = "reactorwatch"
-MOST_MESSAGES = 2**32 - 1
-"""The largest sequence number that a file holds; beyond it numbers start again from 0."""
+MAX_SEQUENCE = 2**32 - 1
+"""Largest sequence number in MCAP; larger ones wrap around to 0."""
 
 _SAMPLE = encoding_of(messages.Sample)
 
-NUMBER = "file"
-"""In it: which file of its run it is, if it was written by a recorder."""
+FILE_INDEX = "file"
+"""Metadata key: index of the file within its run, from 1, if a recorder wrote it."""
 
 
 class WriteError(InputError):
-    """The file takes no more; `reason` is the system's word for why."""
+    """A file cannot be written; `reason` is the message of the operating system."""
 
     def __init__(self, text: str, reason: str) -> None:
         super().__init__(text)
@@ -42,13 +42,13 @@ class WriteError(InputError):
 
 
 class RecordingWriter:
-    """Writes a recording: to `path + ".part"` until `close`, which gives it its name.
+    """Writes a recording to `path + ".part"`, renamed to `path` by `close`.
 
     Args:
-        path: the file; there must be none of that name yet, finished or not.
-        metadata: what the file should say about its origin, beside the version of this software.
-        open_part: what opens the file that is written to.
-        profile: that the file says its messages follow.
+        path: the file; it must not exist, complete or not.
+        metadata: metadata of the file, beside the version of this software.
+        open_part: opens the file that is written to.
+        profile: MCAP profile of the file.
 
     Raises:
         InputError: the file exists or cannot be written.
@@ -65,13 +65,15 @@ class RecordingWriter:
         self._part = part_of(path)
         self._channels: dict[tuple[str, str, bool, bool], int] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
-        self._copied: dict[int, tuple[Channel, int]] = {}  # by identity, which lasts because the channel is held here
+        self._copied: dict[
+            int, tuple[Channel, int]
+        ] = {}  # by identity, which is stable because the channel is held here
         self._copies: dict[tuple[object, ...], int] = {}
         check_free(path)
         try:
             self._stream = open_part(self._part)
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
         self._writer = McapStream(self._stream)
         try:
             self._writer.start(f"reactorwatch {__version__}", profile)
@@ -80,40 +82,40 @@ class RecordingWriter:
         except OSError as error:
             self._stream.abandon()
             self._part.unlink(missing_ok=True)  # nothing is in it
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
     @property
     def path(self) -> Path:
-        """The name that the file has once it is closed."""
+        """Final name of the file."""
         return self._path
 
     @property
     def size_bytes(self) -> int:
-        """What the file holds so far, without the chunk that is being gathered."""
+        """Bytes written, without the current chunk."""
         return self._stream.tell()
 
-    def write(self, entry: Entry, *, readable: bool = True) -> None:
-        """Append a message; a sample's number is its sequence number in the file.
+    def write(self, message: RecordedMessage, *, readable: bool = True) -> None:
+        """Append a message; the sequence number of a sample becomes that of the MCAP message.
 
         Args:
-            entry: the message.
-            readable: False keeps a payload from being given the schema that its encoding names.
+            message: the message.
+            readable: False writes the payload without the schema that its encoding names.
 
         Raises:
-            WriteError: the file cannot be written, for lack of room perhaps.
+            WriteError: the file cannot be written, for example because the disk is full.
         """
         try:
-            name = (entry.key, entry.encoding, readable, entry.repeated)
+            name = (message.key, message.encoding, readable, message.latched)
             channel = self._channels.get(name)
             if channel is None:
-                channel = self._channels[name] = self._register(entry, readable=readable)
-            number = read_sequence(entry.payload) & MOST_MESSAGES if readable and entry.encoding == _SAMPLE else 0
-            self._writer.add_message(channel, entry.log_time_ns, entry.payload, entry.publish_time_ns, number)
+                channel = self._channels[name] = self._register(message, readable=readable)
+            number = read_sequence(message.payload) & MAX_SEQUENCE if readable and message.encoding == _SAMPLE else 0
+            self._writer.add_message(channel, message.log_time_ns, message.payload, message.publish_time_ns, number)
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
-    def copy(self, stored: Stored) -> None:
-        """Append a message of another file as it is, its channel described as there.
+    def copy(self, stored: RawMessage) -> None:
+        """Append a message of another file unchanged, with its channel.
 
         Raises:
             WriteError: as `write`.
@@ -126,10 +128,10 @@ class RecordingWriter:
                 known[1], stored.log_time_ns, stored.payload, stored.publish_time_ns, stored.sequence
             )
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
     def add_metadata(self, name: str, metadata: dict[str, str]) -> None:
-        """Append what a program says about the file.
+        """Append a metadata record.
 
         Raises:
             WriteError: as `write`.
@@ -138,10 +140,10 @@ class RecordingWriter:
             self._writer.flush()
             self._writer.add_metadata(name, metadata)
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
     def add_attachment(self, attachment: Attachment) -> None:
-        """Append a file that belongs to the recording.
+        """Append an attachment.
 
         Raises:
             WriteError: as `write`.
@@ -150,10 +152,10 @@ class RecordingWriter:
             self._writer.flush()
             self._writer.add_attachment(attachment)
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
     def flush(self) -> None:
-        """Hand everything written so far to the operating system, as chunks that are whole.
+        """End the chunk and hand all bytes to the operating system.
 
         Raises:
             WriteError: the file cannot be written.
@@ -161,10 +163,10 @@ class RecordingWriter:
         try:
             self._writer.flush()
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
     def sync(self) -> None:
-        """Wait until what was flushed is on the disk.
+        """Wait until flushed bytes are on the disk.
 
         Raises:
             WriteError: the file cannot be written.
@@ -172,13 +174,13 @@ class RecordingWriter:
         try:
             self._stream.sync()
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
 
     def close(self) -> None:
-        """Complete the file and give it its name; a second call does nothing.
+        """Complete and rename the file; a second call does nothing.
 
         Raises:
-            WriteError: the file cannot be written; what was flushed is kept under the name it had.
+            WriteError: the file cannot be written; flushed bytes stay in the `.part` file.
         """
         if self._stream.closed:
             return
@@ -186,12 +188,12 @@ class RecordingWriter:
             self._writer.finish()
             self._stream.finish(self._path)
         except OSError as error:
-            raise self._failed(error) from error
+            raise self._write_error(error) from error
         finally:
             self._stream.abandon()
 
     def abandon(self) -> None:
-        """Leave the file as it was when it was last flushed, to be recovered; after `close` it does nothing."""
+        """Leave the file as last flushed, to be recovered; after `close` it does nothing."""
         self._stream.abandon()
 
     def __enter__(self) -> Self:
@@ -202,22 +204,22 @@ class RecordingWriter:
     ) -> None:
         self.close()
 
-    def _register(self, entry: Entry, *, readable: bool) -> int:
-        metadata = {REPEATED: "true"} if entry.repeated else {}
-        kind = message_type(entry.encoding) if readable else None
+    def _register(self, message: RecordedMessage, *, readable: bool) -> int:
+        metadata = {LATCHED: "true"} if message.latched else {}
+        kind = message_type(message.encoding) if readable else None
         if kind is None:
-            return self._add_channel(entry.key, entry.encoding, 0, metadata)
+            return self._add_channel(message.key, message.encoding, 0, metadata)
         schema = self._schema(kind.DESCRIPTOR.full_name, SchemaEncoding.Protobuf, _descriptors())
-        return self._add_channel(entry.key, MessageEncoding.Protobuf, schema, metadata)
+        return self._add_channel(message.key, MessageEncoding.Protobuf, schema, metadata)
 
     def _add_channel(self, topic: str, encoding: str, schema: int, metadata: dict[str, str]) -> int:
-        """Describe a channel, if the format has a number left for it."""
-        if self._writer.channel_count >= MOST_CHANNELS:
-            reason = f"a file has room for {MOST_CHANNELS} keys, and {topic!r} is one more"
+        """Add a channel, unless the format has no number left."""
+        if self._writer.channel_count >= MAX_CHANNELS:
+            reason = f"a file has room for {MAX_CHANNELS} keys, and {topic!r} is one more"
             raise WriteError(f"recording {self._path}: {reason}", reason)
         return self._writer.add_channel(topic, encoding, schema, metadata)
 
-    def _copied_channel(self, stored: Stored) -> int:
+    def _copied_channel(self, stored: RawMessage) -> int:
         channel, schema = stored.channel, stored.schema
         number = self._schema(schema.name, schema.encoding, schema.data) if schema else 0
         name = (channel.topic, channel.message_encoding, number, *sorted(channel.metadata.items()))
@@ -232,22 +234,22 @@ class RecordingWriter:
             number = self._schemas[described] = self._writer.add_schema(name, encoding, data)
         return number
 
-    def _failed(self, error: OSError) -> WriteError:
+    def _write_error(self, error: OSError) -> WriteError:
         kept = f"; what was written is in {self._part}" if self._part.exists() else ""
         reason = error.strerror or type(error).__name__
         return WriteError(f"recording {self._path}: cannot be written: {reason}{kept}", reason)
 
 
 def part_of(path: Path) -> Path:
-    """The name that a recording has until it is whole."""
+    """Name of a recording until it is complete."""
     return path.with_name(path.name + PART)
 
 
 def check_free(path: Path) -> None:
-    """See that a recording of that name can be begun.
+    """Check that a recording of that name can be started.
 
     Raises:
-        InputError: there is one, finished or not, or the folder does not exist.
+        InputError: it exists, complete or not, or its folder does not exist.
     """
     part = part_of(path)
     if not path.parent.is_dir():
@@ -256,7 +258,7 @@ def check_free(path: Path) -> None:
         raise InputError(f"recording {path}: the folder {path.parent} cannot be written to")
     if path.exists():
         raise InputError(f"recording {path}: exists already and is not overwritten; choose another name")
-    if is_held(part):
+    if is_locked(part):
         raise InputError(f"recording {path}: {part} is being written by another recorder; choose another name")
     if part.exists():
         raise InputError(
@@ -266,7 +268,7 @@ def check_free(path: Path) -> None:
 
 
 def own_metadata(records: Iterable[Metadata]) -> dict[str, str]:
-    """What this software wrote about the origin of a file, among all that programs did; empty if it wrote nothing."""
+    """Metadata that this software wrote, among those of all programs; empty if there are none."""
     return next((record.metadata for record in records if record.name == METADATA), {})
 
 

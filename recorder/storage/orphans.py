@@ -1,53 +1,52 @@
-"""What killed recorders left behind: found at a start, and made whole while recording goes on."""
+"""Find and repair files left by a crashed recorder."""
 
 from pathlib import Path
 
 import structlog
 
 from reactorwatch.errors import InputError
-from recorder.policy.series import Series
+from recorder.policy.file_names import FileNames
 from recorder.storage.mcap_scan import Scan
-from recorder.storage.part_file import PART, is_held, left_behind
-from recorder.storage.recover import origin, recover
+from recorder.storage.part_file import PART, is_locked, lock_orphan
+from recorder.storage.recover import read_origin, recover
 
 log = structlog.get_logger()
 
 DAMAGED = ".damaged"
-"""The ending of a file left behind from which not all could be recovered: it is kept as long as a recording is."""
+"""Ending of an orphan that was recovered in part only; it is retained like a recording."""
 
 
-def remains_of(series: Series) -> list[Path]:
-    """What killed recorders left behind.
+def find_orphans(names: FileNames) -> list[Path]:
+    """Find files left by crashed recorders, and delete their unfinished copies.
 
     Raises:
-        InputError: the file that was asked for by name is being written by another recorder.
+        InputError: the named file is being written by another recorder.
     """
-    found = []
-    for part in sorted(series.folder.glob(f"*{PART}")):
+    orphans = []
+    for part in sorted(names.folder.glob(f"*{PART}")):
         name = part.name.removesuffix(PART)
-        if series.owns(name):
-            if not is_held(part):
-                found.append(part)
-            elif not series.dated:
+        if names.owns(name):
+            if not is_locked(part):
+                orphans.append(part)
+            elif not names.dated:
                 raise InputError(f"recording {part.with_name(name)}: {part} is being written by another recorder")
-    for copy in series.folder.glob(f".{series.stem}*.tmp{PART}"):
-        if not is_held(copy):
-            copy.unlink(missing_ok=True)  # it was being made when its maker was killed
-    return found
+    for copy in names.folder.glob(f".{names.stem}*.tmp{PART}"):
+        if not is_locked(copy):
+            copy.unlink(missing_ok=True)
+    return orphans
 
 
-def damaged(series: Series) -> list[Path]:
-    """What was kept because not all of it could be recovered."""
+def list_damaged(names: FileNames) -> list[Path]:
+    """Orphans that were recovered in part only."""
     ending = PART + DAMAGED
-    there = series.folder.glob(f"*{ending}")
-    return [path for path in there if series.owns(path.name.removesuffix(ending))]
+    return [path for path in names.folder.glob(f"*{ending}") if names.owns(path.name.removesuffix(ending))]
 
 
-def make_whole(part: Path) -> None:
-    """Make a file whole that was left behind. It is deleted only if nothing but its end is missing."""
-    with left_behind(part):
+def repair(part: Path) -> None:
+    """Recover an orphan, which is deleted only if nothing but its end is missing."""
+    with lock_orphan(part):
         path = part.with_name(part.name.removesuffix(PART))
-        if path.exists() and not _is_of(path, part):
+        if path.exists() and not _is_recovered_from(path, part):
             path = path.with_name(f"{path.stem}-recovered{path.suffix}")
         if _is_empty(part):
             part.unlink()
@@ -59,7 +58,7 @@ def make_whole(part: Path) -> None:
             part.rename(part.with_name(part.name + DAMAGED))
             log.warning("nothing recovered", why=str(error))
             return
-        if saved.only_cut_off:
+        if saved.is_only_truncated:
             part.unlink()
         else:
             part.rename(part.with_name(part.name + DAMAGED))
@@ -67,17 +66,17 @@ def make_whole(part: Path) -> None:
 
 
 def _is_empty(part: Path) -> bool:
-    """Whether a file was left behind before anything that it received was handed over."""
+    """True if an orphan has no message."""
     try:
         scan = Scan(part)
-        return not any(True for _ in scan) and not scan.orphans and all(damage.cut_off for damage in scan.damages)
+        return not any(True for _ in scan) and not scan.orphans and all(damage.is_end for damage in scan.damages)
     except InputError:
         return part.stat().st_size == 0
 
 
-def _is_of(path: Path, part: Path) -> bool:
-    """Whether a file was recovered from another, by a recorder that was killed before it could delete that one."""
+def _is_recovered_from(path: Path, part: Path) -> bool:
+    """True if `path` was recovered from `part` by a recorder that crashed before it deleted `part`."""
     try:
-        return origin(path) == origin(part) != {}
+        return read_origin(path) == read_origin(part) != {}
     except InputError:
         return False

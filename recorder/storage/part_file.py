@@ -1,8 +1,8 @@
-"""The file that a recording is written to until it is whole, held so that nobody else takes it for one left behind.
+"""File of an incomplete recording, locked so that no other process takes it for an orphan.
 
-Writing is in two steps: what is written is gathered in memory, and handed to the operating system by `flush`, which is
-where a full disk shows. What was handed over outlives the process, whatever kills it; what was also synced outlives the
-machine. The lock is the operating system's and ends with the process, so a file that nobody holds was left behind.
+Bytes are buffered in memory and handed to the operating system by `flush`, which is where a full disk shows. Flushed
+bytes survive the process, synced bytes the machine. The lock ends with the process, so a file without a lock is an
+orphan.
 """
 
 import contextlib
@@ -16,19 +16,19 @@ from typing import BinaryIO
 from reactorwatch.errors import InputError
 
 PART = ".part"
-"""The ending that a name has until the recording is whole."""
+"""Ending of an incomplete recording."""
 DELETED = "its file was deleted"
-LARGEST_PENDING = 1 << 18  # bytes gathered before they are handed over anyway
+LARGEST_PENDING = 1 << 18  # buffered bytes that force a flush
 
 
 class PartFile:
-    """A new file that grows at its end. It is a stream, as far as the MCAP library needs one.
+    """New append-only file, with a lock.
 
     Args:
-        path: the file; there must be none of that name.
+        path: the file; it must not exist.
 
     Raises:
-        OSError: it cannot be made.
+        OSError: it cannot be created.
     """
 
     def __init__(self, path: Path) -> None:
@@ -36,10 +36,10 @@ class PartFile:
         self._raw = path.open("xb", buffering=0)
         fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self._pending = bytearray()
-        self._handed_over = 0
+        self._flushed = 0
 
     def write(self, data: bytes) -> int:
-        """Gather bytes; as many as come together are handed over.
+        """Buffer bytes, and flush a full buffer.
 
         Raises:
             OSError: as `flush`.
@@ -50,37 +50,37 @@ class PartFile:
         return len(data)
 
     def tell(self) -> int:
-        """The bytes written so far, handed over or not."""
-        return self._handed_over + len(self._pending)
+        """Number of bytes written, buffered ones included."""
+        return self._flushed + len(self._pending)
 
     def flush(self) -> None:
-        """Hand all that was written to the operating system.
+        """Hand the buffer to the operating system.
 
         Raises:
-            OSError: it does not take it, for lack of room perhaps; part of it may be in the file. Or the file was
-                deleted, with its folder perhaps: the system would take what is written, and keep nothing of it.
+            OSError: the write failed, for example on a full disk, perhaps after part of the buffer; or the file was
+                deleted, so that writes would succeed and be lost.
         """
         while self._pending:
             taken = self._append(self._pending)
-            self._handed_over += taken
+            self._flushed += taken
             del self._pending[:taken]
         if self._is_deleted:
             raise OSError(errno.ENOENT, DELETED)
 
     def sync(self) -> None:
-        """Wait until all that was written is on the disk.
+        """Flush, and wait until all bytes are on the disk.
 
         Raises:
-            OSError: as `flush`, or the disk fails.
+            OSError: as `flush`, or the sync failed.
         """
         self.flush()
         os.fsync(self._raw.fileno())
 
     def finish(self, path: Path) -> None:
-        """Hand over the rest, and give the file its name while it is still held.
+        """Flush, rename to `path` while the lock is held, and close.
 
         Raises:
-            OSError: as `flush`, or it cannot be renamed; it then keeps its name, and is closed.
+            OSError: as `flush`, or it cannot be renamed; it is closed under its old name.
         """
         try:
             self.flush()
@@ -89,18 +89,18 @@ class PartFile:
             self.abandon()
 
     def abandon(self) -> None:
-        """Close it as it is: what was not handed over is gone. A second call does nothing."""
+        """Close and drop the buffer; a second call does nothing."""
         self._pending.clear()
         self._raw.close()
 
     @property
     def closed(self) -> bool:
-        """Whether it was finished or abandoned."""
+        """True after `finish` or `abandon`."""
         return self._raw.closed
 
     @property
     def _is_deleted(self) -> bool:
-        """True if the file has lost its name, or another file has it."""
+        """True if no file or another file has its name."""
         try:
             return not os.path.samestat(os.fstat(self._raw.fileno()), self.path.stat())
         except (FileNotFoundError, NotADirectoryError):
@@ -110,10 +110,10 @@ class PartFile:
         return self._raw.write(data)
 
 
-def is_held(path: Path) -> bool:
-    """Whether a process that lives is writing the file; False if there is no such file."""
+def is_locked(path: Path) -> bool:
+    """True if a running process writes the file; False if it does not exist."""
     try:
-        with left_behind(path):
+        with lock_orphan(path):
             return False
     except InputError:
         return True
@@ -122,12 +122,12 @@ def is_held(path: Path) -> bool:
 
 
 @contextlib.contextmanager
-def left_behind(path: Path) -> Iterator[BinaryIO]:
-    """A file that nobody writes any more, held while the context lasts.
+def lock_orphan(path: Path) -> Iterator[BinaryIO]:
+    """Open and lock an orphan within the context.
 
     Raises:
-        InputError: somebody writes it.
-        OSError: it cannot be opened, or was just given its name by who wrote it.
+        InputError: a process writes it.
+        OSError: it cannot be opened, or was replaced since.
     """
     with path.open("rb") as stream:
         try:

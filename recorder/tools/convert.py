@@ -12,7 +12,7 @@ from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.output import refuse_source
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, to_time_ns
 from recorder.columns.run_splitter import ContinuousTime
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import CLOCK, NO_CLOCK, ZERO_NS, RecordingWriter, read_record
 from recorder.tools.player import samples_of
 
@@ -57,7 +57,7 @@ def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | N
             encoded = encode(publication)
             received_ns = received.of(*publication)
             time_ns = publication.message.time_ns
-            writer.write(Entry(encoded.key, encoded.payload, encoded.encoding, received_ns, time_ns))
+            writer.write(RecordedMessage(encoded.key, encoded.payload, encoded.encoding, received_ns, time_ns))
     return record
 
 

@@ -18,11 +18,11 @@ from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.output import refuse_source
-from recorder.message import Entry
-from recorder.policy.latched import Head
+from recorder.message import RecordedMessage
+from recorder.policy.latched import LatchedMessages
 from recorder.storage.gaps import GAP, from_metadata
-from recorder.storage.mcap_chunks import damaged, read_summary, span_ns
-from recorder.storage.mcap_scan import FOREVER_NS, Scan, Stored, Wanted, profile_of
+from recorder.storage.mcap_chunks import damage_error, read_summary, span_ns
+from recorder.storage.mcap_scan import LATEST_NS, RawMessage, Scan, Wanted, profile_of
 from recorder.storage.mcap_writer import METADATA, RecordingWriter
 from recorder.tools.overlap import in_turn
 
@@ -41,13 +41,13 @@ class Window(NamedTuple):
     received_ns: tuple[int, int]
     sampled_ns: tuple[int, int] | None = None
 
-    def holds(self, stored: Stored) -> bool:
+    def holds(self, stored: RawMessage) -> bool:
         """Whether a message is in it."""
         if self.sampled_ns is not None and speaks_of_a_sample(stored.channel.topic):
             return self.sampled_ns[0] <= stored.publish_time_ns <= self.sampled_ns[1]
         return self.received_ns[0] <= stored.log_time_ns <= self.received_ns[1]
 
-    def is_after(self, stored: Stored) -> bool:
+    def is_after(self, stored: RawMessage) -> bool:
         """Whether a message was there before it began."""
         if self.sampled_ns is not None and speaks_of_a_sample(stored.channel.topic):
             return stored.publish_time_ns < self.sampled_ns[0]
@@ -65,9 +65,9 @@ def sampled_between(sources: Sequence[Path], from_ns: int, to_ns: int) -> Window
     Raises:
         InputError: there is no such sample; or as `cut`.
     """
-    first_ns, last_ns = FOREVER_NS, 0
+    first_ns, last_ns = LATEST_NS, 0
     for stored in _in_order(_sources(sources), wanted=speaks_of_a_sample):
-        if not stored.repeated and from_ns <= stored.publish_time_ns <= to_ns:
+        if not stored.latched and from_ns <= stored.publish_time_ns <= to_ns:
             first_ns, last_ns = min(first_ns, stored.log_time_ns), max(last_ns, stored.log_time_ns)
     if first_ns > last_ns:
         raise InputError(f"{sources[0]}: holds no sample of that time")
@@ -84,13 +84,13 @@ def cut(
         out: the new one; an older file of that name is replaced.
         window: the stretch.
         metadata: what the new one says about its origin.
-        tolerant: pass over what is damaged, and take a file as it is that is still being written.
+        tolerant: pass over what is damage_error, and take a file as it is that is still being written.
 
     Returns:
         The number of messages in the stretch, without what is said again at its beginning.
 
     Raises:
-        InputError: nothing was received then, a source is damaged, or the new file cannot be written.
+        InputError: nothing was received then, a source is damage_error, or the new file cannot be written.
     """
     if not sources:
         raise InputError(f"{out.name}: there is no recording of that time; were its files deleted?")
@@ -99,7 +99,7 @@ def cut(
     count = 0
     with atomic_write(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(found)) as writer:
         for stored in _in_order(found, window.received_ns, tolerant=tolerant):
-            if stored.repeated or not window.holds(stored):
+            if stored.latched or not window.holds(stored):
                 continue
             if not count:
                 for entry in _standing(found, window, stored.log_time_ns):
@@ -124,7 +124,7 @@ def merge(sources: Sequence[Path], out: Path, metadata: Mapping[str, str]) -> in
         The number of messages.
 
     Raises:
-        InputError: a source is damaged, or the new file cannot be written.
+        InputError: a source is damage_error, or the new file cannot be written.
     """
     found = _sources(sources)
     refuse_source(out, sources)
@@ -160,7 +160,7 @@ def _sources(paths: Sequence[Path], *, tolerant: bool = False) -> list[_Source]:
             if not tolerant:
                 raise
             begin = next(iter(Scan(path)), None)
-            span = (begin.log_time_ns if begin is not None else 0, FOREVER_NS)
+            span = (begin.log_time_ns if begin is not None else 0, LATEST_NS)
         spans.append((span, path))
     spans.sort()
     return [_Source(path, span, first=not number) for number, (span, path) in enumerate(spans)]
@@ -168,30 +168,30 @@ def _sources(paths: Sequence[Path], *, tolerant: bool = False) -> list[_Source]:
 
 def _in_order(
     sources: Sequence[_Source],
-    received_ns: tuple[int, int] = (0, FOREVER_NS),
+    received_ns: tuple[int, int] = (0, LATEST_NS),
     *,
     wanted: Wanted | None = None,
     tolerant: bool = False,
-) -> Iterator[Stored]:
+) -> Iterator[RawMessage]:
     """The messages of all files in the order of receipt; each file for itself is taken to be in order."""
     from_ns, to_ns = received_ns
 
-    def of(source: _Source) -> Iterator[Stored]:
+    def of(source: _Source) -> Iterator[RawMessage]:
         scan = Scan(source.path, from_ns, to_ns, wanted)
         for stored in scan:
-            if source.first or not stored.repeated:
+            if source.first or not stored.latched:
                 yield stored
-        if not (scan.whole or tolerant):
-            raise damaged(source.path, "; ".join(map(str, scan.damages)) or "some channels are described nowhere")
+        if not (scan.is_intact or tolerant):
+            raise damage_error(source.path, "; ".join(map(str, scan.damages)) or "some channels are described nowhere")
 
     within = [source for source in sources if source.span[1] >= from_ns and source.span[0] <= to_ns]
     for group in in_turn(within, lambda source: source.span):
         yield from heapq.merge(*map(of, group), key=lambda stored: stored.log_time_ns)
 
 
-def _standing(sources: Sequence[_Source], window: Window, begun_ns: int) -> list[Entry]:
+def _standing(sources: Sequence[_Source], window: Window, begun_ns: int) -> list[RecordedMessage]:
     """How things stood when the window began."""
-    head = Head()
+    head = LatchedMessages()
 
     def wanted(topic: str) -> bool:
         parsed = keys.parse(topic)
@@ -201,18 +201,18 @@ def _standing(sources: Sequence[_Source], window: Window, begun_ns: int) -> list
         if source.span[0] > begun_ns:
             continue
         for stored in Scan(source.path, to_ns=begun_ns, wanted=wanted):
-            if not (stored.repeated or window.is_after(stored)):
+            if not (stored.latched or window.is_after(stored)):
                 continue
-            entry = stored.entry
+            entry = stored.recorded
             try:
-                head.remember(entry, decode(entry.payload, entry.encoding))
+                head.update(entry, decode(entry.payload, entry.encoding))
             except DecodeError:
                 continue
-    return head.entries(begun_ns)
+    return head.messages(begun_ns)
 
 
 def _copy_the_rest(
-    sources: Sequence[_Source], writer: RecordingWriter, received_ns: tuple[int, int] = (0, FOREVER_NS)
+    sources: Sequence[_Source], writer: RecordingWriter, received_ns: tuple[int, int] = (0, LATEST_NS)
 ) -> None:
     """Write what programs say about the sources and what they attached to them; what several say alike, once.
 

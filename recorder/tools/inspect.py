@@ -50,7 +50,7 @@ def look_over(path: Path) -> Look:
         found, metadata = overview(read_messages(path)), read_metadata(path)
         return Look(found, metadata, zero_from(metadata, found.starts_ns or 0), (), gaps_in(path))
     scan = Scan(path)
-    found = overview(stored.entry for stored in scan)
+    found = overview(stored.recorded for stored in scan)
     metadata = own_metadata(scan.metadata)
     damages = [str(damage) for damage in scan.damages]
     if scan.orphans:

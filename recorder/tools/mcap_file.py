@@ -30,8 +30,15 @@ from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import MINUTE_NS, UNITS, Record, join_runs
 from recorder.columns.measurement import measured
 from recorder.columns.run_splitter import RunSplitter
-from recorder.message import Entry
-from recorder.storage.mcap_chunks import entries, is_in_order, metadata_records, read_summary, sorted_entries, span_ns
+from recorder.message import RecordedMessage
+from recorder.storage.mcap_chunks import (
+    is_in_order,
+    metadata_records,
+    ordered_messages,
+    read_summary,
+    sorted_messages,
+    span_ns,
+)
 from recorder.storage.mcap_writer import RecordingWriter, own_metadata
 from recorder.tools.overlap import in_turn
 
@@ -43,7 +50,9 @@ CLOCK, NO_CLOCK = "clock", "none"
 _SAMPLE = encoding_of(messages.Sample)
 
 
-def read_messages(path: Path, kinds: Collection[str] | None = None, plant: str | None = None) -> Iterator[Entry]:
+def read_messages(
+    path: Path, kinds: Collection[str] | None = None, plant: str | None = None
+) -> Iterator[RecordedMessage]:
     """The messages of a recording in the order in which they were received; those of equal time as in the file.
 
     Args:
@@ -65,13 +74,13 @@ def read_messages(path: Path, kinds: Collection[str] | None = None, plant: str |
             return kinds is None and plant is None
         return (kinds is None or topic.kind in kinds) and (plant is None or topic.plant == plant)
 
-    def of(file: _File) -> Iterator[Entry]:
+    def of(file: _File) -> Iterator[RecordedMessage]:
         if is_in_order(file.summary):
             numbers = {number for number, channel in file.summary.channels.items() if wanted(channel.topic)}
-            found = entries(file.path, file.summary, numbers)
+            found = ordered_messages(file.path, file.summary, numbers)
         else:
-            found = (entry for entry in sorted_entries(file.path, file.summary) if wanted(entry.key))
-        return found if file.first else (entry for entry in found if not entry.repeated)
+            found = (entry for entry in sorted_messages(file.path, file.summary) if wanted(entry.key))
+        return found if file.first else (entry for entry in found if not entry.latched)
 
     if len(groups) == len(groups[0]) == 1:
         return of(groups[0][0])
@@ -97,7 +106,7 @@ def plants_in(path: Path) -> tuple[str, ...]:
     for file in _files(path):
         topics = {channel.topic for channel in file.summary.channels.values()}
         if not topics:  # nothing was recorded, or the file's index does not say what
-            topics = {entry.key for entry in sorted_entries(file.path, file.summary)}
+            topics = {entry.key for entry in sorted_messages(file.path, file.summary)}
         parsed = map(keys.parse, topics)
         found.update(topic.plant for topic in parsed if topic is not None and topic.kind == keys.SAMPLE)
     return tuple(sorted(found))

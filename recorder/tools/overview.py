@@ -8,7 +8,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, decode
 from recorder.columns.run_splitter import RunSpan, RunSplitter
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 
 MOST_GAPS = 1000
 """Gaps that are named; more are counted only."""
@@ -104,7 +104,7 @@ class Overview:
         return (self.last_ns - self.first_ns) / 1e9
 
 
-def overview(entries: Iterable[Entry]) -> Overview:
+def overview(entries: Iterable[RecordedMessage]) -> Overview:
     """Look over a recording.
 
     Args:
@@ -115,7 +115,7 @@ def overview(entries: Iterable[Entry]) -> Overview:
     splitters: dict[str, RunSplitter] = {}
     standing: dict[str, int] = {}
     for entry in entries:
-        if not entry.repeated:
+        if not entry.latched:
             _count(seen, entry)
         if entry.key not in checks:
             checks[entry.key] = _Check.of(entry.key, splitters)
@@ -143,7 +143,7 @@ def overview(entries: Iterable[Entry]) -> Overview:
     return seen
 
 
-def _count(seen: Overview, entry: Entry) -> None:
+def _count(seen: Overview, entry: RecordedMessage) -> None:
     at_ns = entry.log_time_ns
     topic = seen.topics.get(entry.key)
     if topic is None:

@@ -18,7 +18,7 @@ from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, to_time_ns
 from recorder.columns.run_splitter import ContinuousTime
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 
 BATCH = 256
 """Messages that go out before the loop looks for a stop again."""
@@ -80,7 +80,9 @@ def samples_of(record: Record, plant: str, zero_ns: int = 0) -> Iterator[Publica
             yield Publication(names[signal], sample)
 
 
-def playable(entries: Iterable[Entry], plant: str = "", kinds: frozenset[str] = SAMPLES) -> Iterator[Publication]:
+def playable(
+    entries: Iterable[RecordedMessage], plant: str = "", kinds: frozenset[str] = SAMPLES
+) -> Iterator[Publication]:
     """The messages of a recording that can be played back.
 
     Args:

@@ -21,7 +21,7 @@ from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from recorder.__main__ import record
 from recorder.config import RecorderConfig, ReplayConfig
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter, read_messages
 from recorder.tools.replay import replay
 from tests.running import WITHIN_S, running
@@ -50,7 +50,7 @@ def samples(count: int) -> Iterator[Encoded]:
             yield encode(Publication(keys.key("cstr", keys.SAMPLE, signal_name), sample))
 
 
-def of_others(path: Path) -> list[Entry]:
+def of_others(path: Path) -> list[RecordedMessage]:
     return [entry for entry in read_messages(path) if not entry.key.endswith("health/recorder")]
 
 
@@ -213,8 +213,8 @@ def test_what_cannot_be_replayed_is_told_before_the_waiting_for_a_router(tmp_pat
     path.write_text("time_min,qc,C,T\n0,1,2,3\n")
     with RecordingWriter(empty, {}), RecordingWriter(two, {}) as writer:
         for message in samples(1):
-            writer.write(Entry(*message[:3], 0, 0))
-            writer.write(Entry(message.key.replace("cstr", "b"), *message[1:3], 0, 0))
+            writer.write(RecordedMessage(*message[:3], 0, 0))
+            writer.write(RecordedMessage(message.key.replace("cstr", "b"), *message[1:3], 0, 0))
     for config, said in (
         (ReplayConfig(file=str(empty)), "holds no samples"),
         (ReplayConfig(file=str(two), plant="c"), "holds samples of b, cstr; they cannot all be played as 'c'"),

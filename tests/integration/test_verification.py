@@ -14,7 +14,7 @@ from reactorwatch.contract.codec import decode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.storage.gaps import GAP, to_metadata
 from recorder.storage.recover import recover
 from recorder.tools.cut import cut, sampled_between
@@ -23,7 +23,7 @@ from recorder.tools.mcap_file import RecordingWriter, read_messages, read_metada
 from .watched_hour import ROWS, START_NS, record_hour
 
 Told = dict[str, Any]
-Change = Callable[[Entry], Entry | None]
+Change = Callable[[RecordedMessage], RecordedMessage | None]
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def verified(path: Path, capsys: pytest.CaptureFixture[str]) -> tuple[int, Told]
 
 
 def recorded(path: Path, kind: str) -> int:
-    return sum(1 for entry in read_messages(path, {kind}) if not entry.repeated)
+    return sum(1 for entry in read_messages(path, {kind}) if not entry.latched)
 
 
 def events(path: Path) -> set[tuple[str, str]]:
@@ -58,7 +58,7 @@ def rewritten(path: Path, out: Path, change: Change) -> Path:
     return out
 
 
-def first_after(path: Path, key: str, minutes: float) -> Entry:
+def first_after(path: Path, key: str, minutes: float) -> RecordedMessage:
     return next(e for e in read_messages(path) if e.key == key and e.publish_time_ns >= START_NS + minutes * 60e9)
 
 
@@ -125,7 +125,7 @@ def test_a_recording_that_ends_between_a_sample_and_what_was_said_of_it_is_exact
     assert told["after_the_end"] > 0
 
 
-def as_after_a_cut(hour: Path, out: Path, lost: Callable[[Entry], bool] = lambda _: False) -> Path:
+def as_after_a_cut(hour: Path, out: Path, lost: Callable[[RecordedMessage], bool] = lambda _: False) -> Path:
     """The hour as a recorder has it whose link was down from 25 to 35 minutes, around the leak and its alarms.
 
     What it missed came afterwards, all of one kind after the other; but for what was lost.
@@ -191,7 +191,7 @@ def test_a_sample_that_was_changed_in_its_last_digit_is_found_out(
     key = keys.key("cstr", keys.SAMPLE, "T")
     target = first_after(hour, key, 20.0)
 
-    def change(entry: Entry) -> Entry:
+    def change(entry: RecordedMessage) -> RecordedMessage:
         if entry != target:
             return entry
         sample = decode(entry.payload, entry.encoding)
@@ -209,7 +209,7 @@ def test_an_estimate_that_was_changed_is_named_with_both_values(
 ) -> None:
     target = first_after(hour, keys.key("cstr", keys.ESTIMATE, "T"), 25.0)
 
-    def change(entry: Entry) -> Entry:
+    def change(entry: RecordedMessage) -> RecordedMessage:
         if entry != target:
             return entry
         estimate = decode(entry.payload, entry.encoding)

@@ -22,7 +22,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import ALARM_STATE_UNACKNOWLEDGED, QUALITY_GOOD, Alarm, Sample
 from reactorwatch.runtime import logs
 from reactorwatch.terminal import printable, printable_lines
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
@@ -78,7 +78,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
             sample = Sample(time_ns=time_ns, sequence=3 * row, value=1.0, quality=QUALITY_GOOD, unit=HOSTILE)
             for kind, message in (("sample", sample), ("alarm", alarm)):
                 body = encode(Publication(f"reactor/x/{kind}/T", message))
-                writer.write(Entry(f"reactor/{name}/{kind}/T", body.payload, body.encoding, time_ns, time_ns))
+                writer.write(RecordedMessage(f"reactor/{name}/{kind}/T", body.payload, body.encoding, time_ns, time_ns))
     (tmp_path / f"{name}.csv").write_text(f"time_min,qc,C,T\n0,1,2,{name}\n", newline="")
     (tmp_path / "header.csv").write_text('time_min,qc,C,"' + HOSTILE + '"\n0,1,2,3\n', newline="")
     (tmp_path / "bad.toml").write_text("[monitor]\n" + json.dumps(HOSTILE[:20]) + " = 1\n")

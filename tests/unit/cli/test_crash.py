@@ -24,7 +24,7 @@ from reactorwatch.records.csv_file import write_csv
 from reactorwatch.runtime import crash
 from reactorwatch.runtime.config import read_settings
 from recorder.config import RecorderConfig
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter
 from tests.unit.diagnosis.cases import CASES
 
@@ -54,7 +54,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
                     sample = Sample(time_ns=time_ns, sequence=row, value=value, quality=QUALITY_GOOD)
                     message = encode(Publication(f"reactor/x/sample/{signal}", sample))
                     topic = f"reactor/{plant}/sample/{signal}"
-                    writer.write(Entry(topic, message.payload, message.encoding, time_ns, time_ns))
+                    writer.write(RecordedMessage(topic, message.payload, message.encoding, time_ns, time_ns))
     return folder
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from reactorwatch.cli.batch import as_table, expand_files
 from reactorwatch.errors import InputError
-from recorder.storage.mcap_writer import NUMBER
+from recorder.storage.mcap_writer import FILE_INDEX
 from recorder.tools.mcap_file import RecordingWriter
 
 
@@ -16,7 +16,7 @@ def recording(path: Path, **metadata: str) -> Path:
 
 
 def test_what_a_recorder_has_written_into_a_folder_is_one_recording(tmp_path: Path) -> None:
-    recording(tmp_path / "run-1.mcap", **{NUMBER: "1"})
+    recording(tmp_path / "run-1.mcap", **{FILE_INDEX: "1"})
     recording(tmp_path / "cut.mcap", cut="from 3min to the end of run-2.mcap")
     (tmp_path / "a.csv").touch()
     assert expand_files([tmp_path]) == [tmp_path, tmp_path / "a.csv"]
@@ -33,7 +33,7 @@ def test_a_damaged_recording_does_not_change_what_its_folder_stands_for(tmp_path
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(b"this is no recording")
     assert expand_files([tmp_path]) == [damaged]
-    recording(tmp_path / "whole.mcap", **{NUMBER: "1"})
+    recording(tmp_path / "whole.mcap", **{FILE_INDEX: "1"})
     assert expand_files([tmp_path]) == [tmp_path]
 
 

@@ -18,7 +18,7 @@ from reactorwatch.cli.diagnosis import REPORT
 from reactorwatch.cli.main import app, main
 from reactorwatch.records import output
 from recorder.dashboard.picture import picture_names
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter
 from tests.unit.recorder import golden
 
@@ -135,7 +135,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     with RecordingWriter(path, {"plant": "cstr"}) as writer:
         for entry in golden.entries():
             writer.write(entry)
-        writer.write(Entry("weather/today", b"1", "text/plain", 1, 1))
+        writer.write(RecordedMessage("weather/today", b"1", "text/plain", 1, 1))
     return path.read_bytes()
 
 

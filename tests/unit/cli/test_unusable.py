@@ -9,7 +9,7 @@ from reactorwatch.cli.batch import expand_files
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_BAD, QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter, recordings_in
 from tests.unit.cli.test_crash import run
 
@@ -30,7 +30,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
                 for signal in ("qc", "C", "T"):
                     sample = Sample(time_ns=time_ns, sequence=row, value=value, quality=quality)
                     body = encode(Publication(f"reactor/cstr/sample/{signal}", sample))
-                    writer.write(Entry(body.key, body.payload, body.encoding, time_ns, time_ns))
+                    writer.write(RecordedMessage(body.key, body.payload, body.encoding, time_ns, time_ns))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

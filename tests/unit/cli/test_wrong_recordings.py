@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.cli.main import main
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter
 from tests.unit.recorder import golden
 
@@ -45,7 +45,7 @@ def folder(tmp_path: Path, good: bytes, monkeypatch: pytest.MonkeyPatch) -> Path
     with RecordingWriter(tmp_path / "nothing.mcap", {}):
         pass
     with RecordingWriter(tmp_path / "stranger.mcap", {}) as writer:
-        writer.write(Entry("weather/today", b"1", "text/plain", 1, 1))
+        writer.write(RecordedMessage("weather/today", b"1", "text/plain", 1, 1))
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

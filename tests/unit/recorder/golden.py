@@ -14,7 +14,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication, encode
 from reactorwatch.records.record import UNITS, to_time_ns
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 
 PLANT = "cstr"
 ZERO_NS = 1_700_000_000_000_000_000
@@ -133,9 +133,9 @@ def _named(kind: str, name: str, message: Body) -> Publication:
     return Publication(keys.key(PLANT, kind, name), message)
 
 
-def entries() -> Iterator[Entry]:
+def entries() -> Iterator[RecordedMessage]:
     """The same as a recorder would have received it, 1 ms after the other."""
     for number, publication in enumerate(publications()):
         encoded = encode(publication)
         received = RECEIVED_NS + number * 1_000_000
-        yield Entry(encoded.key, encoded.payload, encoded.encoding, received, publication.message.time_ns)
+        yield RecordedMessage(encoded.key, encoded.payload, encoded.encoding, received, publication.message.time_ns)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Health
-from recorder.__main__ import begin, files_for
+from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
 from recorder.files import RecordingFiles
 from recorder.node import RecorderNode
@@ -92,13 +92,13 @@ def recorder(
     start_ns: int,
     open_part: Callable[[Path], PartFile] = PartFile,
     *,
-    known: Collection[int] = (),
-    known_until_ns: int = 0,
+    fingerprints: Collection[int] = (),
+    fingerprints_until_ns: int = 0,
     boot: str = "a boot",
     **settings: object,
 ) -> Fed:
     """A recorder that has just begun."""
     config = RecorderConfig(out=str(out), **settings)  # type: ignore[arg-type]
     confirmed = Confirmed(start_ns, boot)
-    files = files_for(config, open_part, confirmed.read)
-    return Fed(begin(config, files, start_ns, known, known_until_ns), files, start_ns, confirmed)
+    files = open_files(config, open_part, confirmed.read)
+    return Fed(start_node(config, files, start_ns, fingerprints, fingerprints_until_ns), files, start_ns, confirmed)

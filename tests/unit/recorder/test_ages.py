@@ -84,13 +84,13 @@ def test_of_files_on_both_sides_of_a_jump_the_oldest_by_the_confirmed_time_goes_
 def test_ages_go_on_after_a_restart_in_the_same_boot_and_stand_still_while_the_machine_is_off(tmp_path: Path) -> None:
     clock = Confirmed(1000, "first")
     ages = Ages(tmp_path / ".ages", clock.read)
-    assert ages.see([("a", 7)]) == {"a": 0}
+    assert ages.update([("a", 7)]) == {"a": 0}
     clock.now_ns = 1500
     ages.store()
     clock.now_ns = 1800
     again = Ages(tmp_path / ".ages", clock.read)
     assert again.now_ns() == 800
-    assert again.see([("a", 7), ("b", 7)]) == {"a": 0, "b": 800}
+    assert again.update([("a", 7), ("b", 7)]) == {"a": 0, "b": 800}
     again.store()
     rebooted = Ages(tmp_path / ".ages", Confirmed(3, "second").read)
     assert rebooted.now_ns() == 800
@@ -99,16 +99,16 @@ def test_ages_go_on_after_a_restart_in_the_same_boot_and_stand_still_while_the_m
 def test_a_new_file_of_an_old_name_is_not_as_old(tmp_path: Path) -> None:
     clock = Confirmed(0)
     ages = Ages(tmp_path / ".ages", clock.read)
-    ages.see([("run.mcap", 1)])
+    ages.update([("run.mcap", 1)])
     clock.now_ns = 500
-    assert ages.see([("run.mcap", 2)]) == {"run.mcap": 500}
+    assert ages.update([("run.mcap", 2)]) == {"run.mcap": 500}
 
 
 @pytest.mark.parametrize("content", [b"", b"{}", b"\xff" * 20, b'{"boot": 1}'])
 def test_a_damaged_file_of_ages_counts_them_from_now(tmp_path: Path, content: bytes) -> None:
     (tmp_path / ".ages").write_bytes(content)
     ages = Ages(tmp_path / ".ages", Confirmed(500).read)
-    assert ages.see([("a", 1)]) == {"a": 0}
+    assert ages.update([("a", 1)]) == {"a": 0}
 
 
 @given(steps=st.lists(st.tuples(st.sampled_from(["run", "off", "store"]), st.integers(0, 10**6)), max_size=20))
@@ -117,7 +117,7 @@ def test_no_age_is_more_than_the_time_in_which_the_machine_ran(
 ) -> None:
     path, clock, ran_ns = tmp_path_factory.mktemp("ages") / ".ages", Confirmed(0), 0
     ages = Ages(path, clock.read)
-    ages.see([("a", 1)])
+    ages.update([("a", 1)])
     for number, (what, span_ns) in enumerate(steps):
         if what == "run":
             clock.now_ns += span_ns
@@ -127,7 +127,7 @@ def test_no_age_is_more_than_the_time_in_which_the_machine_ran(
         else:
             clock = Confirmed(span_ns, f"boot {number}")
             ages = Ages(path, clock.read)
-        assert 0 <= ages.now_ns() - ages.see([("a", 1)])["a"] <= ran_ns
+        assert 0 <= ages.now_ns() - ages.update([("a", 1)])["a"] <= ran_ns
 
 
 def test_the_clock_since_the_machine_s_start_has_a_name_and_goes_on() -> None:

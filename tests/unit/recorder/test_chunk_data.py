@@ -14,7 +14,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from reactorwatch.errors import InputError
 from recorder.storage.chunk_data import LARGEST_MB
-from recorder.storage.mcap_scan import FOREVER_NS
+from recorder.storage.mcap_scan import LATEST_NS
 from recorder.storage.recover import recover
 from recorder.tools.cut import cut, merge, received_between
 from recorder.tools.inspect import look_over
@@ -97,7 +97,7 @@ BOMBS: dict[str, Callable[[str], tuple[Chunk, int | None]]] = {
 }
 READERS: dict[str, Callable[[Path, Path], object]] = {
     "read": lambda path, _: list(read_messages(path)),
-    "cut": lambda path, out: cut([path], out, received_between(0, FOREVER_NS), {}),
+    "cut": lambda path, out: cut([path], out, received_between(0, LATEST_NS), {}),
     "merge": lambda path, out: merge([path], out, {}),
 }
 

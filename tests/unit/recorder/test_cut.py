@@ -10,7 +10,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.cut import cut, merge, received_between, sampled_between
 from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
 from tests.unit.recorder import golden
@@ -19,7 +19,9 @@ MINUTE = 60_000_000_000
 ENTRIES = list(golden.entries())
 
 
-def recorded(path: Path, entries: list[Entry], every: int = 100, metadata: dict[str, str] | None = None) -> Path:
+def recorded(
+    path: Path, entries: list[RecordedMessage], every: int = 100, metadata: dict[str, str] | None = None
+) -> Path:
     with RecordingWriter(path, metadata or {}) as writer:
         for number, entry in enumerate(entries, start=1):
             writer.write(entry)
@@ -36,7 +38,7 @@ def test_a_cut_by_receipt_holds_what_was_received_then(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     window = received_between(ENTRIES[250].log_time_ns, ENTRIES[449].log_time_ns)
     assert cut([source], tmp_path / "cut.mcap", window, {}) == 200
-    kept = [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.repeated]
+    kept = [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.latched]
     assert kept == ENTRIES[250:450]
 
 
@@ -44,7 +46,7 @@ def test_a_cut_by_sample_time_holds_what_speaks_of_it_and_what_was_received_mean
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     out = tmp_path / "cut.mcap"
     cut([source], out, sampled_between([source], at(10.0), at(20.0)), {})
-    kept = [entry for entry in read_messages(out) if not entry.repeated]
+    kept = [entry for entry in read_messages(out) if not entry.latched]
     spoken = [entry for entry in ENTRIES if "/health/" not in entry.key]
     expected = [entry for entry in spoken if at(10.0) <= entry.publish_time_ns <= at(20.0)]
     assert [entry for entry in kept if "/health/" not in entry.key] == expected
@@ -63,23 +65,25 @@ def test_a_cut_says_first_how_things_stood(tmp_path: Path) -> None:
     out = tmp_path / "cut.mcap"
     cut([source], out, sampled_between([source], at(24.0), at(30.0)), {})
     entries = list(read_messages(out))
-    standing = [entry for entry in entries if entry.repeated]
+    standing = [entry for entry in entries if entry.latched]
     assert entries[: len(standing)] == standing
     assert [entry.key.split("/", 2)[2] for entry in standing] == ["fault/coolant_flow", "alarm/shewhart/T"]
     again = tmp_path / "again.mcap"
     cut([out], again, sampled_between([out], at(25.0), at(26.0)), {})
-    assert [entry[:3] for entry in read_messages(again) if entry.repeated] == [entry[:3] for entry in standing]
+    assert [entry[:3] for entry in read_messages(again) if entry.latched] == [entry[:3] for entry in standing]
 
 
 def test_a_cut_of_several_files_goes_across_them(tmp_path: Path) -> None:
     halves = [recorded(tmp_path / "b.mcap", ENTRIES[800:]), recorded(tmp_path / "a.mcap", ENTRIES[:800])]
     window = received_between(ENTRIES[700].log_time_ns, ENTRIES[899].log_time_ns)
     assert cut(halves, tmp_path / "cut.mcap", window, {}) == 200
-    assert [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.repeated] == ENTRIES[700:900]
+    assert [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.latched] == ENTRIES[700:900]
 
 
 def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
-    strange = Entry("reactor/cstr/sample/T", b"\xff\xff", encoding_of(messages.Sample), ENTRIES[10].log_time_ns, 5)
+    strange = RecordedMessage(
+        "reactor/cstr/sample/T", b"\xff\xff", encoding_of(messages.Sample), ENTRIES[10].log_time_ns, 5
+    )
     path = tmp_path / "run.mcap"
     with RecordingWriter(path, {}) as writer:
         for entry in ENTRIES[:10]:
@@ -144,7 +148,7 @@ def test_cutting_in_two_and_merging_gives_the_same_record(tmp_path: Path) -> Non
     assert np.array_equal(first.time_min, again.time_min)
     for signal in ("qc", "C", "T"):
         assert np.array_equal(first.columns[signal], again.columns[signal])
-    assert [entry for entry in read_messages(tmp_path / "again.mcap") if entry.repeated] == []
+    assert [entry for entry in read_messages(tmp_path / "again.mcap") if entry.latched] == []
 
 
 def test_the_model_that_stands_is_that_of_the_moment_and_not_a_later_one(tmp_path: Path) -> None:
@@ -155,10 +159,10 @@ def test_the_model_that_stands_is_that_of_the_moment_and_not_a_later_one(tmp_pat
         for what, message in ((keys.MODEL, kind), (keys.SAMPLE, sample)):
             if message is not None:
                 encoded = encode(Publication(keys.key("cstr", what, "T"), message))
-                entries.append(Entry(*encoded[:3], 10 + number * MINUTE, number * MINUTE))
+                entries.append(RecordedMessage(*encoded[:3], 10 + number * MINUTE, number * MINUTE))
     source = recorded(tmp_path / "run.mcap", entries, every=1000)
     cut([source], tmp_path / "cut.mcap", sampled_between([source], 12 * MINUTE, 14 * MINUTE), {})
-    (standing,) = [entry for entry in read_messages(tmp_path / "cut.mcap") if entry.repeated]
+    (standing,) = [entry for entry in read_messages(tmp_path / "cut.mcap") if entry.latched]
     model = decode(standing.payload, standing.encoding)
     assert isinstance(model, messages.ModelSnapshot)
     assert model.rows == 10

@@ -118,5 +118,5 @@ def test_a_disk_that_is_full_when_a_file_is_completed_loses_nothing_that_was_flu
     assert kept[:2910] == list(range(2910))
     assert kept[-1] == 3109
     assert fed.last_health().refused_by_reason["disk"] == 3110 - len(kept)
-    assert [entry.key for entry in read_messages(second) if entry.repeated] == ["reactor/cstr/alarm/ewma/T"]
+    assert [entry.key for entry in read_messages(second) if entry.latched] == ["reactor/cstr/alarm/ewma/T"]
     assert first.name == "run.mcap"

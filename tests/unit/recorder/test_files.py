@@ -12,8 +12,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode
 from reactorwatch.errors import InputError
-from recorder.message import Entry
-from recorder.storage.background import Chores
+from recorder.message import RecordedMessage
+from recorder.storage.background import BackgroundTasks
 from recorder.storage.mcap_scan import Scan
 from recorder.tools.mcap_file import (
     RecordingWriter,
@@ -30,7 +30,7 @@ START = golden.RECEIVED_NS
 ALL = [encode(publication) for publication in golden.publications()]
 
 
-def of_others(path: Path) -> list[Entry]:
+def of_others(path: Path) -> list[RecordedMessage]:
     return [entry for entry in read_messages(path) if not entry.key.endswith("health/recorder")]
 
 
@@ -77,11 +77,11 @@ def test_every_file_says_first_how_things_stand_and_a_folder_says_it_once(tmp_pa
     files = recordings_in(tmp_path)
     assert len(files) == 4
     for path in files[1:]:
-        first = [entry for entry in read_messages(path) if entry.repeated]
+        first = [entry for entry in read_messages(path) if entry.latched]
         assert [decode(entry.payload, entry.encoding) for entry in first] == [item.message for item in stands]
         assert list(read_messages(path))[: len(first)] == first
         assert [entry.publish_time_ns for entry in first] == [5, 1]
-    assert not any(entry.repeated for entry in read_messages(tmp_path))
+    assert not any(entry.latched for entry in read_messages(tmp_path))
     assert sum("/alarm/" in entry.key for entry in read_messages(tmp_path)) == 1
 
 
@@ -150,9 +150,9 @@ def test_a_black_box_holds_what_came_before_and_after_the_alarm_and_how_things_s
     assert first.name.endswith("Z-shewhart-C.mcap")
     assert second.name.endswith("Z-ewma-T.mcap")
     assert read_metadata(second)["alarm"] == "ewma/T"
-    (standing,) = [entry for entry in read_messages(second) if entry.repeated]
+    (standing,) = [entry for entry in read_messages(second) if entry.latched]
     assert standing.key == "reactor/cstr/alarm/shewhart/C"
-    kept = [entry for entry in of_others(second) if not entry.repeated]
+    kept = [entry for entry in of_others(second) if not entry.latched]
     (at,) = [entry.log_time_ns for entry in kept if "/alarm/" in entry.key]
     whole = [entry for entry in of_others(tmp_path) if at - MINUTE // 2 <= entry.log_time_ns <= at + MINUTE // 2]
     assert kept == whole
@@ -173,7 +173,7 @@ def test_all_of_a_stretch_is_in_the_file_when_it_is_copied(tmp_path: Path, monke
     there: list[int] = []
     part = tmp_path / "run.mcap.part"
     monkeypatch.setattr(
-        fed.files, "keep_for_good", lambda _: there.append(sum("/sample/" in x.channel.topic for x in Scan(part)))
+        fed.files, "save_black_box", lambda _: there.append(sum("/sample/" in x.channel.topic for x in Scan(part)))
     )
     fed.hear([alarm("ewma/T")], SECOND)
     fed.pass_time(29 * SECOND)
@@ -263,12 +263,12 @@ def test_no_more_is_deleted_by_who_comes_to_it_when_the_last_file_is_whole(
 ) -> None:
     """As a machine does that is busy with other things."""
     late: list[Callable[[], None]] = []
-    monkeypatch.setattr(Chores, "add", lambda _self, _what, chore: late.append(chore))
+    monkeypatch.setattr(BackgroundTasks, "submit", lambda _self, _name, task: late.append(task))
     fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, keep_files=3.0, black_box_min=0.0)
     fed.hear(samples(130), SECOND)
     fed.stop()
-    for chore in late:
-        chore()
+    for task in late:
+        task()
     assert late
     assert {path.name for path in tmp_path.glob("*.mcap")} == {"run.mcap", "run-2.mcap", "run-3.mcap"}
 

@@ -8,7 +8,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.__main__ import files_for
+from recorder.__main__ import open_files
 from recorder.config import RecorderConfig
 from recorder.storage.gaps import from_metadata, to_metadata
 from recorder.storage.recover import recover
@@ -74,9 +74,11 @@ def test_what_the_files_before_hold_is_not_written_again_once(tmp_path: Path) ->
     first = recorder(tmp_path, 10 * SECOND, black_box_min=0.0)
     first.hear([sample(0), sample(1)], SECOND)
     first.stop()
-    known = files_for(RecorderConfig(out=str(tmp_path))).received_since(0)
-    assert len(known) == 3  # with its last report of health
-    again = recorder(tmp_path, 30 * SECOND, known=known, known_until_ns=90 * SECOND, black_box_min=0.0)
+    fingerprints = open_files(RecorderConfig(out=str(tmp_path))).fingerprints_since(0)
+    assert len(fingerprints) == 3  # with its last report of health
+    again = recorder(
+        tmp_path, 30 * SECOND, fingerprints=fingerprints, fingerprints_until_ns=90 * SECOND, black_box_min=0.0
+    )
     told = [encode(item) for item in (sample(0), sample(1), sample(1), sample(2))]
     for message in told:
         again.node.on_message(Encoded(*message[:3], 31 * SECOND), 31 * SECOND)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
 from tests.unit.recorder import golden
 
@@ -25,7 +25,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return path.read_bytes()
 
 
-def read(path: Path) -> list[Entry] | str:
+def read(path: Path) -> list[RecordedMessage] | str:
     """What is in a file, or the line that says why it cannot be told."""
     try:
         return list(read_messages(path))
@@ -33,7 +33,7 @@ def read(path: Path) -> list[Entry] | str:
         return str(error)
 
 
-def reads_as(path: Path, contents: Iterator[bytes]) -> list[list[Entry] | str]:
+def reads_as(path: Path, contents: Iterator[bytes]) -> list[list[RecordedMessage] | str]:
     found = []
     for content in contents:
         path.write_bytes(content)

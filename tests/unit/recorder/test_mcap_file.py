@@ -15,12 +15,12 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.errors import InputError
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
 from tests.unit.recorder import golden
 
 
-def recorded(path: Path, entries: list[Entry], every: int = 0) -> Path:
+def recorded(path: Path, entries: list[RecordedMessage], every: int = 0) -> Path:
     """A recording, flushed after each so many entries."""
     with RecordingWriter(path, {"seed": "3"}) as writer:
         for number, entry in enumerate(entries, start=1):
@@ -33,11 +33,13 @@ def recorded(path: Path, entries: list[Entry], every: int = 0) -> Path:
 MINUTE = 60_000_000_000
 
 
-def sample(time_ns: int, value: float = 1.0, signal: str = "T", plant: str = "cstr", received_ns: int = 0) -> Entry:
+def sample(
+    time_ns: int, value: float = 1.0, signal: str = "T", plant: str = "cstr", received_ns: int = 0
+) -> RecordedMessage:
     """A sample of a plant that samples once a minute and counts as it should."""
     message = messages.Sample(time_ns=time_ns, sequence=time_ns // MINUTE, value=value, quality=messages.QUALITY_GOOD)
     encoded = encode(Publication(keys.key(plant, keys.SAMPLE, signal), message))
-    return Entry(encoded.key, encoded.payload, encoded.encoding, received_ns or time_ns, time_ns)
+    return RecordedMessage(encoded.key, encoded.payload, encoded.encoding, received_ns or time_ns, time_ns)
 
 
 @pytest.mark.parametrize("every", [0, 100])
@@ -65,8 +67,8 @@ def test_other_software_reads_the_same_values_by_the_schemas_in_the_file(tmp_pat
 
 def test_bytes_of_strangers_are_kept_with_the_encoding_they_claimed_and_no_schema(tmp_path: Path) -> None:
     strange = [
-        Entry("reactor/cstr/sample/T", b"{}", "application/json", 1, 1),
-        Entry("reactor/cstr/sample/T", b"\xff\xff", encoding_of(messages.Sample), 2, 2),
+        RecordedMessage("reactor/cstr/sample/T", b"{}", "application/json", 1, 1),
+        RecordedMessage("reactor/cstr/sample/T", b"\xff\xff", encoding_of(messages.Sample), 2, 2),
     ]
     path = tmp_path / "run.mcap"
     with RecordingWriter(path, {}) as writer:
@@ -95,7 +97,7 @@ def test_a_recording_of_nothing_is_a_recording(tmp_path: Path) -> None:
 
 def test_reading_can_be_limited_to_kinds_and_to_a_plant(tmp_path: Path) -> None:
     entries = [*golden.entries(), *(entry._replace(key=entry.key.replace("cstr", "b")) for entry in golden.entries())]
-    entries.append(Entry("reactor/odd", b"", "?", entries[-1].log_time_ns, 0))
+    entries.append(RecordedMessage("reactor/odd", b"", "?", entries[-1].log_time_ns, 0))
     path = recorded(tmp_path / "run.mcap", entries)
     alarms = list(read_messages(path, {keys.ALARM, keys.FAULT}, "b"))
     assert {entry.key for entry in alarms} == {"reactor/b/alarm/shewhart/T", "reactor/b/fault/coolant_flow"}
@@ -204,10 +206,10 @@ def test_a_record_has_nan_where_a_signal_was_not_measured(tmp_path: Path) -> Non
         sample(1 * minute, 10.0, received_ns=2),
         sample(1 * minute, 1.0, "qc", received_ns=3),
         sample(2 * minute, 99.0, received_ns=4),
-        Entry(encoded.key, encoded.payload, encoded.encoding, 5, 3 * minute),
+        RecordedMessage(encoded.key, encoded.payload, encoded.encoding, 5, 3 * minute),
         sample(3 * minute, np.inf, "C", received_ns=6),
         sample(4 * minute, 5.0, "level", received_ns=7),
-        Entry("reactor/cstr/sample/T", b"", encoding_of(messages.Sample), 8, 8),
+        RecordedMessage("reactor/cstr/sample/T", b"", encoding_of(messages.Sample), 8, 8),
     ]
     record = read_record(recorded(tmp_path / "run.mcap", entries))
     assert record.time_min.tolist() == [0.0, 1.0, 2.0]
@@ -234,7 +236,7 @@ def test_the_file_s_sequence_numbers_are_those_of_the_samples(tmp_path: Path) ->
     """Read by the bare MCAP library; what is no sample has none, and neither has what cannot be read."""
     late = messages.Sample(time_ns=1, sequence=2**32 + 7, quality=messages.QUALITY_GOOD)
     encoded = encode(Publication("reactor/cstr/sample/T", late))
-    entries = [*golden.entries(), Entry(*encoded[:3], 2**62, 1)]
+    entries = [*golden.entries(), RecordedMessage(*encoded[:3], 2**62, 1)]
     path = recorded(tmp_path / "run.mcap", entries)
     with path.open("rb") as stream:
         found = [(channel.topic, message.sequence) for _, channel, message in make_reader(stream).iter_messages()]

@@ -12,10 +12,10 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, decode, encode
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal
-from recorder.__main__ import begin, files_for
+from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
 from recorder.files import RecordingFiles
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.node import RecorderNode
 from recorder.tools.mcap_file import read_messages
 from tests.running import WITHIN_S, running
@@ -26,11 +26,11 @@ SECOND = 10**9
 
 def node_on(path: Path, start_ns: int = 0) -> tuple[RecorderNode, RecordingFiles]:
     config = RecorderConfig(out=str(path), flush_period_s=1.0)
-    files = files_for(config)
-    return begin(config, files, start_ns), files
+    files = open_files(config)
+    return start_node(config, files, start_ns), files
 
 
-def of_health(entry: Entry) -> messages.Health:
+def of_health(entry: RecordedMessage) -> messages.Health:
     health = decode(entry.payload, entry.encoding)
     assert isinstance(health, messages.Health)
     return health

@@ -7,7 +7,7 @@ from reactorwatch.cli.recording_reports import info_object
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.inspect import Look, look_over, zero_ns_of
 from recorder.tools.mcap_file import RecordingWriter
 from recorder.tools.overview import Gap, overview
@@ -17,12 +17,14 @@ SECOND = 1_000_000_000
 KEY = "reactor/cstr/sample/T"
 
 
-def entry(key: str, message: messages.Sample | messages.Alarm, received_ns: int, *, repeated: bool = False) -> Entry:
+def entry(
+    key: str, message: messages.Sample | messages.Alarm, received_ns: int, *, latched: bool = False
+) -> RecordedMessage:
     encoded = encode(Publication(key, message))
-    return Entry(*encoded[:3], received_ns, message.time_ns, repeated)
+    return RecordedMessage(*encoded[:3], received_ns, message.time_ns, latched)
 
 
-def sampled(*sequences: int) -> list[Entry]:
+def sampled(*sequences: int) -> list[RecordedMessage]:
     """Samples that were taken a second apart, by their number, and received in this order."""
     return [
         entry(
@@ -32,10 +34,10 @@ def sampled(*sequences: int) -> list[Entry]:
     ]
 
 
-def alarm(at: int, event: str, raised: int, cleared: int = 0, *, repeated: bool = False) -> Entry:
+def alarm(at: int, event: str, raised: int, cleared: int = 0, *, latched: bool = False) -> RecordedMessage:
     key = keys.key("cstr", keys.ALARM, "ewma/T")
     message = messages.Alarm(time_ns=at, alarm="ewma/T", event=event, raised_ns=raised, cleared_ns=cleared)
-    return entry(key, message, at, repeated=repeated)
+    return entry(key, message, at, latched=latched)
 
 
 def test_counts_and_times_are_those_of_the_entries() -> None:
@@ -61,7 +63,7 @@ def test_what_came_late_is_not_missing() -> None:
 
 
 def test_what_is_said_again_is_not_counted_but_tells_of_an_alarm_that_stands() -> None:
-    seen = overview([alarm(10, "raised", 10, repeated=True), *sampled(0, 1), alarm(30, "cleared", 10, 30)])
+    seen = overview([alarm(10, "raised", 10, latched=True), *sampled(0, 1), alarm(30, "cleared", 10, 30)])
     assert seen.messages == 3
     assert [(item.raised_ns, item.cleared_ns) for item in seen.alarms] == [(10, 30)]
 

@@ -19,7 +19,7 @@ def by_ada(name: str) -> AlarmCommand:
 
 
 def ask(alarms: OwnAlarms, command: str, message: Message) -> tuple[CommandReply, list[Publication]]:
-    return alarms.obey(Encoded(keys.key("cstr", keys.COMMAND, command), *encode_message(message)), 7)
+    return alarms.execute(Encoded(keys.key("cstr", keys.COMMAND, command), *encode_message(message)), 7)
 
 
 def now(alarms: OwnAlarms, name: str) -> Alarm:

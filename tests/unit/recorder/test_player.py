@@ -10,7 +10,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.records.record import Record
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.player import BATCH, EVERYTHING, NEVER_NS, Player, between, playable, samples_of
 from tests.unit.recorder import golden
 
@@ -95,10 +95,10 @@ def test_what_goes_out_is_what_was_recorded_byte_for_byte_under_the_name_asked_f
 
 def test_what_cannot_be_decoded_or_is_no_publication_is_left_out() -> None:
     strange = [
-        Entry("reactor/cstr/sample/T", b"\xff\xff", "application/protobuf;reactorwatch.v1.Sample", 0, 0),
-        Entry("reactor/cstr/sample/T", b"", "text/plain", 0, 0),
-        Entry("reactor/cstr/sample/T", b"", "application/protobuf;reactorwatch.v1.SetInput", 0, 0),
-        Entry("reactor", b"", "application/protobuf;reactorwatch.v1.Sample", 0, 0),
+        RecordedMessage("reactor/cstr/sample/T", b"\xff\xff", "application/protobuf;reactorwatch.v1.Sample", 0, 0),
+        RecordedMessage("reactor/cstr/sample/T", b"", "text/plain", 0, 0),
+        RecordedMessage("reactor/cstr/sample/T", b"", "application/protobuf;reactorwatch.v1.SetInput", 0, 0),
+        RecordedMessage("reactor", b"", "application/protobuf;reactorwatch.v1.Sample", 0, 0),
     ]
     assert list(playable(strange)) == []
 

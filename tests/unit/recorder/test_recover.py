@@ -14,11 +14,11 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 
 from reactorwatch.errors import InputError
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.storage.mcap_chunks import metadata_records
-from recorder.storage.mcap_scan import Scan, Stored
+from recorder.storage.mcap_scan import RawMessage, Scan
 from recorder.storage.mcap_writer import RecordingWriter
-from recorder.storage.recover import Saved, recover
+from recorder.storage.recover import RecoveryResult, recover
 from recorder.tools.mcap_file import read_messages, read_metadata
 from tests.unit.recorder import golden
 
@@ -52,7 +52,7 @@ def chunks(content: bytes) -> list[tuple[int, int]]:
     return [(start, end) for opcode, start, end in records(content) if opcode == Opcode.CHUNK]
 
 
-def recovered(folder: Path, content: bytes) -> tuple[list[Entry], Saved]:
+def recovered(folder: Path, content: bytes) -> tuple[list[RecordedMessage], RecoveryResult]:
     """What is in the recovered file, read as any whole file is."""
     damaged, out = folder / "damaged.mcap", folder / "out.mcap"
     damaged.write_bytes(content)
@@ -62,7 +62,7 @@ def recovered(folder: Path, content: bytes) -> tuple[list[Entry], Saved]:
     return list(read_messages(out)), saved
 
 
-def expected_of_a_cut(content: bytes, length: int) -> list[Entry]:
+def expected_of_a_cut(content: bytes, length: int) -> list[RecordedMessage]:
     """The messages of the chunks that end before the cut."""
     return ENTRIES[: CHUNK * sum(end <= length for _, end in chunks(content))]
 
@@ -77,7 +77,7 @@ def test_a_file_cut_off_anywhere_keeps_every_chunk_that_is_whole(tmp_path: Path,
         if expected:
             kept, saved = recovered(tmp_path, whole[:length])
             assert kept == expected, length
-            assert saved.only_cut_off, length
+            assert saved.is_only_truncated, length
             assert "cut off" in saved.lost
             (tmp_path / "out.mcap").unlink()
         else:
@@ -110,7 +110,7 @@ def test_a_length_that_is_damaged_costs_its_chunk_and_no_more(tmp_path: Path, wh
     for wrong in (0, 3, 500, 2**40):
         kept, saved = recovered(tmp_path, whole[: start + 1] + struct.pack("<Q", wrong) + whole[start + 9 :])
         assert kept == ENTRIES[:CHUNK] + ENTRIES[2 * CHUNK :]
-        assert not saved.only_cut_off
+        assert not saved.is_only_truncated
         (tmp_path / "out.mcap").unlink()
 
 
@@ -252,6 +252,6 @@ def test_a_pass_over_a_stretch_of_time_reads_only_the_chunks_in_it(tmp_path: Pat
     _, end = chunks(whole)[0]
     path.write_bytes(whole[: end - 10] + bytes(10) + whole[end:])
     scan = Scan(path, ENTRIES[CHUNK].log_time_ns, ENTRIES[2 * CHUNK - 1].log_time_ns)
-    found: list[Stored] = list(scan)
+    found: list[RawMessage] = list(scan)
     assert [stored.payload for stored in found] == [entry.payload for entry in ENTRIES[CHUNK : 2 * CHUNK]]
-    assert scan.whole
+    assert scan.is_intact

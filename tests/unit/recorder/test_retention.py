@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.policy.retention import Finished, Limits, to_delete
+from recorder.policy.retention import CompleteRecording, Limits, select_deletions
 
-FILES = [Finished(Path(f"{name}.mcap"), 100, at) for name, at in (("c", 30), ("a", 10), ("b", 20))]
+FILES = [CompleteRecording(Path(f"{name}.mcap"), 100, at) for name, at in (("c", 30), ("a", 10), ("b", 20))]
 
 
 @pytest.mark.parametrize(
@@ -29,16 +29,16 @@ FILES = [Finished(Path(f"{name}.mcap"), 100, at) for name, at in (("c", 30), ("a
 def test_the_oldest_go_until_the_rest_and_the_file_being_written_are_within_limits(
     limits: Limits, gone: list[str]
 ) -> None:
-    assert [path.stem for path in to_delete(FILES, 50, limits, now_ns=40)] == gone
+    assert [path.stem for path in select_deletions(FILES, 50, limits, now_ns=40)] == gone
 
 
 def test_when_no_file_is_being_written_none_goes_for_it() -> None:
-    assert to_delete(FILES, None, Limits(files=3, size_bytes=300), 40) == []
-    assert [path.stem for path in to_delete(FILES, None, Limits(files=2), 40)] == ["a"]
+    assert select_deletions(FILES, None, Limits(files=3, size_bytes=300), 40) == []
+    assert [path.stem for path in select_deletions(FILES, None, Limits(files=2), 40)] == ["a"]
 
 
 def test_what_a_black_box_still_needs_stays() -> None:
-    assert [path.stem for path in to_delete(FILES, 50, Limits(files=1), 40, needed_since_ns=20)] == ["a"]
+    assert [path.stem for path in select_deletions(FILES, 50, Limits(files=1), 40, protected_since_ns=20)] == ["a"]
 
 
 @given(
@@ -48,8 +48,8 @@ def test_what_a_black_box_still_needs_stays() -> None:
     size=st.integers(0, 500),
 )
 def test_no_more_goes_than_has_to(ends: list[int], sizes: list[int], files: int, size: int) -> None:
-    found = [Finished(Path(str(n)), sizes[n], end) for n, end in enumerate(ends)]
-    gone = to_delete(found, 0, Limits(size_bytes=size, files=files), 100)
+    found = [CompleteRecording(Path(str(n)), sizes[n], end) for n, end in enumerate(ends)]
+    gone = select_deletions(found, 0, Limits(size_bytes=size, files=files), 100)
     left = [item for item in found if item.path not in gone]
     assert len(left) + 1 <= files or not left
     assert sum(item.size_bytes for item in left) <= size or not left

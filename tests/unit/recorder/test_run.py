@@ -8,7 +8,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.errors import InputError
 from recorder.columns.run import ADAPTS, EQUATIONS, HELD, JUDGES, Earlier, Run
 from recorder.columns.run_reader import read_run, stretches
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from tests.unit.recorder import golden
 
 
@@ -73,8 +73,8 @@ def test_unusable_values_are_gaps_and_what_cannot_be_read_is_passed_over() -> No
             encode(Publication(key, messages.Fault(time_ns=3))),
             encode(Publication(key, messages.Sample(time_ns=4))),  # without a quality it is no sample
             Encoded(key, b"\xff\xff", "application/protobuf;reactorwatch.v1.Sample"),
-            Entry("reactor/other/sample/T", b"", "text/plain", 0, 0),
-            Entry("reactor", b"", "text/plain", 0, 0),
+            RecordedMessage("reactor/other/sample/T", b"", "text/plain", 0, 0),
+            RecordedMessage("reactor", b"", "text/plain", 0, 0),
         ]
     )
     assert np.isnan(run.measured["T"].value).tolist() == [True, True]

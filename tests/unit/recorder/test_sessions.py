@@ -9,7 +9,7 @@ from reactorwatch.cli.recording_reports import info_object, info_text
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import Record
 from recorder.columns.run_reader import read_run
-from recorder.message import Entry
+from recorder.message import RecordedMessage
 from recorder.tools.convert import export_csv
 from recorder.tools.inspect import look_over, zero_ns_of
 from recorder.tools.mcap_file import RecordingWriter, read_messages, read_record
@@ -31,7 +31,7 @@ def write_session(folder: Path, number: int, clock_s: int) -> None:
         for publication in samples_of(Record(time_min, columns, "session"), "cstr", start_ns):
             encoded, time_ns = encode(publication), publication.message.time_ns
             received_ns = start_ns + (time_ns - start_ns) // PACE
-            writer.write(Entry(encoded.key, encoded.payload, encoded.encoding, received_ns, time_ns))
+            writer.write(RecordedMessage(encoded.key, encoded.payload, encoded.encoding, received_ns, time_ns))
 
 
 @pytest.fixture(params=[60, 40_000], ids=["the clock steps back", "the clock goes on"])

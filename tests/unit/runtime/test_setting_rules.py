@@ -17,7 +17,7 @@ from reactorwatch.cli.supervise import diagnosis_settings
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, section
 from reactorwatch.runtime.setting_rules import MAX_SPAN_S, PROTOCOLS, check_endpoint, valid_choices
-from recorder.__main__ import black_box_for
+from recorder.__main__ import build_black_box
 from recorder.config import RecorderConfig, ReplayConfig
 
 TABLES: dict[str, type[msgspec.Struct]] = {
@@ -68,7 +68,7 @@ def test_any_value_of_any_setting_is_valid_or_one_line(key: tuple[str, str], val
         assert "Invalid enum value" not in refused or "(valid: " in refused
         return
     if isinstance(found, RecorderConfig):
-        black_box_for(found)
+        build_black_box(found)
     if isinstance(found, PlantConfig):
         assert found.rows is None or found.rows > 0
 

@@ -8,10 +8,10 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from recorder.message import Entry
-from recorder.policy import room as room_module
+from recorder.message import RecordedMessage
+from recorder.policy import channel_budget
+from recorder.policy.channel_budget import MAX_OTHER_CHANNELS, Channel, ChannelBudget
 from recorder.policy.own_alarms import KEYS_ALARM
-from recorder.policy.room import MOST_OTHERS, Channel, Room
 from recorder.storage.mcap_writer import RecordingWriter, WriteError
 from recorder.tools.mcap_file import read_messages, recordings_in
 from tests.unit.recorder import golden
@@ -55,7 +55,7 @@ def test_10_000_stray_keys_take_no_room_from_messages_of_the_product(tmp_path: P
     assert fed.alarms()[-1].event == "cleared"
     fed.stop()
     assert {f"reactor/p{number}/sample/T" for number in range(100)} <= recorded_keys(tmp_path)
-    assert fed.last_health().refused_by_reason["too many keys"] == 10_000 - MOST_OTHERS
+    assert fed.last_health().refused_by_reason["too many keys"] == 10_000 - MAX_OTHER_CHANNELS
 
 
 def test_messages_of_the_product_beyond_the_room_raise_the_alarm_and_those_that_have_room_go_on(tmp_path: Path) -> None:
@@ -94,37 +94,37 @@ def test_keys_that_fell_silent_give_their_room_to_others_in_the_next_file(tmp_pa
 
 
 def test_a_fleet_of_12_000_plants_has_room_for_five_keys_each() -> None:
-    room = Room(room_module.MOST_KEYS)
+    room = ChannelBudget(channel_budget.MAX_KEYS)
     assert all(
-        room.admit(Channel(f"reactor/p{plant}/sample/{key}", SAMPLE.encoding, is_of_product=True), 0)
+        room.admit(Channel(f"reactor/p{plant}/sample/{key}", SAMPLE.encoding, is_product=True), 0)
         for plant in range(12_000)
         for key in range(5)
     )
 
 
 def test_room_is_bounded_by_what_the_format_can_number() -> None:
-    assert room_module.MOST_KEYS + MOST_OTHERS < room_module.MOST_CHANNELS
+    assert channel_budget.MAX_KEYS + MAX_OTHER_CHANNELS < channel_budget.MAX_CHANNELS
 
 
 def test_reserved_keys_have_room_in_a_full_file() -> None:
     own = keys.key("cstr", keys.ALARM, KEYS_ALARM)
-    room = Room(100, reserved=(own,))
-    admitted = [room.admit(Channel(f"reactor/{n}/sample/T", "", is_of_product=True), 0) for n in range(101)]
+    room = ChannelBudget(100, reserved=(own,))
+    admitted = [room.admit(Channel(f"reactor/{n}/sample/T", "", is_product=True), 0) for n in range(101)]
     assert admitted == [True] * 100 + [False]
-    assert room.admit(Channel(own, "", is_of_product=True), 0)
+    assert room.admit(Channel(own, "", is_product=True), 0)
 
 
 def test_messages_repeated_at_the_start_of_a_file_count_too() -> None:
-    room = Room(100)
-    room.start(repeated=50)
-    assert sum(room.admit(Channel(f"reactor/{n}/sample/T", "", is_of_product=True), 0) for n in range(100)) == 50
+    room = ChannelBudget(100)
+    room.reset(latched=50)
+    assert sum(room.admit(Channel(f"reactor/{n}/sample/T", "", is_product=True), 0) for n in range(100)) == 50
 
 
 def test_a_channel_beyond_those_that_the_format_can_number_is_refused_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("recorder.storage.mcap_writer.MOST_CHANNELS", 3)
-    first = Entry("", b"", "?", 0, 0)
+    monkeypatch.setattr("recorder.storage.mcap_writer.MAX_CHANNELS", 3)
+    first = RecordedMessage("", b"", "?", 0, 0)
     with RecordingWriter(tmp_path / "run.mcap", {}) as writer:
         for number in range(3):
             writer.write(first._replace(key=f"reactor/p{number}/sample/T"))

@@ -3,14 +3,14 @@
 from google.protobuf.message import Message
 
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.message import Entry
-from recorder.policy.latched import Head
+from recorder.message import RecordedMessage
+from recorder.policy.latched import LatchedMessages
 
 
-def remembered(*told: tuple[str, Message], most: int = 100) -> Head:
-    head = Head(most)
+def remembered(*told: tuple[str, Message], most: int = 100) -> LatchedMessages:
+    head = LatchedMessages(most)
     for number, (key, message) in enumerate(told):
-        head.remember(Entry(key, message.SerializeToString(), "?", number, 100 + number), message)
+        head.update(RecordedMessage(key, message.SerializeToString(), "?", number, 100 + number), message)
     return head
 
 
@@ -27,11 +27,11 @@ def test_the_last_of_each_model_alarm_and_fault_is_said_again_and_nothing_else()
         ("fault/x", messages.Fault(cause="x")),
         ("alarm/a", messages.Alarm(alarm="a", event="cleared")),
     )
-    entries = head.entries(1000)
+    entries = head.messages(1000)
     assert [entry.publish_time_ns - 100 for entry in entries] == [0, 2, 3, 7, 8, 9]
-    assert {(entry.log_time_ns, entry.repeated) for entry in entries} == {(1000, True)}
+    assert {(entry.log_time_ns, entry.latched) for entry in entries} == {(1000, True)}
 
 
 def test_of_more_than_it_may_hold_the_oldest_are_forgotten() -> None:
     head = remembered(*((f"alarm/{number % 5}", messages.Alarm()) for number in range(20)), most=3)
-    assert [entry.key for entry in head.entries(1000)] == ["alarm/2", "alarm/3", "alarm/4"]
+    assert [entry.key for entry in head.messages(1000)] == ["alarm/2", "alarm/3", "alarm/4"]

@@ -6,14 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.policy.rotation import SECOND_NS, Filing, Fsync
+from recorder.policy.rotation import SECOND_NS, FlushAndRotation, Fsync
 
 HALF = SECOND_NS // 2
 START = 1_000 * SECOND_NS
 
 
-def filing(fsync: Fsync = "never", rotate_s: float = inf, rotate_bytes: float = inf) -> Filing:
-    return Filing(HALF, fsync, rotate_s * SECOND_NS, rotate_bytes, START)
+def filing(fsync: Fsync = "never", rotate_s: float = inf, rotate_bytes: float = inf) -> FlushAndRotation:
+    return FlushAndRotation(HALF, fsync, rotate_s * SECOND_NS, rotate_bytes, START)
 
 
 @given(gaps=st.lists(st.integers(0, 2 * SECOND_NS), max_size=60))
@@ -26,13 +26,13 @@ def test_no_message_waits_longer_than_the_period_for_its_flush(gaps: list[int]) 
         if decide.flush_is_due(now):
             assert all(now - since <= HALF for since in waiting)
             waiting.clear()
-            decide.flushed()
+            decide.mark_flushed()
 
     for gap in gaps:
         while (due := decide.next_due_ns()) <= now + gap:
             look(due)
         now += gap
-        decide.wrote(now)
+        decide.count_message(now)
         waiting.append(now)
         look(now)
     assert all(now - since < HALF for since in waiting)
@@ -53,29 +53,29 @@ def test_the_policy_says_how_often_ten_seconds_are_synced(fsync: Fsync, synced: 
     for tenth in range(101):
         now = START + tenth * SECOND_NS // 10
         if decide.flush_is_due(now):
-            decide.flushed()
+            decide.mark_flushed()
         if decide.sync_is_due(now):
             syncs += 1
-            decide.synced(now)
+            decide.mark_synced(now)
         if tenth % 5 == 0:
-            decide.wrote(now)
+            decide.count_message(now)
     assert syncs == synced
 
 
 def test_a_file_is_full_by_age_or_by_size() -> None:
     decide = filing(rotate_s=60, rotate_bytes=1000)
-    decide.wrote(START)
+    decide.count_message(START)
     assert not decide.is_full(START + 59 * SECOND_NS, 999)
     assert decide.is_full(START + 60 * SECOND_NS, 0)
     assert decide.is_full(START, 1000)
-    decide.began(START + 60 * SECOND_NS)
-    decide.wrote(START + 60 * SECOND_NS)
+    decide.start_file(START + 60 * SECOND_NS)
+    decide.count_message(START + 60 * SECOND_NS)
     assert not decide.is_full(START + 119 * SECOND_NS, 0)
 
 
 def test_a_clock_that_is_set_back_puts_nothing_off() -> None:
     decide = filing(rotate_s=60)
-    decide.wrote(START)
+    decide.count_message(START)
     hour_ago = START - 3600 * SECOND_NS
     assert not decide.flush_is_due(hour_ago)
     assert decide.flush_is_due(hour_ago + HALF)
