@@ -55,7 +55,7 @@ class SimulationError(ValueError):
     """The equations cannot be integrated further; the text says where."""
 
 
-def passed_min(model: ProcessModel, u: ca.SX, p: ca.SX, t: ca.SX, middle: ca.SX, h: ca.SX) -> ca.SX:
+def state_time_step(model: ProcessModel, u: ca.SX, p: ca.SX, t: ca.SX, middle: ca.SX, h: ca.SX) -> ca.SX:
     """How long the states go on in a step of the clock from t to t + h; see `ProcessModel.clock_ahead`."""
     clock = model.clock
     if not ca.depends_on(model.clock_ahead, ca.vertcat(clock.now, clock.middle)):
@@ -73,7 +73,7 @@ def symbolic_step(model: ProcessModel) -> ca.Function:
     rhs = model.function("rhs")
     x, u, p = model.arguments()
     t, middle, h = ca.SX.sym("t"), ca.SX.sym("t_middle"), ca.SX.sym("h")
-    passed, slopes = passed_min(model, u, p, t, middle, h), list[ca.SX]()
+    passed, slopes = state_time_step(model, u, p, t, middle, h), list[ca.SX]()
     for time, weights in zip(_TIMES, _STAGES, strict=True):
         slopes.append(rhs(x + passed * _weighted(weights, slopes), u, p, t + time * h, middle)[0])
     after = x + passed * _weighted(_FIFTH_ORDER, slopes)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.process.model import ProcessModel
 
-COMPILED = 64
+MODEL_CACHE_SIZE = 64
 """Models whose derivatives are kept."""
 
 
@@ -63,7 +63,7 @@ def linearise(
     return LinearModel(A, B, C, D, np.array(state, dtype=float), np.array(inputs, dtype=float))
 
 
-@lru_cache(maxsize=COMPILED)
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
 def _derivatives(model: ProcessModel) -> ca.Function:
     """(x, u, p, t, t_middle) -> A, B, C, D."""
     x, u, p = model.arguments()

@@ -21,7 +21,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.process.effect_states import reset_function, rest_function
 from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
 from reactorwatch.process.model import ProcessModel
@@ -68,7 +68,7 @@ class Simulator:
         self.model = model
         self._own = sum(state.name not in model.at_rest for state in model.states)
         self._stepper = Stepper(model)
-        self._sensitivity_codes: dict[tuple[int, ...], RowCode] = {}
+        self._sensitivity_codes: dict[tuple[int, ...], CompiledFunction] = {}
 
     def run(
         self,
@@ -133,27 +133,27 @@ class Simulator:
         grid = grid.refined(cuts)
         of_states = self._run_sensitivities(grid, inputs, start, p, wanted, initial)
         of_states = np.concatenate([initial[None], of_states[grid.end_of_row]])
-        by_x, by_p = self._output_derivatives.over(trajectory.states, inputs, p, time_min)
+        by_x, by_p = self._output_derivatives.map(trajectory.states, inputs, p, time_min)
         of_outputs: Array = by_x @ of_states + by_p[:, :, wanted]
         return trajectory, Sensitivities(tuple(names), of_states, of_outputs)
 
     # --- what is compiled once a model -----------------------------------------------------------------------
 
     @cached_property
-    def _code(self) -> RowCode:
+    def _code(self) -> CompiledFunction:
         """(x, u, p, t, t_middle, h) -> (state after the step, 1 if it keeps the tolerance), step after step."""
         step = _row_step(self.model)
         after, error = step(*step.sx_in())
         good = ca.logic_and(error <= TOLERANCE, ca.fabs(ca.sum1(after)) < inf)
-        return RowCode(ca.Function("step", step.sx_in(), [after, good]), shared=[2], chained=1, stops=True)
+        return CompiledFunction(ca.Function("step", step.sx_in(), [after, good]), shared=[2], chained=1, stops=True)
 
-    def _sensitivity_code(self, wanted: tuple[int, ...]) -> RowCode:
+    def _sensitivity_code(self, wanted: tuple[int, ...]) -> CompiledFunction:
         """(x, S, u, p, t, t_middle, h, dt, dh) -> (x, S) after the step, for the parameters of these numbers."""
         if wanted not in self._sensitivity_codes:
             self._sensitivity_codes[wanted] = self._new_sensitivity_code(wanted)
         return self._sensitivity_codes[wanted]
 
-    def _new_sensitivity_code(self, wanted: tuple[int, ...]) -> RowCode:
+    def _new_sensitivity_code(self, wanted: tuple[int, ...]) -> CompiledFunction:
         step = _row_step(self.model)
         n_x, n = len(self.model.states), len(wanted)
         x, u, p, t, middle, h = step.sx_in()
@@ -166,20 +166,20 @@ class Simulator:
             + ca.mtimes(ca.jacobian(after, h), of_h)
         )
         one = ca.Function("sensitivities", [x, S, u, p, t, middle, h, of_t, of_h], [after, S_after])
-        return RowCode(one, shared=[3], chained=2)
+        return CompiledFunction(one, shared=[3], chained=2)
 
     @cached_property
-    def _outputs(self) -> RowCode:
+    def _outputs(self) -> CompiledFunction:
         """(x, u, p, t) -> y."""
         x, u, p, t, y = self.model.shown()
-        return RowCode(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
+        return CompiledFunction(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
 
     @cached_property
-    def _output_derivatives(self) -> RowCode:
+    def _output_derivatives(self) -> CompiledFunction:
         """(x, u, p, t) -> dy/dx, dy/dp."""
         x, u, p, t, y = self.model.shown()
         by = ca.Function("outputs_by", [x, u, p, t], [ca.jacobian(y, x), ca.jacobian(y, p)])
-        return RowCode(by, shared=[2])
+        return CompiledFunction(by, shared=[2])
 
     @cached_property
     def _complete(self) -> ArrayFunction:
@@ -245,7 +245,7 @@ class Simulator:
         """d(state after each step)/dp, shape (steps, n_x, n), on a grid that keeps the tolerance."""
         u, *times = self._columns(grid, inputs)
         code = self._sensitivity_code(tuple(wanted))
-        results = code.results(grid.length_min.size)
+        results = code.allocate_results(grid.length_min.size)
         edges = self._edge_derivatives(grid, wanted)
         code.fill(grid.length_min.size, [start, np.ascontiguousarray(initial.T), u, p, *times, *edges], results)
         return results[1].transpose(0, 2, 1)
@@ -275,7 +275,7 @@ class Simulator:
         return of_time, of_length
 
     def _trajectory(self, time_min: Array, inputs: Array, p: Array, states: Array) -> Trajectory:
-        (y,) = self._outputs.over(states, inputs, p, time_min)
+        (y,) = self._outputs.map(states, inputs, p, time_min)
         return Trajectory(time_min, states, y[:, :, 0])
 
     def _checked(

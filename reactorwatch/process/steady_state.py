@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.process.effect_states import rest_function
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel
@@ -80,7 +80,7 @@ class SteadyStates:
         self._scales = np.array([state.scale for state in own.states])
         lower, upper = (np.array([getattr(state, name) for state in own.states]) for name in ("lower", "upper"))
         self._starts = lower + _lattice(len(own.states)).T * (upper - lower)
-        self._search = RowCode(_search_step(own), shared=[1, 2, 3])
+        self._search = CompiledFunction(_search_step(own), shared=[1, 2, 3])
         self._outputs = model.function()
         self._completed = rest_function(model)
 
@@ -115,13 +115,13 @@ class SteadyStates:
         x = self._starts.copy()
         searching = np.arange(len(x))
         for _ in range(ITERATIONS):
-            after = self._search.over(x[searching], *fixed)[0][:, :, 0]
+            after = self._search.map(x[searching], *fixed)[0][:, :, 0]
             moved = np.any(after != x[searching], axis=1)
             x[searching] = after
             searching = searching[moved]
             if not searching.size:
                 break
-        rate = self._search.over(x, *fixed)[1][:, :, 0]
+        rate = self._search.map(x, *fixed)[1][:, :, 0]
         there = x[np.max(np.abs(rate) / self._scales, axis=1) < RESIDUAL]
         found = []
         while len(there):

@@ -6,7 +6,7 @@ import sys
 import numba
 import pytest
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 
 PROGRAM = """
 import numba
@@ -61,4 +61,4 @@ def test_a_kernel_compiles_where_no_folder_can_be_written_to(monkeypatch: pytest
     def double(x: float) -> float:
         return 2.0 * x
 
-    assert compiled(double)(2.0) == 4.0
+    assert jit(double)(2.0) == 4.0
