@@ -79,7 +79,7 @@ def gained(run: Run, nominal: Explained, best: Explained) -> tuple[Errors, Error
     fit = best.fit
     if best is not nominal:
         fit = best.hypothesis.fit(seen, best.fit.theta)
-    elif best.hypothesis.sized.model.lasting:
+    elif best.hypothesis.sized.model.constant_states:
         fit = best.hypothesis.at(seen, ())
     known = best.hypothesis.offsets(fit)
     before = _errors(run, hidden, nominal.hypothesis.sized, (), known)

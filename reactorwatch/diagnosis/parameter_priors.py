@@ -82,7 +82,7 @@ def offsets(model: ProcessModel, x: Array) -> dict[str, float]:
         model: with or without such.
         x: states of it, shape (n_x,) or more.
     """
-    return {model.states[place].name.removesuffix(_OFF): float(x[place]) for place in model.lasting}
+    return {model.states[place].name.removesuffix(_OFF): float(x[place]) for place in model.constant_states}
 
 
 def beginning_with(known: Mapping[str, float]) -> dict[str, float]:

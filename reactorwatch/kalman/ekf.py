@@ -26,7 +26,7 @@ Exceptions:
 - The filter restarts where the equations leave the bounds of the states or are not finite. A correction that leads out
   of the bounds is clipped.
 - It starts at the first measurements (see `initial_state`), without an innovation for that row, and waits for them.
-- Estimates of constant states (`ProcessModel.lasting`) survive a restart.
+- Estimates of constant states (`ProcessModel.constant_states`) survive a restart.
 """
 
 import struct
@@ -129,7 +129,7 @@ class Filter:
         self._pack, self._unpack = struct.Struct(f"{new.size}d").pack_into, struct.Struct(f"{outputs.size}d").unpack
         self._break_indices = [model.parameter_names.index(name) for name in model.breakpoints]
         self._time_min: float | None = None
-        self._lasting, self._learned = list(model.lasting), False
+        self._lasting, self._learned = list(model.constant_states), False
         self._inputs: tuple[float, ...] = ()
         self._breaks: tuple[float, ...] = ()
         self.noise = noise

@@ -139,7 +139,7 @@ class ErrorLinearization:
         if began is not None:
             restarted = began[1:, None, None]
             kept = np.zeros(F.shape[1:])
-            kept[self.model.lasting, self.model.lasting] = 1.0
+            kept[self.model.constant_states, self.model.constant_states] = 1.0
             F = np.where(restarted, kept, F)
             G, H, D, K = (np.where(restarted, 0.0, item) for item in (G, H, D, K))
         items = (F, G, H, D, K, whitening, w)
@@ -248,7 +248,7 @@ class _Code:
 
     @cached_property
     def outputs(self) -> CompiledFunction:
-        x, u, p, t, y = self.model.shown()
+        x, u, p, t, y = self.model.output_expressions()
         return CompiledFunction(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
 
 
@@ -359,6 +359,6 @@ def piece_function(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
 
 def output_derivatives(model: ProcessModel, sizes: Sequence[ca.SX]) -> ca.Function:
     """(x, u, p, t) -> derivatives of the outputs with respect to x and the sizes."""
-    x, u, p, t, y = model.shown()
+    x, u, p, t, y = model.output_expressions()
     by = [ca.densify(ca.jacobian(y, item)) for item in (x, ca.vertcat(*sizes))]
     return ca.Function("shown", [x, u, p, t], ca.cse(by))

@@ -13,9 +13,9 @@ and steps are shortened until they improve. The search starts with the best of a
 state alike, and with sensor noises for which the innovations' mean square is as expected. At the end the noise of a
 state is removed if the record does not need it: a plant that the model describes perfectly has no process noise.
 
-Constant states (`ProcessModel.lasting`) have no noise. Other parameters of the model that the likelihood depends on,
-such as the time constant of a sensor's coloured noise, are estimated together with the noise: their logarithms are
-further components of theta.
+Constant states (`ProcessModel.constant_states`) have no noise. Other parameters of the model that the likelihood
+depends on, such as the time constant of a sensor's coloured noise, are estimated together with the noise: their
+logarithms are further components of theta.
 
 Estimation is robust: values beyond `GATE` standard deviations are left out, and the loss is constant beyond `CLIP`. So
 that the tails of normal noise do not count as outliers, squares are compared with those of normal values that are cut
@@ -160,7 +160,7 @@ class _NoiseSearch:
         self._full, self._rows = (time_min, inputs, measured), time_min.size
         self._use_rows(FIRST_ROWS)
         self._n_y = len(model.outputs)
-        self._states = [i for i in range(len(model.states)) if i not in model.lasting]
+        self._states = [i for i in range(len(model.states)) if i not in model.constant_states]
         self._of_states = range(self._n_y, self._n_y + len(self._states))
         self._scales = np.array([model.states[i].scale for i in self._states])
         names = [model.states[i].name for i in self._states]

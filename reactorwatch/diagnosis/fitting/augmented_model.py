@@ -61,15 +61,15 @@ def with_size_inputs(model: ProcessModel, effects: tuple[Effect, ...]) -> SizedM
     for number, effect in enumerate(effects, start=1):
         size = ca.SX.sym("size")
         extended = effect.apply(model, size)
-        moves_clock.append(bool(ca.depends_on(extended.clock_ahead, size)))
+        moves_clock.append(bool(ca.depends_on(extended.time_offset, size)))
         largest = max(abs(effect.lower), abs(effect.upper))  # bounds are those of a size; a sine swings about zero
         bounds = {"felt": np.inf if moves_clock[-1] else largest, "seen": largest}
         felt, seen = (
             variable(f"{effect.name}.{number}.{where}", effect.unit, (-bound, bound), effect.typical, effect.label)
             for where, bound in bounds.items()
         )
-        ahead = ca.substitute(extended.clock_ahead, size, felt.symbol * model.clock.now)
-        model = replace(extended.substitute(size, felt.symbol), clock_ahead=ahead)
+        ahead = ca.substitute(extended.time_offset, size, felt.symbol * model.clock.now)
+        model = replace(extended.substitute(size, felt.symbol), time_offset=ahead)
         outputs = tuple(
             replace(item, expression=ca.substitute(was.expression, size, seen.symbol))
             for item, was in zip(model.outputs, extended.outputs, strict=True)

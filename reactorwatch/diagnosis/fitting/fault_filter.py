@@ -81,10 +81,10 @@ class Sized:
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], noise: Noise, period_min: float = 0.1) -> None:
         self.effects = tuple(effects)
-        places = [place for place, effect in enumerate(self.effects) if effect.late_output is not None]
+        places = [place for place, effect in enumerate(self.effects) if effect.delays_output is not None]
         self.late = places[0] if places else None
         self._plant, self._noise, self._period_min = model, noise, period_min
-        sized = with_size_inputs(model, tuple(item for item in self.effects if item.late_output is None))
+        sized = with_size_inputs(model, tuple(item for item in self.effects if item.delays_output is None))
         if noise.wandering:
             sized = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
         self._filtered = sized
@@ -132,7 +132,7 @@ class Sized:
 
     def size_symbols(self, effect: Effect) -> tuple[ca.SX, ca.SX] | None:
         """The inputs that are the size of an effect, as balances and outputs have it; None if it has none."""
-        names = [item for item in self.effects if item.late_output is None]
+        names = [item for item in self.effects if item.delays_output is None]
         if effect not in names:
             return None
         place = names.index(effect)
@@ -267,7 +267,7 @@ class Sized:
         return moved(run, inputs, held, self._output(late), signals[late].at_row)
 
     def _output(self, late: int) -> int:
-        return self._plant.output_names.index(str(self.effects[late].late_output))
+        return self._plant.output_names.index(str(self.effects[late].delays_output))
 
     def _levels_of(self, noise: Noise) -> NoiseLevels:
         """States that an effect brings have none of their own; those of the sensors come last."""

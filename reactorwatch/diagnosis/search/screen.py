@@ -136,7 +136,7 @@ class Screen:
     def _explained(self, hypothesis: Hypothesis, fit: Fit, place: int) -> Array:
         """What a fitted deviation does to the innovations of a filter that does not know it, shape (rows, n_y)."""
         sized = hypothesis.sized
-        if place == sized.late or sized.effects[place].jumps or sized.moves_clock(place):
+        if place == sized.late or sized.effects[place].is_discontinuous or sized.moves_clock(place):
             return clipped(hypothesis.without(self._run, fit, place)[2:]) - clipped(fit.w[2:])
         signals = hypothesis.signals(fit)
         ways = sized.ways(self._run, signals, fit.found)

@@ -50,7 +50,7 @@ def with_rates(of_C: Callable[[ca.SX, ca.SX], ca.SX | float], of_T: Callable[[ca
     """Of a plant whose balances have something more in them."""
     model = cstr()
     C, T = (state.symbol for state in model.states)
-    return run_of(model.added_to("C", ca.SX(of_C(C, T))).added_to("T", ca.SX(of_T(C, T))))
+    return run_of(model.add_rate("C", ca.SX(of_C(C, T))).add_rate("T", ca.SX(of_T(C, T))))
 
 
 def swinging() -> ca.SX:
