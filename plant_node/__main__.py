@@ -31,14 +31,14 @@ def run(
     model: ProcessModel | None = None,
     driver: Record | None = None,
 ) -> None:
-    """Simulate a plant on the bus until its duration is over, or SIGINT or SIGTERM.
+    """Simulate a plant on the bus until the end of its duration, SIGINT or SIGTERM.
 
     Args:
-        config: of the plant.
-        bus_config: where the bus is.
-        metrics_config: where its counts are shown.
-        model: the process; that of the settings if not given.
-        driver: a record whose input drives the plant, instead of the scenario of `config`.
+        config: settings of the plant.
+        bus_config: settings of the bus.
+        metrics_config: settings of the metrics page.
+        model: the process; None: that of the settings.
+        driver: a record whose input drives the plant instead of the scenario of `config`.
 
     Raises:
         InputError: settings that cannot be used.
@@ -68,7 +68,7 @@ def serve_plant(
     stop: StopSignal,
     on_publish: Callable[[Publication], None] | None = None,
 ) -> None:
-    """Run the node on an open bus: listen to commands, show that it is alive, wait for the others, run."""
+    """Run the node on an open bus: take commands, declare liveliness, wait for other nodes, publish rows."""
     loop = EventLoop(node, bus, stop, on_publish=on_publish)
     loop.accept_commands(*(keys.key(config.name, keys.COMMAND, name) for name in COMMANDS))
     bus.declare_token(keys.key(config.name, keys.ALIVE, NODE))

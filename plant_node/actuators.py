@@ -1,11 +1,11 @@
-"""What an actuator makes of its command."""
+"""Actuators: from a command to a physical input."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class CoolantValve:
-    """Lets through what it is told, between closed and fully open.
+    """A valve whose flow is its command, limited to its range.
 
     Attributes:
         lower_l_min: flow when it is closed.
@@ -20,5 +20,5 @@ class CoolantValve:
         return min(max(command_l_min, self.lower_l_min), self.upper_l_min)
 
     def reaches(self, command_l_min: float) -> bool:
-        """Whether a command is within what it can do."""
+        """True if a command is within the valve's range."""
         return self.lower_l_min <= command_l_min <= self.upper_l_min

@@ -21,7 +21,7 @@ class NoiseSd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Resolution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The smallest difference that the sensor of each signal can show, in the signal's unit; 0: any."""
+    """Resolution of the sensor of each signal, in the signal's unit; 0: continuous."""
 
     C: float = 0.0
     T: float = 0.0
@@ -29,33 +29,34 @@ class Resolution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a plant is simulated.
+    """Settings of the simulated plant.
 
-    A settings table may name one of `presets` as `preset`: its settings hold where the table and the flags say nothing.
+    A settings table may name one of `presets` as `preset`; the table and the flags override the preset's settings.
 
     Attributes:
-        name: of the plant, in keys and file names.
-        period_min: between two rows, in minutes of the plant.
-        speed: plant time over wall time; 1: real time, inf: as fast as it goes.
-        duration_min: of the run, in minutes of the plant; None: endless.
-        seed: of the input and all noise.
-        zero_ns: plant time 0, in nanoseconds since 1970-01-01 UTC; None: when it starts.
-        scenario: the input: a kind (random-steps, sines, square, constant) for its defaults, the path of a .csv
-            record, or a table with `kind` and its numbers (see `plant_node.scenario`). Not used under temperature
-            control, unless as its dither.
+        name: name of the plant, in keys and file names.
+        period_min: sampling period, in minutes of the plant.
+        speed: plant time over wall time; 1: real time, inf: as fast as possible.
+        duration_min: length of the run, in minutes of the plant; None: endless.
+        seed: seed of the input and all noise.
+        zero_ns: plant time 0, in nanoseconds since 1970-01-01 UTC; None: the time of the start.
+        scenario: the input: a kind (random-steps, sines, square, constant) with its defaults, the path of a .csv
+            record, or a table with `kind` and its parameters (see `plant_node.scenario`). Under temperature control it
+            is used as dither only.
         temperature_control: see `TemperatureControl`; None: open loop.
         level_control: see `LevelControl`; None: the volume is constant.
-        process_noise_sd: of the states by name, in the state's unit per square root of a minute (see
+        process_noise_sd: process noise by name of a state, in the state's unit per square root of a minute (see
             `plant_node.disturbances`), such as {T = 0.2}.
         noise_sd: see `NoiseSd`.
         resolution: see `Resolution`.
-        valve_limits_l_min: what the coolant valve lets through, closed and fully open.
-        model: file of an extended model (`diagnose -o`) that the plant is; its minutes are those of the plant. None:
-            the nominal reactor.
-        faults: that are in it from the start, such as `coolant_flow:step:-0.05@30min`; on top of those of `model`.
+        valve_limits_l_min: flows of the coolant valve, closed and fully open.
+        model: file of an extended model (`diagnose -o`) to simulate; its minutes are those of the plant. None: the
+            nominal reactor.
+        faults: faults that are in the plant from the start, such as `coolant_flow:step:-0.05@30min`, in addition to
+            those of `model`.
         start: the steady state at the first input or, under temperature control, of the closed loop (`operating`: the
             hottest, `extinguished`: the coldest), or a value for each state, such as {C = 0.1, T = 438.54}.
-        health_period_s: how often health is published, in seconds of the wall clock.
+        health_period_s: interval at which health is published, in seconds of the wall clock.
         wait_for: nodes that must be alive before the first row, such as `monitor`.
     """
 
@@ -108,22 +109,22 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         self.fault_specifications()
 
     def scenario_settings(self) -> Settings:
-        """The scenario.
+        """Parse the scenario.
 
         Raises:
-            InputError: a kind or a number that cannot be.
+            InputError: an invalid kind or parameter.
         """
         return scenario_settings(self.scenario)
 
     def fault_specifications(self) -> tuple[FaultSpecification, ...]:
-        """The faults, every number said: an onset that was left out is 0, a ramp ends with the run.
+        """Parse the faults; the default onset is 0, and the default end of a ramp is that of the run.
 
         Raises:
-            InputError: a specification that cannot be.
+            InputError: an invalid specification.
         """
-        return tuple(parse_fault(text).settled(0.0, self.duration_min) for text in self.faults)
+        return tuple(parse_fault(text).with_defaults(0.0, self.duration_min) for text in self.faults)
 
     @property
     def rows(self) -> int | None:
-        """How many rows the run has: those at 0, one period, two ... before its duration; None: endless."""
+        """Number of rows of the run, those before its duration; None: endless."""
         return None if self.duration_min is None else max(round(self.duration_min / self.period_min), 1)

@@ -1,20 +1,20 @@
-"""The plant's controllers: of the temperature, by the coolant flow; of the level, by the outflow.
+"""Controllers of the plant: of the temperature, by the coolant flow; of the level, by the outflow.
 
-Temperature. A proportional controller, as in the work that this project starts from:
+Temperature. A proportional controller, as in the study that this project starts from:
 
     qc = qc0 + Kp (T_measured - T_set)
 
-It acts once a row, on the temperature measured in that row, noise included, and its command is held until the row
-after. More coolant makes the reactor colder, so a positive Kp is negative feedback. There is no integral action: at
-rest the temperature is off its set point by (qc - qc0) / Kp, and only at the set point's own flow is it zero.
+It acts once a row, on the temperature measured in that row, noise included, and its command is held until the next row.
+More coolant makes the reactor colder, so a positive Kp is negative feedback. There is no integral action: the steady
+offset of the temperature from its set point is (qc - qc0) / Kp.
 
-How large Kp may be follows from the linear plant sampled with period h, x(k+1) = Phi x(k) + Gamma qc(k): the loop is
-stable while the eigenvalues of Phi + Kp Gamma c (c picks T) lie inside the unit circle: Astrom & Wittenmark (1997),
+The range of Kp follows from the linear plant sampled with period h, x(k+1) = Phi x(k) + Gamma qc(k): the loop is stable
+while the eigenvalues of Phi + Kp Gamma c (c picks T) lie inside the unit circle: Astrom & Wittenmark (1997),
 Computer-Controlled Systems, ch. 3. With rows of 0.1 min, at the operating points between 85 and 111 l/min, that is
-below 18 l/min/K (the hottest point, 85 l/min, is the first to go); with rows 0.2 and 0.3 min apart below 7.7 and 2.0.
-The default of 4 keeps a gain margin above 4, damps the point at 111 l/min (from a radius of 0.989 to 0.882), and passes
-the noise of a thermometer, 0.3 K, on as 1.2 l/min. It also steadies flows beyond 112 l/min, where the plant by itself
-is unstable.
+below 18 l/min/K (the limit of the hottest point, 85 l/min); with rows 0.2 and 0.3 min apart below 7.7 and 2.0. The
+default of 4 keeps a gain margin above 4, damps the point at 111 l/min (from a radius of 0.989 to 0.882), and passes a
+thermometer's noise of 0.3 K on as 1.2 l/min. It also stabilises flows beyond 112 l/min, where the plant in open loop is
+unstable.
 
 Level. See `reactorwatch.process.level_control`.
 """
@@ -35,15 +35,15 @@ from reactorwatch.process.model import ProcessModel
 
 CONTROLLED = "T"
 GAIN = 4.0
-"""l/min/K, of the temperature controller where nothing else is said."""
+"""Default gain of the temperature controller, l/min/K."""
 
 SetPoint: TypeAlias = float | tuple[tuple[float, float], ...]
 
-_EDGE_MIN = 1e-9  # a row that should lie on a step may lie this much before it, by rounding
+_EDGE_MIN = 1e-9  # rounding of a row's time relative to a step
 
 
 class TemperatureControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A proportional controller of the temperature. It remembers nothing.
+    """A proportional controller of the temperature, without a state.
 
     Attributes:
         set_point_K: one value, or steps as pairs of plant time in min and K, the first at 0, like
@@ -51,7 +51,7 @@ class TemperatureControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         gain_l_min_K: Kp.
         base_flow_l_min: qc0, the coolant flow at the set point.
         dither: whether the scenario's deviation from its mean is added to the command. Identification in closed loop
-            needs that: what feedback alone does is a function of the output, and no news to a model.
+            needs it: feedback alone is a function of the output and carries no information about the plant.
     """
 
     set_point_K: SetPoint = OPERATING_STATE[1]  # noqa: N815 # K is the unit
@@ -66,8 +66,8 @@ class TemperatureControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True
             raise ValueError(f"base_flow_l_min must be at least 0, got {self.base_flow_l_min:g}")
         times = [time for time, _ in self.steps]
         if not times or times[0] != 0 or any(not one < other for one, other in pairwise(times)):
-            said = ", ".join(f"{time:g}" for time in times) or "none"
-            raise ValueError(f"set_point_K must have steps at rising times in min, the first at 0, got {said}")
+            given = ", ".join(f"{time:g}" for time in times) or "none"
+            raise ValueError(f"set_point_K must have steps at rising times in min, the first at 0, got {given}")
         for _, value in self.steps:
             if not (isfinite(value) and value > 0):
                 raise ValueError(f"set_point_K must be above 0 K, got {value:g}")
@@ -82,21 +82,21 @@ class TemperatureControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         return [value for time, value in self.steps if time <= time_min + _EDGE_MIN][-1]
 
     def command(self, temperature_K: float, time_min: float, dither_l_min: float = 0.0) -> float:
-        """The coolant flow in l/min that is asked for, which the valve may not reach.
+        """Commanded coolant flow in l/min, which may be beyond the valve's range.
 
         Args:
-            temperature_K: as measured in the row.
-            time_min: of the row.
-            dither_l_min: what is added.
+            temperature_K: temperature measured in the row.
+            time_min: time of the row.
+            dither_l_min: dither added to the command.
         """
         error_K = temperature_K - self.set_point(time_min)
         return self.base_flow_l_min + dither_l_min + self.gain_l_min_K * error_K
 
     def check(self, model: ProcessModel, valve: CoolantValve) -> None:
-        """Whether a plant of this model and valve can be controlled like this.
+        """Check the settings against a model and a valve.
 
         Raises:
-            InputError: it does not measure the temperature, or cannot have this set point or base flow.
+            InputError: the model has no temperature output, or a set point or the base flow is out of range.
         """
         if CONTROLLED not in model.output_names:
             raise InputError(
@@ -112,9 +112,9 @@ class TemperatureControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True
             check_set_point(model, value)
 
     def closed(self, model: ProcessModel, valve: CoolantValve) -> ProcessModel:
-        """The model with this controller in it at all times instead of once a row, at the set point of plant time 0.
+        """Model of the closed loop in continuous time, at the set point of plant time 0.
 
-        It rests where the sampled loop rests, which is what it is for; its way there is another. The input is the
+        It has the steady state of the sampled loop, which is its purpose, but other transients. The input is the
         coolant flow at the set point: `base_flow_l_min`, dither included.
         """
         qc = model.inputs[model.input_names.index(SIGNAL)].symbol
@@ -124,7 +124,7 @@ class TemperatureControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
 
 def check_set_point(model: ProcessModel, value: float) -> None:
-    """Whether the model can have this temperature.
+    """Check a temperature set point.
 
     Raises:
         InputError: it is out of the bounds of the state.
@@ -140,7 +140,7 @@ class LevelControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A proportional controller of the level.
 
     Attributes:
-        gain_per_min: Kc, the outflow's change over the volume's.
+        gain_per_min: Kc, change of the outflow over that of the volume.
     """
 
     gain_per_min: float = level_control.GAIN

@@ -1,12 +1,12 @@
-"""The simulated plant: row after row from equations, valve, sensors, scenario and faults. No clock, no bus.
+"""The simulated plant: rows from equations, valve, sensors, scenario and faults. No clock, no bus.
 
-Row k is what is measured at t_k = k periods, and its input is held until the row after. What is done to the plant
-between two rows (another input, a fault put in or taken away) acts from the next row on, whose time is `time_min`.
-Under temperature control the input of row k is the controller's answer to what is measured in row k. So the rows are a
-function of the configuration and of which row each command came before, and of nothing else.
+Row k is measured at t_k = k periods, and its input is held until the next row. A change between two rows (an input, a
+fault injected or cleared) acts from the next row on, whose time is `time_min`. Under temperature control the input of
+row k is the controller's response to the measurement in row k. So the rows are a function of the configuration and of
+the row that each command precedes, and of nothing else.
 
-The plant may leave its operating branch, go out, ignite again or run away: that is its physics, and it goes on. Should
-the equations fail to be integrable, the state is held and the rows are marked, until they can be again.
+The plant may leave its operating branch, extinguish, ignite or run away: that is its physics, and the run continues.
+While the equations cannot be integrated, the state is held and the rows are marked bad.
 """
 
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ from plant_node.actuators import CoolantValve
 from plant_node.config import PlantConfig
 from plant_node.controllers import CONTROLLED, check_set_point
 from plant_node.disturbances import process_noise
-from plant_node.initial_state import carried_over, start_state
+from plant_node.initial_state import complete_state, start_state
 from plant_node.scenario import SIGNAL, Scenario
 from plant_node.sensors import Sensor
 from reactorwatch.arrays import Array
@@ -34,18 +34,18 @@ from reactorwatch.process.level_control import with_level_control
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import to_minutes, to_time_ns
 
-MOST_FAULTS = 32
-"""In a plant at a time: each makes its equations larger, and slower to compile."""
+MAX_FAULTS = 32
+"""Largest number of faults at a time: each makes the equations larger, and slower to compile."""
 
 
 @dataclass(frozen=True)
 class FaultChange:
-    """A fault that has set in, or was taken away.
+    """A fault that has set in, or was cleared.
 
     Attributes:
-        specification: every number of it said.
-        onset_min: when it set in, plant time.
-        active: whether it is there now.
+        specification: the fault, with all parameters.
+        onset_min: plant time at which it set in.
+        active: whether it is in the plant now.
     """
 
     specification: FaultSpecification
@@ -55,14 +55,14 @@ class FaultChange:
 
 @dataclass(frozen=True)
 class Row:
-    """What is measured at one time.
+    """The measurements of one time.
 
     Attributes:
-        number: from 0.
+        number: index of the row, from 0.
         time_min: plant time.
-        readings: by signal, in its unit: the inputs as commanded, the outputs as measured.
+        readings: commanded inputs and measured outputs by signal, in its unit.
         good: false while the state is held because the equations could not be integrated.
-        changes: the faults that set in or were taken away since the row before.
+        changes: faults that set in or were cleared since the row before.
     """
 
     number: int
@@ -87,10 +87,10 @@ class Plant:
     Args:
         config: its settings; those about pace and health are not used here.
         model: the process, without the faults of `config`.
-        scenario: drives it.
+        scenario: its input.
 
     Raises:
-        InputError: settings that do not go with the model.
+        InputError: settings that do not fit the model.
     """
 
     def __init__(self, config: PlantConfig, model: ProcessModel, scenario: Scenario) -> None:
@@ -121,7 +121,7 @@ class Plant:
         self._control = config.temperature_control
         if self._control is not None:
             self._control.check(model, self._valve)
-        self._by_hand_l_min: float | None = None
+        self._manual_l_min: float | None = None
         self._cleared: list[FaultChange] = []
         self._installed = [_Installed(item, item.values.get("onset", 0.0)) for item in config.fault_specifications()]
         self._use(self._extended(self._installed))
@@ -129,20 +129,20 @@ class Plant:
 
     @property
     def number(self) -> int:
-        """Of the next row."""
+        """Index of the next row."""
         return self._number
 
     @property
     def time_min(self) -> float:
-        """Plant time of the next row, from which on whatever is done to the plant acts."""
-        return self._time_of(self._number)
+        """Plant time of the next row, from which on commands act."""
+        return to_minutes(to_time_ns(self._number * self._config.period_min))
 
     @property
     def mode(self) -> Literal["open loop", "automatic", "manual"]:
-        """Of the coolant flow: by the scenario, by the temperature controller, or as set in place of it."""
+        """Control mode of the coolant flow: by the scenario, by the temperature controller, or set in place of it."""
         if self._control is None:
             return "open loop"
-        return "automatic" if self._by_hand_l_min is None else "manual"
+        return "automatic" if self._manual_l_min is None else "manual"
 
     @property
     def state(self) -> dict[str, float]:
@@ -151,13 +151,13 @@ class Plant:
 
     @property
     def faults(self) -> tuple[FaultSpecification, ...]:
-        """All faults in the plant, those included that have not set in yet."""
+        """All faults in the plant, including those that have not set in yet."""
         return tuple(item.specification for item in self._installed)
 
     def next_row(self) -> Row:
-        """Measure, and let the plant run on to the row after."""
+        """Measure a row, and integrate to the next."""
         time_min, inputs = self.time_min, self._input()
-        self._x, self._held = self._stepper.begin_row(self._x, inputs, self._p, time_min), inputs
+        self._x, self._held = self._stepper.start_row(self._x, inputs, self._p, time_min), inputs
         row = Row(
             number=self._number,
             time_min=time_min,
@@ -172,26 +172,25 @@ class Plant:
         try:
             self._x = self._stepper.advance(self._x, inputs, self._p, time_min, self.time_min)
             for index, noise in self._process_noise:
-                self._x[index] = noise.moved(float(self._x[index]), self._number)
+                self._x[index] = noise.add_to(float(self._x[index]), self._number)
             self.trouble = None
         except SimulationError as error:
             self.trouble = str(error)
         return row
 
     def set_input(self, signal: str, value: float) -> None:
-        """Hold an input at a value from the next row on, whatever the scenario or the controller says.
+        """Hold an input at a value from the next row on, in place of the scenario or the controller.
 
-        Under temperature control, `qc` puts the coolant flow on manual, as an operator would; and `T` is an input too:
-        the set point, constant from then on, and back on automatic.
+        Under temperature control, `qc` switches the coolant flow to manual; and `T` sets the set point, constant from
+        then on, and switches back to automatic.
 
         Raises:
-            InputError: a signal that is not an input, or a value that the valve does not reach or the process cannot
-                have.
+            InputError: a signal that is not an input, or a value out of the range of the valve or the process.
         """
         if self._control is not None and signal == CONTROLLED:
             check_set_point(self._base, value)
             self._control = with_changes(self._control, set_point_K=value)
-            self._by_hand_l_min = None
+            self._manual_l_min = None
             return
         if signal != SIGNAL:
             valid = SIGNAL if self._control is None else f"{SIGNAL}, {CONTROLLED}"
@@ -199,62 +198,58 @@ class Plant:
         if not (isfinite(value) and self._valve.reaches(value)):
             lower, upper = self._valve.lower_l_min, self._valve.upper_l_min
             raise InputError(f"{signal} must be in [{lower:g}, {upper:g}] l/min, got {value:g}")
-        self._by_hand_l_min = value
+        self._manual_l_min = value
 
     def inject(self, specification: FaultSpecification) -> FaultSpecification:
-        """Put a fault into the plant.
+        """Inject a fault.
 
         Args:
-            specification: without an onset it sets in with the next row; a ramp without end reaches its size
-                at the end of the run.
+            specification: the fault; its default onset is the next row, the default end of a ramp that of the run.
 
         Returns:
-            The same with every number said.
+            The fault with all parameters.
 
         Raises:
-            InputError: an onset that is past, a ramp that never ends, a fault that the model cannot have, or one too
-                many.
+            InputError: an onset in the past, a ramp without an end, a fault that does not fit the model, or too many
+                faults.
         """
-        settled = specification.settled(self.time_min, self._config.duration_min)
-        onset_min = settled.values.get("onset", self.time_min)
+        fault = specification.with_defaults(self.time_min, self._config.duration_min)
+        onset_min = fault.values.get("onset", self.time_min)
         if onset_min < self.time_min:
             raise InputError(
-                f"fault {str(settled)!r}: onset must not lie before the plant's time, {self.time_min:g} min, "
+                f"fault {str(fault)!r}: onset must not lie before the plant's time, {self.time_min:g} min, "
                 f"got {onset_min:g} min; leave it out for now"
             )
-        if len(self._installed) >= MOST_FAULTS:
-            raise InputError(f"there are {MOST_FAULTS} faults in the plant, which is the most; clear one")
-        self._install([*self._installed, _Installed(settled, onset_min)])
-        return settled
+        if len(self._installed) >= MAX_FAULTS:
+            raise InputError(f"there are {MAX_FAULTS} faults in the plant, which is the most; clear one")
+        self._install([*self._installed, _Installed(fault, onset_min)])
+        return fault
 
     def clear(self, cause: str) -> tuple[FaultSpecification, ...]:
-        """Take all faults of a cause away, from the next row on.
+        """Clear all faults of a cause, from the next row on.
 
         Returns:
-            What was taken away.
+            The cleared faults.
 
         Raises:
-            InputError: there is none of that cause.
+            InputError: there is no fault of that cause.
         """
-        gone = [item for item in self._installed if item.specification.effect.name == cause]
-        if not gone:
+        cleared = [item for item in self._installed if item.specification.effect.name == cause]
+        if not cleared:
             there = sorted({item.specification.effect.name for item in self._installed})
             raise InputError(f"no fault {cause!r} is in the plant (there is: {', '.join(there) or 'none'})")
-        self._install([item for item in self._installed if item not in gone])
-        self._cleared += [FaultChange(item.specification, item.onset_min, False) for item in gone if item.announced]
-        return tuple(item.specification for item in gone)
-
-    def _time_of(self, number: int) -> float:
-        return to_minutes(to_time_ns(number * self._config.period_min))
+        self._install([item for item in self._installed if item not in cleared])
+        self._cleared += [FaultChange(item.specification, item.onset_min, False) for item in cleared if item.announced]
+        return tuple(item.specification for item in cleared)
 
     def _input(self) -> Array:
-        command = self._by_hand_l_min
+        command = self._manual_l_min
         if command is None and self._control is not None:
-            # A sensor sees the state, which no input moves at once: that of this row is not needed to read it.
-            there = self._true_outputs(np.array([self._control.base_flow_l_min]), self._seen_by_controller)
+            # The temperature does not depend on this row's input, which is not known yet.
+            outputs = self._true_outputs(np.array([self._control.base_flow_l_min]), self._controller_outputs)
             index = self._model.output_names.index(CONTROLLED)
             sensor = self._sensors[len(self._model.inputs) + index]
-            temperature_K = sensor.reading(float(there[index]), self._number)
+            temperature_K = sensor.reading(float(outputs[index]), self._number)
             command = self._control.command(temperature_K, self.time_min, self._dither())
         elif command is None:
             command = self._scenario.level(self.time_min, self._config.seed)
@@ -276,13 +271,13 @@ class Plant:
         function = function or self._outputs
         x, u, p, now, middle = function.arguments
         x[0], u[0], now[0], middle[0] = self._x, inputs, self.time_min, self.time_min
-        p[0] = self._p[: p.size]  # those of faults of timing come last
+        p[0] = self._p[: p.size]  # the parameters of timing faults come last
         function()
         outputs: Array = function.results[1][0]
         return outputs
 
     def _changes(self, time_min: float) -> tuple[FaultChange, ...]:
-        """What has changed up to now and was not told yet."""
+        """Fault changes up to now that were not reported yet."""
         changes, self._cleared = self._cleared, []
         for item in self._installed:
             if not item.announced and item.onset_min <= time_min:
@@ -291,19 +286,19 @@ class Plant:
         return tuple(changes)
 
     def _install(self, faults: list[_Installed]) -> None:
-        """Go on from where the plant is, with these faults in it; nothing has changed if they cannot be."""
+        """Continue from the present state with these faults; nothing changes if they are invalid."""
         model = self._extended(faults)
         held = self._input() if self._held is None else self._held
-        self._x = carried_over(model, self.state, held, self.time_min)
+        self._x = complete_state(model, self.state, held, self.time_min)
         self._installed = faults
         self._use(model)
 
     def _physical(self, faults: list[_Installed]) -> list[_Installed]:
-        """Those that are in the plant, not in how its rows are stamped, which no controller sees."""
+        """Faults of the plant, without those of the timestamps, which a controller does not see."""
         return [fault for fault in faults if fault.specification.effect.location != TIMING]
 
     def _extended(self, faults: list[_Installed]) -> ProcessModel:
-        """The model with these faults in it; first those that are physical, because the others shift what they do."""
+        """The model with these faults; the physical ones come first, as timing faults shift their times."""
         model = self._base
         physical = self._physical(faults)
         for fault in (*physical, *(fault for fault in faults if fault not in physical)):
@@ -316,8 +311,8 @@ class Plant:
     def _use(self, model: ProcessModel) -> None:
         self._model, self._p = model, model.values()
         self._stepper, self._outputs = Stepper(model), ArrayFunction(model.function("outputs"))
-        seen = self._extended(self._physical(self._installed))
-        self._seen_by_controller = ArrayFunction(seen.function("outputs"))
+        physical = self._extended(self._physical(self._installed))
+        self._controller_outputs = ArrayFunction(physical.function("outputs"))
 
 
 def _with_level(model: ProcessModel, gain_per_min: float) -> ProcessModel:

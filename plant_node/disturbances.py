@@ -1,10 +1,10 @@
-"""What disturbs the process itself, beside its faults: a random walk of its states.
+"""Process noise: a random walk of the states.
 
-A real reactor never follows its equations exactly: the feed is not mixed ideally, the reaction is not the same
-everywhere. In the language of stochastic differential equations dx = f(x) dt + sd dW, where W is Brownian motion; so sd
-has the unit of x per square root of a minute. Here the increment of a whole period is added at its end, which is the
-discrete-time model that a Kalman filter assumes, x(k+1) = F(x(k)) + w(k) with Var w = sd^2 times the period: Jazwinski
-(1970), Stochastic Processes and Filtering Theory, ch. 7. Unlike the noise of a sensor the plant carries it on.
+A real reactor never follows its equations exactly: the feed is not mixed ideally, the reaction is not uniform. As a
+stochastic differential equation, dx = f(x) dt + sd dW with W Brownian motion; so sd has the unit of x per square root
+of a minute. Here the increment of a period is added at its end, which is the discrete-time model that a Kalman filter
+assumes, x(k+1) = F(x(k)) + w(k) with Var w = sd^2 times the period: Jazwinski (1970), Stochastic Processes and
+Filtering Theory, ch. 7. Unlike sensor noise it acts on the states, and so on later rows.
 """
 
 from collections.abc import Mapping
@@ -18,15 +18,15 @@ from reactorwatch.process.model import ProcessModel
 
 @dataclass(frozen=True)
 class ProcessNoise:
-    """Moves one state at random.
+    """Process noise of one state.
 
     Attributes:
-        state: its name.
-        sd: in the state's unit per square root of a minute.
-        period_min: between two rows.
-        lower: the smallest value that the state can have; the noise does not move it beyond.
-        upper: the largest.
-        seed: of the noise.
+        state: name of the state.
+        sd: noise level, in the state's unit per square root of a minute.
+        period_min: sampling period.
+        lower: lower bound of the state; the noise does not move it beyond.
+        upper: upper bound of the state.
+        seed: seed of the noise.
     """
 
     state: str
@@ -36,26 +36,26 @@ class ProcessNoise:
     upper: float
     seed: int
 
-    def moved(self, value: float, row: int) -> float:
-        """The state at a row of the run, where its equations took it to `value` from the row before."""
+    def add_to(self, value: float, row: int) -> float:
+        """Add the noise of a row to the integrated value of the state."""
         increment = self.sd * sqrt(self.period_min) * standard_normal(self.seed, f"process {self.state}", row)
-        # A state that the equations themselves took beyond its bounds is not pulled back: that would be no noise.
+        # A state that the equations took beyond its bounds is not pulled back: that would not be noise.
         return min(max(value + increment, min(self.lower, value)), max(self.upper, value))
 
 
 def process_noise(
     sd: Mapping[str, float], model: ProcessModel, period_min: float, seed: int
 ) -> list[tuple[int, ProcessNoise]]:
-    """The noise of each state that has some, with the index of the state.
+    """Make the process noise of each state with a level above 0, with the index of the state.
 
     Args:
-        sd: by name of the state; see `ProcessNoise`.
-        model: the process; faults put states of their own behind its states.
-        period_min: between two rows.
-        seed: of the noise.
+        sd: noise levels by name of the state; see `ProcessNoise`.
+        model: the process; states of faults come after its own.
+        period_min: sampling period.
+        seed: seed of the noise.
 
     Raises:
-        InputError: a state that there is not.
+        InputError: an unknown state.
     """
     names = model.state_names
     for name in sd:

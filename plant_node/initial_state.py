@@ -1,4 +1,4 @@
-"""Where the plant's state begins: at the start of a run, and when its equations change under way."""
+"""Initial state of the plant, at the start of a run and after a change of its equations."""
 
 from collections.abc import Mapping
 from math import nextafter
@@ -13,20 +13,20 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import steady_states
 
 BEFORE_MIN = nextafter(0.0, -1.0)
-"""The last moment before plant time 0: what sets in at 0 has not yet moved a plant that starts at rest."""
+"""Last time before plant time 0: an onset at 0 does not affect the initial steady state."""
 
 ITERATIONS = 50
-SETTLED = 1e-9  # scales
+TOLERANCE = 1e-9  # scales
 
 
 def start_state(
     model: ProcessModel, inputs: Array, start: Literal["operating", "extinguished"] | Mapping[str, float]
 ) -> Array:
-    """The state at the beginning of a run.
+    """Initial state of a run.
 
     Args:
-        model: the process, with the faults that are in it from the start.
-        inputs: shape (n_u,), of the first row.
+        model: the process, with its initial faults.
+        inputs: inputs of the first row, shape (n_u,).
         start: `operating` or `extinguished` for the hottest or coldest steady state at these inputs, or values of
             the states by name.
 
@@ -34,7 +34,7 @@ def start_state(
         Shape (n_x,).
 
     Raises:
-        InputError: a state that is not there or out of its bounds, or no steady state at these inputs.
+        InputError: an unknown state, a value out of its bounds, or no steady state at these inputs.
     """
     if isinstance(start, Mapping):
         for name, value in start.items():
@@ -45,42 +45,42 @@ def start_state(
                 raise InputError(
                     f"start: {name} must be in [{state.lower:g}, {state.upper:g}] {state.unit}, got {value:g}"
                 )
-        return carried_over(model, start, inputs, BEFORE_MIN)
-    found = steady_states(model, inputs, BEFORE_MIN)
-    if not found:
-        said = ", ".join(f"{item.name} = {value:g}" for item, value in zip(model.inputs, inputs, strict=True))
+        return complete_state(model, start, inputs, BEFORE_MIN)
+    points = steady_states(model, inputs, BEFORE_MIN)
+    if not points:
+        given = ", ".join(f"{item.name} = {value:g}" for item, value in zip(model.inputs, inputs, strict=True))
         raise InputError(
-            f"start: {model.name} has no steady state at {said}; give the states, like {{C = 0.1, T = 438.54}}"
+            f"start: {model.name} has no steady state at {given}; give the states, like {{C = 0.1, T = 438.54}}"
         )
     temperature = model.state_names.index("T")
-    by_temperature = sorted((item.state for item in found), key=lambda state: float(state[temperature]))
+    by_temperature = sorted((item.state for item in points), key=lambda state: float(state[temperature]))
     return by_temperature[-1 if start == "operating" else 0]
 
 
-def carried_over(model: ProcessModel, known: Mapping[str, float], inputs: Array, time_min: float) -> Array:
-    """The state of a model of which some states are known.
+def complete_state(model: ProcessModel, known: Mapping[str, float], inputs: Array, time_min: float) -> Array:
+    """Complete a state of which some values are known.
 
-    The others, such as the position of a valve that was without inertia before, are where they do not change while the
-    known ones are as they are: Newton's method on their balances.
+    The others, such as the position of a valve that had no inertia before, are in equilibrium with the known ones:
+    Newton's method on their balances.
 
     Args:
         model: the process.
         known: values by name; names that the model lacks are left out.
         inputs: shape (n_u,).
-        time_min: when.
+        time_min: time.
 
     Returns:
         Shape (n_x,).
 
     Raises:
-        InputError: the others have no such point.
+        InputError: the others have no equilibrium.
     """
     state = np.array([known.get(item.name, 0.5 * (item.lower + item.upper)) for item in model.states])
     missing = [index for index, item in enumerate(model.states) if item.name not in known]
     if not missing:
         return state
     free = ca.vertcat(*(model.states[index].symbol for index in missing))
-    balance = ca.vertcat(*(_at_rest(model, index) for index in missing))
+    balance = ca.vertcat(*(_balance(model, index) for index in missing))
     step = ca.Function(
         "step",
         [*model.arguments(), model.clock.now, model.clock.middle],
@@ -90,13 +90,13 @@ def carried_over(model: ProcessModel, known: Mapping[str, float], inputs: Array,
     for _ in range(ITERATIONS):
         change = np.array(step(state, inputs, model.values(), time_min, time_min)).ravel()
         state[missing] -= change
-        if np.all(np.abs(change) <= SETTLED * scales):
+        if np.all(np.abs(change) <= TOLERANCE * scales):
             return state
     names = ", ".join(model.states[index].name for index in missing)
     raise InputError(f"{model.name}: {names} cannot be at rest while {dict(known)}; give a start for them")
 
 
-def _at_rest(model: ProcessModel, index: int) -> ca.SX:
-    """What is zero where a state is at rest."""
+def _balance(model: ProcessModel, index: int) -> ca.SX:
+    """Expression that is zero where a state is in equilibrium."""
     state = model.states[index]
     return state.symbol - model.at_rest[state.name] if state.name in model.at_rest else model.rhs[index]

@@ -1,7 +1,7 @@
-"""The plant as a node: rows at their pace, commands, health. Pure: it is told what time it is.
+"""The plant as a node: rows at their pace, commands, health. Pure: time is an argument.
 
-Plant time runs `speed` times as fast as the wall clock, from the first tick on. A row is due when its plant time has
-come; if the machine cannot keep up, rows come late, but all of them, and the lag is reported.
+Plant time runs `speed` times as fast as the wall clock, from the first tick on. A row is due at its plant time; if the
+machine cannot keep up, rows are late but complete, and the lag is reported.
 """
 
 from collections import Counter
@@ -34,11 +34,11 @@ COMMANDS: dict[str, type[SetInput | InjectFault | ClearFault]] = {
     "inject_fault": InjectFault,
     "clear_fault": ClearFault,
 }
-"""The commands and what they carry."""
+"""The message type of each command."""
 
-BATCH = 200  # rows published before the loop may serve a command again
-BEHIND_S = 1.0  # a lag worth a line in the log
-SAY_AGAIN_NS = 60_000_000_000
+BATCH = 200  # rows published before the loop serves commands again
+BEHIND_S = 1.0  # a longer lag is logged
+LOG_INTERVAL_NS = 60_000_000_000
 
 
 class PlantNode:
@@ -47,18 +47,18 @@ class PlantNode:
     Args:
         plant: the simulated plant, at its first row.
         config: its settings.
-        tell: called with a line for people when something happens.
+        log: called with a line of text when something happens.
     """
 
-    def __init__(self, plant: Plant, config: PlantConfig, tell: Callable[[str], None]) -> None:
+    def __init__(self, plant: Plant, config: PlantConfig, log: Callable[[str], None]) -> None:
         self._plant = plant
         self._config = config
-        self._tell = tell
+        self._log = log
         self._started_ns: int | None = None
         self._zero_ns = config.zero_ns
         self._health_due_ns = 0
-        self._said_behind_ns = -SAY_AGAIN_NS
-        self._was_in_trouble = False
+        self._lag_logged_ns = -LOG_INTERVAL_NS
+        self._had_trouble = False
         self._lag_ns = 0
         self._published = 0
         self._received = 0
@@ -66,17 +66,17 @@ class PlantNode:
 
     @property
     def finished(self) -> bool:
-        """Whether all rows of the run are out."""
+        """True when all rows of the run are published."""
         return self._config.rows is not None and self._plant.number >= self._config.rows
 
     def next_tick_ns(self) -> int:
-        """When the next row, or the next word on health, is due."""
+        """Time at which the next row or health message is due."""
         if self._started_ns is None:
             return 0
         return min(self._row_due_ns(self._started_ns), self._health_due_ns)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """The rows that are due, a batch at most, and health if it is due."""
+        """Publish the rows that are due, at most a batch, and health if it is due."""
         if self._started_ns is None:
             self._started_ns = self._health_due_ns = now_ns
             self._zero_ns = now_ns if self._zero_ns is None else self._zero_ns
@@ -87,7 +87,7 @@ class PlantNode:
                 break
             self._lag_ns = 0 if isinf(self._config.speed) else now_ns - due_ns
             publications += self._publications(self._plant.next_row())
-        self._say_what_is_wrong(now_ns)
+        self._log_problems(now_ns)
         if now_ns >= self._health_due_ns:
             self._health_due_ns = now_ns + round(self._config.health_period_s * 1e9)
             self._published += len(publications) + 1
@@ -96,32 +96,32 @@ class PlantNode:
         return publications
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        """Nothing that is published concerns a plant."""
+        """Ignore messages: a plant subscribes to none."""
         return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Do what is asked, from the next row on; or say why not."""
+        """Execute a command from the next row on, or reply with the reason for refusing it."""
         self._received += 1
         try:
-            text = self._obey(question)
+            text = self._execute(question)
         except InputError as error:
             self._refused["command"] += 1
             return CommandReply(accepted=False, text=str(error)), []
         except DecodeError as error:
             self._refused[error.reason] += 1
             return CommandReply(accepted=False, text=str(error)), []
-        self._tell(text)
+        self._log(text)
         return CommandReply(accepted=True, text=text), []
 
     def on_stop(self, now_ns: int) -> list[Publication]:
-        """Last words."""
+        """Publish the last health message."""
         self._published += 1
         return [self._health(now_ns, "stopped")]
 
     def _row_due_ns(self, started_ns: int) -> int:
         return started_ns + round(self._plant.time_min * 60e9 / self._config.speed)
 
-    def _obey(self, question: Encoded) -> str:
+    def _execute(self, question: Encoded) -> str:
         _, command = decode_command(question, COMMANDS)
         when = f"from {self._plant.time_min:g} min on"
         match command:
@@ -132,9 +132,9 @@ class PlantNode:
             case InjectFault():
                 return f"fault {self._plant.inject(parse_fault(command.specification))} is in the plant"
             case ClearFault():
-                gone = ", ".join(str(item) for item in self._plant.clear(command.cause))
-                return f"fault {gone} is taken away {when}"
-        raise AssertionError("the catalogue holds no others")
+                cleared = ", ".join(str(item) for item in self._plant.clear(command.cause))
+                return f"fault {cleared} is taken away {when}"
+        raise AssertionError("COMMANDS has no other types")
 
     def _publications(self, row: Row) -> list[Publication]:
         time_ns = self._time_ns(row.time_min)
@@ -149,7 +149,7 @@ class PlantNode:
 
     def _fault(self, change: FaultChange, time_ns: int) -> Publication:
         cause = change.specification.effect.name
-        self._tell(f"fault {change.specification} {'sets in' if change.active else 'is gone'}")
+        self._log(f"fault {change.specification} {'sets in' if change.active else 'is gone'}")
         return Publication(
             keys.key(self._config.name, keys.FAULT, cause),
             Fault(
@@ -178,14 +178,14 @@ class PlantNode:
         )
         return Publication(keys.key(self._config.name, keys.HEALTH, NODE), health)
 
-    def _say_what_is_wrong(self, now_ns: int) -> None:
+    def _log_problems(self, now_ns: int) -> None:
         trouble = self._plant.trouble
-        if trouble is not None and not self._was_in_trouble:
-            self._tell(f"{trouble}: the state is held, samples are marked bad")
-        self._was_in_trouble = trouble is not None
-        if self._lag_ns > BEHIND_S * 1e9 and now_ns - self._said_behind_ns >= SAY_AGAIN_NS:
-            self._said_behind_ns = now_ns
-            self._tell(f"behind its pace by {self._lag_ns / 1e9:.1f} s; no row is left out")
+        if trouble is not None and not self._had_trouble:
+            self._log(f"{trouble}: the state is held, samples are marked bad")
+        self._had_trouble = trouble is not None
+        if self._lag_ns > BEHIND_S * 1e9 and now_ns - self._lag_logged_ns >= LOG_INTERVAL_NS:
+            self._lag_logged_ns = now_ns
+            self._log(f"behind its pace by {self._lag_ns / 1e9:.1f} s; no row is left out")
 
     def _time_ns(self, time_min: float) -> int:
         assert self._zero_ns is not None, "set at the first tick"

@@ -1,8 +1,7 @@
-"""Random numbers that belong to a row of the run.
+"""Random numbers by row of the run.
 
-The number of row k is a function of (seed, stream, k), drawn in blocks that each have a generator of their own. So it
-depends neither on where a run begins nor on any other stream: without noise in C, that in T is the same to the last
-bit.
+The number of row k is a function of (seed, stream, k), drawn in blocks with a generator each. So it depends neither on
+the first row of a run nor on any other stream: without noise in C, that in T is the same to the last bit.
 """
 
 from functools import lru_cache
@@ -14,7 +13,7 @@ BLOCK = 1024  # rows
 
 
 def standard_normal(seed: int, stream: str, row: int) -> float:
-    """A number from the normal distribution of mean 0 and variance 1, the same for the same arguments, always."""
+    """Draw a standard normal number, a deterministic function of the arguments."""
     return float(_block(seed, stream, row // BLOCK)[row % BLOCK])
 
 

@@ -1,17 +1,16 @@
-"""Named runs: the four records of the work that this project starts from, a fault free one and three with a fault.
+"""Named runs: the four records of the study that this project starts from, one fault-free and three with a fault.
 
-They differ in their fault alone: same input, same noise, same length, and with the same seed the same rows until the
-fault sets in, two hours of watching after the hundred minutes that a monitor learns from. Their flow goes up to 105
-l/min and not, as elsewhere, to 111, where the slower reaction would go out.
+They differ in their fault only: same input, same noise, same length, and with the same seed the same rows until the
+fault sets in, two hours of monitoring after the hundred minutes of training. The flow goes up to 105 l/min instead of
+111, where the slower reaction would extinguish.
 
-Input leakage: the input is the coolant flow, so coolant that the valve lets through leaks out on its way to the jacket,
-while `qc` stays what was commanded. Of internal parameters, the two that change in a real plant: heat transfer, as the
-jacket fouls, and the reaction rate, as a catalyst loses its activity. They differ in kind, too. Less heat transfer
-warms the reactor as the leakage does, and can be told from it only by how it depends on the flow; a slower reaction
-cools it. (The activation energy would be a second name for the rate: about one temperature a change of E/R is one of
-k0.)
+Input leakage: the input is the coolant flow, so coolant leaks between the valve and the jacket while `qc` remains the
+command. Of internal parameters, the two that change in a real plant: heat transfer, as the jacket fouls, and the
+reaction rate, as a catalyst deactivates. They differ in kind, too. Less heat transfer warms the reactor as the leakage
+does, and differs from it only in its dependence on the flow; a slower reaction cools it. (The activation energy would
+be a second name for the rate: near one temperature a change of E/R is one of k0.)
 
-The sizes move the operating point by several standard deviations of the thermometer, and leave the plant on its
+The sizes move the operating point by several standard deviations of the thermometer, and keep the plant on its
 operating branch.
 """
 
@@ -24,11 +23,11 @@ DURATION_MIN = 400.0
 
 @dataclass(frozen=True)
 class Preset:
-    """Settings of the plant that go together.
+    """A named set of settings of the plant.
 
     Attributes:
-        name: as in `--preset input-leakage`.
-        meaning: one line for people.
+        name: name, as in `--preset input-leakage`.
+        meaning: a one-line description.
         faults: see `PlantConfig.faults`.
     """
 
@@ -38,7 +37,7 @@ class Preset:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Of `PlantConfig`, by name, in the form that a settings file has."""
+        """Settings of `PlantConfig` by name, as in a settings file."""
         return {
             "duration_min": DURATION_MIN,
             "scenario": {"kind": "random-steps", "low": 85.0, "high": 105.0, "hold_min": 1.0},

@@ -1,4 +1,4 @@
-"""A plant from its settings, and its record without a bus: what tests and studies are made of."""
+"""Make a plant from its settings, and simulate its record without a bus."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,19 +18,19 @@ from reactorwatch.runtime.model_file import read_extended_model
 
 
 def plant_from(config: PlantConfig, model: ProcessModel | None = None, driver: Record | None = None) -> Plant:
-    """The simulated plant at its first row; reads the record that drives it, if there is one.
+    """Make the simulated plant; reads the record that drives it, if there is one.
 
     Args:
         config: settings.
-        model: the process; that of the settings if not given.
+        model: the process; None: that of the settings.
         driver: a record whose input drives the plant, instead of the scenario of `config`.
 
     Raises:
-        InputError: settings that do not go with the model, or a file that cannot be used.
+        InputError: settings that do not fit the model, or an invalid file.
     """
     scenario = config.scenario_settings()
     if model is None:
-        config, model = _settled(config)
+        config, model = _load_model(config)
     if driver is not None:
         return Plant(config, model, HeldRecord.of(driver))
     if isinstance(scenario, FromFile):
@@ -38,13 +38,13 @@ def plant_from(config: PlantConfig, model: ProcessModel | None = None, driver: R
     return Plant(config, model, scenario)
 
 
-def _settled(config: PlantConfig) -> tuple[PlantConfig, ProcessModel]:
-    """The process of the settings. What in it is in how rows are stamped, and not in the plant, becomes a fault."""
+def _load_model(config: PlantConfig) -> tuple[PlantConfig, ProcessModel]:
+    """Load the process of the settings; its timing effects become faults."""
     if config.model is None:
         return config, cstr()
-    whole = read_extended_model(Path(config.model))
-    timing = [item for item in whole.effects if item.effect.location == TIMING]
-    physical = replace(whole, effects=tuple(item for item in whole.effects if item not in timing))
+    loaded = read_extended_model(Path(config.model))
+    timing = [item for item in loaded.effects if item.effect.location == TIMING]
+    physical = replace(loaded, effects=tuple(item for item in loaded.effects if item not in timing))
     faults = (*config.faults, *(str(item) for item in timing))
     return with_changes(config, faults=faults), physical.build()
 
@@ -52,13 +52,13 @@ def _settled(config: PlantConfig) -> tuple[PlantConfig, ProcessModel]:
 def simulate_record(
     config: PlantConfig, rows: int | None = None, model: ProcessModel | None = None, driver: Record | None = None
 ) -> Record:
-    """What a plant of these settings publishes, as a record.
+    """Simulate the record that a plant of these settings publishes.
 
     Args:
         config: settings; those about pace are not used.
-        rows: how many; those of the configured duration if not given.
-        model: as for `plant_from`.
-        driver: as for `plant_from`.
+        rows: number of rows; None: those of the configured duration.
+        model: see `plant_from`.
+        driver: see `plant_from`.
 
     Raises:
         ValueError: neither rows nor a duration is given, or fewer than one row.

@@ -1,11 +1,11 @@
-"""What the plant is driven with: the coolant flow that is asked for, as a function of time.
+"""Scenarios: the commanded coolant flow as a function of time.
 
-A scenario is a frozen structure that settings fill, and its level at a time depends on nothing but that time and
-the seed. So a run can be cut anywhere, sped up or begun in the middle, and its input is the same. Randomness gets this
-by numbering: every hold of `RandomSteps` has a generator of its own, seeded with (seed, stream, number of the hold).
+A scenario is a frozen structure of settings, and its level depends on nothing but time and seed. So a run can be cut
+anywhere, sped up or started in the middle, and its input is the same. Random levels are numbered for this: every hold
+of `RandomSteps` has a generator of its own, seeded with (seed, stream, index of the hold).
 
-The default levels keep the nominal plant on its operating branch, which a large or quick enough change of the coolant
-flow leaves for the extinguished state.
+The default levels keep the nominal plant on its operating branch; a large or fast enough change of the coolant flow
+extinguishes it.
 """
 
 import difflib
@@ -25,7 +25,7 @@ from reactorwatch.records.record import Record
 SIGNAL = "qc"
 
 _STREAM = int.from_bytes(b"scenario")
-_EDGE = 1e-6  # holds: a sample that should lie on an edge may lie this much before it, by rounding
+_EDGE = 1e-6  # in holds: rounding of a sample's time relative to an edge
 
 
 class Scenario(Protocol):
@@ -33,19 +33,19 @@ class Scenario(Protocol):
 
     @property
     def mean(self) -> float:
-        """About which it goes up and down, in l/min."""
+        """Mean level in l/min."""
 
     def level(self, time_min: float, seed: int) -> float:
-        """The coolant flow in l/min that is asked for at a plant time; the same for the same arguments, always."""
+        """Commanded coolant flow in l/min at a plant time, a deterministic function of the arguments."""
 
 
 class RandomSteps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A new level, uniform between two, at regular times.
+    """A new level, uniformly distributed, at regular times.
 
     Attributes:
-        low: l/min.
-        high: l/min.
-        hold_min: how long each level is held.
+        low: lowest level, l/min.
+        high: highest level, l/min.
+        hold_min: length of a hold.
     """
 
     kind: ClassVar[str] = "random-steps"
@@ -72,10 +72,10 @@ class Sines(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A sum of sinusoids about a mean.
 
     Attributes:
-        mean: l/min.
-        amplitudes: l/min, one a sinusoid.
-        periods_min: one a sinusoid. The defaults have no common multiple within hours.
-        phases: at plant time 0, in rad, one a sinusoid; not said: all zero.
+        mean: mean level, l/min.
+        amplitudes: amplitude of each sinusoid, l/min.
+        periods_min: period of each sinusoid. The defaults have no common multiple within hours.
+        phases: phase of each sinusoid at plant time 0, in rad; default: zero.
     """
 
     kind: ClassVar[str] = "sines"
@@ -108,9 +108,9 @@ class Square(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Half a period low, half a period high.
 
     Attributes:
-        low: l/min.
-        high: l/min.
-        period_min: from rise to rise.
+        low: low level, l/min.
+        high: high level, l/min.
+        period_min: period.
     """
 
     kind: ClassVar[str] = "square"
@@ -134,10 +134,10 @@ class Square(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Constant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One level.
+    """A constant level.
 
     Attributes:
-        level_l_min: l/min.
+        level_l_min: the level, l/min.
     """
 
     kind: ClassVar[str] = "constant"
@@ -157,10 +157,10 @@ class Constant(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FromFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The coolant flow of a measured record; `HeldRecord` once it is read.
+    """The coolant flow of a measured record, read into a `HeldRecord`.
 
     Attributes:
-        path: of the record, a .csv file.
+        path: path of the record, a .csv file.
     """
 
     kind: ClassVar[str] = "file"
@@ -169,11 +169,11 @@ class FromFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class HeldRecord:
-    """The coolant flow of a record, each row's until the next; the first row is plant time 0, the last goes on.
+    """The coolant flow of a record with zero-order hold; the first row is plant time 0, the last is held.
 
     Attributes:
-        time_min: shape (rows,), from 0.
-        levels: l/min, shape (rows,).
+        time_min: times from 0, shape (rows,).
+        levels: levels in l/min, shape (rows,).
     """
 
     time_min: NDArray[np.float64]
@@ -181,7 +181,7 @@ class HeldRecord:
 
     @classmethod
     def of(cls, record: Record) -> "HeldRecord":
-        """The coolant flow of a record.
+        """Take the coolant flow from a record.
 
         Raises:
             InputError: it has no coolant flow, or one with gaps.
@@ -204,7 +204,7 @@ class HeldRecord:
 
     @property
     def mean(self) -> float:
-        """See `Scenario`; every row counts alike."""
+        """See `Scenario`; the mean over rows."""
         return float(np.mean(self.levels))
 
     def level(self, time_min: float, seed: int) -> float:
@@ -218,40 +218,40 @@ Settings: TypeAlias = RandomSteps | Sines | Square | Constant | FromFile
 SCENARIOS: tuple[type[Settings], ...] = (RandomSteps, Sines, Square, Constant, FromFile)
 
 
-def scenario_settings(said: str | Mapping[str, Any]) -> Settings:
-    """The scenario that a setting names.
+def scenario_settings(setting: str | Mapping[str, Any]) -> Settings:
+    """Parse the scenario of a setting.
 
     Args:
-        said: the kind alone, for its defaults; the path of a .csv record; or a table with `kind` and its numbers.
+        setting: a kind, for its defaults; the path of a .csv record; or a table with `kind` and its parameters.
 
     Raises:
-        InputError: a kind or key that there is not, or a value that breaks a rule.
+        InputError: an unknown kind or key, or a value that breaks a rule.
     """
-    if isinstance(said, str):
-        said = {"kind": FromFile.kind, "path": said} if said.lower().endswith(".csv") else {"kind": said}
+    if isinstance(setting, str):
+        setting = {"kind": FromFile.kind, "path": setting} if setting.lower().endswith(".csv") else {"kind": setting}
     kinds = {item.kind: item for item in SCENARIOS}
-    if "kind" not in said:
-        raise InputError(f"scenario must have a 'kind' (valid: {', '.join(kinds)}), got {dict(said)}")
-    kind, numbers = said["kind"], {key: value for key, value in said.items() if key != "kind"}
+    if "kind" not in setting:
+        raise InputError(f"scenario must have a 'kind' (valid: {', '.join(kinds)}), got {dict(setting)}")
+    kind, values = setting["kind"], {key: value for key, value in setting.items() if key != "kind"}
     if kind not in kinds:
         raise InputError(f"scenario: {_unknown('kind', str(kind), tuple(kinds))}")
     fields = tuple(field.name for field in msgspec.structs.fields(kinds[kind]))
-    for key in numbers:
+    for key in values:
         if key not in fields:
             raise InputError(f"scenario {kind}: {_unknown('key', key, fields)}")
-    if kind == FromFile.kind and "path" not in numbers:
+    if kind == FromFile.kind and "path" not in values:
         raise InputError("scenario file: 'path' must say which .csv record drives the plant")
     try:
-        settings: Settings = msgspec.convert(numbers, kinds[kind])
+        settings: Settings = msgspec.convert(values, kinds[kind])
     except msgspec.ValidationError as error:
         raise InputError(f"scenario {kind}: {error}") from error
     return settings
 
 
 @lru_cache(maxsize=1024)
-def _uniform(seed: int, number: int) -> float:
-    """A number in [0, 1) that belongs to (seed, number)."""
-    return float(np.random.default_rng(np.random.SeedSequence([seed, _STREAM, number])).random())
+def _uniform(seed: int, index: int) -> float:
+    """Draw a uniform number in [0, 1), a deterministic function of the arguments."""
+    return float(np.random.default_rng(np.random.SeedSequence([seed, _STREAM, index])).random())
 
 
 def _unknown(what: str, name: str, valid: tuple[str, ...]) -> str:

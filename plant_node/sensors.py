@@ -1,4 +1,4 @@
-"""What a sensor makes of the value that is there: noise, and the steps of its converter."""
+"""Sensors: from a true value to a reading, with noise and quantisation."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ class Sensor:
     """Measures one signal.
 
     Attributes:
-        signal: its name.
-        noise_sd: standard deviation of the noise, white and normal, in the signal's unit.
-        resolution: readings are multiples of this, in the signal's unit; 0: of nothing.
-        seed: of the noise.
+        signal: name of the signal.
+        noise_sd: standard deviation of the white normal noise, in the signal's unit.
+        resolution: quantisation step, in the signal's unit; 0: none.
+        seed: seed of the noise.
     """
 
     signal: str
@@ -22,7 +22,7 @@ class Sensor:
     seed: int
 
     def reading(self, value: float, row: int) -> float:
-        """What it shows in a row of the run, counted from 0, where the true value is `value`."""
+        """Reading in a row of the run, counted from 0, at a true value."""
         if self.noise_sd:
             value += self.noise_sd * standard_normal(self.seed, f"sensor {self.signal}", row)
         if self.resolution:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from monitor_node.ingest.sampling import missing_rows
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
-from reactorwatch.kalman.noise_estimation import tune
+from reactorwatch.kalman.noise_estimation import estimate_noise
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import StoredState
@@ -372,4 +372,4 @@ def tuned(
     smallest = [1e-6] * len(model.outputs)
     for place, column, sd in zip(places(model, outputs), measured.T, smallest_sd, strict=True):
         whole[:, place], smallest[place] = column, sd
-    return tune(model, time_min, _until_missing(time_min, inputs), whole, smallest)
+    return estimate_noise(model, time_min, _until_missing(time_min, inputs), whole, smallest)

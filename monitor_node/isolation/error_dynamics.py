@@ -9,8 +9,8 @@ import numpy as np
 from monitor_node.isolation.window import Window
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.ekf_step import COMPILED
-from reactorwatch.kalman.error_dynamics import FilterErrors
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
+from reactorwatch.kalman.error_dynamics import ErrorLinearization
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
@@ -55,25 +55,27 @@ class Linearisation:
 
     def ways(self, window: Window) -> Ways:
         """Those between the rows of a window."""
-        ways = self._errors.ways(
+        ways = self._errors.dynamics(
             window.time_min,
             window.inputs,
             window.x,
             window.covariance,
             window.residual,
             window.used,
-            doubt=window.doubt,
+            uncertainty=window.uncertainty,
         )
-        by_state = np.concatenate([np.eye(ways.F.shape[1]) - ways.K @ ways.H, ways.L_inverse @ ways.H], axis=1)
-        by_shown = np.concatenate([-ways.K, ways.L_inverse], axis=1)
+        by_state = np.concatenate([np.eye(ways.F.shape[1]) - ways.K @ ways.H, ways.whitening @ ways.H], axis=1)
+        by_shown = np.concatenate([-ways.K, ways.whitening], axis=1)
         return Ways(by_state @ ways.F, by_state @ ways.G, by_shown @ ways.D, ways.w)
 
 
-@lru_cache(maxsize=COMPILED)
-def _compiled(model: ProcessModel, effects: tuple[Effect, ...]) -> FilterErrors:
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def _compiled(model: ProcessModel, effects: tuple[Effect, ...]) -> ErrorLinearization:
     """With all effects in the model, and some noise."""
     symbols = []
     for effect in effects:
         model = effect.extend(model)
         symbols.append(model.parameters[-1].symbol)
-    return FilterErrors(model, NoiseLevels((1.0,) * len(model.outputs), (0.0,) * len(model.states)), symbols, symbols)
+    return ErrorLinearization(
+        model, NoiseLevels((1.0,) * len(model.outputs), (0.0,) * len(model.states)), symbols, symbols
+    )

@@ -190,7 +190,7 @@ class Fitter:
             budget: of the filter steps that the fit may take; None: as many as it needs.
 
         Raises:
-            StepsSpentError: the budget does not reach. How far a large fault has been followed is kept.
+            BudgetExceededError: the budget does not reach. How far a large fault has been followed is kept.
         """
         self._nominal.budget = budget
         best, rows = _begun(whole, window), window.time_min.size

@@ -16,7 +16,7 @@ import numpy as np
 from monitor_node.isolation.segment import HUBER, Loss, Stretch
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
-from reactorwatch.kalman.ekf_step import COMPILED
+from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP, STEP, Profile
@@ -62,12 +62,12 @@ class Hypothesis:
         if self.profile is RAMP:
             end_min = stretch.end_min
             size = min(max(size * (end_min - onset_min), self.effect.lower), self.effect.upper)
-        self._filter.change(dict(zip(self._names, (size, onset_min, end_min), strict=True)))
+        self._filter.set_parameters(dict(zip(self._names, (size, onset_min, end_min), strict=True)))
         self._filter.budget = stretch.budget
         return stretch.loss(self._filter, onset_min)
 
 
-@lru_cache(maxsize=COMPILED)
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
 def _extended(model: ProcessModel, effect: Effect) -> ProcessModel:
     """The model with a ramp of the effect in it, and with a step: that is the ramp which ends where it begins."""
     return effect.extend(model, RAMP)

@@ -35,7 +35,7 @@ from monitor_node.isolation.hypothesis import Hypothesis
 from monitor_node.isolation.segment import HUBER
 from monitor_node.isolation.window import Row, Window, newest_rows, window_of
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
-from reactorwatch.kalman.step_budget import StepBudget, StepsSpentError
+from reactorwatch.kalman.step_budget import BudgetExceededError, StepBudget
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import RAMP
@@ -158,7 +158,7 @@ class Isolation:
         self.budget, self.stopped = StepBudget(self.steps), False
         try:
             return self._compared(newest_rows(tuple(self._rows), LEAST_ROWS + 2 * since_rows), not_before_min)
-        except StepsSpentError:  # hypotheses of which some were fitted and some were not cannot be compared
+        except BudgetExceededError:  # hypotheses of which some were fitted and some were not cannot be compared
             self.stopped = True
             return [_unknown(1.0)]
 

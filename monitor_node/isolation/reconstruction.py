@@ -10,14 +10,14 @@ from math import isfinite, nan, sqrt
 
 from monitor_node.isolation.window import MOST_PIECES, Row, newest_rows
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
-from reactorwatch.kalman.step_budget import A_ROW_ALONE, A_WALK, StepBudget, StepsSpentError
+from reactorwatch.kalman.step_budget import STEPS_PER_PREDICTION, STEPS_PER_ROW, BudgetExceededError, StepBudget
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import StoredState
 
 MARGIN_MIN = 1.0
 """So long before the onset that was found the sensor is left out already."""
 
-START_STEPS, START_STEPS_A_ROW = 25_000 + A_WALK * MOST_PIECES, A_ROW_ALONE
+START_STEPS, START_STEPS_A_ROW = 25_000 + STEPS_PER_PREDICTION * MOST_PIECES, STEPS_PER_ROW
 """Filter steps that the rows from before may take: enough for each row and a search for steady states."""
 
 
@@ -51,7 +51,7 @@ class Reconstruction:
         try:
             for time_min, input_value, measured in past:
                 self._step(time_min, input_value, measured, right=time_min < onset_min - MARGIN_MIN)
-        except StepsSpentError:  # the filter loses the plant again and again: it begins with the next row instead
+        except BudgetExceededError:  # the filter loses the plant again and again: it begins with the next row instead
             self._filter.restart()
         self._filter.budget = None
 

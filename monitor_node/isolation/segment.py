@@ -15,8 +15,8 @@ from monitor_node.isolation.window import Window
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import Filter, FilterState
 from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.innovations import Innovations
-from reactorwatch.kalman.resampling import filled
+from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.resampling import insert_rows
 
 HUBER = 4.0
 LOST = 100.0
@@ -57,13 +57,15 @@ class Stretch:
         self.budget = nominal.budget
         self.times = window.time_min[begin:rows]
         self.earliest_min, self.end_min = max(window.earliest_min, float(self.times[0])), float(self.times[-1])
-        doubt = None if window.doubt is None else window.doubt.of_rows(part)
+        uncertainty = None if window.uncertainty is None else window.uncertainty.select(part)
         # Rows that are far apart are filtered one by one, thirty times as slowly, so rows are put in between.
-        rows_near = filled(window.time_min[part], window.inputs[part], window.measured[part], doubt)
-        self._own = rows_near.own
-        self._record = FilterRecord.of(rows_near.time_min, rows_near.inputs, rows_near.measured, doubt=rows_near.doubt)
+        rows_near = insert_rows(window.time_min[part], window.inputs[part], window.measured[part], uncertainty)
+        self._own = rows_near.original_index
+        self._record = FilterRecord.of(
+            rows_near.time_min, rows_near.inputs, rows_near.measured, uncertainty=rows_near.uncertainty
+        )
         self._known = np.isfinite(rows_near.measured)
-        found = nominal.over(self._record, window.states[begin])
+        found = nominal.run_record(self._record, window.states[begin])
         losses, self._w = self._losses(found, 0)
         self._before = [0.0, *np.cumsum(losses).tolist()]
         self._found, self._states = found, {0: window.states[begin]}
@@ -79,13 +81,13 @@ class Stretch:
         row = int(self._record.time_min.searchsorted(onset_min))
         if row == len(self._known):
             return self.nothing
-        losses, w = self._losses(kalman.over(self._record.rest(row), self._state(row)), row)
+        losses, w = self._losses(kalman.run_record(self._record.after(row), self._state(row)), row)
         return Loss(self._before[row] + float(np.sum(losses)), np.concatenate([self._w[:row], w])[self._own])
 
-    def _losses(self, found: Innovations, row: int) -> tuple[Array, Array]:
+    def _losses(self, found: FilterResult, row: int) -> tuple[Array, Array]:
         """Of each row from one on, and the whitened innovations."""
         # Where a filter had to begin anew it says nothing of what was measured, and did not expect it at all.
-        w = np.where(self._known[row:], np.where(np.isfinite(found.whitened), found.whitened, LOST), 0.0)
+        w = np.where(self._known[row:], np.where(np.isfinite(found.normalized), found.normalized, LOST), 0.0)
         size = np.abs(w)
         within = np.minimum(size, HUBER)
         sd = found.conditional_sd

@@ -21,7 +21,7 @@ from monitor_node.ingest.sampling import missing_rows
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import LONGEST_GAP_MIN, Filter, FilterState
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
-from reactorwatch.kalman.input_uncertainty import Doubt
+from reactorwatch.kalman.input_uncertainty import InputUncertainty
 
 Row: TypeAlias = tuple[float, float, Sequence[float]]
 """Time in minutes, input, outputs; NaN where missing."""
@@ -55,7 +55,7 @@ class Window:
         used: whether a value corrected the filter, shape (rows, n_y).
         states: of the filter after each row.
         first_onset: the first row at which something may set in; at least 1.
-        doubt: ways on which the input changed at an unknown time; None: there are none.
+        uncertainty: ways on which the input changed at an unknown time; None: there are none.
     """
 
     time_min: Array
@@ -65,7 +65,7 @@ class Window:
     used: NDArray[np.bool_]
     states: list[FilterState]
     first_onset: int
-    doubt: Doubt | None = None
+    uncertainty: InputUncertainty | None = None
 
     @property
     def earliest_min(self) -> float:
@@ -99,7 +99,7 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
     """
     kept = _since_gap(_running_on(rows))
     times, inputs = np.array([row[0] for row in kept]), np.array([[row[1]] for row in kept])
-    doubt = _doubt(times, inputs)
+    uncertainty = _doubt(times, inputs)
     first_onset = max(BURN_IN_ROWS, int(np.searchsorted(times, not_before_min)))
     if first_onset >= times.size:
         return None
@@ -112,8 +112,12 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
     accept = [False] * n_y
     kalman.restart()
     for place, (time_min, value, outputs) in enumerate(kept):
-        other = ((value,), doubt.times_min(place)) if doubt is not None and doubt.rows[place] else None
-        found = kalman.update(time_min, (value,), outputs, gate=GATE, accept=accept, doubt=other)
+        other = (
+            ((value,), uncertainty.change_times_min(place))
+            if uncertainty is not None and uncertainty.rows[place]
+            else None
+        )
+        found = kalman.update(time_min, (value,), outputs, gate=GATE, accept=accept, uncertainty=other)
         far = [abs(size) > GATE * sd for size, sd in zip(found.residual, found.sd, strict=True)]
         off[place] = far
         used[place] = [
@@ -135,7 +139,7 @@ def window_of(rows: Sequence[Row], kalman: Filter, not_before_min: float = -inf)
         used,
         states,
         first_onset,
-        doubt,
+        uncertainty,
     )
 
 
@@ -152,7 +156,7 @@ def newest_rows(rows: Sequence[Row], least: int = 0) -> Sequence[Row]:
     return rows[-max(before, least, 1) :]
 
 
-def _doubt(time_min: Array, inputs: Array) -> Doubt | None:
+def _doubt(time_min: Array, inputs: Array) -> InputUncertainty | None:
     """Ways to rows behind missing rows whose input is another than that of the row before; None: there are none."""
     if time_min.size < 2:
         return None
@@ -160,7 +164,7 @@ def _doubt(time_min: Array, inputs: Array) -> Doubt | None:
     period, missing = float(np.median(spacing)), np.zeros(time_min.size, dtype=np.intp)
     for place in np.flatnonzero(changed).tolist():
         missing[place + 1] = missing_rows(float(spacing[place]) / period)
-    return Doubt.behind(time_min, inputs, missing) if missing.any() else None
+    return InputUncertainty.for_missing_rows(time_min, inputs, missing) if missing.any() else None
 
 
 def _standing_out(values: Array, sd: Array) -> NDArray[np.bool_]:

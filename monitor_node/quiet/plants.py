@@ -21,7 +21,7 @@ from monitor_node.quiet.rows import NEW_MINUTE, judge
 from monitor_node.quiet.samples import silent_from, take_samples
 from monitor_node.quiet.slots import NEVER_NS, Slots
 from monitor_node.state.monitor_state import sealed, settings_of
-from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Sample
@@ -68,7 +68,7 @@ class QuietPlants:
         self._settings = settings_of(config, model, points=False)
         self._signals = (config.input, *config.outputs)
         self._slots = Slots(form, self._signals)
-        self._rows = RowCode(row_function(model))
+        self._rows = CompiledFunction(row_function(model))
         self._parameters = model.values()
         self._ranges = np.array([[item.lower, item.upper] for item in ranges_of(model, self._signals)])
         self._scratch = np.zeros(1, form.record)

@@ -24,7 +24,7 @@ from monitor_node.quiet.ring import VALUE_BYTES, ZERO
 from monitor_node.quiet.samples import allowed_ns
 from monitor_node.signal_checks.stuck import AT_REST, STRETCH
 from monitor_node.signal_checks.timeout import MEMORY
-from reactorwatch.codegen.numba_kernel import call_at, compiled
+from reactorwatch.codegen.numba_kernel import call_at, jit
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import LARGEST_VALUE, LOWER, OUT, PRESENT, SETTINGS, STATISTIC, UPPER, X
 from reactorwatch.spc.charts.cusum import Cusum
@@ -45,7 +45,7 @@ _STRETCH, _ORDER, _MEMORY = STRETCH, LARGEST_ORDER, MEMORY
 _MOST_PERIODS = 1.99 - WHOLE  # between rows that are further apart one may be missing
 
 
-@compiled
+@jit
 def _predicted(
     p: Any,
     row_time_ns: int,
@@ -97,7 +97,7 @@ def _predicted(
     return bool(told[told.size - 1] != 0.0)
 
 
-@compiled
+@jit
 def _hear(p: Any, spacing: int, limit: float) -> bool:
     """Look for silence; whether there is none."""
     for place in range(p.silence_count.size):
@@ -116,7 +116,7 @@ def _hear(p: Any, spacing: int, limit: float) -> bool:
     return True
 
 
-@compiled
+@jit
 def _step(p: Any, place: int, size: float) -> None:
     if p.stepped[place] == _STRETCH:
         for k in range(_STRETCH - 1):
@@ -127,7 +127,7 @@ def _step(p: Any, place: int, size: float) -> None:
         p.stepped[place] += 1
 
 
-@compiled
+@jit
 def _moves(p: Any, place: int, value: float) -> bool:
     """Count equal readings; whether the sensor is not stuck."""
     if value == p.last[place]:
@@ -145,7 +145,7 @@ def _moves(p: Any, place: int, value: float) -> bool:
     return True
 
 
-@compiled
+@jit
 def _whitened(p: Any, place: int, z: float) -> float:
     """As `Prewhitener.update`."""
     expected = p.constant[place]
@@ -157,7 +157,7 @@ def _whitened(p: Any, place: int, z: float) -> float:
     return float((z - expected) / p.sigma[place])
 
 
-@compiled
+@jit
 def _noted(
     p: Any,
     alarm: int,
@@ -183,7 +183,7 @@ def _noted(
     return not (out and ones >= rules[alarm, 0])
 
 
-@compiled
+@jit
 def _each(p: Any, columns: Array, first: int, rules: Places, reach: float) -> bool:
     """Take in what the charts of the outputs, of one kind, have said; whether they raise no alarm."""
     for place in range(columns.shape[1]):
@@ -193,7 +193,7 @@ def _each(p: Any, columns: Array, first: int, rules: Places, reach: float) -> bo
     return True
 
 
-@compiled
+@jit
 def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
     """The columns of a bank, see `charts.base`: a new value for each chart."""
     for place in range(e.size):
@@ -202,14 +202,14 @@ def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
             columns[SETTINGS + row, place] = numbers[row, place]
 
 
-@compiled
+@jit
 def _put_back(columns: Array, numbers: Array) -> None:
     for row in range(numbers.shape[0]):
         for place in range(numbers.shape[1]):
             numbers[row, place] = columns[SETTINGS + row, place]
 
 
-@compiled
+@jit
 def _charted(p: Any, e: Array, columns: Array, charts: Places, rules: Places, reach: float, weight: float) -> bool:
     """Let the charts judge; whether none raises an alarm."""
     if charts[0] >= 0:
@@ -240,7 +240,7 @@ def _charted(p: Any, e: Array, columns: Array, charts: Places, rules: Places, re
     return True
 
 
-@compiled
+@jit
 def _level(p: Any, bits: int) -> int:
     """Which level the input is at, perhaps a new one in place of one that no row has; `LEVELS` if there is none."""
     free = LEVELS
@@ -254,7 +254,7 @@ def _level(p: Any, bits: int) -> int:
     return free
 
 
-@compiled
+@jit
 def _keep(p: Any, row: Bytes, others: Ints, bits: Ints) -> None:
     """Put a row into the ring, see `ring.Kept`."""
     if p.kept == others.size and row[0] < LEVELS:
@@ -271,7 +271,7 @@ def _keep(p: Any, row: Bytes, others: Ints, bits: Ints) -> None:
             row[1 + VALUE_BYTES * place + byte] = code >> 8 * byte & 0xFF
 
 
-@compiled
+@jit
 def judge(
     plants: Records,
     scratch: Records,

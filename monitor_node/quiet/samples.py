@@ -16,13 +16,13 @@ from monitor_node.ingest.sequence_check import DEVIATIONS as RUN_DEVIATIONS
 from monitor_node.ingest.sequence_check import MEMORY as RUN_MEMORY
 from monitor_node.quiet.layout import Array, Ints, Places, Records
 from monitor_node.signal_checks.timeout import BURST, DEVIATIONS, LEARN_FROM, MEMORY
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 
 # Under names of this module: compiled code keeps them as they are now.
 _MEMORY, _LEARN_FROM = MEMORY, LEARN_FROM
 
 
-@compiled
+@jit
 def allowed_ns(limit: float, count: int, mean: float, deviation: float) -> int:
     """As `Spacing.allowed_ns`; -1: too little is known."""
     if count < _LEARN_FROM:
@@ -30,7 +30,7 @@ def allowed_ns(limit: float, count: int, mean: float, deviation: float) -> int:
     return int(limit * (mean + DEVIATIONS * deviation))
 
 
-@compiled
+@jit
 def _follows(p: Any, signal: int, time_ns: int) -> bool:
     """Take the sample with the number that comes next into the run of its signal; as `SampleRun` if none is held."""
     spacing_ns = float(time_ns - p.left_ns)
@@ -44,7 +44,7 @@ def _follows(p: Any, signal: int, time_ns: int) -> bool:
     return True
 
 
-@compiled
+@jit
 def _heard(p: Any, now_ns: int, silence_limit: float, least_ns: int) -> None:
     """Note that something came; as `Silence.received`."""
     before_ns, p.received_ns = p.counted_ns, now_ns
@@ -63,7 +63,7 @@ def _heard(p: Any, now_ns: int, silence_limit: float, least_ns: int) -> None:
             p.receipt_deviation += (abs(off) - p.receipt_deviation) / p.receipt_count
 
 
-@compiled
+@jit
 def take_samples(
     plants: Records,
     codes: Places,
@@ -148,7 +148,7 @@ def take_samples(
     return count, left_over
 
 
-@compiled
+@jit
 def silent_from(plants: Records, silence_limit: float, least_ns: int) -> Ints:
     """When it is too long since something came from each plant, as `Silence.due_ns`; never where there is none."""
     found = np.empty(plants.size, np.int64)

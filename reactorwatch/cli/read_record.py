@@ -155,7 +155,7 @@ def load_process_model(path: Path | None, measured: Record) -> ProcessModel:
     if path is None:
         return cstr()
     model = read_extended_model(path)
-    return (model.counted_from(measured.zero_ns) if measured.zero_ns else model).build()
+    return (model.rebase(measured.zero_ns) if measured.zero_ns else model).build()
 
 
 def resolve_plant(path: Path, plant: str | None) -> str:

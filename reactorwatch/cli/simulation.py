@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from plant_node.initial_state import carried_over
+from plant_node.initial_state import complete_state
 from reactorwatch.diagnosis.impossible_values import check_values
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
@@ -57,7 +57,7 @@ def _simulate_run(measured: Record, model: ProcessModel, faults: list[str], *, a
         )
     if measured.rows == 1 and not alone:
         return replace(measured, columns={name: measured.columns[name] for name in (*model.input_names, *first)})
-    start = carried_over(model, first, inputs[0], float(measured.time_min[0]))
+    start = complete_state(model, first, inputs[0], float(measured.time_min[0]))
     try:
         trajectory = Simulator(model).run(measured.time_min, inputs, start)
     except ValueError as error:

@@ -1,8 +1,7 @@
-"""A CasADi function on NumPy arrays as they are.
+"""A CasADi function that reads and writes NumPy arrays in place.
 
-A call of a `ca.Function` converts every argument and every result, which costs a hundred times the arithmetic of our
-small functions. Here the function reads and writes arrays that stay where they are. For many rows at once see
-`compiled_function`.
+A call of a `ca.Function` converts every argument and every result, which takes a hundred times as long as the
+arithmetic of a small function. For many rows at once see `compiled_function`.
 """
 
 import casadi as ca
@@ -18,11 +17,11 @@ class ArrayFunction:
     of shape (m, n), and a vector of n an array of shape (1, n).
 
     Args:
-        function: its results are made dense.
+        function: the CasADi function; its results are made dense.
 
     Attributes:
-        arguments: one array an argument.
-        results: one array a result.
+        arguments: one array for each argument.
+        results: one array for each result.
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -37,7 +36,7 @@ class ArrayFunction:
         )
         self._buffer, self._evaluate = function.buffer()
         for index, array in enumerate(self.arguments):
-            self._buffer.set_arg(index, memoryview(array))  # type: ignore[call-arg,arg-type] # the stub wants a size
+            self._buffer.set_arg(index, memoryview(array))  # type: ignore[call-arg,arg-type] # the stub asks for a size
         for index, array in enumerate(self.results):
             self._buffer.set_res(index, memoryview(array))  # type: ignore[call-arg,arg-type] # as above
 

@@ -1,8 +1,8 @@
-"""Machine code that is kept on disk, so that the next program need not make it again.
+"""An on-disk cache of machine code, shared by the processes of a user.
 
-A diagnosis looks at some sixty models, and to make their machine code takes a fifth of its time. What is kept is named
-by a digest of the function, of the compiler and of the processor, so it is never wrong, only no longer asked for.
-Without a folder that can be written to all goes on, only slower.
+A diagnosis fits some sixty models, and compiling them takes a fifth of its time. An entry is named by a digest of the
+function, the compiler and the processor, so it is never wrong, only no longer requested. Where the folder cannot be
+written to, every process compiles for itself.
 """
 
 import hashlib
@@ -13,64 +13,61 @@ from pathlib import Path
 
 import platformdirs
 
-KEPT, REMOVED = 4000, 1000
-"""How many functions are kept, of some 30 kB each; beyond that so many of the oldest go."""
+CAPACITY, EVICTED = 4000, 1000
+"""Number of entries, of some 30 kB each, and how many of the oldest are evicted when there are more."""
 
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
-class MachineStore:
+class CodeCache:
     """A folder of machine code.
 
     Args:
-        folder: it; made when something is kept.
-        kept: how many functions at most.
-        removed: how many of the oldest go where there are more.
+        folder: where the entries are; made with the first one.
+        capacity: largest number of entries.
+        evicted: number of the oldest entries that are evicted when there are more.
     """
 
-    def __init__(self, folder: Path, kept: int = KEPT, removed: int = REMOVED) -> None:
-        self._folder, self._kept, self._removed = folder, kept, removed
+    def __init__(self, folder: Path, capacity: int = CAPACITY, evicted: int = EVICTED) -> None:
+        self._folder, self._capacity, self._evicted = folder, capacity, evicted
 
-    def code(self, name: str, make: Callable[[], bytes]) -> bytes:
-        """What is kept under a name; if there is nothing, or it is damaged, it is made and kept.
+    def get_or_make(self, name: str, make: Callable[[], bytes]) -> bytes:
+        """Return the entry of a name; make and store it if it is missing or damaged.
 
         Args:
-            name: a digest of all that it depends on.
-            make: makes it.
+            name: a digest of everything that the code depends on.
+            make: compiles the code.
         """
         path = self._folder / name
         try:
-            digest, code = _parted(path.read_bytes())
-        except OSError:  # it is not there, or not to be had
-            digest, code = b"", b""
+            entry = path.read_bytes()
+        except OSError:  # missing or unreadable
+            entry = b""
+        digest, code = entry[:_DIGEST_BYTES], entry[_DIGEST_BYTES:]
         if digest != hashlib.sha256(code).digest():
             code = make()
-            self._keep(path, code)
+            self._store(path, code)
         return code
 
-    def _keep(self, path: Path, code: bytes) -> None:
-        """Written beside and renamed, for others read and write at the same time."""
-        beside = path.with_name(f"{path.name}.{os.getpid()}")
+    def _store(self, path: Path, code: bytes) -> None:
+        """Write to a temporary file and rename it, as other processes read and write at the same time."""
+        temporary = path.with_name(f"{path.name}.{os.getpid()}")
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            beside.write_bytes(hashlib.sha256(code).digest() + code)
-            beside.replace(path)
-            self._tidied()
-        except OSError:  # no room, or not ours: it will be made again the next time
+            temporary.write_bytes(hashlib.sha256(code).digest() + code)
+            temporary.replace(path)
+            self._evict()
+        except OSError:  # the disk is full or not writable: the code is compiled again next time
             with suppress(OSError):
-                beside.unlink()
+                temporary.unlink()
 
-    def _tidied(self) -> None:
-        found = [item for item in os.scandir(self._folder) if item.is_file()]
-        if len(found) > self._kept:
-            for item in sorted(found, key=lambda item: item.stat().st_mtime_ns)[: self._removed]:
+    def _evict(self) -> None:
+        entries = [item for item in os.scandir(self._folder) if item.is_file()]
+        if len(entries) > self._capacity:
+            for item in sorted(entries, key=lambda item: item.stat().st_mtime_ns)[: self._evicted]:
                 Path(item.path).unlink(missing_ok=True)
 
 
-def users_store() -> MachineStore:
-    """That of the user who runs the program."""
-    return MachineStore(platformdirs.user_cache_path("reactorwatch") / "machine_code")
-
-
-def _parted(whole: bytes) -> tuple[bytes, bytes]:
-    return whole[:_DIGEST_BYTES], whole[_DIGEST_BYTES:]
+def user_cache() -> CodeCache:
+    """The cache of the user who runs this process."""
+    return CodeCache(platformdirs.user_cache_path("reactorwatch") / "machine_code")

@@ -1,20 +1,20 @@
-"""A CasADi function as machine code that takes row after row.
+"""A CasADi function compiled to machine code, for many rows in one call.
 
-CasADi keeps a function as a list of operations on numbers and goes through it one by one, which takes some nanoseconds
-an operation; of a filter, that are microseconds a row. Its own way to anything faster is to write C, and users have no
-compiler. But Numba brings LLVM along (Lattner & Adve 2004, LLVM: a compilation framework for lifelong program analysis
-and transformation, CGO), which makes machine code of the same list in some milliseconds: rows are then five times
-faster. It is told not to optimise, which would take longer than most functions run for. No operation is left out,
-moved or joined with another, so the results are those of CasADi to the last bit.
+CasADi interprets a function as a list of scalar operations, at some nanoseconds each; for a filter, that is
+microseconds a row. Its own faster path writes C, and users have no compiler. But Numba brings LLVM along (Lattner &
+Adve 2004, LLVM: a compilation framework for lifelong program analysis and transformation, CGO), which compiles the same
+list in some milliseconds: rows are then five times faster. LLVM's optimisation is off, as it would take longer than
+most functions run for. No operation is left out, moved or fused, so the results are CasADi's to the last bit.
 
-Rows that do not depend on each other are taken four at a time, and so are four chains of rows if there are several
-(see `llvm_ir`), which makes them two to three times faster again.
+Independent rows are taken four at a time, and so are four chains of rows (see `llvm_ir`): two to three times faster
+again.
 """
 
 import ctypes
 import hashlib
 from collections.abc import Callable, Sequence
 from ctypes.util import find_library
+from dataclasses import replace
 from functools import cache, cached_property
 from typing import Any, NamedTuple, TypeAlias, cast
 
@@ -23,23 +23,23 @@ import llvmlite.binding as llvm
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.cache import users_store
-from reactorwatch.codegen.llvm_ir import BEFORE, EACH, SAME, TEXT_VERSION, Frame, check, text_of
+from reactorwatch.codegen.cache import user_cache
+from reactorwatch.codegen.llvm_ir import CHAINED, IR_VERSION, PER_ROW, SHARED, RowLoop, check, write_ir
 
 LANES = 4
-"""Rows, or chains of rows, that are taken at once."""
+"""Number of rows, or chains of rows, in one vector operation."""
 
 _Call: TypeAlias = Callable[..., int]
 
 
-class RowCode:
-    """A function of a row, for any number of rows. It is compiled when it is first used.
+class CompiledFunction:
+    """A function of a row, for any number of rows; compiled at its first use.
 
     Args:
-        function: of SX symbols; its arguments are dense, its results are made so.
-        shared: which of its arguments are the same for all rows.
-        chained: so many of its first arguments are the first results of the row before.
-        stops: whether a row whose very last number is not above zero is the last one; of a chained function.
+        function: of SX symbols, with dense arguments; its results are made dense.
+        shared: indices of the arguments that are the same for all rows.
+        chained: number of leading arguments that are the leading results of the row before.
+        stops: whether a chained function stops after a row whose very last number is not above zero.
 
     Raises:
         ValueError: the function has an operation that there is no machine code for.
@@ -52,158 +52,154 @@ class RowCode:
         results = [ca.densify(item) for item in function.call(symbols)]
         self._function = ca.Function(function.name(), symbols, results)
         check(self._function)
-        kinds = (BEFORE if number < chained else SAME if number in shared else EACH for number in range(len(symbols)))
+        kinds = (CHAINED if i < chained else SHARED if i in shared else PER_ROW for i in range(len(symbols)))
         self._shapes = [item.shape for item in results]
         counts = tuple(item.numel() for item in results)
-        self._frame = Frame(tuple(kinds), tuple(item.numel() for item in symbols), counts, stops)
+        self._loop = RowLoop(tuple(kinds), tuple(item.numel() for item in symbols), counts, stops)
 
-    def results(self, rows: int) -> list[Array]:
-        """Where the results of so many rows fit, each of shape (rows, its columns, its rows), as CasADi keeps them."""
+    def allocate_results(self, rows: int) -> list[Array]:
+        """Uninitialised arrays for `fill`, each of shape (rows, columns, rows of the matrix): CasADi's order."""
         return [np.empty((rows, *shape[::-1])) for shape in self._shapes]
 
     def fill(self, rows: int, arguments: Sequence[Array], results: Sequence[Array]) -> int:
-        """Take rows.
+        """Evaluate rows.
 
         Args:
-            rows: how many; at least 1.
-            arguments: of float64, without gaps in memory; of one that is shared or chained its numbers, column by
-                column, else those of row after row.
-            results: as `results`, at least for so many rows; they are filled.
+            rows: number of rows; at least 1.
+            arguments: float64, contiguous, matrices column by column; a shared or chained argument once, others for
+                row after row.
+            results: as `allocate_results` makes them, for at least as many rows; they are filled.
 
         Returns:
-            How many rows went well; what is behind them in the results means nothing.
+            The number of rows before the function stopped; later results are undefined.
 
         Raises:
             ValueError: arrays of other sizes or types.
         """
         self._check(rows, arguments, results)
-        lanes = not self._frame.chained and rows >= LANES
-        return (self._together if lanes else self._alone)(rows, *(item.ctypes.data for item in (*arguments, *results)))
+        lanes = not self._loop.chained and rows >= LANES
+        return (self._vector_call if lanes else self._scalar_call)(
+            rows, *(item.ctypes.data for item in (*arguments, *results))
+        )
 
-    def fill_together(self, rows: int, arguments: Sequence[Sequence[Array]], results: Sequence[Sequence[Array]]) -> int:
-        """Take as many rows of each of some chains.
+    def fill_chains(self, rows: int, arguments: Sequence[Sequence[Array]], results: Sequence[Sequence[Array]]) -> int:
+        """Evaluate the same number of rows of each of several chains.
 
         Args:
-            rows: how many; at least 1.
-            arguments: as for `fill`, of each chain; at least one and at most `LANES`.
-            results: likewise.
+            rows: number of rows; at least 1.
+            arguments: for each chain as for `fill`; at least one chain and at most `LANES`.
+            results: for each chain as for `fill`.
 
         Returns:
-            How many rows went well in all of them; what is behind them in the results means nothing.
+            The number of rows before any chain stopped; later results are undefined.
 
         Raises:
             ValueError: as for `fill`.
         """
-        for of_chain, into in zip(arguments, results, strict=True):
-            self._check(rows, of_chain, into)
-        # Where there are fewer chains than lanes the last lanes do the first chain again, somewhere else.
+        for given, into in zip(arguments, results, strict=True):
+            self._check(rows, given, into)
+        # Lanes without a chain of their own evaluate the first chain again, into arrays that are dropped.
         spare = range(len(arguments), LANES)
         taken = [*arguments, *(arguments[0] for _ in spare)]
         filled = [*results, *([np.empty_like(item) for item in results[0]] for _ in spare)]
         of_lanes = [[item.ctypes.data for item in (*of, *into)] for of, into in zip(taken, filled, strict=True)]
-        return self._together(rows, *(address for of_array in zip(*of_lanes, strict=True) for address in of_array))
+        return self._vector_call(rows, *(address for of_array in zip(*of_lanes, strict=True) for address in of_array))
 
-    def over(self, *arguments: Array) -> list[Array]:
-        """The results of all rows, each of shape (rows, its rows, its columns).
+    def map(self, *arguments: Array) -> list[Array]:
+        """Evaluate all rows; returns results of shape (rows, rows of the matrix, columns).
 
         Args:
-            *arguments: of one that is shared or chained its numbers, else with one row a row.
+            *arguments: a shared or chained argument as it is, others with the rows along the first axis.
 
         Raises:
-            ValueError: none has one row a row, or sizes that do not fit.
+            ValueError: an array has a size that does not fit.
         """
-        rows = next(len(item) for kind, item in zip(self._frame.kinds, arguments, strict=True) if kind == EACH)
-        results = self.results(rows)
+        rows = next(len(item) for kind, item in zip(self._loop.kinds, arguments, strict=True) if kind == PER_ROW)
+        results = self.allocate_results(rows)
         if rows:
             self.fill(rows, [np.ascontiguousarray(item, dtype=np.float64) for item in arguments], results)
         return [item.transpose(0, 2, 1) for item in results]
 
     def _check(self, rows: int, arguments: Sequence[Array], results: Sequence[Array]) -> None:
-        for kind, size, array in zip(self._frame.kinds, self._frame.sizes, arguments, strict=True):
-            _check(array, size * (rows if kind == EACH else 1))
-        for count, array in zip(self._frame.counts, results, strict=True):
-            _check(array, rows * count)
+        for kind, size, array in zip(self._loop.kinds, self._loop.sizes, arguments, strict=True):
+            _check_array(array, size * (rows if kind == PER_ROW else 1))
+        for count, array in zip(self._loop.counts, results, strict=True):
+            _check_array(array, rows * count)
 
     def prepare(self) -> None:
-        """Compile now what is otherwise compiled at the first use."""
-        _ = self._alone
-        if not self._frame.chained:
-            _ = self._together
+        """Compile now instead of at the first use."""
+        _ = self._scalar_call
+        if not self._loop.chained:
+            _ = self._vector_call
 
     @cached_property
     def address(self) -> int:
-        """Where the machine code is, for kernels (`compiled.call_at`).
+        """Address of the machine code, for kernels (`numba_kernel.call_at`); valid as long as this object lives.
 
-        It takes how many rows, and where arguments and results are, as `fill` does, and lives as long as this object.
+        The code takes the number of rows and the addresses of arguments and results, in the order of `fill`.
         """
-        return int(ctypes.cast(cast(Any, self._alone), ctypes.c_void_p).value or 0)
+        return int(ctypes.cast(cast(Any, self._scalar_call), ctypes.c_void_p).value or 0)
 
     @cached_property
-    def _alone(self) -> _Call:
-        return self._compiled(1)
+    def _scalar_call(self) -> _Call:
+        return self._compile(1)
 
     @cached_property
-    def _together(self) -> _Call:
-        return self._compiled(LANES)
+    def _vector_call(self) -> _Call:
+        return self._compile(LANES)
 
-    def _compiled(self, lanes: int) -> _Call:
-        one = self._frame
-        frame = Frame(one.kinds, one.sizes, one.counts, one.stops, lanes)
-        found = _Machine.of_host().code(self._function, frame)
-        pointers = [ctypes.c_void_p] * (frame.chains * (len(frame.sizes) + len(frame.counts)))
-        call: _Call = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, *pointers)(found.address)
-        self._engines.append(found.engine)
+    def _compile(self, lanes: int) -> _Call:
+        loop = replace(self._loop, lanes=lanes)
+        loaded = _Host.get().load(self._function, loop)
+        pointers = [ctypes.c_void_p] * (loop.chains * (len(loop.sizes) + len(loop.counts)))
+        call: _Call = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, *pointers)(loaded.address)
+        self._engines.append(loaded.engine)
         return call
 
     @cached_property
     def _engines(self) -> list[llvm.ExecutionEngine]:
-        """They keep the code."""
+        """The engines that own the code."""
         return []
 
 
-def _check(array: Array, least: int) -> None:
+def _check_array(array: Array, least: int) -> None:
     if array.dtype != np.float64 or not array.flags.c_contiguous or array.size < least:
         raise ValueError(f"an array of {least} float64 without gaps is needed, got {array.dtype} {array.shape}")
 
 
 class _Loaded(NamedTuple):
-    """Machine code that can be called.
-
-    Attributes:
-        engine: keeps it.
-        address: where it begins.
-    """
+    """Machine code in memory: its address, and the engine that owns it."""
 
     engine: llvm.ExecutionEngine
     address: int
 
 
-class _Machine:
-    """The processor that runs this, and what code was made for it."""
+class _Host:
+    """The compiler for this processor."""
 
     def __init__(self) -> None:
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
-        if llvm.address_of_symbol("exp") is None:  # the program has not loaded it for itself
+        if llvm.address_of_symbol("exp") is None:  # libm is not loaded yet
             llvm.load_library_permanently(find_library("m"))
         self._triple = llvm.get_process_triple()
         self._cpu, self._features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-        self._store = users_store()
+        self._cache = user_cache()
 
     @classmethod
     @cache
-    def of_host(cls) -> "_Machine":
-        """That of this process."""
+    def get(cls) -> "_Host":
+        """The one of this process."""
         return cls()
 
-    def code(self, function: ca.Function, frame: Frame) -> _Loaded:
-        """Of a function, from the store if it was made before."""
-        made_by = (llvm.llvm_version_info, self._triple, self._cpu, self._features, TEXT_VERSION)
-        depends_on = repr((made_by, frame)) + function.serialize()
+    def load(self, function: ca.Function, loop: RowLoop) -> _Loaded:
+        """Machine code of a function, from the cache if it was compiled before."""
+        made_by = (llvm.llvm_version_info, self._triple, self._cpu, self._features, IR_VERSION)
+        depends_on = repr((made_by, loop)) + function.serialize()
         name = hashlib.sha256(depends_on.encode()).hexdigest()
         machine = self._target()
-        stored = self._store.code(
-            name, lambda: bytes(machine.emit_object(llvm.parse_assembly(text_of(function, frame))))
+        stored = self._cache.get_or_make(
+            name, lambda: bytes(machine.emit_object(llvm.parse_assembly(write_ir(function, loop))))
         )
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         engine.add_object_file(llvm.ObjectFileRef.from_data(stored))

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 
 _TIME, _SEQUENCE, _VALUE, _UNIT, _QUALITY = 0x09, 0x10, 0x19, 0x22, 0x28  # field and wire type of each
 _TIME_TAG, _SEQUENCE_TAG = bytes([_TIME]), bytes([_SEQUENCE])
@@ -93,7 +93,7 @@ def unit_digest(unit: str) -> int:
     return digest
 
 
-@compiled
+@jit
 def _varint(data: NDArray[np.uint8], position: int, end: int) -> tuple[int, int]:
     """Read a number of at most 63 bits; returns it and the position behind it, -1 if there is none."""
     number, shift = 0, 0
@@ -107,7 +107,7 @@ def _varint(data: NDArray[np.uint8], position: int, end: int) -> tuple[int, int]
     return 0, -1
 
 
-@compiled
+@jit
 def _read(
     data: NDArray[np.uint8],
     ends: NDArray[np.int64],

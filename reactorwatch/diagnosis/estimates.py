@@ -36,7 +36,9 @@ def with_rough_numbers(search: Search, best: Explained) -> tuple[Explained, list
     for effect, whole, numbers in zip(best.hypothesis.sized.effects, covariances, rough, strict=True):
         for number, sd in numbers.items():
             share = sd / max(float(np.sqrt(whole[number, number])), 1e-300)
-            share = share if effect.jumps else max(share, 1.0)  # by derivatives, all other numbers may move as well
+            share = (
+                share if effect.is_discontinuous else max(share, 1.0)
+            )  # by derivatives, all other numbers may move as well
             whole[number] *= share
             whole[:, number] *= share
     return best, covariances

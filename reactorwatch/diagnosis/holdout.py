@@ -20,7 +20,7 @@ from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.parameter_priors import beginning_with
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import Explained
-from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.simulate import Simulator
 
@@ -79,7 +79,7 @@ def gained(run: Run, nominal: Explained, best: Explained) -> tuple[Errors, Error
     fit = best.fit
     if best is not nominal:
         fit = best.hypothesis.fit(seen, best.fit.theta)
-    elif best.hypothesis.sized.model.lasting:
+    elif best.hypothesis.sized.model.constant_states:
         fit = best.hypothesis.at(seen, ())
     known = best.hypothesis.offsets(fit)
     before = _errors(run, hidden, nominal.hypothesis.sized, (), known)
@@ -110,7 +110,9 @@ def free_run(run: Run, sized: Sized, signals: Sequence[Signal], known: Mapping[s
     return _freely(run, sized, signals, sized.follow(run, signals).found, known)
 
 
-def _freely(run: Run, sized: Sized, signals: Sequence[Signal], found: Innovations, known: Mapping[str, float]) -> Array:
+def _freely(
+    run: Run, sized: Sized, signals: Sequence[Signal], found: FilterResult, known: Mapping[str, float]
+) -> Array:
     outputs = np.array(found.prediction)
     whole = sized.whole
     inputs = whole.inputs(run.time_min, run.inputs, signals)

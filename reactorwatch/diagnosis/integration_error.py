@@ -11,16 +11,16 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.process.model import ProcessModel
 
 LEAST_CORRELATION = 0.15
 """Of the residuals with that error, in every output; by chance, in a thousand rows, it is some hundredths."""
 
 
-def looks_like_integration(model: ProcessModel, run: Run, found: Innovations) -> bool:
+def looks_like_integration(model: ProcessModel, run: Run, found: FilterResult) -> bool:
     """Whether the residuals of every output go with the error of a coarse step.
 
     Args:
@@ -47,6 +47,6 @@ def _shown_error(model: ProcessModel, run: Run, x: Array) -> Array:
     after = state + h * slope
     curved = after + 0.5 * h * (f(after, u, p, t, t)[0] - slope)
     error = f(curved, u, p, t, t)[1] - f(after, u, p, t, t)[1]
-    function = RowCode(ca.Function("error", [state, u, p, t, h], [error]), shared=[2])
-    found = function.over(x[:-1], run.inputs[:-1], model.values(), run.time_min[:-1], np.diff(run.time_min))
+    function = CompiledFunction(ca.Function("error", [state, u, p, t, h], [error]), shared=[2])
+    found = function.map(x[:-1], run.inputs[:-1], model.values(), run.time_min[:-1], np.diff(run.time_min))
     return found[0][:, :, 0]

@@ -18,7 +18,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.process.model import Parameter, ProcessModel, parameter, variable
 
 _OFF, _BEGIN = ".off", ".begin"
@@ -82,7 +82,7 @@ def offsets(model: ProcessModel, x: Array) -> dict[str, float]:
         model: with or without such.
         x: states of it, shape (n_x,) or more.
     """
-    return {model.states[place].name.removesuffix(_OFF): float(x[place]) for place in model.lasting}
+    return {model.states[place].name.removesuffix(_OFF): float(x[place]) for place in model.constant_states}
 
 
 def beginning_with(known: Mapping[str, float]) -> dict[str, float]:
@@ -90,7 +90,7 @@ def beginning_with(known: Mapping[str, float]) -> dict[str, float]:
     return {f"{name}{_BEGIN}": value for name, value in known.items()}
 
 
-def last_state(found: Innovations) -> int:
+def last_state(found: FilterResult) -> int:
     """The last row in which a filter knows its state; the last one, if there is none."""
     known = np.flatnonzero(np.all(np.isfinite(found.x), axis=1))
     return int(known[-1]) if known.size else len(found.x) - 1

@@ -65,7 +65,7 @@ def settled(search: Search, best: Explained, sds: Sequence[Array]) -> tuple[Expl
     for place, (effect, course) in enumerate(zip(best.hypothesis.sized.effects, best.hypothesis.courses, strict=True)):
         rough: dict[int, float] = {}
         names = [item.name for item in course.numbers]
-        if effect.jumps and course.coefficients == 1:
+        if effect.is_discontinuous and course.coefficients == 1:
             reach = SIZE_SHARE * abs(float(best.fit.theta[place][0]))
             best, rough[0] = _Scan(search, place, 0, reach, (effect.lower, effect.upper)).settled(best)
         if "onset" in names:
@@ -73,7 +73,7 @@ def settled(search: Search, best: Explained, sds: Sequence[Array]) -> tuple[Expl
                 best = _out_of_the_hollow(search, best, place)
             number = course.coefficients + names.index("onset")
             # Of what acts in jumps there are no derivatives, and no standard deviation follows from them.
-            sd = 0.0 if effect.jumps else float(sds[place][number])
+            sd = 0.0 if effect.is_discontinuous else float(sds[place][number])
             reach = min(float(np.hypot(sd, course.period_min)), LARGEST_SHARE * search.run.span_min)
             bounds = (course.begin_min, course.end_min)
             best, sd = _Scan(search, place, number, reach, bounds).settled(best)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.input_uncertainty import Doubt
+from reactorwatch.kalman.input_uncertainty import InputUncertainty
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Run:
         return float(self.time_min[-1] - self.time_min[0])
 
 
-def doubt_of(run: Run, inputs: Array, leads_to: NDArray[np.intp] | None = None) -> Doubt | None:
+def doubt_of(run: Run, inputs: Array, leads_to: NDArray[np.intp] | None = None) -> InputUncertainty | None:
     """The ways of a run on which nobody knows when inputs changed.
 
     Args:
@@ -72,4 +72,4 @@ def doubt_of(run: Run, inputs: Array, leads_to: NDArray[np.intp] | None = None) 
     to = slice(None) if leads_to is None else leads_to
     others = np.vstack([inputs[:1], inputs[:-1]])
     others[:, : run.inputs.shape[1]] = run.inputs[to]
-    return Doubt.behind(run.time_min, run.inputs, run.missing).of_rows(to)._replace(inputs=others)
+    return InputUncertainty.for_missing_rows(run.time_min, run.inputs, run.missing).select(to)._replace(inputs=others)

@@ -24,7 +24,7 @@ the bits are the same. (Per-plant branches are written as selections for this re
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 
 TILE_PLANTS = 64
 LARGEST_VALUE = 1e30
@@ -57,7 +57,7 @@ def work_size(n: int) -> int:
     return n + _WORK
 
 
-@compiled
+@jit
 def rotate(
     tile: NDArray[np.float64], work: NDArray[np.float64], n: int, first: int, exact: bool, rank_share: float
 ) -> None:
@@ -115,7 +115,7 @@ def rotate(
             entry += 1
 
 
-@compiled
+@jit
 def solve(tile: NDArray[np.float64], work: NDArray[np.float64], n: int) -> None:
     """Set theta to the solution of R theta = z, for the plants whose row counts."""
     plants = tile.shape[1]
@@ -131,7 +131,7 @@ def solve(tile: NDArray[np.float64], work: NDArray[np.float64], n: int) -> None:
                 tile[i, p] -= tile[entry + j - i - 1, p] * tile[j, p] if work[used, p] > 0.0 else 0.0
 
 
-@compiled
+@jit
 def learn(
     tile: NDArray[np.float64],
     work: NDArray[np.float64],
@@ -203,7 +203,7 @@ def learn(
         tile[sums + TURN, p] = turn if turn < n else 0.0
 
 
-@compiled
+@jit
 def acceptable(regressor: NDArray[np.float64], output: float) -> bool:
     """Whether every value is a number smaller in size than LARGEST_VALUE."""
     fine = abs(output) < LARGEST_VALUE
@@ -212,7 +212,7 @@ def acceptable(regressor: NDArray[np.float64], output: float) -> bool:
     return fine
 
 
-@compiled
+@jit
 def first_refused(regressors: NDArray[np.float64], outputs: NDArray[np.float64], present: NDArray[np.bool_]) -> int:
     """The index of the first present plant whose row is not acceptable; -1 if there is none."""
     for plant in range(outputs.size):
@@ -221,7 +221,7 @@ def first_refused(regressors: NDArray[np.float64], outputs: NDArray[np.float64],
     return -1
 
 
-@compiled
+@jit
 def learn_one(
     tile: NDArray[np.float64],
     regressor: NDArray[np.float64],
@@ -247,7 +247,7 @@ def learn_one(
     return work[n + PREDICTION, 0], work[n + RESIDUAL, 0], work[n + SPREAD, 0], work[n + LEVERAGE, 0]
 
 
-@compiled
+@jit
 def learn_all(
     tiles: NDArray[np.float64],
     regressors: NDArray[np.float64],

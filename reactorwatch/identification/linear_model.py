@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.identification.regressor import rows_of, unbroken
 from reactorwatch.identification.structure import Structure, as_columns
 
@@ -212,7 +212,7 @@ def free_run(
     )
 
 
-@compiled
+@jit
 def _plan(
     reach: int, driven: NDArray[np.int64], complete: NDArray[np.int64], after_gap: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -228,7 +228,7 @@ def _plan(
     return starts, running
 
 
-@compiled
+@jit
 def _run(
     parameters: NDArray[np.float64],
     output_lags: int,

@@ -23,7 +23,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import (
     LeastSquares,
@@ -236,7 +236,7 @@ def _variance(errors: NDArray[np.float64], parameters: int) -> NDArray[np.float6
     return np.array([float(errors @ errors) / free if free > 0 else math.inf])
 
 
-@compiled
+@jit
 def stable(a: NDArray[np.float64]) -> bool:
     """Whether all poles of yhat[k] = a1 yhat[k-1] + ... lie inside the unit circle.
 
@@ -256,7 +256,7 @@ def stable(a: NDArray[np.float64]) -> bool:
     return True
 
 
-@compiled
+@jit
 def run_with_gradient(
     theta: NDArray[np.float64],
     output_lags: int,
@@ -314,7 +314,7 @@ def run_with_gradient(
     return run, gradient
 
 
-@compiled
+@jit
 def _triangle(columns: NDArray[np.float64]) -> NDArray[np.float64]:
     """R of a QR factorisation by Householder's reflections (Golub and Van Loan, algorithm 5.2.1), small and often.
 
@@ -348,7 +348,7 @@ def _triangle(columns: NDArray[np.float64]) -> NDArray[np.float64]:
     return triangle
 
 
-@compiled
+@jit
 def _filtered(a: NDArray[np.float64], signals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Each column filtered by 1 / (1 - a1 q^-1 - ...); it starts from rest again after a missing value."""
     filtered = np.empty_like(signals)

@@ -1,4 +1,4 @@
-"""A record laid out as the compiled rows of a filter take it: once, for as many runs as are made over it."""
+"""A record in the layout of the compiled filter, prepared once for many runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.input_uncertainty import Doubt
+from reactorwatch.kalman.input_uncertainty import InputUncertainty
 from reactorwatch.process.integrate import LONGEST_STEP_MIN
 
 LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are rounded
@@ -16,19 +16,18 @@ LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are 
 
 @dataclass(frozen=True, eq=False)
 class FilterRecord:
-    """The rows of a record, for `Filter.over`.
+    """The rows of a record, for `Filter.run_record`.
 
     Attributes:
         time_min: shape (rows,).
-        inputs: shape (rows, n_u); NaN where nobody knows them.
+        inputs: shape (rows, n_u); NaN where unknown.
         measured: shape (rows, n_y); NaN where missing.
-        gate: standard deviations beyond which a measurement does not correct the state ...
-        accept: ... unless this says so, shape (rows, n_y).
-        rows: the arguments `new` of the compiled rows, see `ekf_step`; in the first one, what comes from the row
-            before is not yet there.
-        near: whether a row is so soon after the one before that two steps lead to it, shape (rows,); of the first one
-            nobody knows yet.
-        doubt: ways on which nobody knows when inputs changed; None: there are none.
+        gate: standard deviations beyond which a measurement does not correct the state.
+        accept: measurements that correct the state whatever the gate, shape (rows, n_y).
+        rows: the arguments `new` of the compiled rows, see `ekf_step`; the first row lacks what comes from the row
+            before.
+        near: True for rows at most two integration steps after the one before, shape (rows,); undecided for the first.
+        uncertainty: intervals in which inputs changed at an unknown time; None: there are none.
     """
 
     time_min: Array
@@ -38,7 +37,7 @@ class FilterRecord:
     accept: NDArray[np.bool_]
     rows: Array
     near: NDArray[np.bool_]
-    doubt: Doubt | None = None
+    uncertainty: InputUncertainty | None = None
 
     @classmethod
     def of(
@@ -48,17 +47,17 @@ class FilterRecord:
         measured: Array,
         gate: float = inf,
         accept: NDArray[np.bool_] | None = None,
-        doubt: Doubt | None = None,
+        uncertainty: InputUncertainty | None = None,
     ) -> "FilterRecord":
-        """Lay a record out.
+        """Prepare a record.
 
         Args:
             time_min: shape (rows,).
             inputs: shape (rows, n_u) or (rows,) for one input.
             measured: shape (rows, n_y); NaN where missing.
             gate: see the attributes.
-            accept: see the attributes; None: for none.
-            doubt: see the attributes.
+            accept: see the attributes; None: no measurement.
+            uncertainty: see the attributes.
         """
         count, n_y = measured.shape
         inputs = inputs.reshape(count, -1)
@@ -67,15 +66,15 @@ class FilterRecord:
         rows, near = np.zeros((count, 2 * n_u + 3 + 2 * n_y)), np.zeros(count, dtype=np.bool_)
         half = 0.5 * np.diff(time_min)
         near[1:] = (half > 0.0) & (2.0 * half <= LONGEST_ROW_MIN) & np.all(np.isfinite(inputs[:-1]), axis=1)
-        if doubt is not None:
-            near &= ~doubt.rows
+        if uncertainty is not None:
+            near &= ~uncertainty.rows
         rows[1:, :n_u], rows[:, n_u : 2 * n_u], rows[:, 2 * n_u] = inputs[:-1], inputs, time_min
         rows[1:, 2 * n_u + 1], rows[1:, 2 * n_u + 2] = half, half
         rows[:, -2 * n_y : -n_y], rows[:, -n_y:] = measured, np.where(accept, inf, gate)
-        return cls(time_min, inputs, measured, gate, accept, rows, near, doubt)
+        return cls(time_min, inputs, measured, gate, accept, rows, near, uncertainty)
 
-    def rest(self, row: int) -> "FilterRecord":
-        """The record from a row on."""
+    def after(self, row: int) -> "FilterRecord":
+        """Drop the rows before a row."""
         return FilterRecord(
             self.time_min[row:],
             self.inputs[row:],
@@ -84,17 +83,17 @@ class FilterRecord:
             self.accept[row:],
             self.rows[row:],
             self.near[row:],
-            None if self.doubt is None else self.doubt.of_rows(slice(row, None)),
+            None if self.uncertainty is None else self.uncertainty.select(slice(row, None)),
         )
 
     def following(
         self, before_min: float | None, inputs: Sequence[float], breaks: Sequence[float]
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """The rows, which are only to be read, and which are near, now that it is known what came before.
+        """Complete `rows` (read-only) and `near` with what precedes the record.
 
         Args:
             before_min: time of the row before the first one; None if there is none.
-            inputs: that held there.
+            inputs: inputs of that row.
             breaks: times at which the right-hand side jumps, increasing.
         """
         near, times, n_u = self.near.copy(), self.time_min, self.inputs.shape[1]
@@ -104,7 +103,9 @@ class FilterRecord:
         if before_min is not None:
             half = 0.5 * (times[0] - before_min)
             rows[0, :n_u], rows[0, first], rows[0, second] = inputs, half, half
-            near[0] = 0.0 < 2.0 * half <= LONGEST_ROW_MIN and not (self.doubt is not None and self.doubt.rows[0])
+            near[0] = 0.0 < 2.0 * half <= LONGEST_ROW_MIN and not (
+                self.uncertainty is not None and self.uncertainty.rows[0]
+            )
         for point in breaks:
             row = int(times.searchsorted(point))
             since = times[row - 1] if row else before_min

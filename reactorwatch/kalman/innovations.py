@@ -1,4 +1,4 @@
-"""What a filter gives: what it expected of a row or a record, and what that was off by (see `filter`)."""
+"""Predictions, innovations and filtered states of the extended Kalman filter (see `ekf`)."""
 
 from math import log, pi
 from typing import NamedTuple
@@ -9,45 +9,46 @@ from reactorwatch.arrays import Array
 
 
 class Innovation(NamedTuple):
-    """What a row's measurements were off by, one number an output. In the row that a filter begins with all are NaN.
+    """Innovation of a row, one number an output. In the row that a filter starts with all are NaN.
 
     Attributes:
-        prediction: before the row was seen.
-        residual: measured less predicted; NaN where nothing was measured.
-        sd: standard deviation of the residual if the model is right.
-        whitened: independent of each other and standard normal if the model is right; NaN where nothing was measured.
+        prediction: predicted measurement.
+        residual: the innovation, measured less predicted; NaN where nothing was measured.
+        sd: standard deviation of the innovation if the model is right.
+        normalized: innovation normalised by its covariance, independent and standard normal if the model is right; NaN
+            where nothing was measured.
     """
 
     prediction: tuple[float, ...]
     residual: tuple[float, ...]
     sd: tuple[float, ...]
-    whitened: tuple[float, ...]
+    normalized: tuple[float, ...]
 
 
-class Innovations(NamedTuple):
-    """What a record was off by. In rows that the filter begins with all are NaN.
+class FilterResult(NamedTuple):
+    """Innovations and filtered states of a record. In rows that the filter starts with all are NaN.
 
     Attributes:
-        prediction: shape (rows, n_y), like the next three; as for `Innovation`.
-        residual: likewise.
-        sd: likewise.
-        whitened: likewise.
-        conditional_sd: likewise; the standard deviation of the residual if those of the outputs before it are known.
-        x: the state after each row, shape (rows, n_x).
-        P: its covariance, shape (rows, n_x, n_x).
+        prediction: predicted measurements, shape (rows, n_y).
+        residual: innovations, shape (rows, n_y); NaN where nothing was measured.
+        sd: standard deviations of the innovations, shape (rows, n_y).
+        normalized: normalised innovations, shape (rows, n_y); NaN where nothing was measured.
+        conditional_sd: standard deviation of each innovation given those of the outputs before it, shape (rows, n_y).
+        x: filtered state, shape (rows, n_x).
+        P: filtered covariance, shape (rows, n_x, n_x).
     """
 
     prediction: Array
     residual: Array
     sd: Array
-    whitened: Array
+    normalized: Array
     conditional_sd: Array
     x: Array
     P: Array
 
     @property
     def log_likelihood(self) -> Array:
-        """Of what was measured in each row under the model, shape (rows,)."""
-        known = np.isfinite(self.whitened)
-        parts = np.where(known, 0.5 * self.whitened**2 + 0.5 * log(2 * pi) + np.log(self.conditional_sd), 0.0)
+        """Log likelihood of each row's measurements, shape (rows,)."""
+        measured = np.isfinite(self.normalized)
+        parts = np.where(measured, 0.5 * self.normalized**2 + 0.5 * log(2 * pi) + np.log(self.conditional_sd), 0.0)
         return np.asarray(-np.sum(parts, axis=1))

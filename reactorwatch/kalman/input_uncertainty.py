@@ -1,10 +1,9 @@
-"""Ways from a row to the next on which an input changed, and nobody knows when.
+"""Intervals in which an input changed at an unknown time.
 
-Rows are missing, and behind them an input is another. Each of the missing rows and the one after them may be the one
-that it changed with, and none is likelier than another. So the state is followed from each of these moments; it is on
-average the mean of where they lead, and its covariance is their spread about it. To add to what it would be without a
-change a share of what the change makes of it is not enough: the temperature goes with the time that is left from the
-change on, but the concentration, which only follows the temperature, with the square of it.
+Rows are missing, and after them an input has another value. It may have changed with any of the missing rows or with
+the row after them, each as likely. So the state is predicted for each of these times; the prior mean is the mean of the
+predictions, and their spread is added to its covariance. A share of the change's effect would not do: the temperature's
+response grows with the time since the change, but the concentration's, which follows the temperature, with its square.
 """
 
 from typing import NamedTuple
@@ -15,45 +14,45 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 
 
-class Doubt(NamedTuple):
-    """The ways of a record that are in doubt; of each row, the way that leads to it.
+class InputUncertainty(NamedTuple):
+    """The uncertain intervals of a record, each in the row at its end.
 
     Attributes:
-        inputs: those that may have held already, shape (rows, n_u).
-        first_min: the first moment from which they may have, shape (rows,).
-        last_min: the last one, likewise; the others are at even distances between them.
-        moments: how many there are, shape (rows,); 0 where there is no doubt.
+        inputs: inputs after the change, shape (rows, n_u).
+        first_min: earliest time of the change, shape (rows,).
+        last_min: latest time of the change, shape (rows,); the others are evenly spaced between them.
+        n_times: number of possible times, shape (rows,); 0 where the inputs are known.
     """
 
     inputs: Array
     first_min: Array
     last_min: Array
-    moments: NDArray[np.intp]
+    n_times: NDArray[np.intp]
 
     @classmethod
-    def behind(cls, time_min: Array, inputs: Array, missing: NDArray[np.intp]) -> "Doubt":
-        """Of a record in which rows are missing where inputs changed.
+    def for_missing_rows(cls, time_min: Array, inputs: Array, missing: NDArray[np.intp]) -> "InputUncertainty":
+        """Mark the intervals with missing rows.
 
         Args:
-            time_min: of its rows, shape (rows,).
-            inputs: that hold from each row on, shape (rows, n_u).
-            missing: how many rows are missing before each row with whose inputs it is not known since when they hold,
-                shape (rows,); else 0.
+            time_min: times of the rows, shape (rows,).
+            inputs: inputs that hold from each row on, shape (rows, n_u).
+            missing: number of rows missing before each row whose inputs hold since an unknown time, else 0, shape
+                (rows,).
         """
         before = np.append(time_min[:1], time_min[:-1])
-        moments = np.where(missing > 0, missing + 1, 0)
-        return cls(inputs, before + (time_min - before) / np.maximum(moments, 1), time_min, moments)
+        n_times = np.where(missing > 0, missing + 1, 0)
+        return cls(inputs, before + (time_min - before) / np.maximum(n_times, 1), time_min, n_times)
 
-    def of_rows(self, rows: slice | NDArray[np.intp]) -> "Doubt":
-        """Of some rows."""
-        return Doubt(self.inputs[rows], self.first_min[rows], self.last_min[rows], self.moments[rows])
+    def select(self, rows: slice | NDArray[np.intp]) -> "InputUncertainty":
+        """Select rows."""
+        return InputUncertainty(self.inputs[rows], self.first_min[rows], self.last_min[rows], self.n_times[rows])
 
     @property
     def rows(self) -> NDArray[np.bool_]:
-        """To which ways in doubt lead, shape (rows,)."""
-        return np.asarray(self.moments > 0)
+        """True for rows at the end of an uncertain interval, shape (rows,)."""
+        return np.asarray(self.n_times > 0)
 
-    def times_min(self, row: int) -> list[float]:
-        """The moments of a way, in order."""
-        found: list[float] = np.linspace(self.first_min[row], self.last_min[row], self.moments[row]).tolist()
-        return found
+    def change_times_min(self, row: int) -> list[float]:
+        """Possible times of the change before a row, increasing."""
+        times: list[float] = np.linspace(self.first_min[row], self.last_min[row], self.n_times[row]).tolist()
+        return times

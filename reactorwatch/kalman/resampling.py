@@ -1,7 +1,7 @@
-"""A record with rows put in where rows are far apart, so that two steps lead from each row to the next.
+"""Insert unmeasured rows so that no interval exceeds two integration steps.
 
-A filter takes such rows at once, and any others one by one, thirty times as slowly. Nothing is measured in a row that
-is put in, and the inputs are those of the row before.
+A filter takes such rows in one call, and others one by one, thirty times as slowly. An inserted row has no measurement
+and the inputs of the row before.
 """
 
 from typing import NamedTuple
@@ -12,60 +12,62 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import LONGEST_GAP_MIN
 from reactorwatch.kalman.filter_record import LONGEST_ROW_MIN
-from reactorwatch.kalman.innovations import Innovations
-from reactorwatch.kalman.input_uncertainty import Doubt
+from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.input_uncertainty import InputUncertainty
 
 
-class Filled(NamedTuple):
-    """A record with more rows.
+class ResampledRecord(NamedTuple):
+    """A record with inserted rows.
 
     Attributes:
         time_min: shape (more,).
         inputs: shape (more, n_u).
-        measured: shape (more, n_y); NaN in rows that were put in.
-        doubt: as it was.
-        own: where the rows of the record are, shape (rows,).
+        measured: shape (more, n_y); NaN in inserted rows.
+        uncertainty: uncertain intervals; None: there are none.
+        original_index: indices of the original rows, shape (rows,).
     """
 
     time_min: Array
     inputs: Array
     measured: Array
-    doubt: Doubt | None
-    own: NDArray[np.intp]
+    uncertainty: InputUncertainty | None
+    original_index: NDArray[np.intp]
 
-    def of_record(self, found: Innovations) -> Innovations:
-        """What a filter says of the rows of the record."""
-        if self.own.size == self.time_min.size:
-            return found
-        return Innovations(*(item[self.own] for item in found))
+    def at_original_rows(self, result: FilterResult) -> FilterResult:
+        """Select the original rows of a filter's result."""
+        if self.original_index.size == self.time_min.size:
+            return result
+        return FilterResult(*(item[self.original_index] for item in result))
 
 
-def filled(time_min: Array, inputs: Array, measured: Array, doubt: Doubt | None = None) -> Filled:
-    """Put rows in, but for ways in doubt and for those that no filter goes.
+def insert_rows(
+    time_min: Array, inputs: Array, measured: Array, uncertainty: InputUncertainty | None = None
+) -> ResampledRecord:
+    """Insert rows, except into uncertain intervals and into gaps at which the filter restarts.
 
     Args:
         time_min: shape (rows,), increasing.
         inputs: shape (rows, n_u).
         measured: shape (rows, n_y).
-        doubt: ways on which nobody knows when inputs changed; None: there are none.
+        uncertainty: intervals in which inputs changed at an unknown time; None: there are none.
     """
     step = np.diff(time_min)
     if not np.any(step > LONGEST_ROW_MIN):
-        return Filled(time_min, inputs, measured, doubt, np.arange(time_min.size))
+        return ResampledRecord(time_min, inputs, measured, uncertainty, np.arange(time_min.size))
     pieces = np.where((step > LONGEST_ROW_MIN) & (step <= LONGEST_GAP_MIN), np.ceil(step / LONGEST_ROW_MIN), 1.0)
-    if doubt is not None:
-        pieces[doubt.rows[1:]] = 1.0
+    if uncertainty is not None:
+        pieces[uncertainty.rows[1:]] = 1.0
     counts = np.append(pieces.astype(np.intp), 1)
-    own = np.cumsum(counts) - counts
-    if own[-1] == own.size - 1:
-        return Filled(time_min, inputs, measured, doubt, own)
-    source = np.repeat(np.arange(own.size), counts)
-    share = (np.arange(source.size) - own[source]) / counts[source]
+    index = np.cumsum(counts) - counts
+    if index[-1] == index.size - 1:
+        return ResampledRecord(time_min, inputs, measured, uncertainty, index)
+    source = np.repeat(np.arange(index.size), counts)
+    share = (np.arange(source.size) - index[source]) / counts[source]
     times = time_min[source] + share * np.append(step, 0.0)[source]
     more = np.full((source.size, measured.shape[1]), np.nan)
-    more[own] = measured
-    if doubt is not None:
-        moments = np.zeros(source.size, dtype=np.intp)
-        moments[own] = doubt.moments
-        doubt = doubt.of_rows(source)._replace(moments=moments)
-    return Filled(times, inputs[source], more, doubt, own)
+    more[index] = measured
+    if uncertainty is not None:
+        n_times = np.zeros(source.size, dtype=np.intp)
+        n_times[index] = uncertainty.n_times
+        uncertainty = uncertainty.select(source)._replace(n_times=n_times)
+    return ResampledRecord(times, inputs[source], more, uncertainty, index)

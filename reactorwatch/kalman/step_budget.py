@@ -1,33 +1,33 @@
-"""A budget for runs of filters, counted in filter steps.
+"""A budget of filter steps for a search.
 
-What a search may cost is bounded by the work itself and not by a clock: so it stops at the same step on every machine,
-and a replay gives the results of the live run bit for bit. The unit is a row that is filtered by machine code, about a
-microsecond; the other kinds of work count as many units as they took rows' time when they were measured.
+The cost of a search is bounded by its work and not by a clock: so it stops at the same step on every machine, and a
+replay gives the results of the live run bit for bit. The unit is a row filtered by machine code, about a microsecond;
+other work counts as many units as it took rows' time when it was measured.
 """
 
-A_RUN = 100
-"""Steps for a run of a filter over a record, whatever its length: it is laid out and its results are taken apart."""
+STEPS_PER_RUN = 100
+"""Steps for a run of a filter over a record of any length: its set-up and its results."""
 
-A_ROW_ALONE = 25
+STEPS_PER_ROW = 25
 """Steps for a row that is filtered by itself."""
 
-A_WALK = 3
-"""Steps for two integration steps on the way to such a row, other than the last two."""
+STEPS_PER_PREDICTION = 3
+"""Steps for two integration steps before the last two of an interval."""
 
-A_BEGINNING = 250
-"""Steps for a filter that begins at what is measured, and for the stop of the machine code that this is. Where nothing
-is measured it waits, which costs no more than a row by itself."""
+STEPS_PER_START = 250
+"""Steps for a start of the filter, which also stops the machine code. A row without a measurement, at which the filter
+waits, costs no more than any row by itself."""
 
-A_SEARCH = 12_000
-"""Steps for a search for steady states, from which a filter begins where measurements do not give the whole state."""
+STEPS_PER_SEARCH = 12_000
+"""Steps for a search for steady states, from which a filter starts where measurements do not determine the state."""
 
 
-class StepsSpentError(Exception):
-    """A budget of filter steps is spent: the search that it was for stops here."""
+class BudgetExceededError(Exception):
+    """The budget of filter steps is spent; the search ends here."""
 
 
 class StepBudget:
-    """Filter steps that may be taken yet.
+    """A number of filter steps.
 
     Args:
         steps: their number, at least 1.
@@ -44,8 +44,8 @@ class StepBudget:
         """Count steps.
 
         Raises:
-            StepsSpentError: there are not as many left.
+            BudgetExceededError: the budget is exceeded.
         """
         self.spent += steps
         if self.spent > self._steps:
-            raise StepsSpentError(f"the budget of {self._steps} filter steps is spent")
+            raise BudgetExceededError(f"the budget of {self._steps} filter steps is spent")

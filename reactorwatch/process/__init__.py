@@ -1,4 +1,4 @@
-"""The process description, said once: models, their simulation, their steady states, and deviations from them."""
+"""Process models, their simulation, their steady states, and effects on them."""
 
 from collections.abc import Mapping
 
@@ -10,12 +10,12 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 
 MODELS = (cstr, tanks)
-"""The process models there are: functions that build them."""
+"""The catalogue of process models: functions that build them."""
 
 EFFECTS_OF: Mapping[str, tuple[Effect, ...]] = {"cstr": EFFECTS, "tanks": TANK_EFFECTS}
-"""By the name of a model, the catalogue of what may be different in it."""
+"""The catalogue of effects, by name of a model."""
 
 
 def effects_of(model: ProcessModel) -> tuple[Effect, ...]:
-    """The catalogue of a model's effects; empty for a model that has none."""
+    """Effects of a model; empty if there is no catalogue for it."""
     return EFFECTS_OF.get(model.name, ())

@@ -1,8 +1,8 @@
-"""What an effect is: a physical deviation that maps a model to a model.
+"""Effects: physical deviations that map a model to a model.
 
-An effect has a size m, whose neutral value leaves the model as it was; a profile says how m goes in time. The
-extended model has the profile's numbers as further parameters, named `<effect>.size`, `<effect>.onset` and so on,
-and is a `ProcessModel` like any other: what can be injected into the plant and what can be found in data are one.
+An effect has a size m, whose neutral value leaves the model unchanged; a profile gives m over time. The extended model
+has the profile's parameters as further parameters, named `<effect>.size`, `<effect>.onset` and so on, and is a
+`ProcessModel` like any other: injected faults and diagnosed causes are the same objects.
 """
 
 from abc import ABC, abstractmethod
@@ -15,7 +15,7 @@ from reactorwatch.process.model import Clock, Parameter, ProcessModel, Variable
 from reactorwatch.process.profiles import CONSTANT, Profile
 
 TIMING = "timing"
-"""Location of what is wrong with the times of a record, not with the plant."""
+"""Location of a deviation in the timestamps of a record, not in the plant."""
 
 LOCATIONS = (
     "mass_balance",
@@ -27,28 +27,28 @@ LOCATIONS = (
     "concentration_sensor",
     TIMING,
 )
-"""Where an effect on the reactor can act."""
+"""Locations of effects on the reactor."""
 
 
 class Effect(ABC):
     """A physical deviation.
 
     Attributes:
-        name: as in the catalogue of causes.
-        label: what a person calls it.
-        location: where in the plant it acts; of the reactor's effects one of `LOCATIONS`.
-        unit: of its size.
-        larger: meaning of a positive size, with `{}` for its amount: in the size's unit, or in % where it is a share.
-        smaller: meaning of a negative size likewise; empty where there is none.
+        name: name in the catalogue of causes.
+        label: its usual name in text.
+        location: part of the plant in which it acts; one of `LOCATIONS` for the reactor.
+        unit: unit of its size.
+        larger: meaning of a positive size, with `{}` for its amount: in the size's unit, or in % for a share.
+        smaller: meaning of a negative size, like `larger`; empty: there is none.
         lower: smallest size that makes physical sense.
         upper: largest size that makes physical sense.
-        neutral: the size at which it does nothing.
-        typical: a size that matters in practice: fits are scaled by it.
-        starts: sizes that a fit begins at, where the effect is so far from linear that it may not get there from its
-            neutral size; empty: it begins at neutral.
-        labels: what a person calls it with a given profile, where that has a name of its own.
-        jumps: whether what it does changes with its size in jumps, so that it has no derivative.
-        late_output: the output that shows by m later what was there, and that is all the effect does; None: no such.
+        neutral: the size without an effect.
+        typical: a size of practical significance, by which fits are scaled.
+        start_values: start values of a fit, for an effect so nonlinear that a fit from its neutral size may fail;
+            empty: the neutral size.
+        labels: usual name with a given profile, by name of the profile, where it differs from `label`.
+        is_discontinuous: whether the response jumps as the size changes, so that it has no derivative.
+        delays_output: the output that the effect delays by m, if it does nothing else; None: no such effect.
     """
 
     name: ClassVar[str]
@@ -61,24 +61,24 @@ class Effect(ABC):
     upper: ClassVar[float]
     neutral: ClassVar[float] = 0.0
     typical: ClassVar[float]
-    starts: ClassVar[tuple[float, ...]] = ()
+    start_values: ClassVar[tuple[float, ...]] = ()
     labels: ClassVar[dict[str, str]] = {}
-    jumps: ClassVar[bool] = False
-    late_output: ClassVar[str | None] = None
+    is_discontinuous: ClassVar[bool] = False
+    delays_output: ClassVar[str | None] = None
 
     @abstractmethod
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
-        """The model with the deviation in it; `size` is m(t) as an expression."""
+        """Apply the deviation; `size` is m(t) as an expression."""
 
     def extend(self, model: ProcessModel, profile: Profile = CONSTANT) -> ProcessModel:
-        """The model with this effect in it.
+        """Add this effect to a model.
 
         Args:
             model: any model that has what the effect acts on; it may hold effects already.
-            profile: how the size goes in time.
+            profile: profile of the size over time.
 
         Returns:
-            A model with the parameters `<name>.size` (neutral) and those of the profile, behind constants and states
+            A model with the parameters `<name>.size` (neutral) and those of the profile, after constants and states
             of the effect's own; when the model holds this effect already, `<name>_2.size` and so on.
 
         Raises:
@@ -102,7 +102,7 @@ class Effect(ABC):
         )
         symbols = {"size": size.symbol}
         symbols |= {item.name: new.symbol for item, new in zip(profile.parameters, shape, strict=True)}
-        extended = self.apply(model, self.course(model.clock, profile, symbols))
+        extended = self.apply(model, self.size_signal(model.clock, profile, symbols))
         return replace(
             extended,
             parameters=(*extended.parameters, size, *shape),
@@ -112,16 +112,16 @@ class Effect(ABC):
             ),
         )
 
-    def course(self, clock: Clock, profile: Profile, symbols: dict[str, ca.SX]) -> ca.SX:
-        """m(t) with a profile, an expression of the clock and of the symbols of its size and other numbers."""
+    def size_signal(self, clock: Clock, profile: Profile, symbols: dict[str, ca.SX]) -> ca.SX:
+        """m(t) with a profile, as an expression of the clock and of the symbols of the profile's parameters."""
         return profile.expression(clock, symbols)
 
     def label_with(self, profile: Profile) -> str:
-        """What a person calls this effect with that profile."""
+        """Usual name of this effect with a profile."""
         return self.labels.get(profile.name, self.label)
 
     def prefix(self, model: ProcessModel) -> str:
-        """What the names of the parameters and states begin with that this effect would bring into a model."""
+        """Prefix of the names of the parameters and states that this effect adds to a model."""
         taken = set(model.parameter_names)
         prefix, number = self.name, 1
         while f"{prefix}.size" in taken:
@@ -153,13 +153,13 @@ class ParameterShift(Effect):
 
 
 class SensorEffect(Effect):
-    """An effect on how one output is measured; the balances stay as they are."""
+    """An effect on one sensor; the balances are unchanged."""
 
     output: ClassVar[str]
 
     @abstractmethod
-    def sensed(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
-        """What the sensor makes of the value that is there, and the model with what it remembers for that."""
+    def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
+        """Return the model with the states that the sensor needs, and its reading of the true value."""
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.
@@ -172,25 +172,25 @@ class SensorEffect(Effect):
                 f"{self.name} needs a model with the output {self.output!r}, {model.name} has {model.output_names}"
             )
         value = model.outputs[model.output_names.index(self.output)].expression
-        extended, shown = self.sensed(model, value, size)
-        outputs = (replace(item, expression=shown) if item.name == self.output else item for item in model.outputs)
+        extended, reading = self.sense(model, value, size)
+        outputs = (replace(item, expression=reading) if item.name == self.output else item for item in model.outputs)
         return replace(extended, outputs=tuple(outputs))
 
 
 class ReadingEffect(SensorEffect):
-    """An effect of a sensor that remembers nothing: what it shows is a function of what is there."""
+    """An effect of a sensor without states: its reading is a function of the true value."""
 
     @abstractmethod
-    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """What the sensor makes of the value that is there."""
+    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """Reading of the sensor at a true value."""
 
-    def sensed(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
+    def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
         """See `SensorEffect`."""
-        return model, self.measured(value, size)
+        return model, self.reading(value, size)
 
 
 def coolant_flow_of(effect: Effect, model: ProcessModel) -> Variable:
-    """The input that the coolant valve is told.
+    """The commanded coolant flow, an input.
 
     Raises:
         ValueError: the model has no input qc.

@@ -1,4 +1,4 @@
-"""A model with deviations in it, as a person can read and keep it: which model, which numbers differ, which effects.
+"""A model with effects in it, as a JSON file.
 
     {
       "format": "reactorwatch.model.v1",
@@ -8,10 +8,10 @@
       "zero_ns": 0
     }
 
-An effect is written as the same text that puts it into the plant as a fault (`fault`), to full precision, so a model
-that is read is the one that was written. `parameters` are those of the model that differ from its nominal values, in
-its units. Times are minutes of the record that the deviations were found in; `zero_ns` is the moment that these count
-from, in nanoseconds since 1970-01-01 UTC, and 0 where nobody knows, as of a .csv.
+An effect is file as the text that injects it into the plant as a fault (`fault`), to full precision, so a model that
+is read equals the one that was file. `parameters` are those of the model that differ from its nominal values, in its
+units. Times are minutes of the record in which the deviations were found, counted from `zero_ns`, nanoseconds since
+1970-01-01 UTC; 0 where that is unknown, as for a .csv.
 """
 
 import re
@@ -34,8 +34,8 @@ _MINUTE_NS = 60_000_000_000
 _SIZE = re.compile(r"(.+?)(?:_\d+)?\.size")
 
 
-class _Written(msgspec.Struct, forbid_unknown_fields=True):
-    """The object in a file, before its texts are understood."""
+class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
+    """The JSON object, before its texts are parsed."""
 
     format: str
     model: str
@@ -46,13 +46,13 @@ class _Written(msgspec.Struct, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class ExtendedModel:
-    """A model of the catalogue, and what is different.
+    """A model of the catalogue with effects and changed parameters.
 
     Attributes:
-        name: of the model.
-        effects: that are in it, in the order in which they were put in; times in minutes of the record.
-        parameters: of the model that differ from its nominal values, by name, in their units.
-        zero_ns: what the minutes count from; 0: not known.
+        name: name of the model.
+        effects: its effects in the order in which they were added; times in minutes of the record.
+        parameters: values that differ from the model's nominal ones, by name, in their units.
+        zero_ns: time from which the minutes are counted; 0: unknown.
     """
 
     name: str
@@ -61,7 +61,7 @@ class ExtendedModel:
     zero_ns: int = 0
 
     def build(self, models: Sequence[Callable[[], ProcessModel]] = MODELS) -> ProcessModel:
-        """The model itself, its clock that of the record.
+        """Build the model; its clock is that of the record.
 
         Args:
             models: the catalogue.
@@ -74,22 +74,22 @@ class ExtendedModel:
             raise InputError(f"unknown model {self.name!r} (valid: {', '.join(nominal)})")
         try:
             model = nominal[self.name].with_values(self.parameters)
-            # What is wrong with the times shifts all the others, and so comes last.
+            # A timing effect shifts the times of all others, and so comes last.
             for item in sorted(self.effects, key=lambda item: item.effect.location == TIMING):
                 model = item.extend(model)
         except ValueError as error:
             raise InputError(str(error)) from error
         return model
 
-    def counted_from(self, zero_ns: int) -> "ExtendedModel":
-        """The same with its minutes counted from another moment; as it is where its own is not known."""
+    def rebase(self, zero_ns: int) -> "ExtendedModel":
+        """Copy with minutes counted from another time; unchanged where its own zero is unknown."""
         if not self.zero_ns:
             return self
         by_min = (self.zero_ns - zero_ns) / _MINUTE_NS
-        return replace(self, effects=tuple(item.shifted(by_min) for item in self.effects), zero_ns=zero_ns)
+        return replace(self, effects=tuple(item.shift(by_min) for item in self.effects), zero_ns=zero_ns)
 
     def to_object(self) -> dict[str, Any]:
-        """As it is written, of plain values."""
+        """Convert to the JSON object."""
         return {
             "format": FORMAT,
             "model": self.name,
@@ -104,35 +104,35 @@ def parse_extended_model(
     models: Sequence[Callable[[], ProcessModel]] = MODELS,
     effects: Sequence[Effect] | None = None,
 ) -> ExtendedModel:
-    """Read what `ExtendedModel.to_object` said, as JSON.
+    """Read the JSON that `ExtendedModel.to_object` gives.
 
     Args:
-        text: of the file.
-        models: that may be meant.
-        effects: that may be in it; None: those of the model's own catalogue.
+        text: content of the file.
+        models: catalogue of models.
+        effects: catalogue of effects; None: that of the model.
 
     Raises:
-        InputError: it is something else, or a part of it is wrong.
+        InputError: it is no such file, or a part of it is invalid.
     """
     try:
-        written = msgspec.json.decode(text, type=_Written)
+        file = msgspec.json.decode(text, type=_ModelFile)
     except msgspec.ValidationError as error:
         raise InputError(f"is no model: {error}; it must be like extended.json of reactorwatch diagnose -o") from error
     except (msgspec.DecodeError, RecursionError) as error:
         raise InputError(f"is not JSON: {error}") from error
-    if written.format != FORMAT:
-        raise InputError(f"format must be {FORMAT!r}, got {written.format!r}")
+    if file.format != FORMAT:
+        raise InputError(f"format must be {FORMAT!r}, got {file.format!r}")
     if effects is None:
-        ExtendedModel(written.model).build(models)  # so that an unknown model is told before its effects
-        effects = EFFECTS_OF.get(written.model, ())
-    found = ExtendedModel(
-        written.model,
-        tuple(parse_fault(item, effects).settled() for item in written.effects),
-        written.parameters,
-        written.zero_ns,
+        ExtendedModel(file.model).build(models)  # reports an unknown model before its effects
+        effects = EFFECTS_OF.get(file.model, ())
+    extended = ExtendedModel(
+        file.model,
+        tuple(parse_fault(item, effects).with_defaults() for item in file.effects),
+        file.parameters,
+        file.zero_ns,
     )
-    found.build(models)  # so that what cannot be is told now
-    return found
+    extended.build(models)  # reports invalid combinations now
+    return extended
 
 
 def extended_model_of(
@@ -141,20 +141,20 @@ def extended_model_of(
     models: Sequence[Callable[[], ProcessModel]] = MODELS,
     zero_ns: int = 0,
 ) -> ExtendedModel:
-    """What a model of the catalogue has in it by now, told from its parameters.
+    """Recognise the effects and changed parameters of a model by its parameters.
 
     Args:
         model: with or without effects.
-        effects: that it may have; None: those of its own catalogue.
-        models: the catalogue; of one that is not there, no parameter is taken to differ.
-        zero_ns: what the minutes of its effects count from.
+        effects: catalogue of effects; None: that of the model.
+        models: catalogue of models; a model outside it counts as having nominal parameters.
+        zero_ns: time from which the minutes of its effects are counted.
     """
     effects = effects_of(model) if effects is None else effects
     values = {item.name: item.value for item in model.parameters}
     found = []
     for name in values:
-        said = _SIZE.fullmatch(name)
-        effect = next((item for item in effects if said and item.name == said[1]), None)
+        match = _SIZE.fullmatch(name)
+        effect = next((item for item in effects if match and item.name == match[1]), None)
         if effect is not None:
             found.append(_specification(effect, values, name.removesuffix("size")))
     nominal = next((item for item in (make() for make in models) if item.name == model.name), None)
@@ -167,7 +167,7 @@ def extended_model_of(
 
 
 def _specification(effect: Effect, values: Mapping[str, float], prefix: str) -> FaultSpecification:
-    """An effect whose parameters begin with the prefix; profiles differ in the names of theirs."""
+    """Effect whose parameters have the prefix; profiles are told apart by their parameters' names."""
     own = {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
     profile = _profile({name for name in own if name != "size"})
     return FaultSpecification(effect, profile, {name: own[name] for name in ("size", *_names(profile))})

@@ -1,4 +1,4 @@
-"""What a person says to have a fault put into the plant: an effect of the catalogue, a profile, and numbers.
+"""Fault specifications: the text that injects a fault into the plant.
 
     coolant_flow:step:-0.05@30min
     heat_transfer:ramp:-0.3@30min,end=90min
@@ -6,9 +6,9 @@
     activation_energy:constant:0.002
     coolant_flow:free:-0.05,0min=0,50min=0.2,100min=1
 
-So: cause, profile and size with colons between; where the profile has an onset, `@` and that; then `name=value` for
-whatever else the profile knows, each after a comma. The size is in the effect's unit. A time carries its unit: s,
-min or h. The free profile is a curve, linear between knots: after the size come two or more `time=share of the size`.
+The text is cause, profile and size with colons between; where the profile has an onset, `@` and the onset; then
+`name=value` for the profile's other parameters, each after a comma. The size is in the effect's unit. A time carries
+its unit: s, min or h. The free profile is piecewise linear: after the size come two or more `time=share of the size`.
 """
 
 import difflib
@@ -26,8 +26,8 @@ from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_pro
 
 EXAMPLE = "coolant_flow:step:-0.05@30min"
 
-MOST_KNOTS = 100
-"""Of a curve. Every step of the plant looks for its knots."""
+MAX_KNOTS = 100
+"""Largest number of knots of a curve. Every step of the plant searches them."""
 
 _MINUTES = {"s": 1 / 60, "min": 1.0, "h": 60.0}
 _NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)")
@@ -37,35 +37,35 @@ _Item = TypeVar("_Item")
 
 @dataclass(frozen=True)
 class FaultSpecification:
-    """A fault as it was said: which effect, how it goes in time, how large.
+    """An effect, its profile and its size.
 
     Attributes:
-        effect: from the catalogue.
-        profile: from the catalogue.
-        values: `size`, and those parameters of the profile that were said; times in minutes of the plant.
+        effect: effect of the catalogue.
+        profile: profile of the catalogue.
+        values: `size` and the given parameters of the profile; times in minutes of the plant.
     """
 
     effect: Effect
     profile: Profile
     values: Mapping[str, float]
 
-    def settled(self, onset_min: float = 0.0, end_min: float | None = None) -> "FaultSpecification":
-        """The same fault with every number of its profile said.
+    def with_defaults(self, onset_min: float = 0.0, end_min: float | None = None) -> "FaultSpecification":
+        """Copy with every parameter of its profile.
 
         Args:
-            onset_min: when it sets in, if it does not say so itself.
-            end_min: the end of the run, where a ramp reaches its size if it does not say so itself; None: not known.
+            onset_min: default onset.
+            end_min: end of the run, the default end of a ramp; None: unknown.
 
         Raises:
             InputError: a ramp that has no end in a run that has none, or that ends before it begins.
         """
         values = {"size": self.values["size"]}
         for item in self.profile.parameters:
-            of_the_run = {"onset": onset_min, "end": end_min}.get(item.name, item.default)
-            value = self.values.get(item.name, of_the_run)
+            default = {"onset": onset_min, "end": end_min}.get(item.name, item.default)
+            value = self.values.get(item.name, default)
             if value is None:
                 raise InputError(
-                    f"fault {str(self)!r}: {item.name} ({item.meaning}) must be said where the run has no end, "
+                    f"fault {str(self)!r}: {item.name} ({item.meaning}) must be given where the run has no end, "
                     f"like ,{item.name}=90min; or give the run a duration"
                 )
             values[item.name] = value
@@ -73,38 +73,38 @@ class FaultSpecification:
         return FaultSpecification(self.effect, self.profile, values)
 
     def extend(self, model: ProcessModel, end_min: float | None = None) -> ProcessModel:
-        """The model with this fault in it; an onset that was not said is 0, the start.
+        """Add this fault to a model; the default onset is 0.
 
         Args:
             model: any that has what the effect acts on.
-            end_min: as for `settled`.
+            end_min: end of the run, see `with_defaults`.
 
         Raises:
-            InputError: as `settled`.
+            InputError: as `with_defaults`.
             ValueError: the model lacks what the effect acts on.
         """
-        values = self.settled(end_min=end_min).values
+        values = self.with_defaults(end_min=end_min).values
         extended = self.effect.extend(model, self.profile)
         new = [name for name in extended.parameter_names if name not in model.parameter_names]
         prefix = next(name for name in new if name.endswith(".size")).removesuffix("size")
         return extended.with_values({f"{prefix}{name}": value for name, value in values.items()})
 
-    def shifted(self, by_min: float) -> "FaultSpecification":
-        """The same fault as much later."""
+    def shift(self, by_min: float) -> "FaultSpecification":
+        """Copy with all times later."""
         times = {item.name for item in self.profile.parameters if item.breakpoint}
         values = {name: value + by_min if name in times else value for name, value in self.values.items()}
         return FaultSpecification(self.effect, self.profile, values)
 
     def __str__(self) -> str:
-        """The canonical text; `parse_fault` makes the same specification of it."""
-        text = f"{self.effect.name}:{self.profile.name}:{_written(self.values['size'])}"
+        """The canonical text, which `parse_fault` reads."""
+        text = f"{self.effect.name}:{self.profile.name}:{_format(self.values['size'])}"
         if self.profile.name == FREE_NAME:
-            return text + "".join(f",{_written(time)}min={_written(share)}" for time, share in _curve(self.values))
+            return text + "".join(f",{_format(time)}min={_format(share)}" for time, share in _curve(self.values))
         if "onset" in self.values:
-            text += f"@{_written(self.values['onset'])}min"
+            text += f"@{_format(self.values['onset'])}min"
         for item in self.profile.parameters:
             if item.name in self.values and item.name != "onset":
-                text += f",{item.name}={_written(self.values[item.name])}{'min' if item.unit == 'min' else ''}"
+                text += f",{item.name}={_format(self.values[item.name])}{'min' if item.unit == 'min' else ''}"
         return text
 
 
@@ -115,46 +115,49 @@ def parse_fault(text: str, effects: Sequence[Effect] = EFFECTS) -> FaultSpecific
     'coolant_flow:step:-0.05@30min'
 
     Args:
-        text: as in `EXAMPLE`.
-        effects: the causes there are.
+        text: the specification, like `EXAMPLE`.
+        effects: catalogue of causes.
 
     Raises:
-        InputError: a part of it is wrong; the text names the part, what would be right, and what is there.
+        InputError: a part of it is invalid; the message names the part, the rule and the value.
     """
     parts = [part.strip() for part in text.split(":")]
     if len(parts) != 3:
         raise InputError(f"fault {text!r}: must be cause:profile:size[@onset][,name=value]..., like {EXAMPLE}")
-    effect = _chosen(text, "cause", parts[0], {item.name: item for item in effects})
-    profile = _chosen(text, "profile", parts[1], {item.name: item for item in PROFILES})
+    effect = _look_up(text, "cause", parts[0], {item.name: item for item in effects})
+    profile = _look_up(text, "profile", parts[1], {item.name: item for item in PROFILES})
     first, *assignments = (part.strip() for part in parts[2].split(","))
     size, at, onset = (part.strip() for part in first.partition("@"))
     known = {item.name: item for item in profile.parameters}
     if at and "onset" not in known:
         raise InputError(f"fault {text!r}: the profile {profile.name} has no onset, got '@{onset}'; leave it out")
-    values = {"size": _number(text, "size", size, effect.unit, (effect.lower, effect.upper))}
+    values = {"size": _parse_number(text, "size", size, effect.unit, (effect.lower, effect.upper))}
     if profile.name == FREE_NAME:
-        return _parsed_curve(text, effect, values["size"], assignments)
-    said = [("onset", onset)] if at else []
+        return _parse_curve(text, effect, values["size"], assignments)
+    given = [("onset", onset)] if at else []
     for assignment in assignments:
         name, equals, value = (part.strip() for part in assignment.partition("="))
         if not equals:
             raise InputError(f"fault {text!r}: after the size must come name=value, got {assignment!r}")
-        said.append((name, value))
-    for name, value in said:
-        item = _chosen(text, f"parameter of the profile {profile.name}", name, known)
+        given.append((name, value))
+    for name, value in given:
+        item = _look_up(text, f"parameter of the profile {profile.name}", name, known)
         if name in values:
-            raise InputError(f"fault {text!r}: {name} must be said once, got it again as {value!r}")
-        values[name] = _number(text, name, value, item.unit, (item.lower, item.upper))
+            raise InputError(f"fault {text!r}: {name} must be given once, got it again as {value!r}")
+        values[name] = _parse_number(text, name, value, item.unit, (item.lower, item.upper))
     _check_order(text, values)
     return FaultSpecification(effect, profile, values)
 
 
-def _parsed_curve(text: str, effect: Effect, size: float, assignments: list[str]) -> FaultSpecification:
-    """A fault with the free profile."""
+def _parse_curve(text: str, effect: Effect, size: float, assignments: list[str]) -> FaultSpecification:
+    """Read the knots of a free profile."""
     knots: list[tuple[float, float]] = []
     for assignment in assignments:
         time, _, share = (part.strip() for part in assignment.partition("="))
-        knot = (_number(text, "time", time, "min", (-inf, inf)), _number(text, "share", share, "1", (-inf, inf)))
+        knot = (
+            _parse_number(text, "time", time, "min", (-inf, inf)),
+            _parse_number(text, "share", share, "1", (-inf, inf)),
+        )
         if knots and not knots[-1][0] < knot[0]:
             raise InputError(f"fault {text!r}: times must rise, got {knot[0]:g} min after {knots[-1][0]:g} min")
         if not effect.lower <= size * knot[1] <= effect.upper:
@@ -163,9 +166,9 @@ def _parsed_curve(text: str, effect: Effect, size: float, assignments: list[str]
                 f"got {size * knot[1]:g} at {knot[0]:g} min"
             )
         knots.append(knot)
-    if not 2 <= len(knots) <= MOST_KNOTS:
+    if not 2 <= len(knots) <= MAX_KNOTS:
         raise InputError(
-            f"fault {text!r}: a curve must have 2 to {MOST_KNOTS} times with their shares, like ,0min=0,90min=1, "
+            f"fault {text!r}: a curve must have 2 to {MAX_KNOTS} times with their shares, like ,0min=0,90min=1, "
             f"got {len(knots)}"
         )
     values = {"size": size}
@@ -175,12 +178,12 @@ def _parsed_curve(text: str, effect: Effect, size: float, assignments: list[str]
 
 
 def _curve(values: Mapping[str, float]) -> list[tuple[float, float]]:
-    """The knots of a free profile: times in minutes and shares of the size."""
+    """Knots of a free profile: times in minutes and shares of the size."""
     count = sum(name.startswith("time_") for name in values)
     return [(values[f"time_{number}"], values[f"value_{number}"]) for number in range(1, count + 1)]
 
 
-def _chosen(text: str, what: str, name: str, valid: Mapping[str, _Item]) -> _Item:
+def _look_up(text: str, what: str, name: str, valid: Mapping[str, _Item]) -> _Item:
     if name in valid:
         return valid[name]
     close = difflib.get_close_matches(name, valid, n=1)
@@ -188,8 +191,8 @@ def _chosen(text: str, what: str, name: str, valid: Mapping[str, _Item]) -> _Ite
     raise InputError(f"fault {text!r}: unknown {what} {name!r}{hint} (valid: {', '.join(valid) or 'none'})")
 
 
-def _number(text: str, name: str, written: str, unit: str, bounds: tuple[float, float]) -> float:
-    """The value of a number with its unit, in the unit that it is kept in."""
+def _parse_number(text: str, name: str, written: str, unit: str, bounds: tuple[float, float]) -> float:
+    """Parse a number with its unit and convert it to the stored unit."""
     in_unit = "" if unit == "1" else f" {unit}"
     if unit == "min":
         factors, rule = dict(_MINUTES), f"a time with its unit ({', '.join(_MINUTES)}), like 30min"
@@ -214,5 +217,5 @@ def _check_order(text: str, values: Mapping[str, float]) -> None:
         )
 
 
-def _written(value: float) -> str:
+def _format(value: float) -> str:
     return repr(value).removesuffix(".0")

@@ -1,12 +1,11 @@
-"""One step of integration, and the grid of steps on which its error stays small.
+"""Runge-Kutta step, and the grid of steps on which its error stays small.
 
 The method is the pair of Cash & Karp (1990), A variable order Runge-Kutta method for initial value problems with
-rapidly varying right-hand sides, ACM Trans. Math. Softw. 16(3), orders 5 and 4: six evaluations a step, the error
-estimate included. On the operating branch a fixed step of 0.05 min is inside the tolerance, and a record of
-thousands of rows runs as one piece of machine code. (The pair of Dormand & Prince takes seven evaluations, the
-last of which would only save one if the input did not jump, and at this step has twice the error.)
-Where the estimate breaks the tolerance (an upset, an ignition: the reaction then has time constants below a
-second) that stretch is walked with steps of its own size, as many as it takes.
+rapidly varying right-hand sides, ACM Trans. Math. Softw. 16(3), orders 5 and 4: six evaluations a step, error estimate
+included. On the operating branch a fixed step of 0.05 min is inside the tolerance, and a record of thousands of rows
+runs as one piece of machine code. (The pair of Dormand & Prince takes seven evaluations, the last of which would only
+save one if the input did not jump, and at this step has twice the error.) Where the estimate exceeds the tolerance (an
+upset, an ignition: the reaction then has time constants below a second) the interval is integrated with adaptive steps.
 
 A step never crosses a sample, where the input jumps, nor a breakpoint of the model.
 """
@@ -27,15 +26,15 @@ from reactorwatch.process.model import ProcessModel
 
 LONGEST_STEP_MIN = 0.05
 SHORTEST_STEP_MIN = 1e-9
-MOST_STEPS = 100_000
-"""In one walk between two samples: some half a second. Where more are needed the equations are too stiff for us."""
+MAX_STEPS = 100_000
+"""Largest number of steps between two samples: some half a second. Beyond it the equations count as too stiff."""
 
 TOLERANCE = 1e-6
 """Allowed local error of a step, relative to `Variable.scale` of each state."""
 
 MEMORY_SLACK = 100
-"""The tolerance of the memory that effects bring along (`ProcessModel.at_rest`) over that of the process's own states.
-It is linear and stable, so its errors don't grow, and where an input jumps, it follows as fast as a step is long."""
+"""Tolerance of the states that effects add (`ProcessModel.at_rest`) over that of the process's own states. These are
+linear and stable, so errors do not grow, and after a jump of an input they respond as fast as a step is long."""
 
 _TIMES = (0.0, 1 / 5, 3 / 10, 3 / 5, 1.0, 7 / 8)
 _STAGES: tuple[tuple[float, ...], ...] = (
@@ -55,13 +54,13 @@ class SimulationError(ValueError):
     """The equations cannot be integrated further; the text says where."""
 
 
-def passed_min(model: ProcessModel, u: ca.SX, p: ca.SX, t: ca.SX, middle: ca.SX, h: ca.SX) -> ca.SX:
-    """How long the states go on in a step of the clock from t to t + h; see `ProcessModel.clock_ahead`."""
+def state_time_step(model: ProcessModel, u: ca.SX, p: ca.SX, t: ca.SX, middle: ca.SX, h: ca.SX) -> ca.SX:
+    """Time step of the states in a step of the clock from t to t + h; see `ProcessModel.time_offset`."""
     clock = model.clock
-    if not ca.depends_on(model.clock_ahead, ca.vertcat(clock.now, clock.middle)):
+    if not ca.depends_on(model.time_offset, ca.vertcat(clock.now, clock.middle)):
         return h
     _, inputs, parameters = model.arguments()
-    ahead = ca.Function("ahead", [inputs, parameters, clock.now, clock.middle], [model.clock_ahead])
+    ahead = ca.Function("ahead", [inputs, parameters, clock.now, clock.middle], [model.time_offset])
     return h - (ahead(u, p, t + h, middle) - ahead(u, p, t, middle))
 
 
@@ -73,7 +72,7 @@ def symbolic_step(model: ProcessModel) -> ca.Function:
     rhs = model.function("rhs")
     x, u, p = model.arguments()
     t, middle, h = ca.SX.sym("t"), ca.SX.sym("t_middle"), ca.SX.sym("h")
-    passed, slopes = passed_min(model, u, p, t, middle, h), list[ca.SX]()
+    passed, slopes = state_time_step(model, u, p, t, middle, h), list[ca.SX]()
     for time, weights in zip(_TIMES, _STAGES, strict=True):
         slopes.append(rhs(x + passed * _weighted(weights, slopes), u, p, t + time * h, middle)[0])
     after = x + passed * _weighted(_FIFTH_ORDER, slopes)
@@ -95,18 +94,18 @@ def _weighted(weights: tuple[float, ...], slopes: list[ca.SX]) -> ca.SX:
 
 @dataclass(frozen=True, eq=False)
 class StepGrid:
-    """The steps of a run, one after the other.
+    """Consecutive integration steps of a run.
 
     Attributes:
-        start_min: shape (steps,), when each begins.
-        length_min: shape (steps,).
-        middle_min: shape (steps,), the middle of the stretch without a jump that each lies in.
-        row: shape (steps,), the row of the record whose input holds.
-        origin: shape (steps,), which breakpoint starts the stretch that the step lies in; -1: none.
-        target: shape (steps,), which breakpoint ends it; -1: none.
-        share_before: shape (steps,), the part of the stretch that lies before the step, in [0, 1).
-        share: shape (steps,), the part of the stretch that the step covers, in (0, 1].
-        end_of_row: shape (rows - 1,), index of the step that ends at the following row.
+        start_min: start of each step, shape (steps,).
+        length_min: length of each step, shape (steps,).
+        middle_min: middle of the interval without a jump that contains the step, shape (steps,).
+        row: row of the record whose input holds, shape (steps,).
+        origin: breakpoint at the start of that interval, shape (steps,); -1: none.
+        target: breakpoint at its end, shape (steps,); -1: none.
+        share_before: share of the interval before the step, in [0, 1), shape (steps,).
+        share: share of the interval that the step covers, in (0, 1], shape (steps,).
+        end_of_row: index of the step that ends at the following row, shape (rows - 1,).
     """
 
     start_min: Array
@@ -119,11 +118,11 @@ class StepGrid:
     share: Array
     end_of_row: NDArray[np.int64]
 
-    def refined(self, cuts: Mapping[int, Array]) -> "StepGrid":
-        """The grid with some steps cut.
+    def refine(self, cuts: Mapping[int, Array]) -> "StepGrid":
+        """Cut some steps.
 
         Args:
-            cuts: by the step's number, the lengths that it is cut into.
+            cuts: lengths of the parts of a step, by index of the step.
         """
         counts = np.ones(self.length_min.size, dtype=np.int64)
         counts[list(cuts)] = [lengths.size for lengths in cuts.values()]
@@ -134,9 +133,9 @@ class StepGrid:
             length[ends[step] - lengths.size : ends[step]] = lengths
         total = np.cumsum(length)
         before = total - length - np.concatenate(([0.0], total[ends[:-1] - 1]))[parts]
-        whole = np.where(self.length_min > 0, self.length_min, 1.0)[parts]  # a step of no length is not cut
-        fraction = np.where(counts[parts] > 1, length / whole, 1.0)
-        fraction_before = before / whole
+        uncut = np.where(self.length_min > 0, self.length_min, 1.0)[parts]  # a step of zero length is not cut
+        fraction = np.where(counts[parts] > 1, length / uncut, 1.0)
+        fraction_before = before / uncut
         return StepGrid(
             start_min=self.start_min[parts] + before,
             length_min=length,
@@ -151,10 +150,10 @@ class StepGrid:
 
 
 def step_grid(time_min: Array, breakpoints: Array, longest_min: float = LONGEST_STEP_MIN) -> StepGrid:
-    """Steps that end at every sample and every breakpoint.
+    """Make steps that end at every sample and every breakpoint.
 
-    A breakpoint on a sample opens a stretch of no length there, which lies before it: derivatives with respect to
-    it are those towards later times. Of breakpoints that coincide, the last is given the derivative of all.
+    A breakpoint on a sample opens an interval of zero length before it: derivatives with respect to it are those
+    towards later times. Of coinciding breakpoints, the last gets the derivative of all.
 
     Args:
         time_min: shape (rows,), increasing.
@@ -166,17 +165,17 @@ def step_grid(time_min: Array, breakpoints: Array, longest_min: float = LONGEST_
     marks = np.concatenate([np.full(time_min.size, -1), inside])
     order = np.argsort(edges, kind="stable")
     edges, marks = edges[order], marks[order]
-    stretch = np.diff(edges)
-    middle = np.minimum(0.5 * (edges[:-1] + edges[1:]), np.nextafter(edges[1:], -np.inf))  # before what ends it
-    counts = np.maximum(np.ceil(stretch / longest_min - 1e-9).astype(np.int64), 1)
-    part = np.repeat(np.arange(stretch.size), counts)
+    interval = np.diff(edges)
+    middle = np.minimum(0.5 * (edges[:-1] + edges[1:]), np.nextafter(edges[1:], -np.inf))  # before the jump at its end
+    counts = np.maximum(np.ceil(interval / longest_min - 1e-9).astype(np.int64), 1)
+    part = np.repeat(np.arange(interval.size), counts)
     position = np.arange(part.size) - np.repeat(np.cumsum(counts) - counts, counts)
     share = 1.0 / counts[part]
     row = np.searchsorted(time_min, edges[:-1], side="right") - 1
     ends = np.cumsum(counts) - 1
     return StepGrid(
-        start_min=edges[part] + position * share * stretch[part],
-        length_min=share * stretch[part],
+        start_min=edges[part] + position * share * interval[part],
+        length_min=share * interval[part],
         middle_min=middle[part],
         row=row[part],
         origin=marks[part],
@@ -188,7 +187,7 @@ def step_grid(time_min: Array, breakpoints: Array, longest_min: float = LONGEST_
 
 
 class Stepper:
-    """Walks a model step by step, each as long as the tolerance allows.
+    """Integrates a model with adaptive steps.
 
     Args:
         model: the process.
@@ -200,14 +199,14 @@ class Stepper:
         self._breakpoints = [model.parameter_names.index(name) for name in model.breakpoints]
         self._reset = ArrayFunction(reset_function(model)) if model.resets else None
 
-    def begin_row(self, x: Array, u: Array, p: Array, time_min: float) -> Array:
-        """The state when a row has begun: what jumps then has jumped.
+    def start_row(self, x: Array, u: Array, p: Array, time_min: float) -> Array:
+        """State after the jumps (`ProcessModel.resets`) at a row.
 
         Args:
             x: state before, shape (n_x,).
             u: input from then on, shape (n_u,).
             p: parameters, shape (n_p,).
-            time_min: of the row.
+            time_min: time of the row.
         """
         if self._reset is None:
             return x
@@ -218,14 +217,14 @@ class Stepper:
         return after
 
     def advance(self, x: Array, u: Array, p: Array, start_min: float, end_min: float) -> Array:
-        """The state at the end of a stretch over which the input is constant.
+        """State at the end of an interval over which the input is constant.
 
         Args:
-            x: state at its start, shape (n_x,).
+            x: state at the start, shape (n_x,).
             u: input, shape (n_u,).
             p: parameters, shape (n_p,).
-            start_min: where it starts, plant time.
-            end_min: where it ends.
+            start_min: start of the interval, plant time.
+            end_min: end of the interval.
 
         Raises:
             SimulationError: the equations cannot be integrated further.
@@ -233,13 +232,13 @@ class Stepper:
         jumps = sorted({float(p[i]) for i in self._breakpoints if start_min < p[i] < end_min})
         edges = [start_min, *jumps, end_min]
         for left, right in pairwise(edges):
-            x, _ = self.walk(x, u, p, left, right - left, 0.5 * (left + right))
+            x, _ = self.integrate(x, u, p, left, right - left, 0.5 * (left + right))
         return x
 
-    def walk(
+    def integrate(
         self, x: Array, u: Array, p: Array, start_min: float, length_min: float, middle_min: float
     ) -> tuple[Array, Array]:
-        """Walk a stretch without a jump; returns the state at its end and the lengths of the steps taken.
+        """Integrate over an interval without a jump; returns the state at its end and the lengths of the steps.
 
         Raises:
             SimulationError: no step, however short, keeps the tolerance, or too many are needed.
@@ -262,7 +261,7 @@ class Stepper:
                 lengths.append(step)
                 state[:] = after
                 step = min(LONGEST_STEP_MIN, step * min(5.0, 0.9 * max(error, 1e-10) ** -0.2))
-                stuck = len(lengths) > MOST_STEPS
+                stuck = len(lengths) > MAX_STEPS
             else:
                 step *= max(0.1, 0.9 * error**-0.2) if good else 0.1
                 stuck = step < SHORTEST_STEP_MIN

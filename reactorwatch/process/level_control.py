@@ -1,10 +1,10 @@
-"""The reactor with a level of its own: the volume as a state, held by a controller that moves the outflow.
+"""The reactor with a variable level: the volume as a state, held by a controller that moves the outflow.
 
     dV/dt = q - q_out          q_out = max(0, q0 + Kc (V - V_set))
 
 The balances of mass and energy keep their form, because what leaves has the composition and the temperature of the
 contents: from d(V C)/dt = q Cf - q_out C - V r follows dC/dt = q/V (Cf - C) - r. What changes is that V is now what the
-level is, and that K2, which holds 1/V as a factor, goes with it.
+level is, and that K2, which holds 1/V as a factor, changes with it.
 
 A proportional controller leaves an offset: with a steady inflow q the level rests at V_set + (q - q0) / Kc. The faster
 it is, the closer the plant comes to the one of constant volume, which is its limit for Kc -> infinity.
@@ -17,11 +17,11 @@ import casadi as ca
 from reactorwatch.process.model import ProcessModel, parameter, variable
 
 GAIN = 5.0
-"""1/min, of the level controller where nothing else is said: a time constant of 12 seconds."""
+"""Default gain of the level controller, 1/min: a time constant of 12 seconds."""
 
 
 def with_level_control(model: ProcessModel, gain_per_min: float = GAIN) -> ProcessModel:
-    """The model with the volume as a state.
+    """Make the volume of a model a state.
 
     Args:
         model: with the parameters `V` and `q`, and `K2` in proportion to 1/V.

@@ -1,4 +1,4 @@
-"""The linear model at a point: first-order Taylor expansion, with derivatives taken symbolically."""
+"""Linear model at a point: first-order Taylor expansion with symbolic derivatives."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.process.model import ProcessModel
 
-COMPILED = 64
-"""Models whose derivatives are kept."""
+MODEL_CACHE_SIZE = 64
+"""Number of models whose derivatives are cached."""
 
 
 @dataclass(frozen=True, eq=False)
-class LinearModel:
+class Linearization:
     """d(dx)/dt = A dx + B du, dy = C dx + D du, for deviations from the point.
 
     Attributes:
@@ -37,7 +37,7 @@ class LinearModel:
 
     @property
     def eigenvalues(self) -> NDArray[np.complex128]:
-        """Of A, in 1/min, shape (n_x,), by rising real part."""
+        """Eigenvalues of A, in 1/min, shape (n_x,), by increasing real part."""
         values = np.linalg.eigvals(self.A).astype(np.complex128)
         return values[np.lexsort((values.imag, values.real))]
 
@@ -48,22 +48,22 @@ def linearise(
     inputs: Array,
     time_min: float = 0.0,
     changes: Mapping[str, float] | None = None,
-) -> LinearModel:
-    """The linear model at a point, which need not be a steady state.
+) -> Linearization:
+    """Linearise a model at a point, which need not be a steady state.
 
     Args:
         model: the process.
         state: shape (n_x,).
         inputs: shape (n_u,).
-        time_min: when, for models with an effect that depends on time.
+        time_min: time, for models with time-dependent effects.
         changes: parameters that differ from the model's values.
     """
     matrices = _derivatives(model)(state, inputs, model.values(changes), time_min, time_min)
     A, B, C, D = (np.array(matrix) for matrix in matrices)
-    return LinearModel(A, B, C, D, np.array(state, dtype=float), np.array(inputs, dtype=float))
+    return Linearization(A, B, C, D, np.array(state, dtype=float), np.array(inputs, dtype=float))
 
 
-@lru_cache(maxsize=COMPILED)
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
 def _derivatives(model: ProcessModel) -> ca.Function:
     """(x, u, p, t, t_middle) -> A, B, C, D."""
     x, u, p = model.arguments()

@@ -1,17 +1,16 @@
-"""A process, said once: its balances as symbolic expressions, its parameters with units and bounds.
+"""A process model: balances as symbolic expressions, parameters with units and bounds.
 
-Everything else is derived from this: trajectories and their exact sensitivities, steady states, linear models, and
-the model with an effect in it, which is again a `ProcessModel`.
+Everything else is derived from it: trajectories and their exact sensitivities, steady states, linear models, and the
+model with an effect in it, which is again a `ProcessModel`.
 
-Time is in minutes. The right-hand side may depend on it through effects that come and go. Where an effect sets in
-at once, the right-hand side jumps, and an integrator that steps across the jump loses its order. So such an
-expression compares its onset with `Clock.middle`, the middle of the integration step, and never with `Clock.now`,
-which within one step takes both sides; and the onset is listed in `breakpoints`, where the integrator ends its step.
+Time is in minutes. The right-hand side may depend on it through the profiles of effects. Where an effect sets in at
+once, the right-hand side jumps, and an integrator that steps across the jump loses its order. So such an expression
+compares its onset with `Clock.middle`, the middle of the integration step, and never with `Clock.now`, which takes both
+sides within one step; and the onset is listed in `breakpoints`, where the integrator ends its step.
 
-Some states are not the process's own but memory that an effect brings along: a valve that lags, the wall of the vessel.
-Nobody measures them and nobody says where they begin, so the model does: in `at_rest`, by the other states and the
-inputs. And some do not flow but jump, at the moment at which a row of a record begins and the input may have changed: a
-valve that sticks. Those are in `resets`.
+Some states are added by effects: a valve's lag, the vessel's wall. They are not measured and no initial value is given;
+the model computes it from the other states and the inputs (`at_rest`). Some states jump when a row begins and the input
+may have changed, such as a valve that sticks (`resets`).
 """
 
 from collections.abc import Callable, Mapping
@@ -29,15 +28,14 @@ class Variable:
     """A state or an input.
 
     Attributes:
-        name: as the field writes it.
-        unit: of its values.
+        name: its symbol in the literature.
+        unit: unit of its values.
         lower: smallest value that makes physical sense.
         upper: largest value that makes physical sense.
         scale: a typical magnitude of its changes; tolerances are relative to it.
-        meaning: a few words for people.
-        symbol: stands for it in the expressions.
-        balance: of a state whose equation is the balance of something, the place in the plant that this is (one of
-            `process.effect.LOCATIONS`); else empty.
+        meaning: a short description.
+        symbol: its symbol in the expressions.
+        balance: location of the balance that a state's equation is (one of `process.effect.LOCATIONS`); empty: none.
     """
 
     name: str
@@ -52,7 +50,7 @@ class Variable:
 
 @dataclass(frozen=True, eq=False)
 class Parameter:
-    """A number in the equations. Attributes as for `Variable`; `value` is its nominal value."""
+    """A constant of the equations. Attributes as for `Variable`; `value` is its nominal value."""
 
     name: str
     value: float
@@ -65,7 +63,7 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Output:
-    """What is measured, as an expression of states, inputs and parameters."""
+    """A measured quantity, as an expression of states, inputs and parameters."""
 
     name: str
     unit: str
@@ -74,7 +72,7 @@ class Output:
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """Time in the expressions, in minutes: now, and the middle of the integration step that now lies in."""
+    """Symbols of time, in minutes: now, and the middle of the integration step that contains it."""
 
     now: ca.SX
     middle: ca.SX
@@ -83,12 +81,12 @@ class Clock:
 def variable(
     name: str, unit: str, bounds: tuple[float, float], scale: float, meaning: str, balance: str = ""
 ) -> Variable:
-    """A variable with a symbol of its own."""
+    """Make a variable with a new symbol."""
     return Variable(name, unit, *bounds, scale, meaning, ca.SX.sym(name), balance)
 
 
 def parameter(name: str, value: float, unit: str, bounds: tuple[float, float], meaning: str) -> Parameter:
-    """A parameter with a symbol of its own.
+    """Make a parameter with a new symbol.
 
     Raises:
         ValueError: its value is outside its bounds.
@@ -98,7 +96,7 @@ def parameter(name: str, value: float, unit: str, bounds: tuple[float, float], m
 
 
 def new_clock() -> Clock:
-    """A clock for a new model."""
+    """Make the clock of a new model."""
     return Clock(ca.SX.sym("t"), ca.SX.sym("t_middle"))
 
 
@@ -107,18 +105,19 @@ class ProcessModel:
     """A process: dx/dt = rhs(x, u, p, t), y = outputs(x, u, p, t); t in minutes.
 
     Attributes:
-        name: of the process.
+        name: name of the process.
         states: x.
         inputs: u; held constant between samples.
         parameters: p.
         rhs: dx/dt, one expression a state, in the state's unit per minute.
         outputs: y.
-        clock: the symbols that stand for time.
+        clock: the symbols of time.
         breakpoints: names of the parameters, in minutes, that are times at which `rhs` jumps or has a kink.
-        terms: parts of the balances that effects act on or need, by name, as they stand in `rhs`.
-        at_rest: by name of a state, where it rests while the other states, inputs and parameters are what they are.
-        resets: by name of a state, what it becomes when a row begins: of the states before and the inputs from then on.
-        clock_ahead: by how many minutes the clock is ahead of the states; while that grows, they go on for less.
+        terms: parts of the balances that effects act on or need, by name, as they appear in `rhs`.
+        at_rest: equilibrium of a state at given other states, inputs and parameters, by name of the state.
+        resets: new value of a state when a row begins, from the states before and the new inputs, by name of the state.
+        time_offset: minutes by which the clock is ahead of the states; while it grows, the states' time step is
+            shorter.
     """
 
     name: str
@@ -132,7 +131,7 @@ class ProcessModel:
     terms: Mapping[str, ca.SX] = field(default_factory=dict)
     at_rest: Mapping[str, ca.SX] = field(default_factory=dict)
     resets: Mapping[str, ca.SX] = field(default_factory=dict)
-    clock_ahead: ca.SX = field(default_factory=lambda: ca.SX(0))
+    time_offset: ca.SX = field(default_factory=lambda: ca.SX(0))
 
     def __post_init__(self) -> None:
         if len(self.rhs) != len(self.states):
@@ -144,50 +143,50 @@ class ProcessModel:
 
     @property
     def state_names(self) -> tuple[str, ...]:
-        """Names of the states, in order."""
+        """Names of the states."""
         return tuple(state.name for state in self.states)
 
     @property
     def units(self) -> dict[str, str]:
-        """The units of its inputs and outputs, by name."""
+        """Units of the inputs and outputs, by name."""
         return {item.name: item.unit for item in self.inputs} | {item.name: item.unit for item in self.outputs}
 
     @property
     def input_names(self) -> tuple[str, ...]:
-        """Names of the inputs, in order."""
+        """Names of the inputs."""
         return tuple(item.name for item in self.inputs)
 
     @property
     def output_names(self) -> tuple[str, ...]:
-        """Names of the outputs, in order."""
+        """Names of the outputs."""
         return tuple(output.name for output in self.outputs)
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
-        """Names of the parameters, in order."""
+        """Names of the parameters."""
         return tuple(item.name for item in self.parameters)
 
     @cached_property
-    def lasting(self) -> tuple[int, ...]:
-        """Places of the states in `at_rest` that neither flow nor jump: numbers that hold, though nobody knows them."""
+    def constant_states(self) -> tuple[int, ...]:
+        """Indices of the states in `at_rest` that neither flow nor jump: unknown constants."""
         return tuple(
-            place
-            for place, (state, rate) in enumerate(zip(self.states, self.rhs, strict=True))
+            i
+            for i, (state, rate) in enumerate(zip(self.states, self.rhs, strict=True))
             if rate.is_zero() and state.name in self.at_rest and state.name not in self.resets
         )
 
     def parameter(self, name: str) -> Parameter:
-        """The parameter of that name.
+        """Look a parameter up by name.
 
         Raises:
-            ValueError: there is none.
+            ValueError: there is no such parameter.
         """
-        if name not in self._places:
+        if name not in self._indices:
             raise ValueError(f"{self.name} has no parameter {name!r} (it has {', '.join(self.parameter_names)})")
-        return self.parameters[self._places[name]]
+        return self.parameters[self._indices[name]]
 
     def values(self, changes: Mapping[str, float] | None = None) -> Array:
-        """The parameters' values, shape (n_p,): nominal, but for the changes.
+        """Parameter values, shape (n_p,): nominal except for the changes.
 
         Raises:
             ValueError: a change names no parameter, or lies outside its bounds.
@@ -196,7 +195,7 @@ class ProcessModel:
         for name, value in (changes or {}).items():
             item = self.parameter(name)
             _check_bounds(name, value, item.lower, item.upper)
-            values[self._places[name]] = value
+            values[self._indices[name]] = value
         return values
 
     @cached_property
@@ -204,12 +203,12 @@ class ProcessModel:
         return np.array([item.value for item in self.parameters], dtype=float)
 
     @cached_property
-    def _places(self) -> dict[str, int]:
-        """Of the parameters."""
-        return {name: place for place, name in enumerate(self.parameter_names)}
+    def _indices(self) -> dict[str, int]:
+        """Indices of the parameters, by name."""
+        return {name: i for i, name in enumerate(self.parameter_names)}
 
     def with_values(self, changes: Mapping[str, float]) -> "ProcessModel":
-        """The same model with other nominal values.
+        """Copy with other nominal values.
 
         Raises:
             ValueError: as `values`.
@@ -225,62 +224,62 @@ class ProcessModel:
         )
 
     def term(self, name: str) -> ca.SX:
-        """The part of the balances of that name.
+        """Look a part of the balances up by name.
 
         Raises:
-            ValueError: there is none.
+            ValueError: there is no such term.
         """
         if name not in self.terms:
             raise ValueError(f"{self.name} has no term {name!r} (it has {', '.join(self.terms) or 'none'})")
         return self.terms[name]
 
     def substitute(self, symbol: ca.SX, expression: ca.SX) -> "ProcessModel":
-        """The same model with the symbol of a parameter or input replaced wherever it stands by an expression."""
-        return self._mapped(lambda items: ca.substitute(items, [symbol], [expression]))
+        """Copy with the symbol of a parameter or input replaced by an expression."""
+        return self._map_expressions(lambda items: ca.substitute(items, [symbol], [expression]))
 
-    def added_to(self, state: str, rate: ca.SX) -> "ProcessModel":
-        """The same model with a further rate in the balance of a state.
+    def add_rate(self, state: str, rate: ca.SX) -> "ProcessModel":
+        """Copy with a further rate in the balance of a state.
 
         Raises:
             ValueError: there is no such state.
         """
         index = self.state_index(state)
-        return replace(self, rhs=tuple(item + rate if place == index else item for place, item in enumerate(self.rhs)))
+        return replace(self, rhs=tuple(item + rate if i == index else item for i, item in enumerate(self.rhs)))
 
     def state_index(self, name: str) -> int:
-        """The place of the state of that name.
+        """Index of a state.
 
         Raises:
-            ValueError: there is none.
+            ValueError: there is no such state.
         """
         if name not in self.state_names:
             raise ValueError(f"{self.name} has no state {name!r} (it has {', '.join(self.state_names)})")
         return self.state_names.index(name)
 
-    def _mapped(self, change: Callable[[list[ca.SX]], list[ca.SX]]) -> "ProcessModel":
-        """The same model with all its expressions changed."""
+    def _map_expressions(self, change: Callable[[list[ca.SX]], list[ca.SX]]) -> "ProcessModel":
+        """Copy with all expressions changed."""
         shown = [output.expression for output in self.outputs]
         named = (self.terms, self.at_rest, self.resets)
         of_states = (item for items in named for item in items.values())
-        changed = iter(change([*self.rhs, *shown, self.clock_ahead, *of_states]))
+        changed = iter(change([*self.rhs, *shown, self.time_offset, *of_states]))
         return replace(
             self,
             rhs=tuple(next(changed) for _ in self.rhs),
             outputs=tuple(replace(output, expression=next(changed)) for output in self.outputs),
-            clock_ahead=next(changed),
+            time_offset=next(changed),
             terms={name: next(changed) for name in self.terms},
             at_rest={name: next(changed) for name in self.at_rest},
             resets={name: next(changed) for name in self.resets},
         )
 
     def with_state(self, state: Variable, rate: ca.SX, at_rest: ca.SX, reset: ca.SX | None = None) -> "ProcessModel":
-        """The same model with a further state.
+        """Copy with a further state.
 
         Args:
-            state: behind the others.
+            state: the last state of the copy.
             rate: its balance.
-            at_rest: see `ProcessModel`.
-            reset: likewise; None: it does not jump.
+            at_rest: its equilibrium, see `ProcessModel`.
+            reset: its value when a row begins, see `ProcessModel`; None: it does not jump.
         """
         return replace(
             self,
@@ -290,26 +289,28 @@ class ProcessModel:
             resets=self.resets if reset is None else {**self.resets, state.name: reset},
         )
 
-    def at_rest_states(self) -> tuple[ca.SX, ...]:
+    def rest_expressions(self) -> tuple[ca.SX, ...]:
         """All states as expressions of those that are not in `at_rest`."""
         resting = [state for state in self.states if state.name in self.at_rest]
-        symbols, where = [state.symbol for state in resting], [self.at_rest[state.name] for state in resting]
-        found = [self.at_rest.get(state.name, state.symbol) for state in self.states]
-        while resting and ca.depends_on(ca.vertcat(*found), ca.vertcat(*symbols)):  # one may rest where another does
-            found = ca.substitute(found, symbols, where)
-        return tuple(found)
+        symbols, rest = [state.symbol for state in resting], [self.at_rest[state.name] for state in resting]
+        result = [self.at_rest.get(state.name, state.symbol) for state in self.states]
+        while resting and ca.depends_on(
+            ca.vertcat(*result), ca.vertcat(*symbols)
+        ):  # an equilibrium may depend on another
+            result = ca.substitute(result, symbols, rest)
+        return tuple(result)
 
-    def without_memory(self) -> "ProcessModel":
-        """The model of the states that are not in `at_rest`, while all others are at rest."""
+    def without_effect_states(self) -> "ProcessModel":
+        """Model of the states that are not in `at_rest`, with all others in equilibrium."""
         if not self.at_rest:
             return self
-        symbols, rest = [state.symbol for state in self.states], list(self.at_rest_states())
-        resting = self._mapped(lambda items: ca.substitute(items, symbols, rest))
-        own = [place for place, state in enumerate(self.states) if state.name not in self.at_rest]
+        symbols, rest = [state.symbol for state in self.states], list(self.rest_expressions())
+        resting = self._map_expressions(lambda items: ca.substitute(items, symbols, rest))
+        kept = [i for i, state in enumerate(self.states) if state.name not in self.at_rest]
         return replace(
             resting,
-            states=tuple(self.states[place] for place in own),
-            rhs=tuple(resting.rhs[place] for place in own),
+            states=tuple(self.states[i] for i in kept),
+            rhs=tuple(resting.rhs[i] for i in kept),
             at_rest={},
             resets={},
         )
@@ -325,15 +326,15 @@ class ProcessModel:
         )
 
     def arguments(self) -> tuple[ca.SX, ca.SX, ca.SX]:
-        """The symbols of states, inputs and parameters as three column vectors."""
+        """Symbols of states, inputs and parameters as three column vectors."""
         return (
             ca.vertcat(*(state.symbol for state in self.states)),
             ca.vertcat(*(item.symbol for item in self.inputs)),
             ca.vertcat(*(item.symbol for item in self.parameters)),
         )
 
-    def shown(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
-        """The symbols x, u, p and of the time, and the outputs in terms of them."""
+    def output_expressions(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
+        """Symbols x, u, p and t, and the outputs in terms of them."""
         x, u, p = self.arguments()
         t, y = ca.SX.sym("t"), ca.vertcat(*(output.expression for output in self.outputs))
         return x, u, p, t, ca.substitute(ca.substitute(y, self.clock.now, t), self.clock.middle, t)

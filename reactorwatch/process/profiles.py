@@ -1,7 +1,7 @@
-"""How a deviation goes in time: the size m(t) of an effect, as an expression of the clock.
+"""Profiles: the size m(t) of an effect over time, as an expression of the clock.
 
-All times are minutes of the plant. Before its onset a profile is zero. The free one has no onset: it is a curve through
-knots, which can look like any of the others, or like none.
+All times are minutes of the plant. Before its onset a profile is zero. The free profile has no onset: it is piecewise
+linear between knots.
 """
 
 from collections.abc import Callable
@@ -18,16 +18,16 @@ Expression = Callable[[Clock, dict[str, ca.SX]], ca.SX]
 
 @dataclass(frozen=True)
 class ProfileParameter:
-    """A number that shapes a profile.
+    """A parameter of a profile.
 
     Attributes:
-        name: such as `onset`.
-        unit: of its value.
-        default: where nothing is said; None if it has to be said.
+        name: name, such as `onset`.
+        unit: unit of its value.
+        default: default value; None: required.
         lower: smallest allowed value.
         upper: largest allowed value.
-        meaning: a few words for people.
-        breakpoint: whether it is a time at which the profile jumps or has a kink.
+        meaning: a short description.
+        breakpoint: whether the profile jumps or has a kink at this time.
     """
 
     name: str
@@ -41,13 +41,13 @@ class ProfileParameter:
 
 @dataclass(frozen=True)
 class Profile:
-    """A shape in time.
+    """A shape over time.
 
     Attributes:
-        name: as in `--fault coolant_flow:step:-0.05@30min`.
-        parameters: beside the size.
-        expression: from the clock and the symbols of `size` and the parameters to m(t).
-        meaning: one line for people.
+        name: name, as in `--fault coolant_flow:step:-0.05@30min`.
+        parameters: parameters besides the size.
+        expression: function from the clock and the symbols of `size` and the parameters to m(t).
+        meaning: a one-line description.
     """
 
     name: str
@@ -121,13 +121,13 @@ FREE_NAME = "free"
 
 @cache
 def free_profile(knots: int) -> Profile:
-    """A curve: the size times what is linear between knots at `time_1`, `time_2`, ..., and constant beyond them.
+    """Piecewise-linear profile with knots at `time_1`, `time_2`, ..., constant beyond them.
 
-    The size carries the unit and says how large the curve is; the knots' values `value_1`, ... are shares of it. In a
-    fit of the values the size is held, at one that matters in practice, and the knots stay where they are.
+    The size carries the unit; the values `value_1`, ... are shares of it. A fit of the values keeps the size, at one of
+    practical significance, and the times of the knots.
 
     Args:
-        knots: how many, at least 2; their times must rise.
+        knots: number of knots, at least 2; their times must increase.
 
     Raises:
         ValueError: fewer than 2 knots.
@@ -150,6 +150,6 @@ def free_profile(knots: int) -> Profile:
 
 
 FREE = free_profile(12)
-"""With as many knots as make a step, a ramp, a decay and a sine look like themselves."""
+"""Enough knots to resemble a step, a ramp, a decay or a sine."""
 
 PROFILES: tuple[Profile, ...] = (CONSTANT, STEP, RAMP, DECAY, SINE, FREE)

@@ -1,14 +1,14 @@
-"""From a model and an input record to its trajectory, and to exact sensitivities of it.
+"""Simulation of a model over an input record, with exact sensitivities.
 
-Sensitivities are carried along with the state: with x' = Phi(x, p, h) over one step, S' = Phi_x S + Phi_p, where
-the derivatives of the discrete step itself are taken symbolically. So they are the derivatives of exactly the numbers
-that `simulate` returns, not of an approximation of the continuous system.
+Sensitivities are propagated with the state: with x' = Phi(x, p, h) over one step, S' = Phi_x S + Phi_p, where the
+derivatives of the discrete step itself are symbolic. So they are the derivatives of exactly the numbers that `run`
+returns, not of an approximation of the continuous system.
 
-An onset is a parameter like any other here: it moves the edge between two steps, so it enters through their
-lengths. Before it, dh/d(onset) = +1 for the stretch that ends there; after it, -1, and that stretch starts later.
+An onset is a parameter like any other: it moves the edge between two steps, so it enters through their lengths. Before
+it, dh/d(onset) = +1 for the interval that ends there; after it, -1, and that interval starts later.
 
-States that jump when a row begins (`ProcessModel.resets`) do so at the end of the step that leads there, so what a run
-shows of a row is the state after it has begun.
+States that jump when a row begins (`ProcessModel.resets`) do so at the end of the step before, so a trajectory has the
+state after the jump.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.process.effect_states import reset_function, rest_function
 from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
 from reactorwatch.process.model import ProcessModel
@@ -29,7 +29,7 @@ from reactorwatch.process.model import ProcessModel
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A simulated run.
+    """A simulation.
 
     Attributes:
         time_min: shape (rows,).
@@ -47,7 +47,7 @@ class Sensitivities:
     """Derivatives of a trajectory with respect to parameters.
 
     Attributes:
-        names: of the parameters.
+        names: names of the parameters.
         states: shape (rows, n_x, n_p).
         outputs: shape (rows, n_y, n_p).
     """
@@ -58,7 +58,7 @@ class Sensitivities:
 
 
 class Simulator:
-    """Free runs of one model; what is compiled for it is kept. Not for two threads at once.
+    """Simulates one model; keeps its compiled code. Not thread-safe.
 
     Args:
         model: the process.
@@ -66,9 +66,9 @@ class Simulator:
 
     def __init__(self, model: ProcessModel) -> None:
         self.model = model
-        self._own = sum(state.name not in model.at_rest for state in model.states)
+        self._n_core = sum(state.name not in model.at_rest for state in model.states)
         self._stepper = Stepper(model)
-        self._sensitivity_codes: dict[tuple[int, ...], RowCode] = {}
+        self._sensitivity_codes: dict[tuple[int, ...], CompiledFunction] = {}
 
     def run(
         self,
@@ -77,21 +77,21 @@ class Simulator:
         start: Array,
         changes: Mapping[str, float] | None = None,
     ) -> Trajectory:
-        """Run the equations freely from a start.
+        """Simulate from an initial state.
 
         Args:
             time_min: shape (rows,), increasing.
             inputs: shape (rows, n_u) or (rows,) for one input; row k holds over [t_k, t_k+1).
-            start: state at the first time, shape (n_x,); or without the states of `ProcessModel.at_rest`, if these are
-                behind the others: then they are at rest.
+            start: initial state, shape (n_x,); or without the states of `ProcessModel.at_rest`, which must be the last
+                ones and are then in equilibrium.
             changes: parameters that differ from the model's values.
 
         Raises:
             ValueError: shapes that do not fit, times that do not increase, NaN, an input or parameter out of bounds.
             SimulationError: the equations cannot be integrated further.
         """
-        inputs, start, p = self._checked(time_min, inputs, start, changes)
-        start, _, _ = self._begun(start, inputs, p, time_min)
+        inputs, start, p = self._check(time_min, inputs, start, changes)
+        start, _, _ = self._complete_start(start, inputs, p, time_min)
         grid = self._grid(time_min, p)
         states, _ = self._run_steps(grid, inputs, start, p)
         return self._trajectory(time_min, inputs, p, np.vstack([start, states[grid.end_of_row]]))
@@ -105,13 +105,13 @@ class Simulator:
         changes: Mapping[str, float] | None = None,
         start_sensitivity: Array | None = None,
     ) -> tuple[Trajectory, Sensitivities]:
-        """A free run and its derivatives with respect to some parameters; arguments as for `run`.
+        """Simulate, with derivatives with respect to some parameters.
 
         Args:
             time_min: shape (rows,).
             inputs: shape (rows, n_u) or (rows,).
-            start: shape (n_x,), or shorter, as for `run`.
-            names: the parameters to differentiate by.
+            start: initial state, see `run`.
+            names: the parameters to differentiate with respect to.
             changes: parameters that differ from the model's values.
             start_sensitivity: d start / d parameters, shape (start.size, len(names)); zero if not given.
 
@@ -119,41 +119,41 @@ class Simulator:
             ValueError: as `run`, or an unknown parameter.
             SimulationError: as `run`.
         """
-        inputs, start, p = self._checked(time_min, inputs, start, changes)
+        inputs, start, p = self._check(time_min, inputs, start, changes)
         wanted = [self.model.parameter_names.index(self.model.parameter(name).name) for name in names]
         shape = (start.size, len(wanted))
         initial = np.zeros(shape) if start_sensitivity is None else np.array(start_sensitivity, dtype=float)
         if initial.shape != shape:
             raise ValueError(f"start_sensitivity must have shape {shape}, got {initial.shape}")
-        start, by_start, by_p = self._begun(start, inputs, p, time_min)
+        start, by_start, by_p = self._complete_start(start, inputs, p, time_min)
         initial = by_start @ initial + by_p[:, wanted]
         grid = self._grid(time_min, p)
         states, cuts = self._run_steps(grid, inputs, start, p)
         trajectory = self._trajectory(time_min, inputs, p, np.vstack([start, states[grid.end_of_row]]))
-        grid = grid.refined(cuts)
+        grid = grid.refine(cuts)
         of_states = self._run_sensitivities(grid, inputs, start, p, wanted, initial)
         of_states = np.concatenate([initial[None], of_states[grid.end_of_row]])
-        by_x, by_p = self._output_derivatives.over(trajectory.states, inputs, p, time_min)
+        by_x, by_p = self._output_derivatives.map(trajectory.states, inputs, p, time_min)
         of_outputs: Array = by_x @ of_states + by_p[:, :, wanted]
         return trajectory, Sensitivities(tuple(names), of_states, of_outputs)
 
-    # --- what is compiled once a model -----------------------------------------------------------------------
+    # --- compiled once a model -----------------------------------------------------------------------
 
     @cached_property
-    def _code(self) -> RowCode:
+    def _code(self) -> CompiledFunction:
         """(x, u, p, t, t_middle, h) -> (state after the step, 1 if it keeps the tolerance), step after step."""
         step = _row_step(self.model)
         after, error = step(*step.sx_in())
         good = ca.logic_and(error <= TOLERANCE, ca.fabs(ca.sum1(after)) < inf)
-        return RowCode(ca.Function("step", step.sx_in(), [after, good]), shared=[2], chained=1, stops=True)
+        return CompiledFunction(ca.Function("step", step.sx_in(), [after, good]), shared=[2], chained=1, stops=True)
 
-    def _sensitivity_code(self, wanted: tuple[int, ...]) -> RowCode:
-        """(x, S, u, p, t, t_middle, h, dt, dh) -> (x, S) after the step, for the parameters of these numbers."""
+    def _sensitivity_code(self, wanted: tuple[int, ...]) -> CompiledFunction:
+        """(x, S, u, p, t, t_middle, h, dt, dh) -> (x, S) after the step, for the parameters of these indices."""
         if wanted not in self._sensitivity_codes:
             self._sensitivity_codes[wanted] = self._new_sensitivity_code(wanted)
         return self._sensitivity_codes[wanted]
 
-    def _new_sensitivity_code(self, wanted: tuple[int, ...]) -> RowCode:
+    def _new_sensitivity_code(self, wanted: tuple[int, ...]) -> CompiledFunction:
         step = _row_step(self.model)
         n_x, n = len(self.model.states), len(wanted)
         x, u, p, t, middle, h = step.sx_in()
@@ -166,35 +166,35 @@ class Simulator:
             + ca.mtimes(ca.jacobian(after, h), of_h)
         )
         one = ca.Function("sensitivities", [x, S, u, p, t, middle, h, of_t, of_h], [after, S_after])
-        return RowCode(one, shared=[3], chained=2)
+        return CompiledFunction(one, shared=[3], chained=2)
 
     @cached_property
-    def _outputs(self) -> RowCode:
+    def _outputs(self) -> CompiledFunction:
         """(x, u, p, t) -> y."""
-        x, u, p, t, y = self.model.shown()
-        return RowCode(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
+        x, u, p, t, y = self.model.output_expressions()
+        return CompiledFunction(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
 
     @cached_property
-    def _output_derivatives(self) -> RowCode:
+    def _output_derivatives(self) -> CompiledFunction:
         """(x, u, p, t) -> dy/dx, dy/dp."""
-        x, u, p, t, y = self.model.shown()
+        x, u, p, t, y = self.model.output_expressions()
         by = ca.Function("outputs_by", [x, u, p, t], [ca.jacobian(y, x), ca.jacobian(y, p)])
-        return RowCode(by, shared=[2])
+        return CompiledFunction(by, shared=[2])
 
     @cached_property
     def _complete(self) -> ArrayFunction:
-        """(x without the states of `at_rest`, u, p, t) -> (x, its derivatives by x without them and by p)."""
+        """(x without the states of `at_rest`, u, p, t) -> (x, its derivatives with respect to the argument and p)."""
         return ArrayFunction(_with_derivatives(rest_function(self.model)))
 
     @cached_property
     def _reset(self) -> ArrayFunction:
-        """(x, u, p, t) -> (x when a row has begun, its derivatives by x and by p)."""
+        """(x, u, p, t) -> (x after the jumps at a row, its derivatives with respect to x and p)."""
         return ArrayFunction(_with_derivatives(reset_function(self.model)))
 
-    # --- running ---------------------------------------------------------------------------------------------
+    # --- simulation ---------------------------------------------------------------------------------------------
 
-    def _begun(self, start: Array, inputs: Array, p: Array, time_min: Array) -> tuple[Array, Array, Array]:
-        """The whole state when the first row has begun, and its derivatives by the start that is given and by p."""
+    def _complete_start(self, start: Array, inputs: Array, p: Array, time_min: Array) -> tuple[Array, Array, Array]:
+        """Full state after the jumps at the first row, and its derivatives with respect to `start` and p."""
         x, by_start, by_p = start, np.eye(start.size), np.zeros((start.size, p.size))
         missing, model = start.size < len(self.model.states), self.model
         for function in (*((self._complete,) if missing else ()), *((self._reset,) if model.resets else ())):
@@ -210,10 +210,10 @@ class Simulator:
         return step_grid(time_min, p[indices])
 
     def _run_steps(self, grid: StepGrid, inputs: Array, start: Array, p: Array) -> tuple[Array, dict[int, Array]]:
-        """The state after each step, and which steps had to be cut into what to keep the tolerance.
+        """State after each step, and the lengths into which steps were cut to keep the tolerance.
 
-        The compiled steps go on until one breaks the tolerance; from there on the stepper walks until one step needs no
-        cutting, and they go on after it.
+        The compiled steps run until one breaks the tolerance; from there on the stepper integrates until one step needs
+        no cutting, and they resume after it.
         """
         steps = grid.length_min.size
         states, good = np.empty((steps, start.size)), np.empty(steps)
@@ -225,16 +225,16 @@ class Simulator:
             done = self._code.fill(steps - first, [x, u, p, *times], [states[first:], good[first:]])
             first += done
             x = states[first - 1] if first else start
-            walking = True
-            while walking and first < steps:
+            cutting = True
+            while cutting and first < steps:
                 t, h, middle = grid.start_min[first], grid.length_min[first], grid.middle_min[first]
-                x, lengths = self._stepper.walk(x, inputs[grid.row[first]], p, float(t), float(h), float(middle))
-                walking = lengths.size > 1
-                if walking:
+                x, lengths = self._stepper.integrate(x, inputs[grid.row[first]], p, float(t), float(h), float(middle))
+                cutting = lengths.size > 1
+                if cutting:
                     cuts[first] = lengths
                 if self.model.resets and first in ends:
                     row = grid.row[first] + 1
-                    x = self._stepper.begin_row(x, inputs[row], p, float(t + h))
+                    x = self._stepper.start_row(x, inputs[row], p, float(t + h))
                 states[first] = x
                 first += 1
         return states, cuts
@@ -245,13 +245,13 @@ class Simulator:
         """d(state after each step)/dp, shape (steps, n_x, n), on a grid that keeps the tolerance."""
         u, *times = self._columns(grid, inputs)
         code = self._sensitivity_code(tuple(wanted))
-        results = code.results(grid.length_min.size)
+        results = code.allocate_results(grid.length_min.size)
         edges = self._edge_derivatives(grid, wanted)
         code.fill(grid.length_min.size, [start, np.ascontiguousarray(initial.T), u, p, *times, *edges], results)
         return results[1].transpose(0, 2, 1)
 
     def _columns(self, grid: StepGrid, inputs: Array) -> tuple[Array, Array, Array, Array]:
-        """Of every step: u as in `_row_step`, the start, the middle of its row and the length."""
+        """Arguments of every step: u as in `_row_step`, its start, the middle of its interval and its length."""
         u = inputs[grid.row]
         if self.model.resets:
             last = np.isin(np.arange(grid.row.size), grid.end_of_row)
@@ -262,12 +262,12 @@ class Simulator:
         """d(start of step)/dp and d(length of step)/dp, each of shape (steps, n)."""
         steps = grid.length_min.size
         of_time, of_length = np.zeros((steps, len(wanted))), np.zeros((steps, len(wanted)))
-        for number, name in enumerate(self.model.breakpoints):
+        for i, name in enumerate(self.model.breakpoints):
             index = self.model.parameter_names.index(name)
             if index not in wanted:
                 continue
             column = wanted.index(index)
-            opens, closes = grid.origin == number, grid.target == number
+            opens, closes = grid.origin == i, grid.target == i
             of_length[opens, column] -= grid.share[opens]
             of_time[opens, column] += 1.0 - grid.share_before[opens]
             of_length[closes, column] += grid.share[closes]
@@ -275,10 +275,10 @@ class Simulator:
         return of_time, of_length
 
     def _trajectory(self, time_min: Array, inputs: Array, p: Array, states: Array) -> Trajectory:
-        (y,) = self._outputs.over(states, inputs, p, time_min)
+        (y,) = self._outputs.map(states, inputs, p, time_min)
         return Trajectory(time_min, states, y[:, :, 0])
 
-    def _checked(
+    def _check(
         self, time_min: Array, inputs: Array, start: Array, changes: Mapping[str, float] | None
     ) -> tuple[Array, Array, Array]:
         inputs = np.asarray(inputs, dtype=float)
@@ -292,7 +292,7 @@ class Simulator:
             raise ValueError(f"times must increase, got {time_min[row]:g} after {time_min[row - 1]:g} min (row {row})")
         if inputs.shape != (time_min.size, len(model.inputs)):
             raise ValueError(f"inputs must have shape {(time_min.size, len(model.inputs))}, got {inputs.shape}")
-        if start.shape not in ((len(model.states),), (self._own,)) or not np.all(np.isfinite(start)):
+        if start.shape not in ((len(model.states),), (self._n_core,)) or not np.all(np.isfinite(start)):
             raise ValueError(f"start must be {len(model.states)} finite numbers ({model.state_names}), got {start}")
         for column, item in enumerate(model.inputs):
             outside = ~((inputs[:, column] >= item.lower) & (inputs[:, column] <= item.upper))
@@ -306,7 +306,7 @@ class Simulator:
 
 
 def _row_step(model: ProcessModel) -> ca.Function:
-    """One step; if the model has resets, u is the input, that of the row after, and 1 where the step ends a row."""
+    """One step; if the model has resets, u is the input, the next row's input, and 1 if the step ends a row."""
     step = symbolic_step(model)
     if not model.resets:
         return step
@@ -318,8 +318,8 @@ def _row_step(model: ProcessModel) -> ca.Function:
 
 
 def _with_derivatives(function: ca.Function) -> ca.Function:
-    """Of one vector of results: it, and its derivatives by the first and the third argument."""
+    """Append the derivatives of the only result with respect to the first and the third argument."""
     symbols = function.sx_in()
     result = function(*symbols)
-    derivatives = (ca.densify(ca.jacobian(result, symbols[place])) for place in (0, 2))
+    derivatives = (ca.densify(ca.jacobian(result, symbols[i])) for i in (0, 2))
     return ca.Function(function.name(), symbols, [result, *derivatives])

@@ -1,8 +1,8 @@
 """All steady states of a model at a constant input, and their stability.
 
-Newton's method, damped, from a lattice of starts over the physical range of the states, all in machine code; what they
-reach is put together. A fixed lattice, not random starts: the answer is the same every
-time. For the reactor the result is held in a test against an exhaustive one-dimensional scan.
+Damped Newton's method from a lattice of starts over the physical range of the states, in machine code; coinciding
+results are merged. The lattice is fixed, not random: the answer is the same every time. For the reactor a test compares
+the result with an exhaustive one-dimensional scan.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.process.effect_states import rest_function
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel
@@ -27,12 +27,12 @@ SAME = 1e-6  # scales
 
 @dataclass(frozen=True, eq=False)
 class SteadyState:
-    """A point at which nothing changes.
+    """A steady state.
 
     Attributes:
         state: shape (n_x,).
         outputs: shape (n_y,).
-        eigenvalues: of the linear model there, 1/min, shape (n_x,).
+        eigenvalues: eigenvalues of the linear model, 1/min, shape (n_x,).
     """
 
     state: Array
@@ -41,12 +41,12 @@ class SteadyState:
 
     @property
     def stable(self) -> bool:
-        """Whether small deviations die out."""
+        """True if small deviations decay."""
         return bool(np.all(self.eigenvalues.real < 0))
 
     @property
     def kind(self) -> str:
-        """Node, focus or saddle, stable or not, in the words of the phase plane."""
+        """Type in the phase plane: stable or unstable node or focus, or saddle."""
         if np.any(self.eigenvalues.real > 0) and np.any(self.eigenvalues.real < 0):
             return "saddle"
         shape = "focus" if np.any(np.abs(self.eigenvalues.imag) > 0) else "node"
@@ -59,7 +59,7 @@ def steady_states(model: ProcessModel, inputs: Array, time_min: float = 0.0) -> 
     Args:
         model: the process.
         inputs: shape (n_u,), constant.
-        time_min: when, for models with an effect that depends on time.
+        time_min: time, for models with time-dependent effects.
 
     Raises:
         ValueError: inputs that do not fit the model.
@@ -68,32 +68,32 @@ def steady_states(model: ProcessModel, inputs: Array, time_min: float = 0.0) -> 
 
 
 class SteadyStates:
-    """Finds the steady states of one model; what is compiled for it is kept.
+    """Finds the steady states of one model; keeps its compiled code.
 
     Args:
         model: the process.
     """
 
     def __init__(self, model: ProcessModel) -> None:
-        own = model.without_memory()
+        core = model.without_effect_states()
         self._model = model
-        self._scales = np.array([state.scale for state in own.states])
-        lower, upper = (np.array([getattr(state, name) for state in own.states]) for name in ("lower", "upper"))
-        self._starts = lower + _lattice(len(own.states)).T * (upper - lower)
-        self._search = RowCode(_search_step(own), shared=[1, 2, 3])
+        self._scales = np.array([state.scale for state in core.states])
+        lower, upper = (np.array([getattr(state, name) for state in core.states]) for name in ("lower", "upper"))
+        self._starts = lower + _lattice(len(core.states)).T * (upper - lower)
+        self._search = CompiledFunction(_search_step(core), shared=[1, 2, 3])
         self._outputs = model.function()
-        self._completed = rest_function(model)
+        self._complete = rest_function(model)
 
     def at(self, inputs: Array, time_min: float = 0.0, changes: Mapping[str, float] | None = None) -> list[SteadyState]:
         """All steady states within the bounds of the states.
 
         Args:
             inputs: shape (n_u,), constant.
-            time_min: when, for models with an effect that depends on time.
+            time_min: time, for models with time-dependent effects.
             changes: parameters that differ from the model's values.
 
         Returns:
-            By rising value of the last output (for the reactor: from extinguished to operating).
+            Steady states by increasing value of the last output (for the reactor: from extinguished to operating).
 
         Raises:
             ValueError: inputs that do not fit the model.
@@ -102,32 +102,32 @@ class SteadyStates:
         if inputs.shape != (len(model.inputs),) or not np.all(np.isfinite(inputs)):
             raise ValueError(f"inputs must be {len(model.inputs)} finite numbers ({model.input_names}), got {inputs}")
         fixed = (inputs, model.values(changes), time_min)
-        found = []
-        for point in self._reached(*fixed):
-            state = np.array(self._completed(point, *fixed)).ravel()
+        points = []
+        for point in self._roots(*fixed):
+            state = np.array(self._complete(point, *fixed)).ravel()
             outputs = np.array(self._outputs(state, *fixed, time_min)[1]).ravel()
-            found.append(SteadyState(state, outputs, linearise(model, state, inputs, time_min, changes).eigenvalues))
-        return sorted(found, key=lambda point: float(point.outputs[-1]))
+            points.append(SteadyState(state, outputs, linearise(model, state, inputs, time_min, changes).eigenvalues))
+        return sorted(points, key=lambda point: float(point.outputs[-1]))
 
-    def _reached(self, inputs: Array, p: Array, time_min: float) -> list[Array]:
-        """The states, without those at rest, in which nothing changes, each once."""
+    def _roots(self, inputs: Array, p: Array, time_min: float) -> list[Array]:
+        """Distinct roots of the balances, without the states in `at_rest`."""
         fixed = (inputs, p, np.array([time_min]))
         x = self._starts.copy()
         searching = np.arange(len(x))
         for _ in range(ITERATIONS):
-            after = self._search.over(x[searching], *fixed)[0][:, :, 0]
+            after = self._search.map(x[searching], *fixed)[0][:, :, 0]
             moved = np.any(after != x[searching], axis=1)
             x[searching] = after
             searching = searching[moved]
             if not searching.size:
                 break
-        rate = self._search.over(x, *fixed)[1][:, :, 0]
-        there = x[np.max(np.abs(rate) / self._scales, axis=1) < RESIDUAL]
-        found = []
-        while len(there):
-            found.append(there[0])
-            there = there[np.max(np.abs(there - there[0]) / self._scales, axis=1) > SAME]
-        return found
+        rate = self._search.map(x, *fixed)[1][:, :, 0]
+        roots = x[np.max(np.abs(rate) / self._scales, axis=1) < RESIDUAL]
+        distinct = []
+        while len(roots):
+            distinct.append(roots[0])
+            roots = roots[np.max(np.abs(roots - roots[0]) / self._scales, axis=1) > SAME]
+        return distinct
 
 
 def _search_step(model: ProcessModel) -> ca.Function:
@@ -146,7 +146,7 @@ def _search_step(model: ProcessModel) -> ca.Function:
 
 
 def _lattice(dimensions: int) -> Array:
-    """Points spread evenly over the unit cube, shape (dimensions, STARTS): the R sequence.
+    """Points of the R sequence, evenly spread over the unit cube, shape (dimensions, STARTS).
 
     The additive recurrence with powers of 1/phi_d, phi_d the root of x^(d+1) = x + 1: Roberts (2018), The unreasonable
     effectiveness of quasirandom sequences; for d = 1 it is Kronecker's sequence of the golden ratio.

@@ -1,7 +1,7 @@
-"""How far the linear model of a point follows the plant away from it.
+"""Step responses of the plant and of its linear model.
 
 The error of a first-order Taylor expansion falls with the square of the step, so halving the step halves the error
-relative to the response; how large it is at a given step is what tells whether the linear model is of use there.
+relative to the response; its size at a given step shows whether the linear model is useful there.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.linearise import LinearModel, linearise
+from reactorwatch.process.linearise import Linearization, linearise
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import SteadyState
@@ -18,12 +18,12 @@ from reactorwatch.process.steady_state import SteadyState
 
 @dataclass(frozen=True, eq=False)
 class StepComparison:
-    """The plant's and the linear model's answers to a step of the input, from a steady state.
+    """Step responses of the plant and of the linear model, from a steady state.
 
     Attributes:
-        time_min: shape (rows,), since the step.
-        plant: deviations of the outputs from the steady state, shape (rows, n_y).
-        linear: likewise.
+        time_min: time since the step, shape (rows,).
+        plant: deviations of the plant's outputs from the steady state, shape (rows, n_y).
+        linear: deviations of the linear model's outputs, shape (rows, n_y).
     """
 
     time_min: Array
@@ -32,20 +32,20 @@ class StepComparison:
 
     @property
     def error(self) -> Array:
-        """Root mean square of the difference over that of the plant's deviation, shape (n_y,)."""
+        """Root mean square error relative to the plant's response, shape (n_y,)."""
         difference = np.sqrt(np.mean((self.linear - self.plant) ** 2, axis=0))
         size: Array = difference / np.sqrt(np.mean(self.plant**2, axis=0))
         return size
 
 
-def step_response(linear: LinearModel, step: Array, time_min: Array) -> Array:
-    """What the linear model's outputs deviate by after a step of the inputs, exactly, shape (rows, n_y).
+def step_response(linear: Linearization, step: Array, time_min: Array) -> Array:
+    """Exact step response of a linear model's outputs, shape (rows, n_y).
 
     The exponential of the matrix [[A, B u], [0, 0]] steps the state over an interval with u constant: Van Loan (1978),
     Computing integrals involving the matrix exponential, IEEE Trans. Automatic Control 23(3).
 
     Args:
-        linear: the model.
+        linear: the linear model.
         step: shape (n_u,).
         time_min: shape (rows,), from 0 on.
     """
@@ -60,15 +60,15 @@ def step_response(linear: LinearModel, step: Array, time_min: Array) -> Array:
 def compare_step(
     model: ProcessModel, point: SteadyState, inputs: Array, step: Array, span_min: float = 10.0, period_min: float = 0.1
 ) -> StepComparison:
-    """Step the inputs at a steady state and compare plant and linear model.
+    """Compare the step responses of plant and linear model at a steady state.
 
     Args:
         model: the process.
         point: a steady state at `inputs`.
-        inputs: before the step, shape (n_u,).
-        step: their change, shape (n_u,).
-        span_min: how long the answer is followed.
-        period_min: between rows.
+        inputs: inputs before the step, shape (n_u,).
+        step: change of the inputs, shape (n_u,).
+        span_min: length of the response.
+        period_min: sampling period.
 
     Raises:
         ValueError: the stepped input is outside its bounds.

@@ -38,7 +38,7 @@ def read_model_on_bus_clock(path: str | None, zero_ns: int = 0) -> ProcessModel 
     if path is None:
         return None
     model = read_extended_model(Path(path))
-    return replace(model, zero_ns=model.zero_ns or zero_ns).counted_from(0).build()
+    return replace(model, zero_ns=model.zero_ns or zero_ns).rebase(0).build()
 
 
 def write_extended_model(path: Path, written: dict[str, Any]) -> None:

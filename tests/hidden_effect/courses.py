@@ -10,7 +10,7 @@ from math import exp, floor, pi, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 
 Array = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ class HiddenCourse:
         return values(self.numbers, time_min, time_min)
 
 
-@compiled
+@jit
 def _between(numbers: Array, t: float) -> float:
     """Straight between knots; before the first and after the last as there."""
     knots = int(numbers[7])
@@ -97,7 +97,7 @@ def _between(numbers: Array, t: float) -> float:
     return float(numbers[8 + knots + low]) * (1.0 - share) + float(numbers[8 + knots + high]) * share
 
 
-@compiled
+@jit
 def value(numbers: Array, t: float, middle: float) -> float:
     """The deviation at a time; `middle`, of the stretch that is gone, decides on which side of a jump that is."""
     kind, size, onset = int(numbers[0]), float(numbers[1]), float(numbers[2])
@@ -120,7 +120,7 @@ def value(numbers: Array, t: float, middle: float) -> float:
     return size * (1.0 - exp(-(t - onset) / float(numbers[4])))
 
 
-@compiled
+@jit
 def values(numbers: Array, time_min: Array, middle: Array) -> Array:
     """`value` at some times."""
     found = np.empty(time_min.size)

@@ -13,7 +13,7 @@ Each m is that of the effect that its place in the equation belongs to. Then com
 
 from math import exp
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from tests.hidden_effect.courses import Array
 
 CATALOGUE = (
@@ -111,7 +111,7 @@ LEAST_LAG_MIN = 5e-4
 """A shorter one is none."""
 
 
-@compiled
+@jit
 def duty_of(T: float, flow: float, m: Array) -> float:
     """The cooling duty at rest, K/min."""
     flow = max(flow, 1e-6)
@@ -119,44 +119,44 @@ def duty_of(T: float, flow: float, m: Array) -> float:
     return float(cooling * (350.0 + m[COOLANT_TEMPERATURE] - T))
 
 
-@compiled
+@jit
 def flow_of(valve: float, m: Array) -> float:
     """What flows where the valve stands at some flow, l/min."""
     return float(valve * (1.0 + m[COOLANT_FLOW]) * (1.0 + m[CURVED_VALVE] * ((valve - 100.0) / 10.0) ** 2))
 
 
-@compiled
+@jit
 def outlet_of(inside: float, feed: float, m: Array) -> float:
     """What leaves the reactor, where a share of the feed takes a short cut."""
     return float((1.0 - m[BYPASS]) * inside + m[BYPASS] * feed)
 
 
-@compiled
+@jit
 def outlet_temperature(T: float, m: Array) -> float:
     """K."""
     return outlet_of(T, 350.0 + m[FEED_TEMPERATURE], m)
 
 
-@compiled
+@jit
 def outlet_concentration(C: float, m: Array) -> float:
     """mol/l."""
     return outlet_of(C, 1.0 + m[FEED_CONCENTRATION] + m[FEED_PULSES], m)
 
 
-@compiled
+@jit
 def shown_temperature(T: float, m: Array) -> float:
     """What the thermometer shows where its sensing element is at T."""
     return float(T + m[TEMPERATURE_BIAS] + m[BOWED_THERMOMETER] * ((T - 438.54) / 10.0) ** 2)
 
 
-@compiled
+@jit
 def shown_concentration(C: float, m: Array) -> float:
     """What the analyser shows of a sample."""
     sampled = C - m[ANALYSER_SATURATION] * max(C - HIGH_MOL_L, 0.0)
     return float(sampled * (1.0 + m[CONCENTRATION_GAIN]) + m[CONCENTRATION_BIAS])
 
 
-@compiled
+@jit
 def rates(x: Array, valve: float, m: Array, constants: Array, dx: Array) -> None:
     """The time derivatives of the state, into dx."""
     C, T = x[C_], x[T_]

@@ -8,7 +8,7 @@ a solver of SciPy with a tight tolerance, and against its order.
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from tests.hidden_effect import reactor
 from tests.hidden_effect.courses import Array, value
 from tests.hidden_effect.reactor import (
@@ -42,7 +42,7 @@ STEPS_A_LAG = 4.0
 DEVIATIONS = len(reactor.EFFECTS)
 
 
-@compiled
+@jit
 def remembered(moments: Array, state: Array, t: float) -> float:
     """The concentration at any time, from values and slopes by Hermite's cubic."""
     if t <= moments[0]:
@@ -56,13 +56,13 @@ def remembered(moments: Array, state: Array, t: float) -> float:
     return low + s * (high - low) + s * (1.0 - s) * bend
 
 
-@compiled
+@jit
 def deviate(m: Array, effects: Places, flat: Array, offsets: Places, t: float, middle: float) -> None:
     for number in range(effects.size):
         m[effects[number]] = value(flat[offsets[number] : offsets[number + 1]], t, middle)
 
 
-@compiled
+@jit
 def analysed(
     time_min: Array, moments: Array, state: Array, effects: Places, flat: Array, offsets: Places, delayed: bool
 ) -> Array:
@@ -79,7 +79,7 @@ def analysed(
     return shown
 
 
-@compiled
+@jit
 def follow(x: Array, valve: float, m: Array) -> None:
     """States behind a lag that there is not are where what they follow is."""
     if m[VALVE_LAG] <= LEAST_LAG_MIN:
@@ -90,7 +90,7 @@ def follow(x: Array, valve: float, m: Array) -> None:
         x[WELL] = outlet_temperature(x[T_], m)
 
 
-@compiled
+@jit
 def moved(valve: float, command: float, m: Array) -> float:
     """Where the valve stands when it has heard a command."""
     if m[VALVE_BACKLASH] > 0.0:
@@ -99,7 +99,7 @@ def moved(valve: float, command: float, m: Array) -> float:
     return command if abs(command - valve) > m[VALVE_STICTION] else valve
 
 
-@compiled
+@jit
 def run(
     moments: Array,
     rows: Places,

@@ -38,7 +38,7 @@ WIDEST, USUAL_WIDTH = 4.0, 1.75
 WIDEST_ONSET_MIN = 0.5
 """Standard deviation of the onset of a step, five rows."""
 
-JUMPING = {effect.name for effect in EFFECTS if effect.jumps}
+JUMPING = {effect.name for effect in EFFECTS if effect.is_discontinuous}
 """A valve that sticks shows it when it should move."""
 
 LONGEST_LIST, USUAL_LENGTH, MEAN_LENGTH = 8, 1, 1.75

@@ -41,6 +41,6 @@ def off_in_sd(hidden_effect: HiddenEffect, seed: int) -> float:
 
 def test_sizes_scatter_about_the_truth_as_their_standard_deviations_say() -> None:
     """Also where the concentration is disturbed and noise levels say, as here mostly, that it is not."""
-    smooth = [item for item in named() if not next(one for one in EFFECTS if one.name == item.name).jumps]
+    smooth = [item for item in named() if not next(one for one in EFFECTS if one.name == item.name).is_discontinuous]
     squares = [off_in_sd(item, SEED + place) ** 2 for place, item in enumerate(smooth)]
     assert chi2.ppf(UNLUCKY, len(squares)) < sum(squares) < chi2.isf(UNLUCKY, len(squares))

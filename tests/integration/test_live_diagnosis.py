@@ -66,7 +66,7 @@ def test_after_an_alarm_there_is_a_report_that_names_the_leak(leaking: Record, t
     assert (found["verdict"], cause["cause"], cause["profile"]) == ("named", "coolant_flow", "step")
     assert abs(cause["parameters"]["size"]["value"] + 0.1) < 4 * cause["parameters"]["size"]["sd"]
     # the extended model is on the plant's own clock, so that a monitor can take it
-    (effect,) = parse_extended_model((folder / "extended.json").read_text()).counted_from(ZERO_NS).effects
+    (effect,) = parse_extended_model((folder / "extended.json").read_text()).rebase(ZERO_NS).effects
     assert effect.values["onset"] == pytest.approx(120.0, abs=0.3)
     (said,) = [item for item in logs if item["event"] == "diagnosed"]
     assert said["verdict"] == "named"

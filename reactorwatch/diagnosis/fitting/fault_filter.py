@@ -11,19 +11,19 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.diagnosis.fitting.augmented_model import SizedModel, with_size_inputs
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, first_rate_sd, learned, with_wandering
 from reactorwatch.diagnosis.fitting.measurement_delay import Moved, gathered, moved
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import Run, doubt_of
-from reactorwatch.kalman.batch_runner import together
+from reactorwatch.kalman.batch_runner import run_together
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
-from reactorwatch.kalman.error_dynamics import FilterErrors, Ways
+from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.innovations import Innovations
-from reactorwatch.kalman.noise_estimation import tune_with
-from reactorwatch.kalman.resampling import Filled, filled
+from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.noise_estimation import estimate_noise_and_parameters
+from reactorwatch.kalman.resampling import ResampledRecord, insert_rows
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
@@ -45,7 +45,7 @@ class Known(NamedTuple):
         rows: how many rows are the same.
     """
 
-    found: Innovations
+    found: FilterResult
     rows: int
 
 
@@ -60,7 +60,7 @@ class Followed(NamedTuple):
 
     loss: float
     w: Array
-    found: Innovations
+    found: FilterResult
 
 
 class Sized:
@@ -81,10 +81,10 @@ class Sized:
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], noise: Noise, period_min: float = 0.1) -> None:
         self.effects = tuple(effects)
-        places = [place for place, effect in enumerate(self.effects) if effect.late_output is not None]
+        places = [place for place, effect in enumerate(self.effects) if effect.delays_output is not None]
         self.late = places[0] if places else None
         self._plant, self._noise, self._period_min = model, noise, period_min
-        sized = with_size_inputs(model, tuple(item for item in self.effects if item.late_output is None))
+        sized = with_size_inputs(model, tuple(item for item in self.effects if item.delays_output is None))
         if noise.wandering:
             sized = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
         self._filtered = sized
@@ -122,7 +122,7 @@ class Sized:
         self._noise, levels = noise, self._levels_of(noise)
         for item in self._filters:
             item.noise = levels
-            item.change(noise.times)
+            item.set_parameters(noise.times)
         self._errors.noise, self._errors.changes = levels, noise.times
 
     @property
@@ -132,11 +132,11 @@ class Sized:
 
     def size_symbols(self, effect: Effect) -> tuple[ca.SX, ca.SX] | None:
         """The inputs that are the size of an effect, as balances and outputs have it; None if it has none."""
-        names = [item for item in self.effects if item.late_output is None]
+        names = [item for item in self.effects if item.delays_output is None]
         if effect not in names:
             return None
         place = names.index(effect)
-        return self._filtered.of_rates[place], self._filtered.of_outputs[place]
+        return self._filtered.rate_symbols[place], self._filtered.output_symbols[place]
 
     def moves_clock(self, place: int) -> bool:
         """Whether one of the effects does, see `input_timing`."""
@@ -168,7 +168,7 @@ class Sized:
         found = self._filtered_rows([rows for rows, _ in laid], known)
         return [self._judged(run, by, item) for (_, by), item in zip(laid, found, strict=True)]
 
-    def _judged(self, run: Run, by: Moved | None, found: Innovations) -> Followed:
+    def _judged(self, run: Run, by: Moved | None, found: FilterResult) -> Followed:
         measured, unseen, least = run.measured, np.zeros(run.measured.shape, dtype=np.bool_), self.noise.measurement_sd
         if by is not None and self.late is not None:
             output = self._output(self.late)
@@ -178,42 +178,42 @@ class Sized:
             measured[by.before, output] = np.nan
         begins = np.array([int(np.argmax(np.any(np.isfinite(measured), axis=1))), *run.breaks], dtype=np.intp)
         unseen[begins] = False
-        loss, w = _judged(measured, unseen, begins, found.whitened, found.conditional_sd, np.array(least))
+        loss, w = _judged(measured, unseen, begins, found.normalized, found.conditional_sd, np.array(least))
         return Followed(float(loss), w, found)
 
-    def _filtered_rows(self, several: Sequence[Filled], begun: Sequence[Known | None]) -> list[Innovations]:
+    def _filtered_rows(self, several: Sequence[ResampledRecord], begun: Sequence[Known | None]) -> list[FilterResult]:
         """The filters' runs over the rows of the record; of rows that are known, nothing is worked out again."""
-        found: list[Innovations] = []
+        found: list[FilterResult] = []
         for begin in range(0, len(several), LANES):
             part = several[begin : begin + LANES]
             found += self._lanes(part, begun[begin : begin + LANES])
         return found
 
-    def _lanes(self, several: Sequence[Filled], begun: Sequence[Known | None]) -> list[Innovations]:
+    def _lanes(self, several: Sequence[ResampledRecord], begun: Sequence[Known | None]) -> list[FilterResult]:
         """As many at once as there are lanes, so all from the same row on."""
         first = min(_rows_of(known, rows) for known, rows in zip(begun, several, strict=True))
         if first == several[0].time_min.size:
             return [known.found for known in begun if known is not None]
         while len(self._filters) < len(several):
-            self._filters.append(self._filters[0].twin())
+            self._filters.append(self._filters[0].clone())
         runs = []
-        for filtering, (time_min, inputs, measured, doubt, _), known in zip(
+        for filtering, (time_min, inputs, measured, uncertainty, _), known in zip(
             self._filters, several, begun, strict=False
         ):
             rest, start = slice(first, None), None
             if known is not None and first:
                 x, P = known.found.x[first - 1].tolist(), known.found.P[first - 1].ravel().tolist()
                 start = FilterState(float(time_min[first - 1]), tuple(inputs[first - 1].tolist()), tuple(x), tuple(P))
-            later = None if doubt is None else doubt.of_rows(rest)
-            record = FilterRecord.of(time_min[rest], inputs[rest], measured[rest], doubt=later)
-            runs.append(filtering.stretches(record, start))
+            later = None if uncertainty is None else uncertainty.select(rest)
+            record = FilterRecord.of(time_min[rest], inputs[rest], measured[rest], uncertainty=later)
+            runs.append(filtering.run_batched(record, start))
         found = []
-        for rows, known, new in zip(several, begun, together(runs), strict=True):
+        for rows, known, new in zip(several, begun, run_together(runs), strict=True):
             if known is None or not first:
-                found.append(rows.of_record(new))
+                found.append(rows.at_original_rows(new))
                 continue
             both = zip(known.found, new, strict=True)
-            found.append(Innovations(*(np.concatenate([before[:first], more]) for before, more in both)))
+            found.append(FilterResult(*(np.concatenate([before[:first], more]) for before, more in both)))
         return found
 
     def tuned(
@@ -226,7 +226,7 @@ class Sized:
         first_sd = {
             f"{item.output}.noise": first_rate_sd(item.scale, self._period_min) for item in self._noise.wandering
         }
-        found, times = tune_with(
+        found, times = estimate_noise_and_parameters(
             self.model,
             rows.time_min,
             rows.inputs,
@@ -234,7 +234,7 @@ class Sized:
             smallest_sd,
             tuple(times),
             first_sd,
-            rows.doubt,
+            rows.uncertainty,
             [self._levels_of(item) for item in nearby if not item.wandering],
             lacking=True,
         )
@@ -242,7 +242,7 @@ class Sized:
         wandering = learned(self._noise.wandering, found.process_sd[of_sensors:], times, self._period_min)
         return Noise(found.measurement_sd, found.process_sd[: len(self._plant.states)], wandering)
 
-    def ways(self, run: Run, signals: Sequence[Signal], found: Innovations) -> Ways:
+    def ways(self, run: Run, signals: Sequence[Signal], found: FilterResult) -> ErrorDynamics:
         """The equations of the filter's errors about its run; from the second row on, the first that it predicts."""
         return ways_between(self._errors, run, self.inputs(run, signals), found, self.used(run))
 
@@ -253,13 +253,13 @@ class Sized:
             found[:, self._output(self.late)] = False
         return found
 
-    def _laid_out(self, run: Run, signals: Sequence[Signal]) -> tuple[Filled, Moved | None]:
+    def _laid_out(self, run: Run, signals: Sequence[Signal]) -> tuple[ResampledRecord, Moved | None]:
         """The rows that the filter takes; and, if an output is late, where its values went."""
         inputs = self.inputs(run, signals)
         if self.late is None:
-            return filled(run.time_min, inputs, run.measured, doubt_of(run, inputs)), None
+            return insert_rows(run.time_min, inputs, run.measured, doubt_of(run, inputs)), None
         by = self._moved(run, inputs, signals, self.late)
-        return filled(by.run.time_min, by.run.inputs, by.run.measured, by.doubt), by
+        return insert_rows(by.run.time_min, by.run.inputs, by.run.measured, by.uncertainty), by
 
     def _moved(self, run: Run, inputs: Array, signals: Sequence[Signal], late: int) -> Moved:
         held: NDArray[np.bool_] = np.ones(inputs.shape[1], dtype=bool)
@@ -267,7 +267,7 @@ class Sized:
         return moved(run, inputs, held, self._output(late), signals[late].at_row)
 
     def _output(self, late: int) -> int:
-        return self._plant.output_names.index(str(self.effects[late].late_output))
+        return self._plant.output_names.index(str(self.effects[late].delays_output))
 
     def _levels_of(self, noise: Noise) -> NoiseLevels:
         """States that an effect brings have none of their own; those of the sensors come last."""
@@ -276,13 +276,15 @@ class Sized:
         return NoiseLevels(noise.measurement_sd, (*noise.process_sd, *(0.0,) * more, *of_sensors))
 
 
-def ways_between(errors: FilterErrors, run: Run, inputs: Array, found: Innovations, used: NDArray[np.bool_]) -> Ways:
+def ways_between(
+    errors: ErrorLinearization, run: Run, inputs: Array, found: FilterResult, used: NDArray[np.bool_]
+) -> ErrorDynamics:
     """The equations of a filter's errors about its run, from the second row on, the first that it predicts."""
     began = np.all(np.isnan(found.prediction), axis=1)
     # What inputs did before a break nobody knows, but in the row itself they were measured, and outputs may show them.
     inputs = np.column_stack([run.inputs, inputs[:, run.inputs.shape[1] :]])
-    doubt, later = doubt_of(run, inputs), slice(1, None)
-    return errors.ways(
+    uncertainty, later = doubt_of(run, inputs), slice(1, None)
+    return errors.dynamics(
         run.time_min[later],
         inputs[later],
         found.x[later],
@@ -290,13 +292,13 @@ def ways_between(errors: FilterErrors, run: Run, inputs: Array, found: Innovatio
         found.residual[later],
         used[later],
         began[later],
-        None if doubt is None else doubt.of_rows(later),
+        None if uncertainty is None else uncertainty.select(later),
     )
 
 
-def _rows_of(known: Known | None, rows: Filled) -> int:
+def _rows_of(known: Known | None, rows: ResampledRecord) -> int:
     """How many rows of a known run can stand for those of another one, that goes on from the last of them."""
-    if known is None or rows.own.size != rows.time_min.size:
+    if known is None or rows.original_index.size != rows.time_min.size:
         return 0
     last = known.rows - 1
     if last < 0 or not np.all(np.isfinite(known.found.x[last])) or not np.all(np.isfinite(rows.inputs[last])):
@@ -309,7 +311,7 @@ def clipped(w: Array) -> Array:
     return np.asarray(np.clip(np.nan_to_num(w), -HUBER, HUBER))
 
 
-@compiled
+@jit
 def _judged(
     measured: Array, unseen: NDArray[np.bool_], begins: NDArray[np.intp], whitened: Array, sd: Array, least: Array
 ) -> tuple[float, Array]:

@@ -40,7 +40,7 @@ def fitted(run: Run, hypothesis: Hypothesis, start: Sequence[Array], steps: int 
     """
     best = hypothesis.fit(run, start, steps)
     for place, effect in enumerate(hypothesis.sized.effects):
-        if effect.jumps:
+        if effect.is_discontinuous:
             best = sized(run, hypothesis, best, place)
             if len(hypothesis.courses) > 1:
                 best = hypothesis.fit(run, best.theta, steps)
@@ -77,7 +77,7 @@ def roughly(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
         hypothesis: one such effect, constant or as a step.
         best: where it begins.
     """
-    usual, onsets = hypothesis.sized.effects[0].starts, _between(run)
+    usual, onsets = hypothesis.sized.effects[0].start_values, _between(run)
     sizes = np.geomspace(usual[0], usual[-1], _USUAL)
     if not hypothesis.courses[0].numbers or not onsets.size:
         best = _best_of(run, hypothesis, best, 0, [np.append(size, best.theta[0][1:]) for size in sizes])

@@ -19,8 +19,8 @@ from reactorwatch.diagnosis.fitting.fault_filter import HUBER, Known, Sized, cli
 from reactorwatch.diagnosis.fitting.profiles import Course, Signal
 from reactorwatch.diagnosis.parameter_priors import last_state, offsets
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.error_dynamics import Ways
-from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.error_dynamics import ErrorDynamics
+from reactorwatch.kalman.innovations import FilterResult
 
 SETTLED, WELL_SETTLED = 0.05, 0.005
 """In log likelihood: a rough fit ends with a step that gains less, and any fit where none promises the second."""
@@ -50,7 +50,7 @@ class Fit:
     theta: tuple[Array, ...]
     loss: float
     w: Array
-    found: Innovations
+    found: FilterResult
 
 
 class Hypothesis:
@@ -193,7 +193,7 @@ class Hypothesis:
         return np.array([effect.upper - effect.lower] * course.coefficients + of_numbers)
 
     def _slope(
-        self, run: Run, fit: Fit, differences: Sequence[Array], ways: Ways | None = None, rough: bool = False
+        self, run: Run, fit: Fit, differences: Sequence[Array], ways: ErrorDynamics | None = None, rough: bool = False
     ) -> Array:
         """What the whitened innovations lose as the numbers grow, shape (values from the third row on, freedom).
 

@@ -1,4 +1,4 @@
-"""The size of an effect that moves the clock (`ProcessModel.clock_ahead`), as signals.
+"""The size of an effect that moves the clock (`ProcessModel.time_offset`), as signals.
 
 The states feel how fast such a size grows, and a row shows how large it is. It grows no faster than the clock goes,
 for what has set in cannot act before it does: of a step the states first stand still for as long as it is large.

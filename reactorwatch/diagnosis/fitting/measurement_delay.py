@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run, doubt_of
-from reactorwatch.kalman.innovations import Innovations
-from reactorwatch.kalman.input_uncertainty import Doubt
+from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.input_uncertainty import InputUncertainty
 
 
 class Moved(NamedTuple):
@@ -24,14 +24,14 @@ class Moved(NamedTuple):
         prompt: where the run's rows are in it, shape (rows,).
         late: where the values of the late output are, shape (rows,).
         before: whether such a value was true before the filter began, so that nothing tells what it is, shape (rows,).
-        doubt: the ways of the run on which nobody knows when inputs changed; None: there are none.
+        uncertainty: the ways of the run on which nobody knows when inputs changed; None: there are none.
     """
 
     run: Run
     prompt: NDArray[np.int64]
     late: NDArray[np.int64]
     before: NDArray[np.bool_]
-    doubt: Doubt | None = None
+    uncertainty: InputUncertainty | None = None
 
 
 def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_min: Array) -> Moved:
@@ -58,13 +58,13 @@ def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_m
     for place in range(measured.shape[1]):
         measured[late if place == output else prompt, place] = run.measured[:, place]
     spread[late[:, None], np.flatnonzero(~held)] = inputs[:, ~held]
-    doubt = doubt_of(run, spread, np.searchsorted(run.time_min, times, side="left"))
-    return Moved(Run(times, spread, measured), prompt, late, before, doubt)
+    uncertainty = doubt_of(run, spread, np.searchsorted(run.time_min, times, side="left"))
+    return Moved(Run(times, spread, measured), prompt, late, before, uncertainty)
 
 
-def gathered(found: Innovations, by: Moved, output: int) -> Innovations:
+def gathered(found: FilterResult, by: Moved, output: int) -> FilterResult:
     """The filter's run in the rows of the record."""
     items = [np.array(item[by.prompt]) for item in found]
     for item, whole in zip(items[:5], found[:5], strict=True):
         item[:, output] = whole[by.late, output]
-    return Innovations(*items)
+    return FilterResult(*items)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.noise_estimation import rough_sensor_sd
+from reactorwatch.kalman.noise_estimation import initial_sensor_sd
 
 FAR = 5.0
 """Standard deviations of the sensor's noise ..."""
@@ -113,7 +113,7 @@ def _noise_sd(column: Array) -> float:
     known = column[np.isfinite(column)]
     if known.size < 2 * SIDE_ROWS:
         return inf
-    return max(rough_sensor_sd(known), resolution(known))
+    return max(initial_sensor_sd(known), resolution(known))
 
 
 def resolution(values: Array) -> float:

@@ -22,8 +22,8 @@ from typing import NamedTuple
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.numba_kernel import compiled
-from reactorwatch.kalman.error_dynamics import Ways
+from reactorwatch.codegen.numba_kernel import jit
+from reactorwatch.kalman.error_dynamics import ErrorDynamics
 
 PART = 256
 """Rows whose signatures are summed up while they are still at hand."""
@@ -48,7 +48,7 @@ class Onsets(NamedTuple):
     other_b: Array
 
 
-def shown(ways: Ways, cause: int, over_row: Array, at_row: Array) -> Array:
+def shown(ways: ErrorDynamics, cause: int, over_row: Array, at_row: Array) -> Array:
     """The signatures of some courses of one cause, shape (rows - 1, n_y, courses).
 
     Args:
@@ -61,20 +61,20 @@ def shown(ways: Ways, cause: int, over_row: Array, at_row: Array) -> Array:
     return np.asarray(_shown(*_common(ways), G, D, over_row, at_row))
 
 
-def products(ways: Ways, cause: int, over_row: Array, at_row: Array) -> tuple[Array, Array]:
+def products(ways: ErrorDynamics, cause: int, over_row: Array, at_row: Array) -> tuple[Array, Array]:
     """The sums w g of all such signatures, shape (courses,), and g g of any two, shape (courses, courses)."""
     G, D = np.ascontiguousarray(ways.G[:, :, cause]), np.ascontiguousarray(ways.D[:, :, cause])
     a, b = _products(*_common(ways), G, D, np.ascontiguousarray(ways.w), over_row, at_row)
     return np.asarray(a), np.asarray(b)
 
 
-def sought(ways: Ways) -> tuple[Array, Array]:
+def sought(ways: ErrorDynamics) -> tuple[Array, Array]:
     """How sum(w g) grows with the deviation over each way, and at the row after it; shapes (rows - 1, causes)."""
     over_row, at_row = _sought(*_common(ways), *_of_sizes(ways), np.ascontiguousarray(ways.w))
     return np.asarray(over_row), np.asarray(at_row)
 
 
-def onsets(ways: Ways, beta: Array, gamma: Array, mean: Array) -> Onsets:
+def onsets(ways: ErrorDynamics, beta: Array, gamma: Array, mean: Array) -> Onsets:
     """Of a step and of other courses, at every onset.
 
     Args:
@@ -86,25 +86,25 @@ def onsets(ways: Ways, beta: Array, gamma: Array, mean: Array) -> Onsets:
     return Onsets(*_onsets(*_common(ways), *_of_sizes(ways), np.ascontiguousarray(ways.w), beta, gamma, mean))
 
 
-def _common(ways: Ways) -> tuple[Array, Array, Array, Array]:
-    return ways.F, ways.H, ways.K, ways.L_inverse
+def _common(ways: ErrorDynamics) -> tuple[Array, Array, Array, Array]:
+    return ways.F, ways.H, ways.K, ways.whitening
 
 
-def _of_sizes(ways: Ways) -> tuple[Array, Array]:
+def _of_sizes(ways: ErrorDynamics) -> tuple[Array, Array]:
     return np.ascontiguousarray(ways.G), np.ascontiguousarray(ways.D)
 
 
-@compiled
-def _shown(F: Array, H: Array, K: Array, L_inverse: Array, G: Array, D: Array, over_row: Array, at_row: Array) -> Array:
+@jit
+def _shown(F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, over_row: Array, at_row: Array) -> Array:
     rows, n_x, n_y, courses = F.shape[0], F.shape[1], H.shape[1], over_row.shape[1]
     found = np.zeros((rows, n_y, courses))
-    _show(F, H, K, L_inverse, G, D, over_row, at_row, 0, np.zeros((n_x, courses)), found)
+    _show(F, H, K, whitening, G, D, over_row, at_row, 0, np.zeros((n_x, courses)), found)
     return found
 
 
-@compiled
+@jit
 def _products(
-    F: Array, H: Array, K: Array, L_inverse: Array, G: Array, D: Array, w: Array, over_row: Array, at_row: Array
+    F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, w: Array, over_row: Array, at_row: Array
 ) -> tuple[Array, Array]:
     rows, n_x, n_y, courses = F.shape[0], F.shape[1], H.shape[1], over_row.shape[1]
     a, b, e = np.zeros(courses), np.zeros((courses, courses)), np.zeros((n_x, courses))
@@ -112,19 +112,19 @@ def _products(
     for begin in range(0, rows, PART):
         count = min(PART, rows - begin)
         part[:] = 0.0
-        _show(F, H, K, L_inverse, G, D, over_row, at_row, begin, e, part[:count])
+        _show(F, H, K, whitening, G, D, over_row, at_row, begin, e, part[:count])
         g = part[:count].reshape(count * n_y, courses)
         a += g.T @ w[begin : begin + count].copy().reshape(count * n_y)
         b += g.T @ g
     return a, b
 
 
-@compiled
+@jit
 def _show(
     F: Array,
     H: Array,
     K: Array,
-    L_inverse: Array,
+    whitening: Array,
     G: Array,
     D: Array,
     over_row: Array,
@@ -165,13 +165,13 @@ def _show(
                 e[i, c] = e[i, c] if abs(e[i, c]) > _DEAD else 0.0
         for i in range(n_y):
             for j in range(i + 1):
-                by = L_inverse[k, i, j]
+                by = whitening[k, i, j]
                 for c in range(courses):
                     found[place, i, c] += by * off[j, c]
 
 
-@compiled
-def _sought(F: Array, H: Array, K: Array, L_inverse: Array, G: Array, D: Array, w: Array) -> tuple[Array, Array]:
+@jit
+def _sought(F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, w: Array) -> tuple[Array, Array]:
     rows, n_x, n_y, causes = F.shape[0], F.shape[1], H.shape[1], G.shape[2]
     over_row, at_row = np.zeros((rows, causes)), np.zeros((rows, causes))
     after, before, off = np.zeros(n_x), np.zeros(n_x), np.zeros(n_y)
@@ -179,7 +179,7 @@ def _sought(F: Array, H: Array, K: Array, L_inverse: Array, G: Array, D: Array, 
         for i in range(n_y):
             value = 0.0
             for j in range(i, n_y):
-                value += L_inverse[k, j, i] * w[k, j]
+                value += whitening[k, j, i] * w[k, j]
             for j in range(n_x):
                 value -= K[k, j, i] * after[j]
             off[i] = value
@@ -201,7 +201,7 @@ def _sought(F: Array, H: Array, K: Array, L_inverse: Array, G: Array, D: Array, 
     return over_row, at_row
 
 
-@compiled
+@jit
 def _add(into: Array, by: Array, columns: Array) -> None:
     """Add by @ columns, all columns at once."""
     for i in range(by.shape[0]):
@@ -211,7 +211,7 @@ def _add(into: Array, by: Array, columns: Array) -> None:
                 into[i, c] += value * columns[j, c]
 
 
-@compiled
+@jit
 def _add_transposed(into: Array, by: Array, columns: Array) -> None:
     """Add by.T @ columns."""
     for i in range(by.shape[1]):
@@ -221,7 +221,7 @@ def _add_transposed(into: Array, by: Array, columns: Array) -> None:
                 into[i, c] += value * columns[j, c]
 
 
-@compiled
+@jit
 def _add_dots(into: Array, one: Array, other: Array) -> None:
     """Add the products of each column with that of the other matrix."""
     for i in range(one.shape[0]):
@@ -229,7 +229,7 @@ def _add_dots(into: Array, one: Array, other: Array) -> None:
             into[0, c] += one[i, c] * other[i, c]
 
 
-@compiled
+@jit
 def _mix(into: Array, share: float, one: Array, slope: float, other: Array) -> None:
     """Make it share * one + slope * other."""
     for i in range(one.shape[0]):
@@ -237,12 +237,12 @@ def _mix(into: Array, share: float, one: Array, slope: float, other: Array) -> N
             into[i, c] = share * one[i, c] + slope * other[i, c]
 
 
-@compiled
+@jit
 def _onsets(
     F: Array,
     H: Array,
     K: Array,
-    L_inverse: Array,
+    whitening: Array,
     G: Array,
     D: Array,
     w: Array,
@@ -277,9 +277,9 @@ def _onsets(
         _add(A, K_minus, HF)
         _add(mg, K_minus, HG)
         _add(md, K_minus, D[k])
-        _add(V, L_inverse[k], HF)
-        _add(vg, L_inverse[k], HG)
-        _add(vd, L_inverse[k], D[k])
+        _add(V, whitening[k], HF)
+        _add(vg, whitening[k], HG)
+        _add(vd, whitening[k], D[k])
         _mix(m, 1.0, mg, 1.0, md)
         _mix(v, 1.0, vg, 1.0, vd)
         for o in range(others):

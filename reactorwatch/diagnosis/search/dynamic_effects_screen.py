@@ -50,7 +50,7 @@ class MemoryScreen:
         """
         found = []
         for effect in self._effects if of is None else of:
-            starts = effect.starts or (effect.typical,)
+            starts = effect.start_values or (effect.typical,)
             followed = follow(effect, [self._constant.signal(np.array([start])) for start in starts])
             tried = [
                 (2.0 * (without.loss - item.loss), start, item.w) for start, item in zip(starts, followed, strict=True)
@@ -65,7 +65,7 @@ class MemoryScreen:
                 found += [
                     replace(item, gain=kept * item.gain)
                     for item in leads
-                    if kept > 0.0 and (not effect.jumps or item.course.name in ("constant", "step"))
+                    if kept > 0.0 and (not effect.is_discontinuous or item.course.name in ("constant", "step"))
                 ]
         return found
 
@@ -77,7 +77,7 @@ class MemoryScreen:
         kept, asked = [1.0] * len(scaled), []
         for number, leads in enumerate(scaled):
             constant = leads[0]
-            if constant.effect.jumps or max(item.score(self._run.values) for item in leads) <= least_score:
+            if constant.effect.is_discontinuous or max(item.score(self._run.values) for item in leads) <= least_score:
                 continue
             if constant.gain > 0.0:
                 asked.append(number)

@@ -44,7 +44,7 @@ def _uncovered(search: Search, known: Found) -> Explained | None:
     asked = by_bic[:OTHERS] + [item for item in by_bic[OTHERS:] if _jumps(item)]
     leads = {lead.effect: lead for lead in known.remembering}
     for effect in search.screen.with_memory:
-        if effect.jumps and (effect.name,) not in (best.hypothesis.causes, *others):
+        if effect.is_discontinuous and (effect.name,) not in (best.hypothesis.causes, *others):
             if effect in leads:
                 asked.append(search.fitted(leads[effect]))
             elif not best.key:  # nothing explains anything
@@ -60,7 +60,7 @@ def _uncovered(search: Search, known: Found) -> Explained | None:
 
 
 def _jumps(item: Explained) -> bool:
-    return any(effect.jumps for effect in item.hypothesis.sized.effects)
+    return any(effect.is_discontinuous for effect in item.hypothesis.sized.effects)
 
 
 def _as_usual(search: Search, effect: Effect) -> Explained:

@@ -22,7 +22,7 @@ from reactorwatch.diagnosis.fitting.bounded_least_squares import within
 from reactorwatch.diagnosis.fitting.profiles import Constant, Course, Free, Sine
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.screen import KNOTS, Screen, usable
-from reactorwatch.kalman.error_dynamics import Ways
+from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect
 
 TAKEN_AWAY, SINES_SHARE = 2, 0.3
@@ -85,7 +85,7 @@ class PairScreen:
         t = run.time_min
         self._constant, self._free, self._sine = Constant(t), Free(t, KNOTS), Sine(t)
 
-    def leads(self, ways: Ways, memory: Sequence["Remembered"], count: int) -> list[PairLead]:
+    def leads(self, ways: ErrorDynamics, memory: Sequence["Remembered"], count: int) -> list[PairLead]:
         """The best of each two causes, the most promising first.
 
         Args:
@@ -102,7 +102,7 @@ class PairScreen:
             return []
         return self._ranked(blocks, w, count)
 
-    def _slow(self, ways: Ways) -> Iterator[Block]:
+    def _slow(self, ways: ErrorDynamics) -> Iterator[Block]:
         """Every direct effect as a constant and as a curve."""
         over_row, at_row = self._free.basis(np.empty(0))
         for cause, effect in enumerate(self._screen.direct):
@@ -129,14 +129,14 @@ class PairScreen:
             yield Block(effect, self._constant, np.empty(0), size, g.sum(axis=1, keepdims=True))
             yield Block(effect, self._free, np.empty(0), size, g)
 
-    def _swinging(self, ways: Ways, blocks: Sequence[Block], w: Array) -> Iterator[Block]:
+    def _swinging(self, ways: ErrorDynamics, blocks: Sequence[Block], w: Array) -> Iterator[Block]:
         """The sines that stand out, and those that do once the best other cause is taken away."""
         found: dict[tuple[str, float], Block] = {}
         curves = [block for block in blocks if block.course is self._free]
         by_gain = sorted(curves, key=lambda block: -_gain(block.columns, w)[0])
         strongest = _of_different_causes(by_gain)[:TAKEN_AWAY]
         for rest in [w, *(w - block.columns @ _gain(block.columns, w)[1] for block in strongest)]:
-            about = Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, rest.reshape(ways.w.shape))
+            about = ErrorDynamics(ways.F, ways.G, ways.H, ways.D, ways.K, ways.whitening, rest.reshape(ways.w.shape))
             leads = [item for item in self._screen.swinging(about, self._screen.direct) if np.isfinite(item.gain)]
             least = max([0.0, *(SINES_SHARE * item.score(self._run.values) for item in leads)])
             for lead in leads:

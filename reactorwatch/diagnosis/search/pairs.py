@@ -213,7 +213,7 @@ class PairSearch:
                     if isinstance(lead.course, Free) and item.bic < best.bic + IN_QUESTION:
                         item = search.resolved(item, EXCHANGE_STEPS)
                     if item.bic < best.bic + NEAR_BEST:
-                        keep(known, self._fitted(_parts(item), scan=lead.effect.jumps))
+                        keep(known, self._fitted(_parts(item), scan=lead.effect.is_discontinuous))
             best = min(known.values(), key=_bic)
             if best.key == again.key:
                 break
@@ -223,7 +223,7 @@ class PairSearch:
         """Each cause with the best of its courses. What acts in jumps had a curve only until a course is found."""
         best = pair
         for place in (0, 1):
-            about, jumps = best, best.hypothesis.sized.effects[place].jumps
+            about, jumps = best, best.hypothesis.sized.effects[place].is_discontinuous
             provisional = jumps and isinstance(about.hypothesis.courses[place], Free)
             leads = self._leads(about, place, own=True)
             leads = leads if jumps else self._new(leads, about)  # its size has not been looked for yet
@@ -281,7 +281,7 @@ class PairSearch:
         parts = _parts(about)
         own = {part.effect.name: place for place, part in enumerate(parts)}
         for effect in self._search.screen.with_memory:
-            starts = effect.starts or (effect.typical,)
+            starts = effect.start_values or (effect.typical,)
             beside, before = parts, about.fit.w
             if effect.name in own:
                 part = parts[own[effect.name]]

@@ -23,7 +23,7 @@ from reactorwatch.diagnosis.fitting.fault_filter import Sized, clipped, ways_bet
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, Course, Decay, Free, Ramp, Signal, Sine, Step
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.error_dynamics import FilterErrors, Ways
+from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
@@ -80,7 +80,7 @@ class Screen:
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], run: Run) -> None:
         self._model, self._run, self.effects = model, run, tuple(effects)
-        self._errors: dict[Sized, FilterErrors] = {}
+        self._errors: dict[Sized, ErrorLinearization] = {}
         names = model.state_names
         self.direct = tuple(effect for effect in effects if effect.extend(model).state_names == names)
         self.with_memory = tuple(effect for effect in effects if effect not in self.direct)
@@ -117,7 +117,7 @@ class Screen:
 
     def ways_of_all(
         self, hypothesis: Hypothesis, fit: Fit, replaced: Sequence[int], of: Sequence[Effect] | None = None
-    ) -> Ways:
+    ) -> ErrorDynamics:
         """The equations of the filter's errors, of all effects in `direct`, with w as rivals have to explain it.
 
         Args:
@@ -131,19 +131,19 @@ class Screen:
             w = w + self._explained(hypothesis, fit, place)
         effects = self.direct if of is None else of
         ways = self._ways(hypothesis.sized, hypothesis.signals(fit), fit, effects)
-        return Ways(ways.F, ways.G, ways.H, ways.D, ways.K, ways.L_inverse, w)
+        return ErrorDynamics(ways.F, ways.G, ways.H, ways.D, ways.K, ways.whitening, w)
 
     def _explained(self, hypothesis: Hypothesis, fit: Fit, place: int) -> Array:
         """What a fitted deviation does to the innovations of a filter that does not know it, shape (rows, n_y)."""
         sized = hypothesis.sized
-        if place == sized.late or sized.effects[place].jumps or sized.moves_clock(place):
+        if place == sized.late or sized.effects[place].is_discontinuous or sized.moves_clock(place):
             return clipped(hypothesis.without(self._run, fit, place)[2:]) - clipped(fit.w[2:])
         signals = hypothesis.signals(fit)
         ways = sized.ways(self._run, signals, fit.found)
         over_row, at_row = signals[place]
         return signatures.shown(ways, hypothesis.column(place), over_row[1:-1, None], at_row[2:, None])[:, :, 0]
 
-    def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit, effects: Sequence[Effect]) -> Ways:
+    def _ways(self, sized: Sized, signals: Sequence[Signal], fit: Fit, effects: Sequence[Effect]) -> ErrorDynamics:
         """Of some effects about the run of a filter."""
         if sized.is_plain and all(effect in self.direct for effect in sized.effects):
             errors, inputs = self._among_all(sized, signals)
@@ -153,9 +153,11 @@ class Screen:
         errors.changes = sized.noise.times
         ways = ways_between(errors, self._run, inputs, fit.found, sized.used(self._run))
         columns = [self.direct.index(effect) for effect in effects]
-        return Ways(ways.F, ways.G[:, :, columns], ways.H, ways.D[:, :, columns], ways.K, ways.L_inverse, ways.w)
+        return ErrorDynamics(
+            ways.F, ways.G[:, :, columns], ways.H, ways.D[:, :, columns], ways.K, ways.whitening, ways.w
+        )
 
-    def _among_all(self, sized: Sized, signals: Sequence[Signal]) -> tuple[FilterErrors, Array]:
+    def _among_all(self, sized: Sized, signals: Sequence[Signal]) -> tuple[ErrorLinearization, Array]:
         """A model with all direct effects in it, and its inputs: it is compiled once, whatever is in the filter."""
         of_all = with_size_inputs(self._model, self.direct)
         nothing = np.zeros(self._run.time_min.size)
@@ -163,22 +165,22 @@ class Screen:
         sizes = [by_effect.get(effect, Signal(nothing, nothing)) for effect in self.direct]
         return of_all.errors, of_all.inputs(self._run.time_min, self._run.known_inputs, sizes)
 
-    def _beside(self, sized: Sized) -> FilterErrors:
+    def _beside(self, sized: Sized) -> ErrorLinearization:
         """A filter's model with all direct effects beside those that are in it."""
         if sized not in self._errors:
             extended = sized.model
-            of_rates, of_outputs = [], []
+            rate_symbols, output_symbols = [], []
             for effect in self.direct:
                 own = sized.size_symbols(effect)
                 if own is None:
                     extended = effect.extend(extended)
                     own = (extended.parameters[-1].symbol,) * 2
-                of_rates.append(own[0])
-                of_outputs.append(own[1])
-            self._errors[sized] = FilterErrors(extended, sized.levels, of_rates, of_outputs)
+                rate_symbols.append(own[0])
+                output_symbols.append(own[1])
+            self._errors[sized] = ErrorLinearization(extended, sized.levels, rate_symbols, output_symbols)
         return self._errors[sized]
 
-    def _set_in(self, ways: Ways, effects: Sequence[Effect]) -> list[Lead]:
+    def _set_in(self, ways: ErrorDynamics, effects: Sequence[Effect]) -> list[Lead]:
         """Constants, steps, ramps and decays."""
         times, leads = self._run.time_min[1:-1], []
         constants = self._run.span_min * np.array(DECAYS)
@@ -208,7 +210,7 @@ class Screen:
         mean = np.vstack([0.5 * step, 1.0 - (1.0 - left) * constants[:, None] / step])
         return beta, np.vstack([np.ones_like(step), left]), mean
 
-    def swinging(self, ways: Ways, effects: Sequence[Effect]) -> list[Lead]:
+    def swinging(self, ways: ErrorDynamics, effects: Sequence[Effect]) -> list[Lead]:
         """The best sine of each cause whose ways these are."""
         over_row, at_row = signatures.sought(ways)
         rows = round(self._run.span_min / self._period_min) + 1
@@ -241,7 +243,7 @@ class Screen:
             leads.append(Lead(effect, self._sine, theta, float(gain[best])))
         return leads
 
-    def _in_course(self, ways: Ways, effects: Sequence[Effect], course: Course, shape: Array) -> list[Lead]:
+    def _in_course(self, ways: ErrorDynamics, effects: Sequence[Effect], course: Course, shape: Array) -> list[Lead]:
         """All causes in one course with given numbers."""
         over_row, at_row = course.basis(shape)
         leads = []
@@ -263,7 +265,7 @@ class Screen:
         return leads
 
 
-def usable(ways: Ways) -> bool:
+def usable(ways: ErrorDynamics) -> bool:
     """Whether they are numbers: about a run that has lost an unstable plant they may not be."""
     return all(bool(np.all(np.isfinite(item))) for item in (ways.w, ways.F, ways.G, ways.K))
 

@@ -295,7 +295,7 @@ class Search:
         """A lead as a hypothesis. Where the linear size leads astray, it is fitted from a smaller one."""
         hypothesis = Hypothesis(self.sized((lead.effect,)), (lead.course,))
         found = self.fit(hypothesis, (lead.theta,))
-        if lead.effect.jumps or found.fit.loss < self._loss_of_nothing():
+        if lead.effect.is_discontinuous or found.fit.loss < self._loss_of_nothing():
             return found
         shares = np.where(np.arange(lead.theta.size) < lead.course.coefficients, _SMALLER, 1.0)
         return min(found, self.fit(hypothesis, (shares * lead.theta,)), key=lambda item: item.bic)
@@ -372,7 +372,7 @@ def _of_different_causes(leads: Sequence[Lead]) -> list[Lead]:
 
 
 def _least_score(lead: Lead) -> float:
-    return SCAN_SCORE if lead.effect.jumps else FIRST_SCORE
+    return SCAN_SCORE if lead.effect.is_discontinuous else FIRST_SCORE
 
 
 def _key(lead: Lead) -> Key:

@@ -120,7 +120,7 @@ class Forcing:
     def about(self, reference: Reference, run: Run) -> "Linearised":
         """The forcing about a path."""
         inputs = self._sized.inputs(run.time_min, run.inputs, [reference.size])
-        path = self._errors.about(run.time_min, inputs, reference.x, doubt_of(run, inputs))
+        path = self._errors.along(run.time_min, inputs, reference.x, doubt_of(run, inputs))
         rows, n_x = reference.x.shape
         F, G, D = np.zeros((rows, n_x, n_x)), np.zeros((rows, n_x)), path.D[:, :, 0]
         F[1:], G[1:] = path.F, path.G[:, :, 0]
@@ -131,7 +131,8 @@ class Forcing:
             G,
             path.H,
             D,
-            np.square(reference.process_sd) * step_min[:, None] + np.square(np.vstack([np.zeros(n_x), path.spread])),
+            np.square(reference.process_sd) * step_min[:, None]
+            + np.square(np.vstack([np.zeros(n_x), path.predicted_sd])),
             reference.known,
             reference.began,
             reference.start - reference.x,
@@ -140,10 +141,10 @@ class Forcing:
         terms, covariance = self._terms(run, reference.x)
         over_way = np.concatenate([np.zeros((1, terms.over_row.shape[1])), terms.over_row[:-1]])
         offset = np.zeros((rows, n_x, 1 + over_way.shape[1]))
-        offset[1:, :, 0] = path.there - reference.x[1:] - G[1:] * reference.size.over_row[:-1, None]
+        offset[1:, :, 0] = path.predicted - reference.x[1:] - G[1:] * reference.size.over_row[:-1, None]
         offset[:, :, 1:] = G[:, :, None] * over_way[:, None, :]
         seen = np.empty((rows, D.shape[1], offset.shape[2]))
-        seen[:, :, 0] = np.nan_to_num(run.measured - path.shown + D * reference.size.at_row[:, None])
+        seen[:, :, 0] = np.nan_to_num(run.measured - path.outputs + D * reference.size.at_row[:, None])
         seen[:, :, 1:] = -D[:, :, None] * terms.at_row[:, None, :]
         return Linearised(
             linear, offset, seen, tuple(clocks), terms, np.asarray(np.linalg.cholesky(covariance)), self.effect
@@ -231,7 +232,7 @@ def _bending() -> Array:
 
 def _sees(sized: SizedModel) -> Sequence[int]:
     """Which of the plant's states and inputs, in this order, the terms of the effect depend on."""
-    model, felt, seen = sized.model, sized.of_rates[0], sized.of_outputs[0]
+    model, felt, seen = sized.model, sized.rate_symbols[0], sized.output_symbols[0]
     terms = [ca.substitute(ca.jacobian(ca.vertcat(*model.rhs), felt), felt, 0)]
     for output in model.outputs:
         by = ca.jacobian(output.expression, seen)

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 
 
 class Linear(NamedTuple):
@@ -82,7 +82,7 @@ def smoothed(about: Linear, r: Array, kept: Array, variance: float, offset: Arra
     return found[:, :-1], found[:, -1]
 
 
-@compiled
+@jit
 def _whitened(about: Linear, r: Array, kept: Array, variance: float, offset: Array, seen: Array) -> tuple[Array, float]:
     F, G, H, D, q, known, began, start, start_covariance = about
     rows, n, n_y, columns = F.shape[0], F.shape[1], H.shape[1], offset.shape[2]
@@ -136,7 +136,7 @@ def _whitened(about: Linear, r: Array, kept: Array, variance: float, offset: Arr
     return found, logs
 
 
-@compiled
+@jit
 def _walk(F: Array, G: Array, q: Array, kept: float, variance: float, A: Array, AP: Array, P: Array) -> None:
     """P <- A P A' + noise, with A of the states and the forcing."""
     n = F.shape[0]
@@ -164,7 +164,7 @@ def _walk(F: Array, G: Array, q: Array, kept: float, variance: float, A: Array, 
     P[n, n] += variance * (1.0 - kept * kept)
 
 
-@compiled
+@jit
 def _gained(P: Array, c: Array, Pc: Array) -> float:
     """P c into Pc; returns c' P c."""
     total = 0.0
@@ -177,14 +177,14 @@ def _gained(P: Array, c: Array, Pc: Array) -> float:
     return total
 
 
-@compiled
+@jit
 def _correct(P: Array, Pc: Array, s: float) -> None:
     for i in range(Pc.size):
         for j in range(Pc.size):
             P[i, j] -= Pc[i] * Pc[j] / s
 
 
-@compiled
+@jit
 def _smoothed(about: Linear, r: Array, kept: Array, variance: float, offset: Array, seen: Array) -> Array:
     F, G, H, D, q, known, began, start, start_covariance = about
     rows, n, n_y = F.shape[0], F.shape[1], H.shape[1]

@@ -31,6 +31,6 @@ def _loss(state: Variable) -> Effect:
 
         def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
             """See `Effect`."""
-            return model.added_to(state.name, -size * state.symbol)
+            return model.add_rate(state.name, -size * state.symbol)
 
     return Loss()

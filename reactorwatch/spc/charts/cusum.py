@@ -13,7 +13,7 @@ half the time, and without one the sums are soon back at 0.
 The statistic is the larger of the two sums, negative if it is the low one, in the units of the values.
 """
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import (
     CENTRE,
@@ -38,7 +38,7 @@ _MEAN, _ALLOWANCE, _LIMIT, _START = range(SETTINGS, SETTINGS + 4)
 _HIGH, _LOW, _END = range(_START + _MEMORIES, _START + _MEMORIES + 3)
 
 
-@compiled
+@jit
 def _judge(columns: Array) -> None:
     for p in range(columns.shape[1]):
         present = columns[PRESENT, p] > 0.0

@@ -14,7 +14,7 @@ from math import sqrt
 
 import numpy as np
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import (
     CENTRE,
@@ -37,7 +37,7 @@ _MEAN, _WEIGHT, _LIMIT, _START = range(SETTINGS, SETTINGS + 4)
 _AVERAGE, _MISSING, _END = range(_START + _MEMORIES, _START + _MEMORIES + 3)
 
 
-@compiled
+@jit
 def _judge(columns: Array) -> None:
     for p in range(columns.shape[1]):
         present = columns[PRESENT, p] > 0.0

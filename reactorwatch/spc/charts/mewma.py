@@ -11,13 +11,13 @@ where Sz is the covariance of z in the long run. z is kept in coordinates in whi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, positive, vector
 from reactorwatch.spc.charts.t2 import Whitening
 
 
-@compiled
+@jit
 def _move(average: Array, x: Array, mean: Array, matrix: Array, weight: float) -> float:
     """Take x into the average, in white coordinates; returns its squared length, -1 if x cannot be taken."""
     for value in x:

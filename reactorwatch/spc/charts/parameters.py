@@ -24,7 +24,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, positive, vector
 
@@ -165,7 +165,7 @@ def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
 _NO_ROW: Array = np.zeros(0)
 
 
-@compiled
+@jit
 def _judge(difference: Array, row: Array, root: Array, inputs: Array, excitation: Array, forgetting: float) -> float:
     """T2, and the row taken into the excitation if there is one; NaN, and nothing changed, if a value is no number."""
     for j in range(difference.size):
@@ -194,7 +194,7 @@ def _judge(difference: Array, row: Array, root: Array, inputs: Array, excitation
     return share * share * statistic
 
 
-@compiled
+@jit
 def _share(excitation: Array) -> float:
     """The harmonic mean of a matrix's eigenvalues, at most 1; 0 if one is 0, and 1 for a matrix of no size.
 

@@ -24,7 +24,7 @@ from math import erfc, sqrt
 
 import numpy as np
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import (
     CENTRE,
@@ -48,7 +48,7 @@ _MEAN, _THIRD, _LOWER, _UPPER, _RULE1, _RULE2, _RULE3, _RULE4, _START = range(SE
 _RUN, _ZONE1, _ZONE2, _ZONE3, _ZONE4, _END = range(_START + _MEMORIES, _START + _MEMORIES + 6)
 
 
-@compiled
+@jit
 def _judge(columns: Array) -> None:
     for p in range(columns.shape[1]):
         present = columns[PRESENT, p] > 0.0

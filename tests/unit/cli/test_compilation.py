@@ -6,7 +6,7 @@ import sys
 import numba
 import pytest
 
-from reactorwatch.codegen.numba_kernel import compiled
+from reactorwatch.codegen.numba_kernel import jit
 
 PROGRAM = """
 import numba
@@ -30,12 +30,12 @@ from monitor_node.config import MonitorConfig
 from monitor_node.isolation.stage import preparation
 from reactorwatch.cli import compilation
 from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.codegen.cache import MachineStore
+from reactorwatch.codegen.cache import CodeCache
 
-made, keep = [], MachineStore._keep
-MachineStore._keep = lambda self, path, code: made.append(path.name)
+made, keep = [], CodeCache._store
+CodeCache._store = lambda self, path, code: made.append(path.name)
 parts = sum(1 for _ in preparation(MonitorConfig(), cstr()))
-MachineStore._keep = keep
+CodeCache._store = keep
 print(parts, len(made))
 compilation.FAULT = "feed_temperature:step:3@40min"
 compilation.compile_kernels()
@@ -61,4 +61,4 @@ def test_a_kernel_compiles_where_no_folder_can_be_written_to(monkeypatch: pytest
     def double(x: float) -> float:
         return 2.0 * x
 
-    assert compiled(double)(2.0) == 4.0
+    assert jit(double)(2.0) == 4.0

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from reactorwatch.codegen.cache import MachineStore
+from reactorwatch.codegen.cache import CodeCache
 
 
 class Maker:
@@ -20,40 +20,40 @@ class Maker:
 
 def test_what_was_made_once_is_not_made_again(tmp_path: Path) -> None:
     make = Maker()
-    assert [MachineStore(tmp_path / "new").code("name", make) for _ in range(3)] == [b"code"] * 3
+    assert [CodeCache(tmp_path / "new").get_or_make("name", make) for _ in range(3)] == [b"code"] * 3
     assert make.made == 1
 
 
 def test_another_name_is_other_code(tmp_path: Path) -> None:
-    store = MachineStore(tmp_path)
-    assert (store.code("one", Maker(b"1")), store.code("two", Maker(b"2"))) == (b"1", b"2")
+    store = CodeCache(tmp_path)
+    assert (store.get_or_make("one", Maker(b"1")), store.get_or_make("two", Maker(b"2"))) == (b"1", b"2")
 
 
 @pytest.mark.parametrize("damage", [b"", b"short", bytes(32) + b"code", bytes(40)])
 def test_what_is_damaged_is_made_anew_and_then_kept(tmp_path: Path, damage: bytes) -> None:
-    store, make = MachineStore(tmp_path), Maker()
-    store.code("name", make)
+    store, make = CodeCache(tmp_path), Maker()
+    store.get_or_make("name", make)
     (tmp_path / "name").write_bytes(damage)
-    assert [store.code("name", make) for _ in range(2)] == [b"code"] * 2
+    assert [store.get_or_make("name", make) for _ in range(2)] == [b"code"] * 2
     assert make.made == 2
 
 
 def test_half_a_file_is_never_under_its_name(tmp_path: Path) -> None:
     """Whatever is in the folder afterwards is whole: one that is written has another name."""
-    MachineStore(tmp_path).code("name", Maker())
+    CodeCache(tmp_path).get_or_make("name", Maker())
     assert [item.name for item in tmp_path.iterdir()] == ["name"]
 
 
 def test_without_a_folder_code_is_made_all_the_same(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     make = Maker()
-    assert [MachineStore(tmp_path / "file" / "store").code("name", make) for _ in range(2)] == [b"code"] * 2
+    assert [CodeCache(tmp_path / "file" / "store").get_or_make("name", make) for _ in range(2)] == [b"code"] * 2
     assert make.made == 2
 
 
 def test_of_too_many_the_oldest_go(tmp_path: Path) -> None:
-    store, make = MachineStore(tmp_path, kept=10, removed=4), Maker()
+    store, make = CodeCache(tmp_path, capacity=10, evicted=4), Maker()
     for number in range(11):
-        store.code(f"{number:02}", make)
+        store.get_or_make(f"{number:02}", make)
         (tmp_path / f"{number:02}").touch()
     assert sorted(item.name for item in tmp_path.iterdir()) == [f"{number:02}" for number in range(4, 11)]

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.compiled_function import RowCode
-from reactorwatch.codegen.numba_kernel import call_at, compiled
+from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.numba_kernel import call_at, jit
 
 VALUES = np.array([0.5, -1.2, 0.0, -0.0, 3.0, 1e-300, 1e300, 0.9999, -7.25, np.nan, np.inf, -np.inf])
 
@@ -31,7 +31,7 @@ def same(found: Array, expected: ca.DM) -> bool:
 @pytest.mark.parametrize("p", [(0.5, -2.0), (0.0, 3.0), (np.nan, np.inf)])
 def test_every_operation_is_casadi_s(p: tuple[float, float]) -> None:
     function = operations()
-    (found,) = RowCode(function, shared=[1]).over(VALUES, np.array(p))
+    (found,) = CompiledFunction(function, shared=[1]).map(VALUES, np.array(p))
     for value, row in zip(VALUES, found, strict=True):
         assert same(row, function(value, p)), value
 
@@ -41,7 +41,7 @@ def test_matrices_keep_their_shape_and_structural_zeros_are_there() -> None:
     function = ca.Function("f", [x, A], [ca.mtimes(x, x.T), ca.mtimes(A, x), ca.vertcat(ca.SX(1, 1), x[0])])
     rng = np.random.default_rng(7)
     xs, a = rng.normal(size=(5, 3)), rng.normal(size=(2, 3))
-    found = RowCode(function, shared=[1]).over(xs, a.T)
+    found = CompiledFunction(function, shared=[1]).map(xs, a.T)
     for number, results in enumerate(zip(*found, strict=True)):
         assert all(same(*pair) for pair in zip(results, function(xs[number], a), strict=True))
 
@@ -49,27 +49,27 @@ def test_matrices_keep_their_shape_and_structural_zeros_are_there() -> None:
 def test_a_chain_goes_from_row_to_row() -> None:
     """X <- x + u, of which the sums are known."""
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    code = RowCode(ca.Function("f", [x, u], [x + u]), chained=1)
-    (sums,) = code.over(np.array([10.0]), np.arange(1.0, 6.0))
+    code = CompiledFunction(ca.Function("f", [x, u], [x + u]), chained=1)
+    (sums,) = code.map(np.array([10.0]), np.arange(1.0, 6.0))
     np.testing.assert_array_equal(sums.ravel(), [11.0, 13.0, 16.0, 20.0, 25.0])
 
 
 def test_a_chain_stops_with_the_row_that_does_not_go_well() -> None:
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    code = RowCode(ca.Function("f", [x, u], [x + u, x + u < 15]), chained=1, stops=True)
+    code = CompiledFunction(ca.Function("f", [x, u], [x + u, x + u < 15]), chained=1, stops=True)
     after, good = np.zeros(5), np.zeros(5)
     assert code.fill(5, [np.array([10.0]), np.arange(1.0, 6.0)], [after, good]) == 2
     np.testing.assert_array_equal(after, [11.0, 13.0, 16.0, 0.0, 0.0])  # the third is worked out, and no more
 
 
-@compiled
+@jit
 def _filled_at(address: int, u: Array, x: Array) -> int:
     return call_at(address, (u.size, x.ctypes.data, u.ctypes.data, x.ctypes.data))
 
 
 def test_a_kernel_calls_it_by_its_address() -> None:
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    code = RowCode(ca.Function("f", [x, u], [2 * x + u]), chained=1)
+    code = CompiledFunction(ca.Function("f", [x, u], [2 * x + u]), chained=1)
     row = np.array([1.0])
     assert _filled_at(code.address, np.array([3.0]), row) == 1
     np.testing.assert_array_equal(row, [5.0])
@@ -77,13 +77,13 @@ def test_a_kernel_calls_it_by_its_address() -> None:
 
 def test_what_is_no_number_does_not_go_well() -> None:
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    code = RowCode(ca.Function("f", [x, u], [x + u, x + u]), chained=1, stops=True)
+    code = CompiledFunction(ca.Function("f", [x, u], [x + u, x + u]), chained=1, stops=True)
     assert code.fill(2, [np.array([1.0]), np.array([1.0, np.nan])], [np.zeros(2), np.zeros(2)]) == 1
 
 
 def test_no_rows_have_no_results() -> None:
     x = ca.SX.sym("x")
-    (found,) = RowCode(ca.Function("f", [x], [x])).over(np.empty((0, 1)))
+    (found,) = CompiledFunction(ca.Function("f", [x], [x])).map(np.empty((0, 1)))
     assert found.shape == (0, 1, 1)
 
 
@@ -91,7 +91,7 @@ def test_no_rows_have_no_results() -> None:
 def test_arrays_that_do_not_fit_are_refused(wrong: Array) -> None:
     """It would read or write what is not its own."""
     x = ca.SX.sym("x")
-    code = RowCode(ca.Function("f", [x], [2 * x]))
+    code = CompiledFunction(ca.Function("f", [x], [2 * x]))
     with pytest.raises(ValueError, match="an array of 5 float64 without gaps is needed"):
         code.fill(5, [wrong], [np.zeros(5)])
     with pytest.raises(ValueError, match="an array of 5 float64 without gaps is needed"):
@@ -101,14 +101,14 @@ def test_arrays_that_do_not_fit_are_refused(wrong: Array) -> None:
 def test_an_operation_without_machine_code_is_named() -> None:
     x = ca.SX.sym("x")
     with pytest.raises(ValueError, match="no machine code for CasADi's operation OP_ERFINV"):
-        RowCode(ca.Function("f", [x], [ca.erfinv(x)]))
+        CompiledFunction(ca.Function("f", [x], [ca.erfinv(x)]))
 
 
 @pytest.mark.parametrize("rows", [1, 2, 3, 4, 5, 11, 12])
 def test_every_row_is_done_whatever_the_number_of_rows(rows: int) -> None:
     """Rows are taken four at a time; behind the last one nothing is written."""
     x = ca.SX.sym("x", 2)
-    code = RowCode(ca.Function("f", [x], [ca.vertcat(x[0] + x[1], ca.sin(x[0]))]))
+    code = CompiledFunction(ca.Function("f", [x], [ca.vertcat(x[0] + x[1], ca.sin(x[0]))]))
     xs, into = np.random.default_rng(rows).normal(size=(rows, 2)), np.full((rows + 4, 2), -7.0)
     assert code.fill(rows, [xs], [into]) == rows
     np.testing.assert_array_equal(into[:rows, 0], xs[:, 0] + xs[:, 1])
@@ -119,11 +119,11 @@ def test_every_row_is_done_whatever_the_number_of_rows(rows: int) -> None:
 def test_chains_go_together_each_by_itself(chains: int) -> None:
     """X <- a x + u of each chain, with a start, a factor and inputs of its own."""
     x, u, a = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("a")
-    code = RowCode(ca.Function("f", [x, u, a], [a * x + u]), shared=[2], chained=1)
+    code = CompiledFunction(ca.Function("f", [x, u, a], [a * x + u]), shared=[2], chained=1)
     rng = np.random.default_rng(chains)
     starts, us, factors = rng.normal(size=(chains, 1)), rng.normal(size=(chains, 9)), rng.normal(size=(chains, 1))
     results = [[np.empty(9)] for _ in range(chains)]
-    assert code.fill_together(9, list(zip(starts, us, factors, strict=True)), results) == 9
+    assert code.fill_chains(9, list(zip(starts, us, factors, strict=True)), results) == 9
     for start, inputs, factor, (found,) in zip(starts, us, factors, results, strict=True):
         value = start[0]
         for row in range(9):
@@ -133,8 +133,8 @@ def test_chains_go_together_each_by_itself(chains: int) -> None:
 
 def test_chains_that_go_together_stop_with_the_first_that_does_not_go_well() -> None:
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    code = RowCode(ca.Function("f", [x, u], [x + u, 15 - (x + u)]), chained=1, stops=True)
+    code = CompiledFunction(ca.Function("f", [x, u], [x + u, 15 - (x + u)]), chained=1, stops=True)
     arguments = [[np.array([begin]), np.arange(1.0, 6.0)] for begin in (0.0, 7.0, -50.0)]
     results = [[np.zeros(5), np.zeros(5)] for _ in arguments]
-    assert code.fill_together(5, arguments, results) == 3  # 7 + 1 + 2 + 3 < 15, + 4 is not
+    assert code.fill_chains(5, arguments, results) == 3  # 7 + 1 + 2 + 3 < 15, + 4 is not
     np.testing.assert_array_equal(results[2][0][:3], [-49.0, -47.0, -44.0])

@@ -13,7 +13,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, Course, Decay, Free, Ramp, Sine, Step
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.screen import Screen
-from reactorwatch.kalman.error_dynamics import Ways
+from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
@@ -37,7 +37,7 @@ def followed(name: str, run: Run, course: Course, theta: Array) -> tuple[Hypothe
     return hypothesis, hypothesis.at(run, (theta,))
 
 
-def ways_of(name: str, run: Run) -> Ways:
+def ways_of(name: str, run: Run) -> ErrorDynamics:
     hypothesis, fit = followed(name, run, Constant(run.time_min), np.zeros(1))
     return hypothesis.sized.ways(run, hypothesis.signals(fit), fit.found)
 

@@ -14,7 +14,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.unknown_input.forcing import Forcing
 from reactorwatch.diagnosis.unknown_input.localise import Located, input_answers, located
-from reactorwatch.kalman.noise_estimation import tune
+from reactorwatch.kalman.noise_estimation import estimate_noise
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
@@ -38,7 +38,7 @@ def run_of(plant: ProcessModel, shown: Callable[[Array], Array] = lambda outputs
 
 
 def where(run: Run) -> Located:
-    tuned = tune(cstr(), run.time_min, run.inputs, run.measured, [1e-4, 1e-2])
+    tuned = estimate_noise(cstr(), run.time_min, run.inputs, run.measured, [1e-4, 1e-2])
     noise = Noise(tuned.measurement_sd, tuned.process_sd)
     nominal = Hypothesis(Sized(cstr(), (), noise), ()).at(run, ())
     found = located(cstr(), EFFECTS, run, nominal, noise)
@@ -50,7 +50,7 @@ def with_rates(of_C: Callable[[ca.SX, ca.SX], ca.SX | float], of_T: Callable[[ca
     """Of a plant whose balances have something more in them."""
     model = cstr()
     C, T = (state.symbol for state in model.states)
-    return run_of(model.added_to("C", ca.SX(of_C(C, T))).added_to("T", ca.SX(of_T(C, T))))
+    return run_of(model.add_rate("C", ca.SX(of_C(C, T))).add_rate("T", ca.SX(of_T(C, T))))
 
 
 def swinging() -> ca.SX:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.kalman.batch_runner import LEAST_ROWS, together
+from reactorwatch.kalman.batch_runner import LEAST_ROWS, run_together
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
 from reactorwatch.kalman.filter_record import FilterRecord
-from reactorwatch.kalman.innovations import Innovations
+from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.process.library.cstr.model import cstr
 
 ROWS = 2 * LEAST_ROWS
@@ -25,18 +25,18 @@ def record(seed: int, rows: int = ROWS) -> FilterRecord:
     return FilterRecord.of(np.arange(rows) / 10.0, qc[:, None], measured, gate=6.0)
 
 
-def same(found: Sequence[Innovations], expected: Sequence[Innovations]) -> bool:
+def same(found: Sequence[FilterResult], expected: Sequence[FilterResult]) -> bool:
     pairs = [pair for of in zip(found, expected, strict=True) for pair in zip(*of, strict=True)]
     return all(np.array_equal(*pair, equal_nan=True) for pair in pairs)
 
 
-def alone(records: Sequence[FilterRecord]) -> list[Innovations]:
-    return [Filter(cstr(), noise).over(item) for noise, item in zip(LEVELS, records, strict=False)]
+def alone(records: Sequence[FilterRecord]) -> list[FilterResult]:
+    return [Filter(cstr(), noise).run_record(item) for noise, item in zip(LEVELS, records, strict=False)]
 
 
-def at_once(records: Sequence[FilterRecord]) -> list[Innovations]:
+def at_once(records: Sequence[FilterRecord]) -> list[FilterResult]:
     filters = [Filter(cstr(), noise) for noise, _ in zip(LEVELS, records, strict=False)]
-    return together([item.stretches(of) for item, of in zip(filters, records, strict=True)])
+    return run_together([item.run_batched(of) for item, of in zip(filters, records, strict=True)])
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 6])

@@ -115,12 +115,12 @@ def test_its_likelihood_is_that_of_the_innovations_and_whitening_takes_their_cor
     expected = 0.0
     for row, (_, _, off, S) in enumerate(textbook(start, time_min[1:], inputs[1:], measured[1:])):
         known = np.isfinite(off)
-        np.testing.assert_array_equal(np.isfinite(found.whitened[row]), known)
+        np.testing.assert_array_equal(np.isfinite(found.normalized[row]), known)
         if known.any():
             part = S[np.ix_(known, known)]
             expected += float(multivariate_normal.logpdf(off[known], cov=part))
             distance = off[known] @ np.linalg.solve(part, off[known])
-            assert np.nansum(found.whitened[row] ** 2) == pytest.approx(distance, rel=1e-6, abs=1e-9)
+            assert np.nansum(found.normalized[row] ** 2) == pytest.approx(distance, rel=1e-6, abs=1e-9)
     assert np.sum(found.log_likelihood) == pytest.approx(expected, rel=1e-8)
 
 
@@ -138,23 +138,23 @@ def record_of(config: PlantConfig, rows: int) -> tuple[Array, Array, Array]:
     return record.time_min, record.columns["qc"], np.column_stack([record.columns["C"], record.columns["T"]])
 
 
-def assert_white(whitened: Array) -> None:
+def assert_white(normalized: Array) -> None:
     """Sums of squares are within the 1e-4 quantiles of chi-square; nothing correlates over time or across (4 sd)."""
-    rows = len(whitened)
-    assert np.all(np.abs(np.mean(whitened, axis=0)) < 4 / np.sqrt(rows))
-    for column in whitened.T:
+    rows = len(normalized)
+    assert np.all(np.abs(np.mean(normalized, axis=0)) < 4 / np.sqrt(rows))
+    for column in normalized.T:
         assert chi2.ppf(1e-4, rows) < np.sum(column**2) < chi2.isf(1e-4, rows)
     for lag in range(1, 6):
-        product = whitened[lag:].T @ whitened[:-lag] / rows
+        product = normalized[lag:].T @ normalized[:-lag] / rows
         assert np.all(np.abs(product) < 4 / np.sqrt(rows))
-    assert abs(np.mean(whitened[:, 0] * whitened[:, 1])) < 4 / np.sqrt(rows)
+    assert abs(np.mean(normalized[:, 0] * normalized[:, 1])) < 4 / np.sqrt(rows)
 
 
 @pytest.mark.parametrize("process_sd", [{}, {"C": 0.002, "T": 0.5}])
 def test_on_the_plant_its_innovations_are_white(process_sd: dict[str, float]) -> None:
     noise = NoiseLevels((0.002, 0.3), (process_sd.get("C", 0.0), process_sd.get("T", 0.0)))
     record = record_of(PlantConfig(seed=5, process_noise_sd=process_sd), 3000)
-    assert_white(Filter(cstr(), noise).run(*record).whitened[BURN_IN:])
+    assert_white(Filter(cstr(), noise).run(*record).normalized[BURN_IN:])
 
 
 @pytest.mark.parametrize(
@@ -169,8 +169,8 @@ def test_on_the_plant_its_innovations_are_white(process_sd: dict[str, float]) ->
 def test_with_the_true_fault_in_the_model_the_innovations_of_a_faulty_plant_are_white(fault: str) -> None:
     config = PlantConfig(seed=6, scenario={"kind": "random-steps", "low": 85.0, "high": 105.0}, faults=(fault,))
     record = record_of(config, 2000)
-    assert_white(Filter(parse_fault(fault).extend(cstr()), SENSORS).run(*record).whitened[BURN_IN:])
-    nominal = Filter(cstr(), SENSORS).run(*record).whitened[BURN_IN:]
+    assert_white(Filter(parse_fault(fault).extend(cstr()), SENSORS).run(*record).normalized[BURN_IN:])
+    nominal = Filter(cstr(), SENSORS).run(*record).normalized[BURN_IN:]
     assert np.sum(nominal**2) > chi2.isf(1e-4, nominal.size)
 
 
@@ -192,7 +192,7 @@ def test_a_sensor_s_step_at_the_time_of_a_row_shows_in_it() -> None:
     kalman = Filter(model, SENSORS)
     for row in range(1, 400):
         kalman.state = FilterState(0.1 * (row - 1), (OPERATING_COOLANT_FLOW,), OPERATING_STATE, (0.0,) * 4)
-        kalman.change({"temperature_bias.onset": 0.1 * row})
+        kalman.set_parameters({"temperature_bias.onset": 0.1 * row})
         shown = kalman.update(0.1 * row, (OPERATING_COOLANT_FLOW,), (np.nan, np.nan)).prediction[1]
         assert shown == pytest.approx(OPERATING_STATE[1] + 3.0, abs=0.05)
 
@@ -230,9 +230,9 @@ def test_over_the_rest_of_a_record_it_goes_on_bit_for_bit(since: int) -> None:
     time_min = time_min + np.where(np.arange(300) > 200, 2.0, 0.0)
     model = parse_fault("coolant_flow:step:-0.2@12.37min").extend(cstr())
     record = FilterRecord.of(time_min, inputs, measured, 6.0)
-    whole, kalman = Filter(model, SENSORS).over(record), Filter(model, SENSORS)
+    whole, kalman = Filter(model, SENSORS).run_record(record), Filter(model, SENSORS)
     kalman.run(time_min[:since], inputs[:since], measured[:since], gate=6.0)
-    rest = kalman.over(record.rest(since), kalman.state)
+    rest = kalman.run_record(record.after(since), kalman.state)
     for field in Innovation._fields:
         np.testing.assert_array_equal(getattr(rest, field), getattr(whole, field)[since:])
 
@@ -364,7 +364,7 @@ def test_parameters_may_change_under_way() -> None:
     predictions = []
     for changes in ({}, {"temperature_bias.size": 5.0}, {"temperature_bias.size": 5.0, "temperature_bias.onset": 0.05}):
         kalman.state = start
-        kalman.change(changes)
+        kalman.set_parameters(changes)
         predictions.append(kalman.update(0.1, (100.0,), (np.nan, np.nan)).prediction[1])
     assert predictions[0] == predictions[1]
     assert predictions[2] == pytest.approx(predictions[0] + 5.0, abs=1e-9)

@@ -11,11 +11,11 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import Filter, NoiseLevels
-from reactorwatch.kalman.error_dynamics import FilterErrors
-from reactorwatch.kalman.innovations import Innovations
-from reactorwatch.kalman.input_uncertainty import Doubt
-from reactorwatch.kalman.noise_estimation import tune_with
-from reactorwatch.kalman.resampling import filled
+from reactorwatch.kalman.error_dynamics import ErrorLinearization
+from reactorwatch.kalman.innovations import FilterResult
+from reactorwatch.kalman.input_uncertainty import InputUncertainty
+from reactorwatch.kalman.noise_estimation import estimate_noise_and_parameters
+from reactorwatch.kalman.resampling import insert_rows
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
@@ -26,9 +26,11 @@ SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
 @pytest.mark.parametrize("missing", [1, 2, 5, 40])
 def test_inputs_may_have_changed_with_each_missing_row_and_the_one_after_them(missing: int) -> None:
     time_min = np.delete(0.1 * np.arange(60.0), np.arange(7, 7 + missing))
-    doubt = Doubt.behind(time_min, np.zeros((time_min.size, 1)), missing * (np.arange(time_min.size) == 7))
-    np.testing.assert_allclose(doubt.times_min(7), 0.1 * np.arange(7, 8 + missing), rtol=1e-12)
-    assert np.flatnonzero(doubt.rows).tolist() == [7]
+    uncertainty = InputUncertainty.for_missing_rows(
+        time_min, np.zeros((time_min.size, 1)), missing * (np.arange(time_min.size) == 7)
+    )
+    np.testing.assert_allclose(uncertainty.change_times_min(7), 0.1 * np.arange(7, 8 + missing), rtol=1e-12)
+    assert np.flatnonzero(uncertainty.rows).tolist() == [7]
 
 
 @pytest.mark.parametrize("missing", [1, 2, 5])
@@ -40,7 +42,7 @@ def test_a_tank_that_fills_is_as_uncertain_as_when_its_valve_opened(missing: int
         for row in range(50):
             tank.update(0.1 * row, (0.0,), (5.0,))
     moments, now = (4.9 + 0.1 * np.arange(1, missing + 2)).tolist(), 5.0 + 0.1 * missing
-    kalman.update(now, (3.0,), (np.nan,), doubt=((3.0,), moments))
+    kalman.update(now, (3.0,), (np.nan,), uncertainty=((3.0,), moments))
     sure.update(now, (3.0,), (np.nan,))
     by = 3.0 * (now - np.array(moments))
     assert kalman.state.x[0] == pytest.approx(sure.state.x[0] + np.mean(by), rel=1e-9)
@@ -56,7 +58,7 @@ def test_what_follows_a_level_goes_with_the_square_of_the_time_for_which_the_val
         for row in range(50):
             tanks.update(0.1 * row, (0.0,), (5.0,))
     moments, now = (4.9 + 0.1 * np.arange(1, missing + 2)).tolist(), 5.0 + 0.1 * missing
-    kalman.update(now, (3.0,), (np.nan,), doubt=((3.0,), moments))
+    kalman.update(now, (3.0,), (np.nan,), uncertainty=((3.0,), moments))
     sure.update(now, (3.0,), (np.nan,))
     open_min = now - np.array(moments)
     by = np.array([3.0 * open_min, 1.5 * open_min**2])
@@ -74,11 +76,13 @@ def test_behind_holes_anywhere_innovations_do_not_go_with_the_way_in_which_the_i
         there = np.random.default_rng(seed).random(time_min.size) >= 0.2
         there[0] = True
         missing = missing_of(time_min[there], qc[there])
-        doubt = Doubt.behind(time_min[there], qc[there][:, None], missing)
-        found = Filter(cstr(), SENSORS).run(time_min[there], qc[there][:, None], measured[there], doubt=doubt)
+        uncertainty = InputUncertainty.for_missing_rows(time_min[there], qc[there][:, None], missing)
+        found = Filter(cstr(), SENSORS).run(
+            time_min[there], qc[there][:, None], measured[there], uncertainty=uncertainty
+        )
         behind = np.flatnonzero(missing)
         way = np.sign(qc[there][behind] - qc[there][behind - 1])[:, None]
-        seen += [*(way * found.whitened[behind])]
+        seen += [*(way * found.normalized[behind])]
     assert len(seen) > 400
     np.testing.assert_allclose(np.mean(seen, axis=0), 0.0, atol=0.12)
 
@@ -86,38 +90,44 @@ def test_behind_holes_anywhere_innovations_do_not_go_with_the_way_in_which_the_i
 def test_the_equations_of_the_errors_expect_of_a_way_in_doubt_what_the_filter_expects() -> None:
     time_min, qc, measured, there = with_holes(seed=7)
     inputs, missing = qc[there][:, None], missing_of(time_min[there], qc[there])
-    doubt, times, seen = Doubt.behind(time_min[there], inputs, missing), time_min[there], measured[there]
+    uncertainty, times, seen = (
+        InputUncertainty.for_missing_rows(time_min[there], inputs, missing),
+        time_min[there],
+        measured[there],
+    )
     levels = NoiseLevels(SENSORS.measurement_sd, (1e-4, 0.05))
-    found = Filter(cstr(), levels).run(times, inputs, seen, doubt=doubt)
+    found = Filter(cstr(), levels).run(times, inputs, seen, uncertainty=uncertainty)
     later = slice(1, None)  # the filter begins with the first row
     x, P, residual = (item[later] for item in (found.x, found.P, found.residual))
-    errors = FilterErrors(cstr(), levels, (), ())
-    ways = errors.ways(times[later], inputs[later], x, P, residual, np.isfinite(residual), None, doubt.of_rows(later))
+    errors = ErrorLinearization(cstr(), levels, (), ())
+    ways = errors.dynamics(
+        times[later], inputs[later], x, P, residual, np.isfinite(residual), None, uncertainty.select(later)
+    )
     assert np.count_nonzero(missing) > 200
-    np.testing.assert_allclose(ways.w, found.whitened[2:], atol=0.03)
+    np.testing.assert_allclose(ways.w, found.normalized[2:], atol=0.03)
 
 
 def test_innovations_behind_holes_are_as_large_as_the_filter_says() -> None:
     """Mean squares of 600 and more, whose standard deviation is 0.06; without doubt they are far larger."""
     time_min, qc, measured, there = with_holes(seed=3)
     inputs, missing = qc[there][:, None], missing_of(time_min[there], qc[there])
-    doubt = Doubt.behind(time_min[there], inputs, missing)
-    doubted = Filter(cstr(), SENSORS).run(time_min[there], inputs, measured[there], doubt=doubt)
+    uncertainty = InputUncertainty.for_missing_rows(time_min[there], inputs, missing)
+    doubted = Filter(cstr(), SENSORS).run(time_min[there], inputs, measured[there], uncertainty=uncertainty)
     behind = np.flatnonzero(missing)
     assert behind.size > 300
-    assert np.mean(doubted.whitened[behind] ** 2) == pytest.approx(1.0, abs=0.25)
-    assert np.mean(doubted.whitened[behind + 1] ** 2) == pytest.approx(1.0, abs=0.25)
+    assert np.mean(doubted.normalized[behind] ** 2) == pytest.approx(1.0, abs=0.25)
+    assert np.mean(doubted.normalized[behind + 1] ** 2) == pytest.approx(1.0, abs=0.25)
     taken_as_held = Filter(cstr(), SENSORS).run(time_min[there], inputs, measured[there])
-    assert np.mean(taken_as_held.whitened[behind] ** 2) > 2.0
+    assert np.mean(taken_as_held.normalized[behind] ** 2) > 2.0
 
 
 def test_what_a_noise_search_learns_does_not_take_holes_for_noise() -> None:
     time_min, qc, measured, there = with_holes(seed=4)
     inputs = qc[there][:, None]
-    doubt = Doubt.behind(time_min[there], inputs, missing_of(time_min[there], qc[there]))
+    uncertainty = InputUncertainty.for_missing_rows(time_min[there], inputs, missing_of(time_min[there], qc[there]))
     with_doubt, without = (
-        tune_with(cstr(), time_min[there], inputs, measured[there], (1e-4, 0.01), (), {}, item)[0]
-        for item in (doubt, None)
+        estimate_noise_and_parameters(cstr(), time_min[there], inputs, measured[there], (1e-4, 0.01), (), {}, item)[0]
+        for item in (uncertainty, None)
     )
     assert with_doubt.process_sd[1] < 0.02
     assert without.process_sd[1] > 0.05
@@ -130,9 +140,11 @@ def test_a_sticking_valve_keeps_its_place_behind_a_hole() -> None:
     qc, there = record.columns["qc"], np.ones(3000, dtype=bool)
     there[2 + np.flatnonzero(np.diff(qc[1:]))[::3]] = False
     measured = np.column_stack([record.columns["C"], record.columns["T"]])
-    doubt = Doubt.behind(record.time_min[there], qc[there][:, None], missing_of(record.time_min[there], qc[there]))
+    uncertainty = InputUncertainty.for_missing_rows(
+        record.time_min[there], qc[there][:, None], missing_of(record.time_min[there], qc[there])
+    )
     kalman = Filter(fault.extend(cstr()), NoiseLevels(SENSORS.measurement_sd, (0.0,) * 3))
-    found = kalman.run(record.time_min[there], qc[there], measured[there], doubt=doubt)
+    found = kalman.run(record.time_min[there], qc[there], measured[there], uncertainty=uncertainty)
     stands = np.empty(3000)
     stands[0] = qc[0]
     for row in range(1, 3000):
@@ -143,19 +155,19 @@ def test_a_sticking_valve_keeps_its_place_behind_a_hole() -> None:
 def test_with_rows_put_in_a_filter_says_what_it_says_row_by_row() -> None:
     time_min, qc, measured, there = with_holes(seed=6)
     inputs, missing = qc[there][:, None], missing_of(time_min[there], qc[there])
-    doubt = Doubt.behind(time_min[there], inputs, missing)
+    uncertainty = InputUncertainty.for_missing_rows(time_min[there], inputs, missing)
     kalman = Filter(cstr(), NoiseLevels(SENSORS.measurement_sd, (1e-4, 0.05)))
-    rows = filled(time_min[there], inputs, measured[there], doubt)
-    assert rows.own.size == np.count_nonzero(there) < rows.time_min.size
-    found = rows.of_record(kalman.run(rows.time_min, rows.inputs, rows.measured, doubt=rows.doubt))
-    expected = kalman.run(time_min[there], inputs, measured[there], doubt=doubt)
-    for name in Innovations._fields:
+    rows = insert_rows(time_min[there], inputs, measured[there], uncertainty)
+    assert rows.original_index.size == np.count_nonzero(there) < rows.time_min.size
+    found = rows.at_original_rows(kalman.run(rows.time_min, rows.inputs, rows.measured, uncertainty=rows.uncertainty))
+    expected = kalman.run(time_min[there], inputs, measured[there], uncertainty=uncertainty)
+    for name in FilterResult._fields:
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-6, atol=1e-9, err_msg=name)
 
 
 def test_a_record_without_holes_stays_as_it_is() -> None:
     time_min = 0.1 * np.arange(10.0)
-    rows = filled(time_min, np.zeros((10, 1)), np.zeros((10, 2)))
+    rows = insert_rows(time_min, np.zeros((10, 1)), np.zeros((10, 2)))
     assert rows.time_min is time_min
 
 

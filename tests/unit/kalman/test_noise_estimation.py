@@ -7,7 +7,7 @@ from plant_node.config import NoiseSd, PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf import NoiseLevels
-from reactorwatch.kalman.noise_estimation import tune
+from reactorwatch.kalman.noise_estimation import estimate_noise
 from reactorwatch.process.library.cstr.model import cstr
 
 SMALLEST = (2e-4, 0.05)
@@ -22,7 +22,7 @@ def record_of(rows: int = ROWS, **settings: object) -> tuple[Array, Array, Array
 
 
 def tuned(time_min: Array, inputs: Array, measured: Array) -> NoiseLevels:
-    return tune(cstr(), time_min, inputs, measured, SMALLEST)
+    return estimate_noise(cstr(), time_min, inputs, measured, SMALLEST)
 
 
 @pytest.mark.parametrize("noise_sd", [NoiseSd(), NoiseSd(C=0.005, T=1.0)])
@@ -97,7 +97,7 @@ def test_it_is_the_same_every_time() -> None:
 @pytest.mark.parametrize("smallest", [(0.0, 0.0), (0.0, 0.05), (1e-300, 1e-300)])
 @pytest.mark.parametrize("noise_sd", [NoiseSd(C=0.0, T=0.0), NoiseSd(C=0.0, T=0.3), NoiseSd(C=0.002, T=0.0)])
 def test_a_sensor_without_noise_needs_no_smallest_level(smallest: tuple[float, float], noise_sd: NoiseSd) -> None:
-    found = tune(cstr(), *record_of(rows=400, seed=5, noise_sd=noise_sd), smallest)
+    found = estimate_noise(cstr(), *record_of(rows=400, seed=5, noise_sd=noise_sd), smallest)
     for sd, least, true in zip(found.measurement_sd, smallest, (noise_sd.C, noise_sd.T), strict=True):
         if true > 0.0:
             assert sd == pytest.approx(true, rel=4 / np.sqrt(2 * 400))
@@ -109,5 +109,5 @@ def test_a_sensor_without_noise_needs_no_smallest_level(smallest: tuple[float, f
 def test_an_output_that_is_always_zero_has_a_level_too() -> None:
     time_min, inputs, measured = record_of(rows=400, seed=5)
     measured[:, 0] = 0.0
-    found = tune(cstr(), time_min, inputs, measured, (0.0, 0.0))
+    found = estimate_noise(cstr(), time_min, inputs, measured, (0.0, 0.0))
     assert np.all(np.isfinite([*found.measurement_sd, *found.process_sd]))

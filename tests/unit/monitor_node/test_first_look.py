@@ -17,11 +17,11 @@ from monitor_node.isolation.window import MOST_PIECES, newest_rows
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import RowCode
+from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.kalman import error_dynamics
-from reactorwatch.kalman.ekf_step import row_code, row_function, walk_function
-from reactorwatch.kalman.initial_state import corrected_function
-from reactorwatch.kalman.step_budget import A_SEARCH
+from reactorwatch.kalman.ekf_step import compiled_row, predict_function, row_function
+from reactorwatch.kalman.initial_state import correction_function
+from reactorwatch.kalman.step_budget import STEPS_PER_SEARCH
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.config import BusConfig
@@ -40,29 +40,29 @@ class Work:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.compiled = self.calls = self.machine_rows = 0
         self._made = self._functions()
-        compile_, fill, call = RowCode._compiled, RowCode.fill, ArrayFunction.__call__
+        compile_, fill, call = CompiledFunction._compile, CompiledFunction.fill, ArrayFunction.__call__
 
-        def compiled(code: RowCode, lanes: int) -> Any:
+        def compiled(code: CompiledFunction, lanes: int) -> Any:
             self.compiled += 1
             return compile_(code, lanes)
 
-        def filled(code: RowCode, rows: int, *arrays: Any) -> int:
+        def filled(code: CompiledFunction, rows: int, *arrays: Any) -> int:
             done = fill(code, rows, *arrays)
-            self.machine_rows += done if code._frame.chained else 0
+            self.machine_rows += done if code._loop.chained else 0
             return done
 
         def called(function: ArrayFunction) -> None:
             self.calls += 1
             call(function)
 
-        monkeypatch.setattr(RowCode, "_compiled", compiled)
-        monkeypatch.setattr(RowCode, "fill", filled)
+        monkeypatch.setattr(CompiledFunction, "_compile", compiled)
+        monkeypatch.setattr(CompiledFunction, "fill", filled)
         monkeypatch.setattr(ArrayFunction, "__call__", called)
 
     @staticmethod
     def _functions() -> int:
-        kept = (row_function, row_code, walk_function, corrected_function)
-        return sum(item.cache_info().misses for item in kept) + len(error_dynamics._whitened.signatures)  # type: ignore[attr-defined]
+        kept = (row_function, compiled_row, predict_function, correction_function)
+        return sum(item.cache_info().misses for item in kept) + len(error_dynamics._normalize.signatures)  # type: ignore[attr-defined]
 
     @property
     def made(self) -> int:
@@ -181,7 +181,7 @@ def test_a_look_takes_no_more_steps_where_rows_are_far_apart(period_min: float, 
     work.forget()
     isolation.suspects(since_rows=100)
     spent, limit = isolation.budget.spent, LOOK_STEPS + LOOK_STEPS_A_ROW * ROWS
-    assert spent <= limit + A_SEARCH + MOST_PIECES + ROWS
+    assert spent <= limit + STEPS_PER_SEARCH + MOST_PIECES + ROWS
     assert work.machine_rows + 3 * work.calls <= spent
 
 

@@ -16,7 +16,7 @@ from monitor_node.isolation.reconstruction import START_STEPS, START_STEPS_A_ROW
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.kalman.ekf import Filter
-from reactorwatch.kalman.step_budget import A_RUN, A_SEARCH, StepBudget, StepsSpentError
+from reactorwatch.kalman.step_budget import STEPS_PER_RUN, STEPS_PER_SEARCH, BudgetExceededError, StepBudget
 from reactorwatch.process.library.cstr.model import cstr
 
 from .faulty import SENSORS, rows_of
@@ -104,7 +104,7 @@ def test_no_run_of_bad_values_fails_or_exceeds_the_budget_and_a_restart_over_it_
     assert again.failures.by_stage == {}
     assert [item.SerializeToString() for item in repeated] == [item.SerializeToString() for item in alarms]
     limit = LOOK_STEPS + LOOK_STEPS_A_ROW * CONFIG.isolation_rows
-    assert max(looks, default=0) <= limit + A_SEARCH + max(A_RUN, CONFIG.isolation_rows)
+    assert max(looks, default=0) <= limit + STEPS_PER_SEARCH + max(STEPS_PER_RUN, CONFIG.isolation_rows)
 
 
 def test_a_look_that_stopped_names_no_cause_and_the_alarm_says_so_until_the_next_look_that_ends(
@@ -147,7 +147,9 @@ def test_the_start_of_a_reconstruction_has_a_budget() -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(StepBudget, "spend", noted)
         found = Reconstruction(cstr(), SENSORS, 1, rows, rows[30][0])
-    assert 0 < sum(steps) - START_STEPS - START_STEPS_A_ROW * len(rows) <= A_SEARCH + A_RUN  # it stopped there
+    assert (
+        0 < sum(steps) - START_STEPS - START_STEPS_A_ROW * len(rows) <= STEPS_PER_SEARCH + STEPS_PER_RUN
+    )  # it stopped there
     time_min, flow, measured = rows[-1]
     found.update(time_min + 0.1, flow, measured)
     value, sd = found.update(time_min + 0.2, flow, measured)
@@ -164,7 +166,7 @@ def test_a_filter_without_a_budget_counts_nothing_and_one_with_stops_at_it() -> 
     for time_min, flow, measured in rows[20:24]:
         kalman.update(time_min, (flow,), measured)
     time_min, flow, measured = rows[24]
-    with pytest.raises(StepsSpentError, match="100 filter steps"):
+    with pytest.raises(BudgetExceededError, match="100 filter steps"):
         kalman.update(time_min, (flow,), measured)
 
 

@@ -51,7 +51,7 @@ def test_the_loss_is_minus_the_log_likelihood_up_to_a_constant(
     loss, w = bias.loss(stretch, SIZE, ONSET_MIN)
     assert np.max(np.abs(w)) < HUBER
     kalman = Filter(effect_of("temperature_bias").extend(cstr(), STEP), SENSORS)
-    kalman.change({"temperature_bias.size": SIZE, "temperature_bias.onset": ONSET_MIN})
+    kalman.set_parameters({"temperature_bias.size": SIZE, "temperature_bias.onset": ONSET_MIN})
     part = slice(BEGIN + 1, None)
     record = biased.time_min[part], biased.inputs[part], biased.measured[part]
     likelihood = np.sum(kalman.run(*record, start=biased.states[BEGIN]).log_likelihood)

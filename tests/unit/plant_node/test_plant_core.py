@@ -184,7 +184,7 @@ def test_a_ramp_ends_with_the_run() -> None:
     running = plant(duration_min=30.0)
     rows(running, 10)
     assert str(running.inject(parse_fault("heat_transfer:ramp:-0.2"))) == "heat_transfer:ramp:-0.2@1min,end=30min"
-    with pytest.raises(InputError, match="must be said where the run has no end"):
+    with pytest.raises(InputError, match="must be given where the run has no end"):
         plant().inject(parse_fault("heat_transfer:ramp:-0.2"))
 
 

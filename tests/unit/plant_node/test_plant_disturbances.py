@@ -105,7 +105,7 @@ def test_a_concentration_does_not_go_below_nothing() -> None:
 @pytest.mark.parametrize(("value", "farthest"), [(710.0, max), (240.0, min)])
 def test_a_state_that_is_out_of_its_bounds_by_itself_is_not_pulled_back(value: float, farthest: Any) -> None:
     noise = ProcessNoise("T", 1.0, 0.1, 250.0, 700.0, seed=0)
-    moved = [noise.moved(value, row) for row in range(200)]
+    moved = [noise.add_to(value, row) for row in range(200)]
     assert farthest(moved) == value
     assert 0.0 < abs(np.mean(moved) - value) < 1.0
 

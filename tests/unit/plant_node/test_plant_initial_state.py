@@ -9,7 +9,7 @@ import pytest
 
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.core import Plant
-from plant_node.initial_state import carried_over, start_state
+from plant_node.initial_state import complete_state, start_state
 from plant_node.scenario import Constant
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect
@@ -50,7 +50,7 @@ QC = np.array([100.0])
 
 def test_new_states_begin_at_rest_and_known_ones_go_over_by_name() -> None:
     model = Thermowell().extend(cstr())
-    found = carried_over(model, {"T": 431.0, "C": 0.1, "gone": 7.0}, QC, 0.0)
+    found = complete_state(model, {"T": 431.0, "C": 0.1, "gone": 7.0}, QC, 0.0)
     np.testing.assert_allclose(found, [0.1, 431.0, 431.0], rtol=1e-12)
 
 
@@ -83,4 +83,4 @@ def test_a_state_that_can_nowhere_rest_is_named() -> None:
     model = cstr()
     drifting = replace(model, rhs=(model.rhs[0], ca.exp(model.states[1].symbol / 1e3)))
     with pytest.raises(InputError, match=r"^cstr: T cannot be at rest while \{'C': 0\.1\}; give a start for them$"):
-        carried_over(drifting, {"C": 0.1}, QC, 0.0)
+        complete_state(drifting, {"C": 0.1}, QC, 0.0)

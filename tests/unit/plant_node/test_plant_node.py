@@ -208,7 +208,7 @@ def test_a_fault_is_told_in_the_row_in_which_it_comes_and_goes() -> None:
         (
             "inject_fault",
             InjectFault(specification="coolant_flow:ramp:0.1"),
-            "fault 'coolant_flow:ramp:0.1': end (when it reaches its size) must be said",
+            "fault 'coolant_flow:ramp:0.1': end (when it reaches its size) must be given",
         ),
         ("clear_fault", ClearFault(cause="heat_transfer"), "no fault 'heat_transfer' is in the plant (there is: none)"),
         ("stop", SetInput(), "unknown command 'stop' (valid: set_input, inject_fault, clear_fault)"),

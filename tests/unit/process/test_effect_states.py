@@ -56,7 +56,7 @@ def test_at_its_neutral_size_its_filter_is_that_of_the_base_model(effect: Effect
     model = effect.extend(cstr())
     expected, found = (Filter(item, noise_of(item)).run(*record()) for item in (cstr(), model))
     np.testing.assert_allclose(found.residual, expected.residual, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(found.whitened, expected.whitened, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.normalized, expected.normalized, rtol=0, atol=1e-6)
     np.testing.assert_allclose(found.P[:, :2, :2], expected.P, rtol=1e-6, atol=1e-12)
 
 
@@ -131,7 +131,7 @@ def test_with_the_true_cause_in_its_model_a_filter_leaves_less_than_the_nominal_
     time_min, flows, measured = record(1000)
     clean = [Simulator(item).run(time_min, flows, START).outputs for item in (cstr(), model)]
     noise = NoiseLevels((0.002, 0.3), (0.0,) * len(model.states))
-    found = Filter(model, noise).run(time_min, flows, measured - clean[0] + clean[1]).whitened[100:]
+    found = Filter(model, noise).run(time_min, flows, measured - clean[0] + clean[1]).normalized[100:]
     nominal = Filter(cstr(), NoiseLevels((0.002, 0.3), (0.0, 0.0))).run(time_min, flows, measured - clean[0] + clean[1])
     assert np.mean(found**2) == pytest.approx(1.0, abs=4 * np.sqrt(2 / found.size))
-    assert np.mean(nominal.whitened[100:] ** 2) > 1.2
+    assert np.mean(nominal.normalized[100:] ** 2) > 1.2

@@ -94,7 +94,7 @@ def test_its_facts_make_sense(effect: Effect) -> None:
     assert effect.location in LOCATIONS
     assert effect.lower <= effect.typical <= effect.upper
     assert effect.typical != effect.neutral
-    assert all(effect.lower <= size <= effect.upper for size in effect.starts)
+    assert all(effect.lower <= size <= effect.upper for size in effect.start_values)
     assert set(effect.labels) <= {profile.name for profile in PROFILES}
     for profile in PROFILES:
         assert effect.label_with(profile) == effect.labels.get(profile.name, effect.label)

@@ -55,7 +55,7 @@ def test_a_model_tells_by_its_parameters_what_is_in_it() -> None:
 def test_minutes_counted_from_another_moment_name_the_same_moments() -> None:
     hour_ns = 3_600_000_000_000
     model = ExtendedModel("cstr", tuple(parse_fault(text) for text in FAULTS), zero_ns=1000 * hour_ns)
-    later = model.counted_from(999 * hour_ns)
+    later = model.rebase(999 * hour_ns)
     for before, after in zip(model.effects, later.effects, strict=True):
         for item in before.profile.parameters:
             shift = 60.0 if item.breakpoint else 0.0
@@ -65,7 +65,7 @@ def test_minutes_counted_from_another_moment_name_the_same_moments() -> None:
 
 def test_minutes_of_an_unknown_moment_stay_as_they_are() -> None:
     model = ExtendedModel("cstr", (parse_fault(FAULTS[0]),))
-    assert model.counted_from(10**18) is model
+    assert model.rebase(10**18) is model
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ CAUSES = ", ".join(effect.name for effect in EFFECTS)
             "unknown parameter of the profile sine 'peroid'; did you mean 'period'? (valid: onset, period, phase)",
         ),
         ("coolant_flow:constant:0.1,end=3min", "unknown parameter of the profile constant 'end' (valid: none)"),
-        ("coolant_flow:step:0.1@3min,onset=4min", "onset must be said once, got it again as '4min'"),
+        ("coolant_flow:step:0.1@3min,onset=4min", "onset must be given once, got it again as '4min'"),
         ("coolant_flow:step:0.1,3min", "after the size must come name=value, got '3min'"),
         ("coolant_flow:sine:0.1,period=0min", "period must be in [0.001, inf] min, got 0"),
         (
@@ -110,23 +110,30 @@ def test_wrong_part_is_named_in_one_line(text: str, why: str) -> None:
 
 
 def test_what_was_not_said_comes_from_the_run() -> None:
-    assert parse_fault("coolant_flow:ramp:0.1").settled(5.0, 90.0).values == {"size": 0.1, "onset": 5.0, "end": 90.0}
-    assert parse_fault("coolant_flow:ramp:0.1@7min,end=8min").settled(5.0, 90.0).values == {
+    assert parse_fault("coolant_flow:ramp:0.1").with_defaults(5.0, 90.0).values == {
+        "size": 0.1,
+        "onset": 5.0,
+        "end": 90.0,
+    }
+    assert parse_fault("coolant_flow:ramp:0.1@7min,end=8min").with_defaults(5.0, 90.0).values == {
         "size": 0.1,
         "onset": 7.0,
         "end": 8.0,
     }
-    assert parse_fault("coolant_flow:constant:0.1").settled(5.0).values == {"size": 0.1}
-    assert str(parse_fault("coolant_flow:decay:0.1").settled(5.0)) == "coolant_flow:decay:0.1@5min,time_constant=60min"
+    assert parse_fault("coolant_flow:constant:0.1").with_defaults(5.0).values == {"size": 0.1}
+    assert (
+        str(parse_fault("coolant_flow:decay:0.1").with_defaults(5.0))
+        == "coolant_flow:decay:0.1@5min,time_constant=60min"
+    )
 
 
 def test_a_ramp_needs_an_end_in_a_run_that_has_none() -> None:
     with pytest.raises(
-        InputError, match=r"^fault 'coolant_flow:ramp:0.1': end \(when it reaches its size\) must be said"
+        InputError, match=r"^fault 'coolant_flow:ramp:0.1': end \(when it reaches its size\) must be given"
     ):
-        parse_fault("coolant_flow:ramp:0.1").settled(5.0)
+        parse_fault("coolant_flow:ramp:0.1").with_defaults(5.0)
     with pytest.raises(InputError, match="end must come after the onset, got end 30 min and onset 50 min"):
-        parse_fault("coolant_flow:ramp:0.1@50min").settled(0.0, 30.0)
+        parse_fault("coolant_flow:ramp:0.1@50min").with_defaults(0.0, 30.0)
 
 
 def test_extended_model_holds_the_values_and_runs_like_the_effect() -> None:

@@ -93,7 +93,7 @@ def test_grid_ends_a_step_at_every_sample_and_breakpoint() -> None:
 
 def test_refined_grid_covers_the_same_time() -> None:
     grid = step_grid(np.array([0.0, 0.1, 0.2]), np.array([0.1]))
-    fine = grid.refined({1: grid.length_min[1] * np.array([0.25, 0.75]), 3: grid.length_min[3] * np.array([0.5, 0.5])})
+    fine = grid.refine({1: grid.length_min[1] * np.array([0.25, 0.75]), 3: grid.length_min[3] * np.array([0.5, 0.5])})
     assert fine.length_min.size == grid.length_min.size + 2
     np.testing.assert_allclose(fine.start_min[1:], np.cumsum(fine.length_min)[:-1], atol=1e-15)
     np.testing.assert_allclose((fine.start_min + fine.length_min)[fine.end_of_row], [0.1, 0.2], atol=1e-15)

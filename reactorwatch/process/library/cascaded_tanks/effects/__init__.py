@@ -14,4 +14,4 @@ TANK_EFFECTS: tuple[Effect, ...] = (
     Overflow(),
     LevelBias(),
 )
-"""From the pump downwards to the sensor."""
+"""In the order of the flow, from the pump to the sensor."""

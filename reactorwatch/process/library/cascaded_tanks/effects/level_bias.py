@@ -1,4 +1,4 @@
-"""The level sensor is off by the same everywhere."""
+"""Bias of the level sensor."""
 
 from typing import ClassVar
 
@@ -22,6 +22,6 @@ class LevelBias(ReadingEffect):
     output = "x2"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the level sensor"}
 
-    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
         """See `ReadingEffect`."""
         return value + size

@@ -1,4 +1,4 @@
-"""The hole between the tanks is narrower than it should be."""
+"""Clogging of the upper tank's outlet."""
 
 import casadi as ca
 

@@ -1,4 +1,4 @@
-"""The upper tank runs over."""
+"""Overflow of the upper tank."""
 
 import casadi as ca
 
@@ -9,18 +9,18 @@ BRIM_V = 10.0
 """Level of the brim of the upper tank."""
 
 INTO_THE_LOWER = 0.5
-"""Share of what runs over that the lower tank catches; the rest is lost."""
+"""Share of the overflow that enters the lower tank; the rest is lost."""
 
 SOFT_V = 0.005
-"""How far about the brim the flow over it sets in."""
+"""Half width of the transition at the brim."""
 
 
 class Overflow(Effect):
     """m times the level above the brim, 10 V, runs over: half of it into the lower tank, the rest beside it.
 
-    What runs over has a kink at the brim, where a filter's equations have no derivative; so it sets in within some
-    hundredths of a volt, as (h + (h^2 + s^2)^(1/2)) / 2 of the level h above the brim. The larger m is, the more
-    firmly it holds the level at the brim.
+    The overflow has a kink at the brim, where it has no derivative; so it sets in within some hundredths of a volt, as
+    (h + (h^2 + s^2)^(1/2)) / 2 with h the level above the brim. The larger m is, the closer the level stays to the
+    brim.
     """
 
     name = "overflow"
@@ -42,4 +42,4 @@ class Overflow(Effect):
         twice = above + ca.sqrt(above**2 + SOFT_V**2)
         # k1 and k2 are of one flow over the cross-section of either tank.
         widths = model.parameter("k2").symbol / model.parameter("k1").symbol
-        return model.added_to("x1", -0.5 * size * twice).added_to("x2", 0.5 * INTO_THE_LOWER * size * widths * twice)
+        return model.add_rate("x1", -0.5 * size * twice).add_rate("x2", 0.5 * INTO_THE_LOWER * size * widths * twice)

@@ -1,4 +1,4 @@
-"""The pump gives more than its command says, or less."""
+"""Gain error of the pump."""
 
 from reactorwatch.process.effect import ParameterEffect
 

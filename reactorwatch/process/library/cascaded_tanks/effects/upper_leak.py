@@ -1,4 +1,4 @@
-"""The upper tank has a second hole."""
+"""Leak of the upper tank."""
 
 import casadi as ca
 
@@ -23,6 +23,6 @@ class UpperLeak(Effect):
         """See `Effect`.
 
         Raises:
-            ValueError: the model has no state x1, or does not say what runs from the upper tank.
+            ValueError: the model has no state x1, or no term of the outflow.
         """
-        return model.added_to("x1", -size * model.term(UPPER_OUTLET))
+        return model.add_rate("x1", -size * model.term(UPPER_OUTLET))

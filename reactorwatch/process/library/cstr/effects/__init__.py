@@ -52,4 +52,4 @@ EFFECTS: tuple[Effect, ...] = (
     Volume(),
     SampleTiming(),
 )
-"""From the feed over the reaction and the cooling to the sensors, then what concerns several of them."""
+"""In the order feed, reaction, cooling, sensors, then effects on several of them."""

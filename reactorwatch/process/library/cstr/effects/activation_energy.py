@@ -1,4 +1,4 @@
-"""The reaction depends on temperature more strongly, or less."""
+"""Deviation of the activation energy."""
 
 from reactorwatch.process.effect import ParameterEffect
 

@@ -1,4 +1,4 @@
-"""Part of the feed takes a short cut to the outlet."""
+"""Bypass of the feed to the outlet."""
 
 from dataclasses import replace
 
@@ -10,7 +10,7 @@ from reactorwatch.process.model import ProcessModel
 
 
 class Bypass(Effect):
-    """A share m of the feed passes the reaction zone by, and what is measured is the mixed outlet.
+    """A share m of the feed bypasses the reaction zone, and the outputs are those of the mixed outlet.
 
     The reaction zone is fed with q (1 - m), and each output shows (1 - m) of what it did and m of the feed.
     """
@@ -28,7 +28,7 @@ class Bypass(Effect):
         """See `Effect`.
 
         Raises:
-            ValueError: the model has no parameter q, or does not say what the feed brings of each output.
+            ValueError: the model has no parameter q, or no feed term of an output.
         """
         flow = model.parameter("q").symbol
         mixed = tuple(

@@ -1,4 +1,4 @@
-"""The analyser is off by the same everywhere."""
+"""Bias of the analyser."""
 
 from typing import ClassVar
 
@@ -22,6 +22,6 @@ class ConcentrationBias(ReadingEffect):
     output = "C"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the analyser"}
 
-    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
         """See `ReadingEffect`."""
         return value + size

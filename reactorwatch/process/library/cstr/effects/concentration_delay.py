@@ -1,33 +1,33 @@
-"""The analyser shows what was there some time ago."""
+"""Delay of the analyser."""
 
 import casadi as ca
 
 from reactorwatch.process.effect import SensorEffect
-from reactorwatch.process.effect_states import positive
+from reactorwatch.process.effect_states import nonnegative
 from reactorwatch.process.model import ProcessModel, variable
 
 WINDOW_MIN = 1.0
-"""The stretch of the past that is remembered; all of the delay if that is longer."""
+"""Length of the past that the states represent; the delay if that is longer."""
 
 COEFFICIENTS = 10
-"""Legendre polynomials that the stretch is remembered by."""
+"""Number of Legendre polynomials."""
 
 
 class ConcentrationDelay(SensorEffect):
     """The measured concentration is C(t - m).
 
-    No finite number of states holds a stretch of the past exactly. Here it is remembered by its first `COEFFICIENTS`
-    Legendre coefficients, the best of all linear memories of this size for a delay (Voelker, Kajic & Eliasmith 2019,
-    Legendre memory units, NeurIPS 32, eqs. 1-4): over a window theta,
+    No finite number of states represents the past exactly. Here its first `COEFFICIENTS` Legendre coefficients do, the
+    best of all linear memories of this size for a delay (Voelker, Kajic & Eliasmith 2019, Legendre memory units,
+    NeurIPS 32, eqs. 1-4): over a window theta,
 
         theta dq_i/dt = (2i + 1) (sum_j a_ij q_j + (-1)^i C),    a_ij = -1 where i < j, else (-1)^(i-j+1),
         C(t - m) = sum_i P_i(2 m/theta - 1) q_i,
 
-    and of this sum what it is off by at m = 0 is taken away. The window does not depend on m up to `WINDOW_MIN`, so the
-    delay may set in, grow and go, and the polynomials have a derivative by m at zero.
+    less the sum's error at m = 0. Up to `WINDOW_MIN` the window does not depend on m, so the delay may set in, grow and
+    disappear, and the polynomials have a derivative with respect to m at zero.
 
-    With the coolant stepping every minute over its whole range, what is shown is off by 0.0001 mol/l (root mean square)
-    up to m = 1 min, 0.001 at 2 min, 0.003 at 3 min.
+    With the coolant stepping every minute over its whole range, the error is 0.0001 mol/l (root mean square) up to m =
+    1 min, 0.001 at 2 min, 0.003 at 3 min.
     """
 
     name = "concentration_delay"
@@ -38,10 +38,10 @@ class ConcentrationDelay(SensorEffect):
     lower = 0.0
     upper = 3.0
     typical = 0.2
-    starts = (0.1, 0.5, 1.5)
-    output = late_output = "C"
+    start_values = (0.1, 0.5, 1.5)
+    output = delays_output = "C"
 
-    def sensed(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
+    def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
         """See `SensorEffect`."""
         prefix = self.prefix(model)
         states = [
@@ -49,7 +49,7 @@ class ConcentrationDelay(SensorEffect):
             for i in range(COEFFICIENTS)
         ]
         q = [state.symbol for state in states]
-        delay = positive(size)
+        delay = nonnegative(size)
         window = ca.fmax(delay, WINDOW_MIN)
         # The sum over j of a_ij q_j: all after i, and the alternating sum up to i, each carried along.
         after, alternating = sum(q, ca.SX(0)), ca.SX(0)

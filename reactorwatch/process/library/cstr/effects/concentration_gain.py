@@ -1,4 +1,4 @@
-"""The analyser is off by a share of what it measures."""
+"""Gain error of the analyser."""
 
 from typing import ClassVar
 
@@ -22,6 +22,6 @@ class ConcentrationGain(ReadingEffect):
     output = "C"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the gain of the analyser"}
 
-    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
         """See `ReadingEffect`."""
         return value * (1 + size)

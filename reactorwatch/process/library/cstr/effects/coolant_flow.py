@@ -1,4 +1,4 @@
-"""The coolant that flows is not the coolant that the valve was told."""
+"""Deviation of the coolant flow from its command."""
 
 from typing import ClassVar
 

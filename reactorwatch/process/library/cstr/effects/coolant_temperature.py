@@ -1,4 +1,4 @@
-"""The coolant comes in warmer or colder than it should."""
+"""Deviation of the coolant's inlet temperature."""
 
 from reactorwatch.process.effect import ParameterShift
 

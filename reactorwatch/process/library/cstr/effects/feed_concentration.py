@@ -1,4 +1,4 @@
-"""The feed holds more of A, or less."""
+"""Deviation of the feed concentration."""
 
 from reactorwatch.process.effect import ParameterShift
 

@@ -1,10 +1,10 @@
-"""More is fed, or less."""
+"""Deviation of the feed flow."""
 
 from reactorwatch.process.effect import ParameterEffect
 
 
 class FeedFlow(ParameterEffect):
-    """q (1 + m). At constant volume as much flows out; with a level of its own the level follows."""
+    """q (1 + m). At constant volume the outflow is equal; with level control the level responds."""
 
     name = "feed_flow"
     label = "wrong feed flow"

@@ -1,4 +1,4 @@
-"""The feed is warmer or colder than it should be."""
+"""Deviation of the feed temperature."""
 
 from reactorwatch.process.effect import ParameterShift
 

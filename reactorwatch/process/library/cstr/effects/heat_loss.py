@@ -1,4 +1,4 @@
-"""Heat is lost to the surroundings."""
+"""Heat loss to the surroundings."""
 
 import casadi as ca
 
@@ -27,4 +27,4 @@ class HeatLoss(Effect):
             ValueError: the model has no state T.
         """
         T = model.states[model.state_index("T")].symbol
-        return model.added_to("T", -size * (T - SURROUNDINGS_K))
+        return model.add_rate("T", -size * (T - SURROUNDINGS_K))

@@ -1,4 +1,4 @@
-"""Heat passes to the coolant less easily, or more."""
+"""Change of the heat transfer to the coolant."""
 
 from typing import ClassVar
 

@@ -1,11 +1,11 @@
-"""The jacket takes its time to take up heat."""
+"""Lag of the cooling jacket."""
 
 from dataclasses import replace
 
 import casadi as ca
 
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.effect_states import lagged
+from reactorwatch.process.effect_states import add_lag
 from reactorwatch.process.library.cstr.model import COOLING
 from reactorwatch.process.model import ProcessModel, variable
 
@@ -13,7 +13,7 @@ from reactorwatch.process.model import ProcessModel, variable
 class JacketLag(Effect):
     """The cooling duty, K2 qc (1 - exp(-K3/qc)) (Tcf - T) in the energy balance, follows this value with a lag of m.
 
-    Whatever else is wrong with the coolant is in the value that is followed.
+    Other effects on the coolant are part of the value that is followed.
     """
 
     name = "jacket_lag"
@@ -24,16 +24,16 @@ class JacketLag(Effect):
     lower = 0.0
     upper = 10.0
     typical = 0.1
-    starts = (0.05, 0.5)
+    start_values = (0.05, 0.5)
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.
 
         Raises:
-            ValueError: the model has no state T, or does not say what the coolant takes.
+            ValueError: the model has no state T, or no term of the cooling.
         """
         static = model.term(COOLING)
         state = variable(f"{self.prefix(model)}.duty", "K/min", (-1e4, 1e4), 10.0, "what the jacket takes up")
-        extended, duty = lagged(model, state, static, size)
-        extended = extended.added_to("T", duty - static)
+        extended, duty = add_lag(model, state, static, size)
+        extended = extended.add_rate("T", duty - static)
         return replace(extended, terms={**extended.terms, COOLING: duty})

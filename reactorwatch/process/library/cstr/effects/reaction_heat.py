@@ -1,4 +1,4 @@
-"""The reaction gives more or less heat, at the same rate."""
+"""Deviation of the heat of reaction at the same rate."""
 
 from reactorwatch.process.effect import ParameterEffect
 

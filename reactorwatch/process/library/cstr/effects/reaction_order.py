@@ -1,4 +1,4 @@
-"""The reaction depends on the concentration by another power than the first."""
+"""Deviation of the reaction order from one."""
 
 import casadi as ca
 
@@ -6,10 +6,10 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
 REFERENCE_MOL_L = 0.1
-"""Where the rate stays as it was: the concentration at the operating point."""
+"""Concentration at which the rate is unchanged: that of the operating point."""
 
 LEAST_MOL_L = 1e-9
-"""A smaller concentration, or a negative one on the way of a solver, counts as this."""
+"""Lower bound of the concentration; a solver may reach negative values."""
 
 
 class ReactionOrder(Effect):

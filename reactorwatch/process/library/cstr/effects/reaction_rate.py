@@ -1,4 +1,4 @@
-"""The reaction runs faster or slower at every temperature alike."""
+"""Deviation of the reaction rate, the same at every temperature."""
 
 from typing import ClassVar
 
@@ -9,7 +9,7 @@ from reactorwatch.process.model import ProcessModel
 
 
 class ReactionRate(Effect):
-    """k0 (1 + m), and the heat of reaction follows: K1 holds k0 as a factor."""
+    """k0 (1 + m), and K1 (1 + m), which has k0 as a factor."""
 
     name = "reaction_rate"
     label = "changed reaction rate"

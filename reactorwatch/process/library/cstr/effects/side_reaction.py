@@ -1,4 +1,4 @@
-"""A reacts to something else as well."""
+"""Side reaction of A."""
 
 from dataclasses import replace
 
@@ -8,21 +8,21 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel, parameter
 
 REFERENCE_K = 438.54
-"""Where the rate constant of the side reaction is m: the temperature at the operating point."""
+"""Temperature at which the rate constant of the side reaction is m: that of the operating point."""
 
 ACTIVATION_K = 15e3
-"""E2, the side reaction's activation energy over the gas constant. Half as much again as that of A -> B: the
-selectivity falls with temperature, which is what makes a side reaction a matter of temperature control."""
+"""E2, the side reaction's activation energy over the gas constant. 1.5 times that of A -> B: the selectivity
+falls with temperature, so temperature control matters."""
 
 HEAT_K_L_MOL = 100.0
-"""By how much a mol/l of A that reacts to D heats the contents: half of what the main reaction does, K1 / k0 = 200."""
+"""Temperature rise per mol/l of A that reacts to D: half of the main reaction's, K1 / k0 = 200."""
 
 
 class SideReaction(Effect):
     """A also goes to D, at the rate m exp(-E2 (1/T - 1/438.54)) C, and releases heat of its own.
 
     E2 and the heat are parameters of the extended model, `side_reaction.E2` and `side_reaction.heat`: a record with
-    enough in it can tell them too.
+    enough excitation identifies them too.
     """
 
     name = "side_reaction"
@@ -33,7 +33,7 @@ class SideReaction(Effect):
     lower = 0.0
     upper = 20.0
     typical = 0.1
-    starts = (0.02, 0.5)
+    start_values = (0.02, 0.5)
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.
@@ -46,5 +46,5 @@ class SideReaction(Effect):
         E2 = parameter(f"{prefix}.E2", ACTIVATION_K, "K", (0.0, 1e5), "activation energy over R, of A -> D")
         heat = parameter(f"{prefix}.heat", HEAT_K_L_MOL, "K l/mol", (-1e3, 1e3), "heat over rho cp, of A -> D")
         rate = size * ca.exp(-E2.symbol * (1 / T - 1 / REFERENCE_K)) * C
-        extended = model.added_to("C", -rate).added_to("T", heat.symbol * rate)
+        extended = model.add_rate("C", -rate).add_rate("T", heat.symbol * rate)
         return replace(extended, parameters=(*model.parameters, E2, heat))

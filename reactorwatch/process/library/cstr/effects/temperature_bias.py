@@ -1,4 +1,4 @@
-"""The thermometer is off."""
+"""Bias of the temperature sensor."""
 
 from typing import ClassVar
 
@@ -22,6 +22,6 @@ class TemperatureBias(ReadingEffect):
     output = "T"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the temperature sensor"}
 
-    def measured(self, value: ca.SX, size: ca.SX) -> ca.SX:
+    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
         """See `ReadingEffect`."""
         return value + size

@@ -1,9 +1,9 @@
-"""The thermometer is slow."""
+"""Lag of the temperature sensor."""
 
 import casadi as ca
 
 from reactorwatch.process.effect import SensorEffect
-from reactorwatch.process.effect_states import lagged
+from reactorwatch.process.effect_states import add_lag
 from reactorwatch.process.model import ProcessModel, variable
 
 
@@ -18,10 +18,10 @@ class TemperatureLag(SensorEffect):
     lower = 0.0
     upper = 10.0
     typical = 0.1
-    starts = (0.05, 0.5)
+    start_values = (0.05, 0.5)
     output = "T"
 
-    def sensed(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
+    def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
         """See `SensorEffect`."""
         well = variable(f"{self.prefix(model)}.well", "K", (150.0, 800.0), 10.0, "temperature in the thermowell")
-        return lagged(model, well, value, size)
+        return add_lag(model, well, value, size)

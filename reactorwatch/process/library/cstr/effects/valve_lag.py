@@ -1,9 +1,9 @@
-"""The coolant valve is slow."""
+"""Lag of the coolant valve."""
 
 import casadi as ca
 
 from reactorwatch.process.effect import Effect, coolant_flow_of
-from reactorwatch.process.effect_states import lagged
+from reactorwatch.process.effect_states import add_lag
 from reactorwatch.process.model import ProcessModel, variable
 
 
@@ -18,7 +18,7 @@ class ValveLag(Effect):
     lower = 0.0
     upper = 10.0
     typical = 0.1
-    starts = (0.05, 0.5)
+    start_values = (0.05, 0.5)
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.
@@ -29,5 +29,5 @@ class ValveLag(Effect):
         qc = coolant_flow_of(self, model)
         name = f"{self.prefix(model)}.flow"
         state = variable(name, qc.unit, (qc.lower, qc.upper), qc.scale, "flow that the valve lets through")
-        _, flow = lagged(model, state, qc.symbol, size)
-        return lagged(model.substitute(qc.symbol, flow), state, qc.symbol, size)[0]
+        _, flow = add_lag(model, state, qc.symbol, size)
+        return add_lag(model.substitute(qc.symbol, flow), state, qc.symbol, size)[0]

@@ -1,4 +1,4 @@
-"""The coolant valve sticks."""
+"""Stiction of the coolant valve."""
 
 from dataclasses import replace
 
@@ -11,9 +11,9 @@ from reactorwatch.process.model import ProcessModel, variable
 class ValveStiction(Effect):
     """The valve moves only when qc is more than m away from it; then it goes to qc.
 
-    That is decided when a row begins, for between rows qc does not change. The flow that the valve stands at is a state
-    which jumps then and stays in between. A run depends on m in jumps: it is the same for all m between two differences
-    that occur in a record. So its derivative by m is zero, and a fit has to scan m, not climb.
+    It moves when a row begins, as qc is constant between rows. The valve's position, as a flow, is a state that jumps
+    then and is constant in between. A simulation is the same for all m between two changes of qc that occur in a
+    record. So its derivative with respect to m is zero, and a fit has to scan m.
     """
 
     name = "valve_stiction"
@@ -24,8 +24,8 @@ class ValveStiction(Effect):
     lower = 0.0
     upper = 100.0
     typical = 2.0
-    jumps = True
-    starts = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
+    is_discontinuous = True
+    start_values = (0.1, 0.2, 0.4, 0.8, 1.6, 3.2, 6.4)
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`.
@@ -39,6 +39,6 @@ class ValveStiction(Effect):
         free = ca.logic_or(ca.fabs(qc.symbol - state.symbol) > size, size <= 0)
         moved = ca.if_else(free, qc.symbol, state.symbol)
         stuck = model.substitute(qc.symbol, state.symbol)
-        # What jumps at the same moment sees where the valve has gone.
+        # Other states that jump at this row see the new position.
         stuck = replace(stuck, resets=model.substitute(qc.symbol, moved).resets)
         return stuck.with_state(state, ca.SX(0), at_rest=qc.symbol, reset=moved)

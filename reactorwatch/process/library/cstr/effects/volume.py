@@ -1,4 +1,4 @@
-"""More is in the reactor than should be, or less."""
+"""Deviation of the volume of the contents."""
 
 import casadi as ca
 
@@ -7,9 +7,9 @@ from reactorwatch.process.model import ProcessModel
 
 
 class Volume(Effect):
-    """V (1 + m); flows and hA are what they were, so q/V and K2, which holds 1/V as a factor, are divided by 1 + m.
+    """V (1 + m); flows and hA are unchanged, so q/V and K2, which has 1/V as a factor, are divided by 1 + m.
 
-    With a level of its own, it is the set point of the level that is off: the level follows.
+    With level control, the set point is V_set (1 + m), and the level responds.
     """
 
     name = "volume"

@@ -1,4 +1,4 @@
-"""The wall of the vessel stores heat."""
+"""Heat capacity of the vessel's wall."""
 
 from dataclasses import replace
 
@@ -8,7 +8,7 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel, parameter, variable
 
 EXCHANGE_PER_MIN = 2.0
-"""How fast the wall follows the contents, the inverse of a time constant of half a minute: 8 mm of steel (7800 kg/m3,
+"""Rate of the wall's temperature, a time constant of half a minute: 8 mm of steel (7800 kg/m3,
 500 J/(kg K)) behind a film of 1000 W/(m2 K), as stirred liquids have it."""
 
 
@@ -17,7 +17,8 @@ class WallHeatCapacity(Effect):
 
         dT/dt = ... + m r (Tw - T),    dTw/dt = r (T - Tw)
 
-    r is a parameter of the extended model, `wall_heat_capacity.exchange`: a record with enough in it can tell it too.
+    r is a parameter of the extended model, `wall_heat_capacity.exchange`: a record with enough excitation identifies it
+    too.
     """
 
     name = "wall_heat_capacity"
@@ -41,5 +42,5 @@ class WallHeatCapacity(Effect):
         wall = variable(f"{prefix}.temperature", inside.unit, bounds, inside.scale, "temperature of the wall")
         exchange = parameter(f"{prefix}.exchange", EXCHANGE_PER_MIN, "1/min", (0.01, 20.0), "how fast the wall follows")
         rate = exchange.symbol * (inside.symbol - wall.symbol)
-        extended = model.added_to("T", -size * rate).with_state(wall, rate, at_rest=inside.symbol)
+        extended = model.add_rate("T", -size * rate).with_state(wall, rate, at_rest=inside.symbol)
         return replace(extended, parameters=(*model.parameters, exchange))
