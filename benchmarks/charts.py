@@ -14,20 +14,21 @@ from typing import Any
 import numpy as np
 
 from monitor_node.alarms.annunciator import AlarmBoard
-from monitor_node.chart_stage import OF_ALL, OF_EACH, ChartWatch
+from monitor_node.chart_stage import ChartWatch
 from monitor_node.config import ChartName, MonitorConfig
 from reactorwatch.spc import run_length
-from reactorwatch.spc.charts.base import Bank, SignalChart
+from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.compiled_chart import Bank, CompiledChart
 from reactorwatch.spc.prewhitening import Prewhitening
 
 ROWS, PLANTS, REPEATS, RUNS = 20_000, 10_000, 5, 4_000
 PHIS = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9)
 
 
-def all_charts() -> list[SignalChart]:
+def all_charts() -> list[CompiledChart]:
     """One of each kind."""
     return [Shewhart(0.0, 1.0, rules=(1, 2, 3, 4)), Cusum(0.0, 1.0), Ewma(0.0, 1.0, exact_limits=True)]
 
@@ -70,11 +71,16 @@ def of_a_plant() -> None:
     rng = np.random.default_rng(2)
     learned = [Prewhitening(0.0, (0.1,), 1.0, 1000, 5e-4, 1e-3)] * 2
     rows = rng.standard_normal((ROWS, 2)).tolist()
-    kinds: tuple[tuple[ChartName, ...], ...] = (MonitorConfig().charts, (*OF_EACH, *OF_ALL))
+    kinds: tuple[tuple[ChartName, ...], ...] = (
+        MonitorConfig().charts,
+        tuple(kind.name for kind in CHARTS if kind.name != "parameters"),
+    )
     for charts in kinds:
         config = MonitorConfig(charts=charts)
         watch = ChartWatch(config, AlarmBoard(config))
-        watch.start(learned, rng.standard_normal((1000, 2)), 2e6)
+        e = rng.standard_normal((1000, 2))
+        watch.choose([True, True], e)
+        watch.start(learned, e, 2e6)
 
         def run(watch: ChartWatch = watch) -> None:
             for time_ns, e in enumerate(rows):
@@ -84,7 +90,7 @@ def of_a_plant() -> None:
         print(f"{', '.join(charts)}: {each * 1e6:.2f} us a row of one plant   (goal: 20)")
 
 
-def simulated(charts: Sequence[SignalChart], phi: float, seed: int) -> tuple[float, float]:
+def simulated(charts: Sequence[CompiledChart], phi: float, seed: int) -> tuple[float, float]:
     """Mean run length on AR(1) data of unit variance, and its standard error."""
     rng = np.random.default_rng(seed)
     bank = Bank(charts)
@@ -99,7 +105,7 @@ def simulated(charts: Sequence[SignalChart], phi: float, seed: int) -> tuple[flo
 
 def autocorrelation() -> None:
     """Print the run lengths without a shift, by the autocorrelation."""
-    charts: list[tuple[str, SignalChart, float]] = [
+    charts: list[tuple[str, CompiledChart, float]] = [
         ("Shewhart 3 sigma", Shewhart(0.0, 1.0), run_length.shewhart(0.0)),
         ("CUSUM h 4", Cusum(0.0, 1.0, h=4.0), run_length.cusum(0.0, h=4.0)),
         ("CUSUM h 5", Cusum(0.0, 1.0, h=5.0), run_length.cusum(0.0, h=5.0)),

@@ -1,36 +1,32 @@
 """All the charts of one plant: built from its training and its budget of false alarms, fed row by row.
 
-What comes in is one prewhitened residual an output, in standard deviations. Which charts look at it is a setting:
-
-- `shewhart` sees a large change within a few rows: an alarm takes several of the last points beyond its limit.
-- `ewma` sees a moderate change of one output, `cusum` likewise.
-- `mewma` has the longest memory and looks at all outputs together: small lasting changes.
-- `t2` looks at all outputs of one row; `pca_t2` and `pca_spe` at what they have in common and what they don't.
-
-A chart with a memory begins anew when its alarm is cleared, so that false alarms do not come in clusters.
+What comes in is one prewhitened residual an output, in standard deviations. Which charts look at it is a setting; the
+charts there are: `reactorwatch.spc.charts.catalogue`. A chart is restarted when its alarm is cleared, so that false
+alarms do not come in clusters.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import compress
+from typing import TypeAlias
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.alarms.alarms import ChartAlarm, Explanation, quantity
+from monitor_node.alarms.alarms import ChartAlarm, Explanation
 from monitor_node.alarms.annunciator import AlarmBoard
-from monitor_node.baseline.chart_design import ChartDesign, VectorChart, joint_obstacle
-from monitor_node.config import ChartName, MonitorConfig, PriorityName
+from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import ChartPoint
-from reactorwatch.spc.charts.base import Bank, Judgement, SignalChart, SignalState
-from reactorwatch.spc.charts.cusum import Cusum
-from reactorwatch.spc.charts.ewma import Ewma
-from reactorwatch.spc.charts.mewma import Mewma, MewmaState
-from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2
-from reactorwatch.spc.charts.shewhart import Shewhart
-from reactorwatch.spc.charts.t2 import T2, T2State
+from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.baseline import Baseline, complete_rows, memory_sds
+from reactorwatch.spc.charts.base import Chart, Judgement, Shown, SignalChart
+from reactorwatch.spc.charts.catalogue import chart
+from reactorwatch.spc.charts.shewhart import designed_width
+from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalState
+from reactorwatch.spc.joint_chart import JointChart
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.stored_state import StoredState
 
@@ -41,14 +37,6 @@ ALL = "all"
 
 SD = "sd"
 """The unit of what charts show: standard deviations of the residual."""
-
-OF_EACH: tuple[ChartName, ...] = ("shewhart", "ewma", "cusum")
-OF_ALL: tuple[ChartName, ...] = ("t2", "mewma", "pca_t2", "pca_spe")
-WITHOUT_MEMORY = ("shewhart", "t2", "pca_t2", "pca_spe")
-"""An alarm of theirs takes several points, so that a single outlier raises none."""
-
-
-SIGNAL_CHARTS: dict[str, type[SignalChart]] = {kind.name: kind for kind in (Shewhart, Ewma, Cusum)}
 
 
 class ChartsState(StoredState, frozen=True):
@@ -66,101 +54,96 @@ class ChartsState(StoredState, frozen=True):
 
 
 def alarm_names(config: MonitorConfig) -> list[tuple[str, str]]:
-    """(chart, of what) of every alarm that the charts of a plant can raise."""
-    of_all = OF_ALL if len(config.outputs) > 1 else ()
+    """(chart, signal or `ALL`) of every alarm that the charts of a plant can raise."""
     names: list[tuple[str, str]] = []
-    for chart in config.charts:
-        if chart in OF_EACH:
-            names += [(chart, signal) for signal in config.outputs]
-        elif chart in of_all:
-            names.append((chart, ALL))
+    for name in config.charts:
+        kind = chart(name)
+        if issubclass(kind, SignalChart):
+            names += [(name, signal) for signal in config.outputs]
+        elif issubclass(kind, JointChart) and len(config.outputs) > 1:
+            names.append((name, ALL))
     return names
 
 
-class _OfEach:
-    """Charts of one kind, one an output."""
+def _without(known: list[bool], withheld: tuple[bool, ...]) -> list[bool]:
+    return [here and not outlier for here, outlier in zip(known, withheld, strict=True)]
 
-    def __init__(self, name: str, bank: Bank[SignalChart], signals: tuple[str, ...], passed: list[float]) -> None:
-        self._name, self._signals, self._passed = name, signals, passed
-        self._bank = bank
-        self._shows_outliers = name in WITHOUT_MEMORY
 
-    @classmethod
-    def from_bytes(cls, name: str, data: bytes, signals: tuple[str, ...], passed: list[float]) -> "_OfEach":
-        """The charts that go on where they were."""
-        state = SignalState.from_bytes(data)
-        if state.plants != len(signals):
-            raise ValueError(f"there must be {len(signals)} charts {name}, got {state.plants}")
-        return cls(name, Bank.from_state(SIGNAL_CHARTS[name], state), signals, passed)
+class _Banked:
+    """Compiled charts, one an output.
+
+    `update` takes a row in and returns whether any chart is out; `judgement` is that of one chart, None if it had
+    nothing to judge. So it is with `_OfEach` and `_OfAll`.
+    """
+
+    def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
+        self._bank, self._has_memory = bank, kind.has_memory
 
     def to_bytes(self) -> bytes:
-        """All that the charts are and remember."""
         return self._bank.state.to_bytes()
 
     def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
-        """Take a row in; whether any chart is out."""
-        if True in withheld and not self._shows_outliers:
-            known = [here and not outlier for here, outlier in zip(known, withheld, strict=True)]
-        self._known = known
-        return self._bank.judge(e, known)
+        self._known = _without(known, withheld) if True in withheld and self._has_memory else known
+        return self._bank.judge(e, self._known)
 
-    def judgement(self, place: int) -> Judgement | None:
-        """Of one of the charts; None if it had nothing to judge."""
-        return self._bank.judgement(place) if self._known[place] else None
+    def judgement(self, index: int) -> Judgement | None:
+        return self._bank.judgement(index) if self._known[index] else None
 
-    def restart(self, place: int) -> None:
-        """Let one of the charts forget."""
-        self._bank.restart(np.arange(len(self._signals)) == place)
+    def restart(self, index: int) -> None:
+        self._bank.restart(np.arange(len(self._known)) == index)
 
-    def explain(self, place: int, judgement: Judgement, scales: list[float], units: list[str]) -> Explanation:
-        """What to say of a point that is out."""
-        signal, unit = self._signals[place], units[place]
-        side = "above" if judgement.statistic > judgement.centre else "below"
-        size = abs(judgement.statistic) * scales[place]
-        if self._name == Shewhart.name:
-            allowed = quantity(judgement.upper_limit * scales[place], unit)
-            text = f"{signal} is {quantity(size, unit)} {side} what the model expects (allowed: {allowed})"
-        elif self._name == Ewma.name:
-            # As the lasting shift of the output that would look like this.
-            text = f"{signal} is on average {quantity(size / self._passed[place], unit)} {side} what the model expects"
-        else:
-            text = f"{signal} has been {side} what the model expects for long"
-        return Explanation(text, {signal: 1.0})
+    def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
+        return self._bank.chart(index).explain(judgement, signals[index])
+
+
+class _OfEach:
+    """Charts without a compiled kernel, one an output."""
+
+    def __init__(self, charts: Sequence[SignalChart]) -> None:
+        self._charts = charts
+        self._judgements: list[Judgement | None] = []
+
+    def to_bytes(self) -> bytes:
+        return msgspec.msgpack.encode([item.state.to_bytes() for item in self._charts])
+
+    def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
+        if True in withheld and self._charts[0].has_memory:
+            known = _without(known, withheld)
+        self._judgements = [
+            item.update(value) if here else None for item, value, here in zip(self._charts, e, known, strict=True)
+        ]
+        return any(judgement is not None and judgement.out for judgement in self._judgements)
+
+    def judgement(self, index: int) -> Judgement | None:
+        return self._judgements[index]
+
+    def restart(self, index: int) -> None:
+        self._charts[index].restart()
+
+    def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
+        return self._charts[index].explain(judgement, signals[index])
 
 
 class _OfAll:
     """A chart of all outputs together.
 
     Args:
-        chart: the chart.
-        signals: names of the outputs.
-        evaluated: which of them the chart looks at.
+        joint: the chart.
+        evaluated: which outputs it looks at.
     """
 
-    def __init__(self, chart: VectorChart, signals: tuple[str, ...], evaluated: list[bool]) -> None:
-        self._chart = chart
-        self._signals = tuple(compress(signals, evaluated))
-        self._evaluated = None if all(evaluated) else evaluated  # None: all
+    def __init__(self, joint: JointChart, evaluated: list[bool]) -> None:
+        self._chart = joint
+        self._evaluated, self._all = evaluated, all(evaluated)
         self._last: list[float] = []
         self._judgement: Judgement | None = None
 
-    @classmethod
-    def from_bytes(cls, name: str, data: bytes, signals: tuple[str, ...], evaluated: list[bool]) -> "_OfAll":
-        """The chart that goes on where it was."""
-        if name == Mewma.name:
-            return cls(Mewma.from_state(MewmaState.from_bytes(data)), signals, evaluated)
-        if name == T2.name:
-            return cls(T2.from_state(T2State.from_bytes(data)), signals, evaluated)
-        model = PcaModel.from_bytes(data)
-        return cls(PcaT2(model) if name == PcaT2.name else PcaSpe(model), signals, evaluated)
-
     def to_bytes(self) -> bytes:
-        """All that the chart is and remembers."""
         return self._chart.state.to_bytes()
 
     def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
         """Take a row in; whether the chart is out. A row in which an output is missing is left out."""
-        if self._evaluated is not None:
+        if not self._all:
             e, known = list(compress(e, self._evaluated)), list(compress(known, self._evaluated))
         if False in known or True in withheld:
             self._judgement = None
@@ -169,30 +152,24 @@ class _OfAll:
         self._judgement = self._chart.update(e)
         return self._judgement.out
 
-    def judgement(self, place: int) -> Judgement | None:
-        """None if it had nothing to judge."""
+    def judgement(self, index: int) -> Judgement | None:
         return self._judgement
 
-    def restart(self, place: int) -> None:
-        """Let the chart forget."""
+    def restart(self, index: int) -> None:
         self._chart.restart()
 
-    def explain(self, place: int, judgement: Judgement, scales: list[float], units: list[str]) -> Explanation:
-        """What to say of a point that is out."""
-        chart = self._chart
-        parts = chart.contributions() if isinstance(chart, Mewma) else chart.contributions(self._last)
-        shares = np.maximum(parts, 0.0) / np.sum(np.maximum(parts, 0.0))
-        order = np.argsort(-shares)
-        told = " and ".join(f"{self._signals[index]} ({100 * shares[index]:.0f} %)" for index in order)
-        text = f"what the model leaves unexplained is unlike the training: {told}"
-        return Explanation(text, {self._signals[index]: float(shares[index]) for index in order})
+    def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
+        return self._chart.explain(self._last, list(compress(signals, self._evaluated)))
+
+
+_Charts: TypeAlias = _Banked | _OfEach | _OfAll
 
 
 @dataclass
 class _Watched:
     """Charts, with the alarm and the key of each."""
 
-    charts: _OfEach | _OfAll
+    charts: _Charts
     alarms: list[ChartAlarm]
     keys: list[str]
     at_rest: bool = True
@@ -210,9 +187,10 @@ class ChartWatch:
         self._config = config
         self._board = board
         self._alarms = {
-            pair: board.declare(*pair, at_once=pair[0] not in WITHOUT_MEMORY, priority=self._priority(pair[1]))
+            pair: board.declare(*pair, at_once=chart(pair[0]).has_memory, priority=self._priority(pair[1]))
             for pair in alarm_names(config)
         }
+        self._names = list[str](dict.fromkeys(name for name, _ in self._alarms))
         self._watched: dict[str, _Watched] = {}
         self._evaluated: list[bool] = []
         self._chosen: list[str] = []
@@ -233,19 +211,22 @@ class ChartWatch:
             evaluated: which outputs are evaluated.
             e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
         """
-        names = list[str](dict.fromkeys(chart for chart, _ in self._alarms))
+        rows, signals = (
+            complete_rows(e, np.flatnonzero(evaluated).tolist()),
+            list(compress(self._config.outputs, evaluated)),
+        )
         obstacles = {
             name: why
-            for name in names
-            if name in OF_ALL and (why := joint_obstacle(name, self._config.outputs, e, evaluated))
+            for name in self._names
+            if issubclass(kind := chart(name), JointChart) and (why := kind.obstacle(rows, signals))
         }
-        self._evaluated, self._chosen = evaluated, [name for name in names if name not in obstacles]
+        self._evaluated, self._chosen = evaluated, [name for name in self._names if name not in obstacles]
         return {self._alarms[name, ALL].name: why for name, why in obstacles.items()}
 
     @property
     def chance_alarms(self) -> int:
         """Number of their alarms that chance can raise."""
-        return sum(sum(self._evaluated) if name in OF_EACH else 1 for name in self._chosen)
+        return sum(sum(self._evaluated) if issubclass(chart(name), SignalChart) else 1 for name in self._chosen)
 
     def start(self, learned: list[Prewhitening], e: Array, arl0: float) -> None:
         """Make the charts, after `choose`.
@@ -256,15 +237,18 @@ class ChartWatch:
             arl0: run length of each alarm without a fault, in rows.
         """
         config = self._config
-        design = ChartDesign(config, learned, e, self._evaluated, arl0)
-        self.widths, self._passed = design.widths, [item.passed for item in learned]
+        p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
+        sds = memory_sds(e, config.chart_settings["ewma_weight"])
+        baseline = Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
+        self.widths, self._passed = [designed_width(p, item) for item in learned], [item.passed for item in learned]
 
-        def made(name: str) -> _OfEach | _OfAll:
-            if name in OF_EACH:
-                return _OfEach(name, Bank(design.of_each(name)), config.outputs, self._passed)
-            return _OfAll(design.of_all(name), config.outputs, self._evaluated)
+        def designed(kind: type[Chart]) -> _Charts:
+            if issubclass(kind, SignalChart):
+                return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(config.outputs))])
+            assert issubclass(kind, JointChart)
+            return _OfAll(kind.design(baseline.of(np.flatnonzero(self._evaluated).tolist())), self._evaluated)
 
-        self._watch(made)
+        self._watch(designed)
 
     @property
     def state(self) -> ChartsState:
@@ -282,30 +266,35 @@ class ChartWatch:
         Raises:
             ValueError: the state is damaged.
         """
-        signals = self._config.outputs
         self.widths, self._passed = list(state.widths), list(state.passed)
-        names = list[str](dict.fromkeys(chart for chart, _ in self._alarms))
-        self._evaluated, self._chosen = evaluated, [name for name in names if name in state.charts]
-        each = {name for name in names if name in OF_EACH}
-        if not each <= set(state.charts) <= set(names) or not len(self.widths) == len(self._passed) == len(signals):
-            raise ValueError(f"there must be the charts {', '.join(names)}, got {', '.join(state.charts)}")
+        self._evaluated, self._chosen = evaluated, [name for name in self._names if name in state.charts]
+        outputs = len(self._config.outputs)
+        each = {name for name in self._names if issubclass(chart(name), SignalChart)}
+        if not each <= set(state.charts) <= set(self._names) or not len(self.widths) == len(self._passed) == outputs:
+            raise ValueError(f"there must be the charts {', '.join(self._names)}, got {', '.join(state.charts)}")
 
-        def made(name: str) -> _OfEach | _OfAll:
-            data = state.charts[name]
-            if name in OF_EACH:
-                return _OfEach.from_bytes(name, data, signals, self._passed)
-            return _OfAll.from_bytes(name, data, signals, self._evaluated)
+        def restored(kind: type[Chart]) -> _Charts:
+            data = state.charts[kind.name]
+            if issubclass(kind, CompiledChart):
+                columns = SignalState.from_bytes(data)
+                if columns.plants != outputs:
+                    raise ValueError(f"there must be {outputs} charts {kind.name}, got {columns.plants}")
+                return _Banked(Bank.from_state(kind, columns), kind)
+            if issubclass(kind, SignalChart):
+                return _OfEach([kind.from_state(kind.State.from_bytes(item)) for item in _split(data, outputs)])
+            assert issubclass(kind, JointChart)
+            return _OfAll(kind.from_state(kind.State.from_bytes(data)), self._evaluated)
 
-        self._watch(made)
+        self._watch(restored)
 
-    def _watch(self, made: Callable[[str], _OfEach | _OfAll]) -> None:
+    def _watch(self, made: Callable[[type[Chart]], _Charts]) -> None:
         """Give the charts of each name their alarms and keys."""
         self._watched = {}
         for name in self._chosen:
             pairs = [pair for pair in self._alarms if pair[0] == name]
             alarms = [self._alarms[pair] for pair in pairs]
             paths = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
-            self._watched[name] = _Watched(made(name), alarms, paths, all(alarm.at_rest for alarm in alarms))
+            self._watched[name] = _Watched(made(chart(name)), alarms, paths, all(alarm.at_rest for alarm in alarms))
 
     def update(
         self,
@@ -338,28 +327,46 @@ class ChartWatch:
             out = watched.charts.update(e, known, withheld)
             if not (out or points) and watched.at_rest:
                 continue
-            for place, alarm in enumerate(watched.alarms):
-                judgement = watched.charts.judgement(place)
+            for index, alarm in enumerate(watched.alarms):
+                judgement = watched.charts.judgement(index)
                 if judgement is None:
                     continue
                 if points:
-                    publications.append(Publication(watched.keys[place], _point(time_ns, judgement)))
+                    publications.append(Publication(watched.keys[index], _point(time_ns, judgement)))
                 rule = alarm.memory.rule
                 if judgement.out or rule.standing or rule.recent:
                     stood = rule.standing
-                    explain = None if stood else _explaining(watched.charts, place, scales, units)
+                    explain = None if stood else self._explaining(watched.charts, index, scales, units)
                     publications.extend(self._board.judge(alarm, time_ns, judgement, SD, explain))
                     raised |= rule.standing and not stood
                     if stood and not rule.standing:
-                        watched.charts.restart(place)
+                        watched.charts.restart(index)
             watched.at_rest = all(alarm.at_rest for alarm in watched.alarms)
         return raised
 
+    def _explaining(
+        self, charts: _Charts, index: int, scales: list[float], units: list[str]
+    ) -> Callable[[Judgement], Explanation]:
+        def explain(judgement: Judgement) -> Explanation:
+            signals = [Shown(*item) for item in zip(self._config.outputs, units, scales, self._passed, strict=True)]
+            return Explanation(*charts.explain(index, judgement, signals))
 
-def _explaining(
-    charts: _OfEach | _OfAll, place: int, scales: list[float], units: list[str]
-) -> Callable[[Judgement], Explanation]:
-    return lambda judgement: charts.explain(place, judgement, scales, units)
+        return explain
+
+
+def _of_each(kind: type[SignalChart], charts: list[SignalChart]) -> _Charts:
+    """One chart an output, as a bank where there is a kernel."""
+    if issubclass(kind, CompiledChart):
+        return _Banked(Bank([item for item in charts if isinstance(item, kind)]), kind)
+    return _OfEach(charts)
+
+
+def _split(data: bytes, count: int) -> list[bytes]:
+    """The states of charts without a kernel, one an output."""
+    states = msgspec.msgpack.decode(data, type=list[bytes])
+    if len(states) != count:
+        raise ValueError(f"there must be {count} charts, got {len(states)}")
+    return states
 
 
 def _point(time_ns: int, judgement: Judgement) -> ChartPoint:

@@ -1,13 +1,24 @@
 """The monitor's settings."""
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
 
 from reactorwatch.contract.keys import check_plant
+from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.m_of_n import check_rule
 
-ChartName = Literal["shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe", "parameters"]
+CHART_SETTINGS = [setting for chart in CHARTS for setting in chart.settings]
+
+if TYPE_CHECKING:
+    ChartName: TypeAlias = str
+    _OfCharts = msgspec.Struct
+else:
+    ChartName = Literal[tuple(chart.name for chart in CHARTS)]
+    _OfCharts = msgspec.defstruct(
+        "_OfCharts", [(setting.key, float, setting.default) for setting in CHART_SETTINGS], frozen=True
+    )
+
 PriorityName = Literal["low", "medium", "high", "critical"]
 
 DEFAULT_PRIORITIES: dict[str, PriorityName] = {"T": "high"}
@@ -18,8 +29,8 @@ SMALLEST_SD = {"C": 2e-4, "T": 0.05}
 """Settings of the reactor's outputs; other outputs have none unless the settings say so."""
 
 
-class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a plant is watched.
+class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
+    """How a plant is watched. The charts of the catalogue have keys of their own beside these: see `chart_settings`.
 
     Attributes:
         plant: its name.
@@ -36,9 +47,6 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         charts: that watch the residuals.
         false_alarms_per_30_days: how many alarms chance may raise in 30 days of the plant, all alarms together; None:
             1, or the nearest number that the charts can keep for the number of alarms and the period of the rows.
-        ewma_weight: of the newest row in the EWMA chart, in (0, 1].
-        mewma_weight: of the newest row in the MEWMA chart, in [0.01, 1].
-        cusum_allowance: k of the CUSUM chart, in standard deviations.
         smallest_sd: standard deviation of the residual that is taken at least, by output, in its unit: what is smaller
             is of no interest.
         isolation: whether the cause of an alarm is looked for, where the reference is the reactor's equations.
@@ -71,9 +79,6 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model: str | None = None
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
     false_alarms_per_30_days: float | None = None
-    ewma_weight: float = 0.1
-    mewma_weight: float = 0.02
-    cusum_allowance: float = 0.25
     smallest_sd: dict[str, float] = msgspec.field(default_factory=SMALLEST_SD.copy)
     isolation: bool = True
     isolation_rows: int = 600
@@ -106,9 +111,7 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             ("forgetting", self.forgetting, 0.5, 1.0),
             ("training_min", self.training_min, 1e-3, 1e6),
             ("false_alarms_per_30_days", 1.0 if asked is None else asked, 1e-3, 1e6),
-            ("ewma_weight", self.ewma_weight, 1e-3, 1.0),
-            ("mewma_weight", self.mewma_weight, 0.01, 1.0),
-            ("cusum_allowance", self.cusum_allowance, 0.05, 5.0),
+            *((item.key, getattr(self, item.key), item.lower, item.upper) for item in CHART_SETTINGS),
             ("isolation_rows", self.isolation_rows, 50, 10_000),
             ("silence_periods", self.silence_periods, 1.5, 1e6),
             ("dead_band", self.dead_band, 0.0, 0.9),
@@ -134,3 +137,8 @@ class MonitorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for signal in self.priorities:
             if signal not in self.outputs:
                 raise ValueError(f"priorities are by output, {self.outputs}, got {signal!r}")
+
+    @property
+    def chart_settings(self) -> dict[str, float]:
+        """The charts' own settings, by key."""
+        return {setting.key: getattr(self, setting.key) for setting in CHART_SETTINGS}

@@ -430,4 +430,4 @@ def _model_of(process: ProcessLike, record: Record | None = None) -> ProcessMode
         names = ", ".join(processes)
         raise InputError(f"process must be one of {names}, the path of an extended.json or a model, got {process!r}")
     extended = read_extended_model(path)
-    return (extended.counted_from(record.zero_ns) if record is not None and record.zero_ns else extended).build()
+    return (extended.rebase(record.zero_ns) if record is not None and record.zero_ns else extended).build()

@@ -10,7 +10,7 @@ from monitor_node.alarms.on_off_delay import Persistence, PersistenceState
 from monitor_node.alarms.states import Event, State, next_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Contribution, Priority, Suspect
-from reactorwatch.spc.charts.base import Judgement
+from reactorwatch.spc.charts.base import Judgement, quantity
 
 PRIORITIES: Mapping[str, Priority] = {
     "low": Priority.PRIORITY_LOW,
@@ -117,22 +117,6 @@ def remembered(alarm: Alarm) -> AlarmMemory:
         by=alarm.by,
         comment=alarm.comment,
     )
-
-
-def quantity(value: float, unit: str, form: str = ".3g") -> str:
-    """A number and its unit, as texts of alarms have it.
-
-    >>> quantity(7.25, "K")
-    '7.25 K'
-    >>> quantity(7.25, "", "+.1f")
-    '+7.2'
-
-    Args:
-        value: the number.
-        unit: empty where it is not known; 1 where there is none.
-        form: of the number.
-    """
-    return f"{value:{form}}" if unit in ("", "1") else f"{value:{form}} {unit}"
 
 
 class Explanation(NamedTuple):

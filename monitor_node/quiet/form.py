@@ -42,6 +42,7 @@ from monitor_node.quiet.lining_up import (
     write_runs,
 )
 from monitor_node.quiet.ring import NewestRows, times_ns_of
+from monitor_node.signal_checks.catalogue import CHECKS
 from monitor_node.state.monitor_state import MonitorState
 from monitor_node.state.pipeline_state import WatchedState, WatchState
 from reactorwatch.contract import keys
@@ -50,15 +51,18 @@ from reactorwatch.contract.sample_bytes import unit_digest
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.spc.charts.base import SignalState
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma, MewmaState
 from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.compiled_chart import SignalState
 from reactorwatch.stored_state import packed, unpacked
 
 CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)
 """That quiet plants may have, in the order of `rows.judge`."""
+
+CHECKED = {"silence", "stuck", "spike", "range"}
+"""The signal checks that `rows.judge` has compiled; with another one every plant keeps its monitor."""
 
 
 class Rest(NamedTuple):
@@ -140,7 +144,11 @@ class QuietForm:
         """
         if model is None or model.breakpoints or len(model.input_names) != 1 or model.output_names != config.outputs:
             return None
-        if not set(config.charts) <= set(CHARTS) or (len(config.outputs) < 2 and Mewma.name in config.charts):
+        if (
+            {check.name for check in CHECKS} != CHECKED
+            or not set(config.charts) <= set(CHARTS)
+            or (len(config.outputs) < 2 and Mewma.name in config.charts)
+        ):
             return None
         form = QuietForm(config, model)
         return form if form.keeps >= form.remembered else None
@@ -309,7 +317,7 @@ class QuietForm:
         for name in dict.fromkeys(self.config.charts):
             if name == Mewma.name:
                 mean, covariance, average = (p[field].tolist() for field in ("mean", "covariance", "average"))
-                weight, limit = self.config.mewma_weight, float(p["mewma_limit"])
+                weight, limit = self.config.chart_settings["mewma_weight"], float(p["mewma_limit"])
                 charts[name] = MewmaState(mean, covariance, weight, limit, average).to_bytes()
             else:
                 numbers = p[name].astype("<f8").tobytes()

@@ -251,7 +251,7 @@ class QuietPlants:
             self._form.places,
             self._form.rules,
             1.0 - self._config.dead_band,
-            self._config.mewma_weight,
+            self._config.chart_settings["mewma_weight"],
             found,
         )
         for place in np.flatnonzero(found).tolist():

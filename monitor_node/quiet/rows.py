@@ -26,7 +26,7 @@ from monitor_node.signal_checks.stuck import AT_REST, STRETCH
 from monitor_node.signal_checks.timeout import MEMORY
 from reactorwatch.codegen.numba_kernel import call_at, jit
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.spc.charts.base import LARGEST_VALUE, LOWER, OUT, PRESENT, SETTINGS, STATISTIC, UPPER, X
+from reactorwatch.spc.charts.base import LARGEST_VALUE
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.cusum import _judge as _judge_cusum
 from reactorwatch.spc.charts.ewma import Ewma
@@ -34,6 +34,7 @@ from reactorwatch.spc.charts.ewma import _judge as _judge_ewma
 from reactorwatch.spc.charts.mewma import _move as _move_mewma
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.shewhart import _judge as _judge_shewhart
+from reactorwatch.spc.compiled_chart import LOWER, OUT, PRESENT, SETTINGS, STATISTIC, UPPER, X
 from reactorwatch.spc.prewhitening import LARGEST_ORDER
 
 ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
@@ -195,7 +196,7 @@ def _each(p: Any, columns: Array, first: int, rules: Places, reach: float) -> bo
 
 @jit
 def _lay_out(columns: Array, numbers: Array, e: Array) -> None:
-    """The columns of a bank, see `charts.base`: a new value for each chart."""
+    """The columns of a bank, see `compiled_chart`: a new value for each chart."""
     for place in range(e.size):
         columns[X, place], columns[PRESENT, place] = e[place], 1.0
         for row in range(numbers.shape[0]):

@@ -31,7 +31,8 @@ more false spikes than promised; but isolated far values are then what the signa
 """
 
 from collections import deque
-from math import ceil, log, sqrt
+from collections.abc import Sequence
+from math import ceil, isfinite, log, sqrt
 from statistics import median
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -39,8 +40,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.baseline.signal_range import SignalRange
+from monitor_node.config import MonitorConfig
+from monitor_node.signal_checks.base import Flags, SignalCheck
+from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import finite, positive
+from reactorwatch.spc.charts.base import Judgement, finite, positive, quantity
 from reactorwatch.stored_state import StoredState
 
 BACK = 0.5
@@ -58,6 +64,8 @@ LEAST_TAIL = 10
 
 SEEN_SHARE = 0.75
 """Of these, the smaller ones whose size counts; the others count as larger."""
+
+FEWEST_ROWS = 5 * LEAST_TAIL
 
 _TO_SD = 1.4826  # of the median absolute deviation, for normal values
 
@@ -226,8 +234,8 @@ def spike_limit(z: ArrayLike, arl0: float) -> float:
     if not 1.0 < arl0 < np.inf:
         raise InputError(f"arl0 must be a number above 1, got {arl0}")
     sizes = np.sort(np.abs(np.asarray(z, dtype=np.float64)))
-    if sizes.ndim != 1 or sizes.size < 5 * LEAST_TAIL or not np.isfinite(sizes).all():
-        raise InputError(f"z must be at least {5 * LEAST_TAIL} finite values in a row, got {sizes.size}")
+    if sizes.ndim != 1 or sizes.size < FEWEST_ROWS or not np.isfinite(sizes).all():
+        raise InputError(f"z must be at least {FEWEST_ROWS} finite values in a row, got {sizes.size}")
     tail = max(ceil(TAIL_SHARE * sizes.size), LEAST_TAIL)
     threshold = float(sizes[-tail - 1])
     seen = int(SEEN_SHARE * tail)
@@ -235,3 +243,59 @@ def spike_limit(z: ArrayLike, arl0: float) -> float:
     scale = float(excess.sum() + (tail - seen) * excess[-1]) / seen
     learned = threshold + scale * (1.0 + 1.0 / sqrt(seen)) * max(0.0, log(arl0 * tail / sizes.size))
     return max(float(-ndtri(0.5 / arl0)), learned)
+
+
+class SpikeCheck(SignalCheck):
+    """Raises an alarm when an output had a spike, and withholds what may be one."""
+
+    name = Spike.name
+    can_be_false = True
+
+    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange]) -> None:
+        super().__init__(config, board, ranges)
+        self._alarms = [
+            board.declare(self.name, name, at_once=True, priority="low", tells_cause=True, is_passing=True)
+            for name in self.outputs
+        ]
+        self._spikes: list[Spike | None] = []
+        self._none = (False,) * len(self.outputs)
+
+    @property
+    def state(self) -> list[SpikeState | None]:
+        """Of each output; None for an output that is not judged; none before the training ends."""
+        return [None if spike is None else spike.state for spike in self._spikes]
+
+    def restore(self, state: list[SpikeState | None]) -> None:
+        """See `SignalCheck`."""
+        self._spikes = [None if item is None else Spike.from_state(item) for item in state]
+
+    def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
+        """See `SignalCheck`."""
+        known = [[size for size in residuals if isfinite(size)] for residuals in e]
+        self._spikes = [Spike(spike_limit(z, arl0)) if len(z) >= FEWEST_ROWS else None for z in known]
+
+    def on_residuals(
+        self, time_ns: int, e: list[float], scales: list[float], units: list[str], publications: list[Publication]
+    ) -> Flags:
+        """See `SignalCheck`."""
+        flags, is_moved = self._none, self.board.has_unexplained
+        for index, spike in enumerate(self._spikes):
+            if spike is None or not isfinite(e[index]):
+                continue
+            alarm, verdict = self._alarms[index], spike.update(e[index], is_moved=is_moved)
+            if verdict.withhold:
+                flags = (*flags[:index], True, *flags[index + 1 :])
+            if verdict.spike or not alarm.at_rest:
+                name = self.outputs[index]
+                size = verdict.size if verdict.spike else 0.0
+                judgement = Judgement(size, 0.0, -spike.limit, spike.limit, verdict.spike)
+                spiked = quantity(size * scales[index], units[index], "+.3g")
+                text = f"{name} had a spike of {spiked} one row before; it was left out"
+                publications += self.judge(alarm, time_ns, judgement, "sd", text, name, cause=self.name)
+        return flags
+
+    def on_gap(self) -> None:
+        """See `SignalCheck`."""
+        for spike in self._spikes:
+            if spike is not None:
+                spike.restart()

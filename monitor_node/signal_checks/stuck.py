@@ -29,12 +29,19 @@ counts from one. Signals that people set, like a valve position, rest as long as
 """
 
 from collections import deque
-from math import ceil, inf, log
+from collections.abc import Sequence
+from math import ceil, inf, isfinite, log
 
 from scipy.special import betaincinv
 
+from monitor_node.alarms.alarms import STUCK_SENSOR
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.baseline.signal_range import SignalRange
+from monitor_node.config import MonitorConfig
+from monitor_node.signal_checks.base import SignalCheck
+from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, quantity
 from reactorwatch.stored_state import StoredState
 
 SMALLEST = 5
@@ -53,6 +60,9 @@ AT_REST = 0.25
 """Of the mean step in the quietest stretch of the training: with less, the plant was coming to rest."""
 
 CONFIDENCE = 0.95
+
+READINGS = "readings"
+"""The unit of the alarm."""
 
 
 class StuckState(StoredState, frozen=True):
@@ -261,3 +271,62 @@ def _length(probability: float, arl0: float) -> float:
     if arl0 <= 1.0:
         return 0.0
     return float(ceil(log(arl0) / -log(probability))) if probability < 1.0 else inf
+
+
+class StuckCheck(SignalCheck):
+    """Raises an alarm when the sensor of an output is stuck; its readings are no measurements then."""
+
+    name = Stuck.name
+    can_be_false = True
+
+    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange]) -> None:
+        super().__init__(config, board, ranges)
+        self._alarms = [board.declare(self.name, name, at_once=True, tells_cause=True) for name in self.outputs]
+        self._stuck: list[Stuck] = []
+        self._note_alarms()
+
+    @property
+    def state(self) -> list[StuckState]:
+        """Of each output; none before the training ends."""
+        return [stuck.state for stuck in self._stuck]
+
+    def restore(self, state: list[StuckState]) -> None:
+        """See `SignalCheck`."""
+        self._stuck = [Stuck.from_state(item) for item in state]
+        self._note_alarms()
+
+    def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
+        """See `SignalCheck`."""
+        self._stuck = [Stuck(arl0) for _ in values]
+        self._note_alarms()
+        for stuck, readings in zip(self._stuck, values, strict=True):
+            for reading in readings:
+                if isfinite(reading):
+                    stuck.learn(reading)
+
+    def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
+        """See `SignalCheck`."""
+        publications: list[Publication] = []
+        for index, value in enumerate(values):
+            if not isfinite(value):
+                continue
+            alarm, judgement = self._alarms[index], self._stuck[index].update(value)
+            if judgement.out or not alarm.at_rest:
+                name, times = self.outputs[index], judgement.statistic
+                text = f"{name} is stuck: it has read {quantity(value, units[index], '.6g')} {times:.0f} times in a row"
+                publications += self.judge(alarm, time_ns, judgement, READINGS, text, name, cause=STUCK_SENSOR)
+                self._note_alarms()
+        return publications
+
+    @property
+    def invalid(self) -> list[bool]:
+        """See `SignalCheck`."""
+        return self._invalid
+
+    def on_restart(self) -> None:
+        """See `SignalCheck`. After a gap equal readings are counted on: it makes them no likelier."""
+        for stuck in self._stuck:
+            stuck.restart()
+
+    def _note_alarms(self) -> None:
+        self._invalid = [alarm.memory.rule.standing for alarm in self._alarms]

@@ -41,12 +41,18 @@ True
 [('T', Change(raised_ns=7500, cleared_ns=None))]
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import msgspec
 
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.baseline.signal_range import SignalRange
+from monitor_node.config import MonitorConfig
+from monitor_node.signal_checks.base import PLANT, SignalCheck
+from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import positive
+from reactorwatch.spc.charts.base import Judgement, positive
 from reactorwatch.stored_state import StoredState
 
 LEARN_FROM = 32
@@ -302,3 +308,76 @@ class Silence:
             return NOTHING
         self.standing = False
         return Change(raised_ns, heard_ns)
+
+
+class SilenceCheck(SignalCheck):
+    """Raises an alarm when the plant, or one of its signals, is silent."""
+
+    name = Silence.name
+
+    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange]) -> None:
+        super().__init__(config, board, ranges)
+        self._names = (PLANT, config.input, *config.outputs)
+        self._silences = [Silence(config.silence_periods) for _ in self._names]
+        self._alarms = [
+            board.declare(self.name, name, at_once=True, over_at_once=True, priority="high", tells_cause=True)
+            for name in self._names
+        ]
+
+    @property
+    def of_plant(self) -> Silence:
+        """The silence of all signals together."""
+        return self._silences[0]
+
+    @property
+    def silent(self) -> list[bool]:
+        """Silence of each signal, the input first."""
+        return [silence.standing for silence in self._silences[1:]]
+
+    @property
+    def state(self) -> list[SilenceState]:
+        """Of the plant, of the input and of each output."""
+        return [silence.state for silence in self._silences]
+
+    def restore(self, state: list[SilenceState]) -> None:
+        """See `SignalCheck`."""
+        self._silences = [Silence.from_state(item) for item in state]
+
+    def listen(self, now_ns: int) -> None:
+        """Wait, after a stop, for the plant's next sample."""
+        self.of_plant.listen(now_ns)
+
+    def go_on_from_alarms(self) -> None:
+        """Take as silent what the alarms say is silent: the next sample ends it."""
+        for silence, alarm in zip(self._silences, self._alarms, strict=True):
+            silence.standing = alarm.memory.rule.standing
+
+    def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
+        """See `SignalCheck`."""
+        silences = self._silences
+        publications: list[Publication] = []
+        change = silences[0].update(time_ns, present=True)
+        if change is not NOTHING:
+            publications += self.publish(0, change)
+            for silence in silences[1:]:
+                silence.excuse(time_ns)
+        is_complete = all(value == value for value in values)  # NaN is not equal to itself
+        unknown_ns = None if is_complete else silences[0].unknown_allowed_ns()
+        for index, value in enumerate(values, start=1):
+            change = silences[index].update(time_ns, present=value == value, unknown_allowed_ns=unknown_ns)
+            if change is not NOTHING:
+                publications += self.publish(index, change)
+        return publications
+
+    def publish(self, index: int, change: Change) -> list[Publication]:
+        """The alarm of the plant (index 0) or of a signal, if it changes."""
+        name, alarm = self._names[index], self._alarms[index]
+        publications: list[Publication] = []
+        if change.raised_ns is not None:
+            text = "the plant is silent: no sample of it comes" if index == 0 else f"{name} is silent: the others go on"
+            raised = Judgement(1.0, 0.0, 0.0, 0.0, True)
+            publications += self.judge(alarm, change.raised_ns, raised, "", text, name, cause=self.name)
+        if change.cleared_ns is not None:
+            over = Judgement(0.0, 0.0, 0.0, 0.0, False)
+            publications += self.judge(alarm, change.cleared_ns, over, "", "", name, cause=self.name)
+        return publications

@@ -23,6 +23,7 @@ def register_commands(app: typer.Typer) -> None:
         arl.command(command.__name__)(command)
     charts.add_typer(arl, name="arl", help="The average run length of a chart, in samples.")
     charts.command("design")(design)
+    charts.command("list")(listed)
     app.add_typer(charts, name="charts", help="Control charts: how long they run, and which is fastest.")
 
 
@@ -99,6 +100,16 @@ def t2(
     _print_length(
         run_length.t2(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift
     )
+
+
+def listed() -> None:
+    """The charts that a monitor can have, with their keys in its settings."""
+    from reactorwatch.spc.charts.catalogue import CHARTS
+
+    for kind in CHARTS:
+        say(f"{kind.name:<11} {(kind.__doc__ or '').partition(chr(10))[0]}")
+        for item in kind.settings:
+            say(f"{'':<11} {item.key} = {item.default:g}, in [{item.lower:g}, {item.upper:g}]")
 
 
 def design(

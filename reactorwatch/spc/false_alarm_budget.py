@@ -23,15 +23,12 @@ not.
 from collections.abc import Callable
 from math import ceil, comb, exp, floor, log, log10, sqrt
 
-import numpy as np
 from scipy import special
 
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Array
-from reactorwatch.spc.estimated_t2 import estimated_t2_quantile
 from reactorwatch.spc.m_of_n import false_alarm_rate
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.run_length.design import LONGEST_DESIGN, SHORTEST, cusum_limit, ewma_limit, mewma_limit
+from reactorwatch.spc.run_length.design import LONGEST_DESIGN, SHORTEST
 
 DAYS = 30
 DAYS_MIN = DAYS * 24 * 60.0
@@ -99,93 +96,23 @@ def point_probability(arl0: float, raise_count: int, window: int) -> float:
     return exp(float(optimize.brentq(off, lowest - 0.1, -0.01)))
 
 
-def shewhart_width(p: float, learned: Prewhitening) -> float:
-    """The width L that a point is beyond with the probability p.
+def widened(limit: float, weight: float, learned: Prewhitening) -> float:
+    """The limit of an average, in standard deviations, where mean and standard deviation were learned.
 
     Args:
-        p: of a single point.
+        limit: the one that holds when both are known.
+        weight: lambda, of the newest value in the average.
         learned: the training.
     """
-    return _wider(float(-special.ndtri(0.5 * p)), 1.0, learned)
-
-
-def ewma_width(arl0: float, weight: float, learned: Prewhitening) -> float:
-    """The width L of an EWMA of weight lambda.
-
-    Args:
-        arl0: its run length without a fault.
-        weight: lambda.
-        learned: the training.
-    """
-    return _wider(ewma_limit(arl0, weight), weight, learned)
-
-
-def cusum_height(arl0: float, k: float, learned: Prewhitening) -> float:
-    """The limit h of a two-sided CUSUM with the allowance k, in standard deviations.
-
-    An error of the mean does not add to a CUSUM as it does to an average, so here the rate of false alarms is averaged
-    over the errors that the training may have made. How it changes with them is told by Siegmund's approximation (1985,
-    Sequential Analysis, sec. 2.6), which costs nothing and is good where run lengths are long.
-
-    Args:
-        arl0: its run length without a fault.
-        k: the allowance.
-        learned: the training.
-    """
-    from scipy import optimize  # only here: to import it is a tenth of a start
-
-    places, weights = np.polynomial.hermite_e.hermegauss(15)
-    shift, log_scale = np.meshgrid(places / sqrt(learned.rows), places * sqrt(_scale_variance(learned, 0.0)))
-    share = np.outer(weights, weights) / weights.sum() ** 2
-    scale = np.exp(log_scale)
-    known = cusum_limit(arl0, k)
-
-    def off(h: float) -> float:
-        return log(float(np.sum(share * _cusum_rate(shift / scale, k / scale, h / scale))) / wanted)
-
-    wanted = float(_cusum_rate(np.zeros(1), np.full(1, k), np.full(1, known))[0])
-    beyond = 10.0 * known + 10.0
-    while off(beyond) > 0.0:  # after a training of few rows; the rate falls with 1 / h, so this comes to an end
-        beyond *= 10.0
-    return float(optimize.brentq(off, known, beyond, xtol=1e-6 * known))
-
-
-def joint_limit(arl0: float, weight: float, learned: list[Prewhitening], rows: float) -> float:
-    """The limit of a MEWMA's, or with the weight 1 of a T2's, statistic.
-
-    Args:
-        arl0: its run length without a fault.
-        weight: lambda.
-        learned: the training of each signal.
-        rows: from which the correlations of the signals were estimated.
-    """
-    dimension = len(learned)
-    known = mewma_limit(arl0, dimension, weight)
-    freedoms = np.array([_freedom(item, weight) for item in learned])
-    limit = estimated_t2_quantile(float(special.chdtrc(dimension, known)), freedoms, rows)
-    return limit * (1.0 + (2.0 - weight) / (weight * min(item.rows for item in learned)))
-
-
-def _cusum_rate(shift: Array, k: Array, h: Array) -> Array:
-    """How often a two-sided CUSUM signals, a row, after Siegmund."""
-    rate = np.zeros(shift.shape)
-    for side in (1.0, -1.0):
-        off = side * shift - k
-        off = np.where(np.abs(off) < 1e-6, 1e-6, off)
-        exponent = np.minimum(-2.0 * off * (h + 1.166), 700.0)
-        rate += 2.0 * off * off / (np.exp(exponent) - exponent - 1.0)
-    return rate
-
-
-def _wider(limit: float, weight: float, learned: Prewhitening) -> float:
-    student = -float(special.stdtrit(_freedom(learned, weight), float(special.ndtr(-limit))))
+    student = -float(special.stdtrit(degrees_of_freedom(learned, weight), float(special.ndtr(-limit))))
     return sqrt(1.0 + (2.0 - weight) / (weight * learned.rows)) * student
 
 
-def _freedom(learned: Prewhitening, weight: float) -> float:
-    return max(0.5 / _scale_variance(learned, weight), 5.0)
+def degrees_of_freedom(learned: Prewhitening, weight: float) -> float:
+    """Of the standard deviation that was learned, as a chart whose newest value weighs `weight` feels it."""
+    return max(0.5 / scale_variance(learned, weight), 5.0)
 
 
-def _scale_variance(learned: Prewhitening, weight: float) -> float:
-    """Of the relative error of the standard deviation, as a chart whose newest value weighs `weight` feels it."""
+def scale_variance(learned: Prewhitening, weight: float) -> float:
+    """Variance of the relative error of that standard deviation, as such a chart feels it."""
     return learned.sd_variance + (1.0 - weight) ** 2 * learned.passed_variance

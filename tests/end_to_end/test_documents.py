@@ -161,7 +161,10 @@ def test_every_table_of_settings_is_read_by_its_own_structure() -> None:
 def test_there_is_an_example_of_each_addition() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     examples = re.findall(r"^## (.*?)$(?:(?!^## ).)*?```python\n", text, re.MULTILINE | re.DOTALL)
-    assert examples == ["Add an effect", "Add a chart", "Add a message", "Add a panel", "Add a process model"]
+    assert examples == [
+        *("Add an effect", "Add a chart", "Add a signal check"),
+        *("Add a message", "Add a panel", "Add a process model"),
+    ]
 
 
 def test_the_readme_s_make_commands_are_targets_that_set_up_by_themselves() -> None:

@@ -3,33 +3,23 @@
 All charts speak this language: `update(x)` takes the next value, a number or a vector, and returns a `Judgement`; all
 that a chart is and remembers is in `state`, and `from_state` goes on where it was, bit for bit. A chart never restarts
 by itself after a point that is out: `restart` does, when whoever watches it says that the cause is gone.
-
-The charts of one signal also come as a `Bank`, one chart a plant for thousands of plants. A chart is a column of
-numbers, a bank is an array (number, plant), and one kernel a kind of chart serves both: its inner loop runs over the
-plants, every plant goes through the same operations, so the bits are the same. (Per-plant branches are written
-as selections, so that the compiler can turn the loop into vector instructions.)
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
 from math import isfinite
-from struct import Struct
-from typing import Any, ClassVar, Generic, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
+from reactorwatch.spc.baseline import Baseline
 from reactorwatch.stored_state import StoredState
 
 Array = NDArray[np.float64]
 
 LARGEST_VALUE = 1e30
 """Values at or beyond this are refused: their sums could overflow."""
-
-# The first rows of a chart's column: what comes in and what goes out. After them come its settings, where its memory
-# starts, and its memory.
-X, PRESENT, STATISTIC, CENTRE, LOWER, UPPER, OUT, SETTINGS = range(8)
 
 
 class Judgement(NamedTuple):
@@ -49,46 +39,123 @@ class Judgement(NamedTuple):
     upper_limit: float
     out: bool
 
-
-class Judgements(NamedTuple):
-    """The fields of `Judgement` for many plants, each of shape (plants,); NaN and False for an absent plant."""
-
-    statistic: Array
-    centre: Array
-    lower_limit: Array
-    upper_limit: Array
-    out: NDArray[np.bool_]
+    @property
+    def side(self) -> str:
+        """On which side of the centre the statistic is."""
+        return "above" if self.statistic > self.centre else "below"
 
 
 class ChartState(StoredState, frozen=True):
     """All that a chart, or a bank of charts, is and remembers; the base of what each kind stores."""
 
 
-Sample = TypeVar("Sample", contravariant=True)
-
-
-class Chart(Protocol[Sample]):
-    """A control chart: of one signal if a sample is a number, of several if it is a vector.
+class Setting(NamedTuple):
+    """A number that people can set for a chart: a key of the monitor's settings.
 
     Attributes:
-        name: as in the key of its points and in the name of its alarm.
+        key: begins with the chart's name.
+        default: its value where the settings give none.
+        lower: the smallest value that it can have.
+        upper: the largest value that it can have.
+    """
+
+    key: str
+    default: float
+    lower: float
+    upper: float
+
+
+class Shown(NamedTuple):
+    """A signal as texts of alarms show it.
+
+    Attributes:
+        name: of the signal.
+        unit: of its values.
+        scale: one standard deviation of its prewhitened residual, in that unit.
+        passed: the part of a lasting shift of the signal that its prewhitened residual shows.
+    """
+
+    name: str
+    unit: str
+    scale: float
+    passed: float
+
+
+class Chart(ABC):
+    """A control chart: a `SignalChart`, a `JointChart`, or one of the parameters of models.
+
+    Attributes:
+        name: in `[monitor] charts`, in the key of its points and in the name of its alarm.
+        State: the type of its state.
+        has_memory: whether a point depends on samples before it. One point out then raises the alarm; otherwise it
+            takes `raise_count` of the last `window`, so that a single outlier raises none.
+        settings: its own keys of `[monitor]`.
     """
 
     name: ClassVar[str]
+    State: ClassVar[type[ChartState]]
+    has_memory: ClassVar[bool] = True
+    settings: ClassVar[tuple[Setting, ...]] = ()
+
+    @classmethod
+    @abstractmethod
+    def from_state(cls, state: Any) -> Self:
+        """The chart that goes on, bit for bit, where `state` was taken.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
 
     @property
+    @abstractmethod
     def state(self) -> ChartState:
         """A copy of all that it is and remembers."""
 
-    def update(self, x: Sample) -> Judgement:
+    @abstractmethod
+    def update(self, x: Any) -> Judgement:
         """Judge the next sample.
 
         Raises:
             ValueError: it is not finite; the chart's state is as before.
         """
 
+    @abstractmethod
     def restart(self) -> None:
         """Forget the samples seen."""
+
+
+class SignalChart(Chart):
+    """A chart of one signal; a sample is a number. A plant has one for each output."""
+
+    @classmethod
+    @abstractmethod
+    def design(cls, baseline: Baseline) -> Self:
+        """The chart for a training of one signal, whose residual has the mean 0 and the standard deviation 1."""
+
+    def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
+        """The text of an alarm, and each signal's share of it.
+
+        Args:
+            judgement: of the newest sample, which is out.
+            signal: what the chart is of.
+        """
+        return f"{signal.name} is {judgement.side} the limit of its {self.name} chart", {signal.name: 1.0}
+
+
+def quantity(value: float, unit: str, form: str = ".3g") -> str:
+    """A number and its unit, as texts of alarms have it.
+
+    >>> quantity(7.25, "K")
+    '7.25 K'
+    >>> quantity(7.25, "", "+.1f")
+    '+7.2'
+
+    Args:
+        value: the number.
+        unit: empty where it is not known; 1 where there is none.
+        form: of the number.
+    """
+    return f"{value:{form}}" if unit in ("", "1") else f"{value:{form}} {unit}"
 
 
 def finite(x: float) -> float:
@@ -125,214 +192,3 @@ def positive(name: str, value: float) -> float:
     if not (value > 0 and isfinite(value)):
         raise InputError(f"{name} must be a positive number, got {value}")
     return float(value)
-
-
-class SignalState(ChartState, frozen=True):
-    """State of a chart of one signal, or of a bank of them.
-
-    Attributes:
-        chart: its name.
-        plants: number of plants.
-        numbers: little-endian doubles, shape (numbers of one chart, plants).
-    """
-
-    chart: str
-    plants: int
-    numbers: bytes
-
-
-class SignalChart(ABC):
-    """A chart of one signal. A kind of chart gives its settings, its start and its kernel.
-
-    Args:
-        settings: the numbers of its constructor, as its kernel wants them.
-        start: its memory before the first value.
-    """
-
-    name: ClassVar[str]
-    numbers: ClassVar[int]  # how many settings and twice how many memories it has
-    memories: ClassVar[int]
-
-    def __init__(self, settings: Iterable[float], start: Sequence[float]) -> None:
-        column = [0.0] * SETTINGS + [*settings, *start, *start]
-        self._columns: Array = np.array(column, dtype=np.float64).reshape(-1, 1)
-        self._columns[PRESENT] = 1.0
-
-    @staticmethod
-    @abstractmethod
-    def kernel(columns: Array) -> None:
-        """Judge X of every plant that is PRESENT.
-
-        Args:
-            columns: shape (SETTINGS + numbers, plants).
-        """
-
-    @classmethod
-    def from_state(cls, state: SignalState) -> Self:
-        """The chart that goes on, bit for bit, where `state` was taken.
-
-        Raises:
-            ValueError: the state is of another chart or of several plants, or damaged.
-        """
-        if state.plants != 1:
-            raise ValueError(f"state must be of one plant, got {state.plants}: use Bank")
-        return cls._of(_columns(cls, state))
-
-    @classmethod
-    def _of(cls, columns: Array) -> Self:
-        chart = cls.__new__(cls)
-        chart._columns = columns
-        return chart
-
-    @property
-    def state(self) -> SignalState:
-        """A copy of all that it is and remembers."""
-        return SignalState(self.name, 1, self._columns[SETTINGS:].astype("<f8").tobytes())
-
-    def update(self, x: float) -> Judgement:
-        """See `Chart`."""
-        columns = self._columns
-        columns[X, 0] = finite(x)
-        self.kernel(columns)
-        statistic, centre, lower, upper, out = columns[STATISTIC:SETTINGS, 0].tolist()
-        return Judgement(statistic, centre, lower, upper, out > 0.0)
-
-    def restart(self) -> None:
-        """Forget the values seen."""
-        _restart(self._columns, self.memories, slice(None))
-
-    def setting(self, row: int) -> float:
-        """A number of the column."""
-        return float(self._columns[row, 0])
-
-
-Kind = TypeVar("Kind", bound=SignalChart)
-
-
-class Bank(Generic[Kind]):
-    """Charts of one kind, one a plant, updated in one call. A plant's numbers are the single chart's, bit for bit.
-
-    Args:
-        charts: at least one; each with settings and memory of its own.
-
-    Raises:
-        InputError: there is none, or they are of several kinds.
-    """
-
-    def __init__(self, charts: Sequence[Kind]) -> None:
-        kinds = {type(chart) for chart in charts}
-        if len(kinds) != 1:
-            raise InputError(f"charts must be one or more of one kind, got {sorted(kind.__name__ for kind in kinds)}")
-        (self._kind,) = kinds
-        self._hold(np.concatenate([chart._columns for chart in charts], axis=1))
-
-    @classmethod
-    def from_state(cls, kind: type[Kind], state: SignalState) -> Self:
-        """The charts that go on, bit for bit, where `state` was taken.
-
-        Raises:
-            ValueError: the state is of another chart, or damaged.
-        """
-        bank = cls.__new__(cls)
-        bank._kind = kind
-        bank._hold(_columns(kind, state))
-        return bank
-
-    def _hold(self, columns: Array) -> None:
-        self._columns = np.ascontiguousarray(columns)
-        self._plants = plants = columns.shape[1]
-        self._numbers = self._columns.reshape(-1).data  # all of them, one row after the other
-        self._come, self._out = Struct(f"{2 * plants}d").pack_into, Struct(f"{plants}d").unpack_from
-        self._out_offset = OUT * plants * self._columns.itemsize
-
-    @property
-    def state(self) -> SignalState:
-        """A copy of all that the charts are and remember."""
-        numbers = self._columns[SETTINGS:].astype("<f8").tobytes()
-        return SignalState(self._kind.name, self._columns.shape[1], numbers)
-
-    def update(self, values: ArrayLike, present: NDArray[np.bool_] | None = None) -> Judgements:
-        """Judge every plant's next value.
-
-        Args:
-            values: shape (plants,).
-            present: shape (plants,); False leaves a plant's chart as it is and its value unread. All, if not given.
-
-        Raises:
-            ValueError: a present value that is not finite, or a wrong shape; nothing is changed then, in no plant.
-        """
-        columns = self._columns
-        x = np.asarray(values, dtype=np.float64)
-        if x.shape != (columns.shape[1],):
-            raise ValueError(f"values must have shape ({columns.shape[1]},), got {x.shape}")
-        if present is None:
-            present = np.ones(x.shape, dtype=np.bool_)
-        if present.shape != x.shape or present.dtype != np.bool_:
-            raise ValueError(f"present must be {x.size} booleans, got {present.shape} of {present.dtype}")
-        refused = present & ~(np.abs(x) < LARGEST_VALUE)
-        if refused.any():
-            plant = int(np.argmax(refused))
-            raise ValueError(f"plant {plant}: a chart takes finite values below {LARGEST_VALUE:g}, got {x[plant]}")
-        columns[X] = np.where(present, x, 0.0)
-        columns[PRESENT] = present
-        self._kind.kernel(columns)
-        said = columns[STATISTIC:OUT].copy()
-        said[:, ~present] = np.nan
-        return Judgements(said[0], said[1], said[2], said[3], present & (columns[OUT] > 0.0))
-
-    def judge(self, values: list[float], present: list[bool]) -> bool:
-        """As `update`, for the few charts of one plant at every row: whether any is out; `judgement` says the rest.
-
-        Args:
-            values: one a chart, finite where present.
-            present: False leaves a chart as it is.
-        """
-        self._come(self._numbers, 0, *values, *present)  # X and PRESENT are the first rows
-        self._kind.kernel(self._columns)
-        out = self._out(self._numbers, self._out_offset)
-        return any(out) and any(here and much > 0.0 for here, much in zip(present, out, strict=True))
-
-    def judgement(self, plant: int) -> Judgement:
-        """What a chart said of its last value."""
-        plants = self._plants
-        told = self._numbers[STATISTIC * plants + plant : SETTINGS * plants : plants].tolist()
-        statistic, centre, lower, upper, out = told
-        return Judgement(statistic, centre, lower, upper, out > 0.0)
-
-    def restart(self, plants: NDArray[np.bool_] | None = None) -> None:
-        """Forget the values seen, of all plants or of those that are True."""
-        _restart(self._columns, self._kind.memories, slice(None) if plants is None else plants)
-
-    def chart(self, plant: int) -> Kind:
-        """A copy of one plant's chart, in the single form.
-
-        Raises:
-            IndexError: there is no such plant.
-        """
-        if not 0 <= plant < self._columns.shape[1]:
-            raise IndexError(f"plant must be in 0..{self._columns.shape[1] - 1}, got {plant}")
-        columns = self._columns[:, plant : plant + 1].copy()
-        columns[PRESENT] = 1.0
-        return self._kind._of(columns)
-
-
-def _restart(columns: Array, memories: int, plants: Any) -> None:
-    if memories:
-        columns[-memories:, plants] = columns[-2 * memories : -memories, plants]
-
-
-def _columns(kind: type[SignalChart], state: SignalState) -> Array:
-    """The columns of charts of a kind, from their state."""
-    if state.chart != kind.name:
-        raise ValueError(f"state must be of the chart {kind.name}, got {state.chart}")
-    if state.plants < 1 or len(state.numbers) != 8 * kind.numbers * state.plants:
-        raise ValueError(
-            f"state of {state.plants} charts {kind.name} must have {8 * kind.numbers * state.plants} bytes, "
-            f"got {len(state.numbers)}"
-        )
-    columns = np.zeros((SETTINGS + kind.numbers, state.plants))
-    columns[PRESENT] = 1.0
-    columns[SETTINGS:] = np.frombuffer(state.numbers, dtype="<f8").reshape(kind.numbers, state.plants)
-    if not np.all(np.isfinite(columns)):
-        raise ValueError(f"state of the chart {kind.name} must hold finite numbers")
-    return columns

@@ -1,5 +1,9 @@
-"""The catalogue of control charts. A new one: a file here, and a line below."""
+"""The catalogue of control charts. A new one: a file here, and a line below.
 
+From it come the names that `[monitor] charts` takes, the charts' own keys there, and their alarms.
+"""
+
+from reactorwatch.spc.charts.base import Chart
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
@@ -8,4 +12,9 @@ from reactorwatch.spc.charts.pca import PcaSpe, PcaT2
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.charts.t2 import T2
 
-CHARTS = (Shewhart, Cusum, Ewma, T2, Mewma, PcaT2, PcaSpe, ParameterT2)
+CHARTS: tuple[type[Chart], ...] = (Shewhart, Ewma, Cusum, T2, Mewma, PcaT2, PcaSpe, ParameterT2)
+
+
+def chart(name: str) -> type[Chart]:
+    """The chart of a name, which is in the catalogue."""
+    return next(kind for kind in CHARTS if kind.name == name)

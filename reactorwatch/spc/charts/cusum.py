@@ -13,9 +13,16 @@ half the time, and without one the sums are soon back at 0.
 The statistic is the larger of the two sums, negative if it is the low one, in the units of the values.
 """
 
+from math import log, sqrt
+from typing import Self
+
+import numpy as np
+
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import (
+from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.baseline import Baseline
+from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, finite, positive
+from reactorwatch.spc.compiled_chart import (
     CENTRE,
     LOWER,
     OUT,
@@ -23,12 +30,12 @@ from reactorwatch.spc.charts.base import (
     SETTINGS,
     STATISTIC,
     UPPER,
-    Array,
-    SignalChart,
+    CompiledChart,
     X,
-    finite,
-    positive,
 )
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.run_length.cusum import check_parameters
+from reactorwatch.spc.run_length.design import cusum_limit
 
 CEILING = 2.0
 """Times the limit: the sums stop there, so that after a large change they are soon back. Run lengths are untouched."""
@@ -55,7 +62,7 @@ def _judge(columns: Array) -> None:
         columns[OUT, p] = 1.0 if max(high, low) > limit else 0.0
 
 
-class Cusum(SignalChart):
+class Cusum(CompiledChart):
     """Two-sided cumulative sums of the deviations beyond an allowance.
 
     >>> chart = Cusum(mean=0.0, sigma=1.0, k=0.5, h=4.0)
@@ -74,25 +81,66 @@ class Cusum(SignalChart):
     """
 
     name = "cusum"
+    settings = (Setting("cusum_allowance", 0.25, 0.05, 5.0),)
     memories = _MEMORIES
     numbers = _END - SETTINGS
     kernel = staticmethod(_judge)
 
     def __init__(self, mean: float, sigma: float, k: float = 0.5, h: float = 5.0, head_start: float = 0.0) -> None:
         positive("sigma", sigma)
-        check(k, h, head_start)
+        check_parameters(k, h, head_start)
         start = head_start * sigma
         super().__init__([finite(mean), k * sigma, h * sigma], [start, start])
 
+    @classmethod
+    def design(cls, baseline: Baseline) -> Self:
+        """See `SignalChart`; `cusum_allowance` is k."""
+        (learned,), (sd,), k = baseline.learned, baseline.memory_sd, baseline.settings["cusum_allowance"]
+        return cls(0.0, sd, k, designed_limit(baseline.arl0, k, learned))
 
-def check(k: float, h: float, head_start: float) -> None:
-    """Whether the parameters make a chart.
+    def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
+        """See `SignalChart`."""
+        return f"{signal.name} has been {judgement.side} what the model expects for long", {signal.name: 1.0}
 
-    Raises:
-        InputError: they don't; the text names which and why.
+
+def designed_limit(arl0: float, k: float, learned: Prewhitening) -> float:
+    """The limit h of a two-sided CUSUM with the allowance k, in standard deviations.
+
+    An error of the mean does not add to a CUSUM as it does to an average, so here the rate of false alarms is averaged
+    over the errors that the training may have made. How it changes with them is told by Siegmund's approximation (1985,
+    Sequential Analysis, sec. 2.6), which costs nothing and is good where run lengths are long.
+
+    Args:
+        arl0: its run length without a fault.
+        k: the allowance.
+        learned: the training.
     """
-    positive("h", h)
-    if not 0.0 <= k < float("inf"):
-        raise InputError(f"k must be a number of at least 0, got {k}")
-    if not 0.0 <= head_start <= h:
-        raise InputError(f"head_start must be in [0, h] = [0, {h}], got {head_start}")
+    from scipy import optimize  # only here: to import it is a tenth of a start
+
+    places, weights = np.polynomial.hermite_e.hermegauss(15)
+    shift, log_scale = np.meshgrid(
+        places / sqrt(learned.rows), places * sqrt(false_alarm_budget.scale_variance(learned, 0.0))
+    )
+    share = np.outer(weights, weights) / weights.sum() ** 2
+    scale = np.exp(log_scale)
+    known = cusum_limit(arl0, k)
+
+    def off(h: float) -> float:
+        return log(float(np.sum(share * _cusum_rate(shift / scale, k / scale, h / scale))) / wanted)
+
+    wanted = float(_cusum_rate(np.zeros(1), np.full(1, k), np.full(1, known))[0])
+    beyond = 10.0 * known + 10.0
+    while off(beyond) > 0.0:  # after a training of few rows; the rate falls with 1 / h, so this comes to an end
+        beyond *= 10.0
+    return float(optimize.brentq(off, known, beyond, xtol=1e-6 * known))
+
+
+def _cusum_rate(shift: Array, k: Array, h: Array) -> Array:
+    """How often a two-sided CUSUM signals, a row, after Siegmund."""
+    rate = np.zeros(shift.shape)
+    for side in (1.0, -1.0):
+        off = side * shift - k
+        off = np.where(np.abs(off) < 1e-6, 1e-6, off)
+        exponent = np.minimum(-2.0 * off * (h + 1.166), 700.0)
+        rate += 2.0 * off * off / (np.exp(exponent) - exponent - 1.0)
+    return rate

@@ -11,12 +11,15 @@ the first value on.
 """
 
 from math import sqrt
+from typing import Self
 
 import numpy as np
 
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import (
+from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.baseline import Baseline
+from reactorwatch.spc.charts.base import Array, Judgement, Setting, Shown, finite, positive, quantity
+from reactorwatch.spc.compiled_chart import (
     CENTRE,
     LOWER,
     OUT,
@@ -24,12 +27,12 @@ from reactorwatch.spc.charts.base import (
     SETTINGS,
     STATISTIC,
     UPPER,
-    Array,
-    SignalChart,
+    CompiledChart,
     X,
-    finite,
-    positive,
 )
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.run_length.design import ewma_limit
+from reactorwatch.spc.run_length.ewma import check_parameters
 
 _MEMORIES = 2
 _MEAN, _WEIGHT, _LIMIT, _START = range(SETTINGS, SETTINGS + 4)
@@ -55,7 +58,7 @@ def _judge(columns: Array) -> None:
         columns[OUT, p] = 1.0 if abs(average - mean) > limit else 0.0
 
 
-class Ewma(SignalChart):
+class Ewma(CompiledChart):
     """The exponentially weighted moving average against mean +- L of its own standard deviations.
 
     >>> chart = Ewma(mean=0.0, sigma=1.0, weight=0.5, limit=2.0)
@@ -74,6 +77,7 @@ class Ewma(SignalChart):
     """
 
     name = "ewma"
+    settings = (Setting("ewma_weight", 0.1, 1e-3, 1.0),)
     memories = _MEMORIES
     numbers = _END - SETTINGS
     kernel = staticmethod(_judge)
@@ -82,17 +86,28 @@ class Ewma(SignalChart):
         self, mean: float, sigma: float, weight: float = 0.2, limit: float = 3.0, *, exact_limits: bool = False
     ) -> None:
         positive("sigma", sigma)
-        check(weight, limit)
+        check_parameters(weight, limit)
         half_width = limit * sigma * sqrt(weight / (2.0 - weight))
         super().__init__([finite(mean), weight, half_width], [mean, 1.0 if exact_limits else 0.0])
 
+    @classmethod
+    def design(cls, baseline: Baseline) -> Self:
+        """See `SignalChart`; `ewma_weight` is the weight of the newest row."""
+        (learned,), (sd,), weight = baseline.learned, baseline.memory_sd, baseline.settings["ewma_weight"]
+        return cls(0.0, sd, weight, designed_limit(baseline.arl0, weight, learned))
 
-def check(weight: float, limit: float) -> None:
-    """Whether the parameters make a chart.
+    def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
+        """See `SignalChart`: as the lasting shift of the signal that would look like this."""
+        size = quantity(abs(judgement.statistic) * signal.scale / signal.passed, signal.unit)
+        return f"{signal.name} is on average {size} {judgement.side} what the model expects", {signal.name: 1.0}
 
-    Raises:
-        InputError: they don't; the text names which and why.
+
+def designed_limit(arl0: float, weight: float, learned: Prewhitening) -> float:
+    """The width L of an EWMA of weight lambda.
+
+    Args:
+        arl0: its run length without a fault.
+        weight: lambda.
+        learned: the training.
     """
-    if not 0.0 < weight <= 1.0:
-        raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
-    positive("limit", limit)
+    return false_alarm_budget.widened(ewma_limit(arl0, weight), weight, learned)

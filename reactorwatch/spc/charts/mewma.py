@@ -8,13 +8,17 @@ Technometrics 34(1). With d = x - mean, S the covariance of x and lambda the wei
 where Sz is the covariance of z in the long run. z is kept in coordinates in which S is the unit matrix.
 """
 
+from typing import Self
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, positive, vector
+from reactorwatch.spc.baseline import Baseline
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, Setting, positive, vector
 from reactorwatch.spc.charts.t2 import Whitening
+from reactorwatch.spc.joint_chart import JointChart, correlation, joint_limit
 
 
 @jit
@@ -43,7 +47,7 @@ class MewmaState(ChartState, frozen=True):
     average: list[float]
 
 
-class Mewma:
+class Mewma(JointChart):
     """The moving average of vectors, its distance from the mean measured by its covariance.
 
     >>> chart = Mewma([0.0, 0.0], [[1.0, 0.0], [0.0, 1.0]], weight=0.1, limit=8.64)
@@ -61,6 +65,8 @@ class Mewma:
     """
 
     name = "mewma"
+    State = MewmaState
+    settings = (Setting("mewma_weight", 0.02, 0.01, 1.0),)
 
     def __init__(self, mean: ArrayLike, covariance: ArrayLike, weight: float, limit: float) -> None:
         if not 0.0 < weight <= 1.0:
@@ -69,6 +75,13 @@ class Mewma:
         self.weight = float(weight)
         self.limit = positive("limit", limit)
         self._average: Array = np.zeros(self.whitening.mean.size)
+
+    @classmethod
+    def design(cls, baseline: Baseline) -> Self:
+        """See `JointChart`; `mewma_weight` is the weight of the newest row."""
+        weight, sd = baseline.settings["mewma_weight"], np.array(baseline.memory_sd)
+        limit = joint_limit(baseline.arl0, weight, baseline.learned, len(baseline.e))
+        return cls(np.zeros(sd.size), correlation(baseline.e) * np.outer(sd, sd), weight, limit)
 
     @classmethod
     def from_state(cls, state: MewmaState) -> "Mewma":
@@ -102,10 +115,10 @@ class Mewma:
         statistic = squares * (2.0 - self.weight) / self.weight
         return Judgement(statistic, float(self._average.size), 0.0, self.limit, statistic > self.limit)
 
-    def contributions(self) -> Array:
+    def contributions(self, x: ArrayLike | None = None) -> Array:
         """Each signal's part of the statistic, shape (p,); their sum is the statistic, one may be negative.
 
-        The partial decomposition, as for `T2.contributions`, of the average instead of the newest vector.
+        The partial decomposition, as for `T2.contributions`, of the average instead of the newest vector x.
         """
         matrix = self.whitening.matrix
         off = np.linalg.solve(matrix, self._average)

@@ -26,7 +26,7 @@ from numpy.typing import ArrayLike
 
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, positive, vector
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, Chart, ChartState, Judgement, positive, vector
 
 
 class ParameterState(ChartState, frozen=True):
@@ -44,7 +44,7 @@ class ParameterState(ChartState, frozen=True):
     excitation: list[list[float]]
 
 
-class ParameterT2:
+class ParameterT2(Chart):
     """How far the parameters are from the reference's, measured by how far chance takes them.
 
     Usually `reactorwatch.spc.parameter_drift.learn` makes it.
@@ -68,6 +68,7 @@ class ParameterT2:
     """
 
     name = "parameters"
+    State = ParameterState
 
     def __init__(
         self,

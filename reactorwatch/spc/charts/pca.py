@@ -20,13 +20,16 @@ SPE, with th_i = sum of l_j^i over the components left out, h = 1 - 2 th_1 th_3 
 Both match moments of a sum of chi-squares. Box's is exact where the eigenvalues left out are equal.
 """
 
+from collections.abc import Sequence
 from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.errors import InputError
+from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import Array, ChartState, Judgement, vector
+from reactorwatch.spc.joint_chart import JointChart
 
 SpeLimit = Literal["jackson_mudholkar", "box"]
 
@@ -100,16 +103,31 @@ class PcaModel(ChartState, frozen=True):
         return cls(mean.tolist(), scale.tolist(), directions[:a].T.tolist(), variances.tolist(), n, t2, left_out)
 
 
-class _PcaChart:
+class _PcaChart(JointChart):
     """What the two charts share: a model, and no memory."""
 
+    State = PcaModel
+    has_memory = False
+
     def __init__(self, model: PcaModel) -> None:
-        self.state = model
+        self._model = model
         self._mean, self._scale = np.array(model.mean), np.array(model.scale)
         self._loadings = np.array(model.loadings)
         p, a = len(model.mean), len(model.variances)
         if self._loadings.shape[:1] != (p,) or self._scale.shape != (p,) or a != p or not np.all(self._scale > 0):
             raise ValueError(f"state must hold loadings, scales and variances of its {p} signals")
+
+    @classmethod
+    def design(cls, baseline: Baseline) -> Self:
+        """See `JointChart`; the signals have one component less in common than there are signals."""
+        return cls(PcaModel.fit(baseline.e, len(baseline.learned) - 1, baseline.point_probability))
+
+    @classmethod
+    def obstacle(cls, e: Array, names: Sequence[str]) -> str:
+        """See `JointChart`."""
+        spans = np.ptp(e, axis=0) if len(e) else np.zeros(len(names))
+        still = "" if np.all(spans > 0.0) else names[int(np.argmin(spans))]
+        return super().obstacle(e, names) or (still and f"the residual of {still} does not vary in the training")
 
     @classmethod
     def from_state(cls, state: PcaModel) -> Self:
@@ -119,6 +137,11 @@ class _PcaChart:
             ValueError: the state is damaged.
         """
         return cls(state)
+
+    @property
+    def state(self) -> PcaModel:
+        """All that it is; it has no memory."""
+        return self._model
 
     def restart(self) -> None:
         """Nothing: there is no memory."""
@@ -148,7 +171,7 @@ class PcaT2(_PcaChart):
         """See `Chart`; x has shape (p,)."""
         scores = self._scaled(x) @ self._white
         statistic = float(scores @ scores)
-        return Judgement(statistic, float(scores.size), 0.0, self.state.t2_limit, statistic > self.state.t2_limit)
+        return Judgement(statistic, float(scores.size), 0.0, self._model.t2_limit, statistic > self._model.t2_limit)
 
     def contributions(self, x: ArrayLike) -> Array:
         """Each signal's part of T2, shape (p,): x_j (P l^-1 P' x)_j. Their sum is T2; one may be negative."""
@@ -171,8 +194,8 @@ class PcaSpe(_PcaChart):
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""
         statistic = float(self.contributions(x).sum())
-        centre = sum(self.state.variances[self._loadings.shape[1] :])
-        return Judgement(statistic, centre, 0.0, self.state.spe_limit, statistic > self.state.spe_limit)
+        centre = sum(self._model.variances[self._loadings.shape[1] :])
+        return Judgement(statistic, centre, 0.0, self._model.spe_limit, statistic > self._model.spe_limit)
 
     def contributions(self, x: ArrayLike) -> Array:
         """Each signal's part of SPE, shape (p,): its squared residual. Their sum is SPE."""

@@ -21,12 +21,16 @@ four, counted in thirds of L from the mean.
 
 from collections.abc import Iterable
 from math import erfc, sqrt
+from typing import Self
 
 import numpy as np
+from scipy import special
 
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import (
+from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.baseline import Baseline
+from reactorwatch.spc.charts.base import Array, Judgement, Shown, finite, positive, quantity
+from reactorwatch.spc.compiled_chart import (
     CENTRE,
     LOWER,
     OUT,
@@ -34,14 +38,11 @@ from reactorwatch.spc.charts.base import (
     SETTINGS,
     STATISTIC,
     UPPER,
-    Array,
-    SignalChart,
+    CompiledChart,
     X,
-    finite,
-    positive,
 )
-
-RULES = (1, 2, 3, 4)
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.run_length.shewhart import RULES, checked_rules
 
 _MEMORIES = 5
 _MEAN, _THIRD, _LOWER, _UPPER, _RULE1, _RULE2, _RULE3, _RULE4, _START = range(SETTINGS, SETTINGS + 9)
@@ -86,7 +87,7 @@ def _judge(columns: Array) -> None:
         columns[OUT, p] = out
 
 
-class Shewhart(SignalChart):
+class Shewhart(CompiledChart):
     """Individual values against mean +- L sigma, and against run rules.
 
     >>> chart = Shewhart(mean=0.0, sigma=1.0, rules=(1, 2))
@@ -104,6 +105,7 @@ class Shewhart(SignalChart):
     """
 
     name = "shewhart"
+    has_memory = False
     memories = _MEMORIES
     numbers = _END - SETTINGS
     kernel = staticmethod(_judge)
@@ -115,6 +117,19 @@ class Shewhart(SignalChart):
         lower, upper = finite(mean) - width * sigma, mean + width * sigma
         flags = [1.0 if rule in wanted else 0.0 for rule in RULES]
         super().__init__([mean, width * sigma / 3.0, lower, upper, *flags], np.zeros(_MEMORIES).tolist())
+
+    @classmethod
+    def design(cls, baseline: Baseline) -> Self:
+        """See `SignalChart`; without run rules."""
+        (learned,) = baseline.learned
+        return cls(0.0, 1.0, designed_width(baseline.point_probability, learned))
+
+    def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
+        """See `SignalChart`."""
+        size = quantity(abs(judgement.statistic) * signal.scale, signal.unit)
+        allowed = quantity(judgement.upper_limit * signal.scale, signal.unit)
+        text = f"{signal.name} is {size} {judgement.side} what the model expects (allowed: {allowed})"
+        return text, {signal.name: 1.0}
 
     @property
     def mean(self) -> float:
@@ -132,16 +147,14 @@ class Shewhart(SignalChart):
         return self.setting(_UPPER)
 
 
-def checked_rules(rules: Iterable[int]) -> tuple[int, ...]:
-    """The rules, each once and in order.
+def designed_width(p: float, learned: Prewhitening) -> float:
+    """The width L that a point is beyond with the probability p.
 
-    Raises:
-        InputError: there is none, or one that does not exist.
+    Args:
+        p: of a single point.
+        learned: the training.
     """
-    wanted = tuple(sorted(set(rules)))
-    if not wanted or not set(wanted) <= set(RULES):
-        raise InputError(f"rules must be some of 1, 2, 3, 4, got {wanted}")
-    return wanted
+    return false_alarm_budget.widened(float(-special.ndtri(0.5 * p)), 1.0, learned)
 
 
 def probability_out(width: float) -> float:

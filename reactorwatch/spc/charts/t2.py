@@ -8,11 +8,15 @@ pair of them is impossible. With d = x - mean and S the covariance, both known,
 T2 of independent normal vectors is chi-square with as many degrees of freedom as there are signals.
 """
 
+from typing import Self
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.errors import InputError
+from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import Array, ChartState, Judgement, positive, vector
+from reactorwatch.spc.joint_chart import JointChart, correlation, joint_limit
 
 
 class T2State(ChartState, frozen=True):
@@ -23,7 +27,7 @@ class T2State(ChartState, frozen=True):
     limit: float
 
 
-class T2:
+class T2(JointChart):
     """A vector's distance from its mean, measured by its covariance.
 
     >>> chart = T2([0.0, 0.0], [[1.0, 0.9], [0.9, 1.0]], limit=10.597)
@@ -40,10 +44,18 @@ class T2:
     """
 
     name = "t2"
+    State = T2State
+    has_memory = False
 
     def __init__(self, mean: ArrayLike, covariance: ArrayLike, limit: float) -> None:
         self.whitening = Whitening(mean, covariance)
         self.limit = positive("limit", limit)
+
+    @classmethod
+    def design(cls, baseline: Baseline) -> Self:
+        """See `JointChart`."""
+        limit = joint_limit(1.0 / baseline.point_probability, 1.0, baseline.learned, len(baseline.e))
+        return cls(np.zeros(len(baseline.learned)), correlation(baseline.e), limit)
 
     @classmethod
     def from_state(cls, state: T2State) -> "T2":

@@ -27,8 +27,7 @@ import numpy as np
 from scipy import special
 
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts import cusum as chart
-from reactorwatch.spc.charts.base import Array
+from reactorwatch.spc.charts.base import Array, positive
 from reactorwatch.spc.run_length.chain import nodes, run_lengths, settled
 from reactorwatch.spc.run_length.limits import checked_shift, told, within
 
@@ -60,7 +59,7 @@ def cusum(
     Raises:
         InputError: an argument out of its range.
     """
-    chart.check(k, h, head_start)
+    check_parameters(k, h, head_start)
     within("h", h, 1e-3, LARGEST_LIMIT)
     within("k", k, 0.0, LARGEST_ALLOWANCE)
     size = checked_shift(shift)
@@ -73,6 +72,19 @@ def cusum(
     if isinf(low_0):
         return told(high)
     return told((high * low_0 + low * high_0 - high_0 * low_0) / (high_0 + low_0))
+
+
+def check_parameters(k: float, h: float, head_start: float) -> None:
+    """Check the parameters of a chart.
+
+    Raises:
+        InputError: one is out of its range.
+    """
+    positive("h", h)
+    if not 0.0 <= k < float("inf"):
+        raise InputError(f"k must be a number of at least 0, got {k}")
+    if not 0.0 <= head_start <= h:
+        raise InputError(f"head_start must be in [0, h] = [0, {h}], got {head_start}")
 
 
 def _one_side(shift: float, k: float, h: float, head_start: float, steady_state: bool) -> tuple[float, float]:

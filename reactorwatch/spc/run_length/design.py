@@ -16,13 +16,12 @@ import msgspec
 from scipy import special
 
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.shewhart import checked_rules
 from reactorwatch.spc.run_length.cusum import LARGEST_LIMIT, cusum
 from reactorwatch.spc.run_length.ewma import ewma
 from reactorwatch.spc.run_length.limits import within
 from reactorwatch.spc.run_length.mewma import LARGEST_DIMENSION, SMALLEST_WEIGHT, mewma
 from reactorwatch.spc.run_length.mewma import LARGEST_LIMIT_WITHOUT_SHIFT as LARGEST_MEWMA_LIMIT
-from reactorwatch.spc.run_length.shewhart import shewhart
+from reactorwatch.spc.run_length.shewhart import checked_rules, shewhart
 from reactorwatch.spc.run_length.t2 import t2
 
 SHORTEST, LONGEST_DESIGN = 5.0, 1e8

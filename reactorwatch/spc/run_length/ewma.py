@@ -14,8 +14,8 @@ from math import ceil, log, sqrt
 
 import numpy as np
 
-from reactorwatch.spc.charts import ewma as chart
-from reactorwatch.spc.charts.base import Array
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import Array, positive
 from reactorwatch.spc.run_length.chain import nodes, run_lengths, settled
 from reactorwatch.spc.run_length.limits import checked_shift, told, within
 
@@ -46,7 +46,7 @@ def ewma(
     Raises:
         InputError: an argument out of its range.
     """
-    chart.check(weight, limit)
+    check_parameters(weight, limit)
     within("weight (lambda)", weight, SMALLEST_WEIGHT, 1.0)
     within("limit", limit, 1e-3, LARGEST_LIMIT)
     size = checked_shift(shift)
@@ -60,6 +60,17 @@ def ewma(
     if exact_limits:
         return _with_exact_limits(size, weight, bound, count, places, lengths)
     return float(1.0 + _kernel(np.zeros(1), places, size, weight)[0] * weights @ lengths)
+
+
+def check_parameters(weight: float, limit: float) -> None:
+    """Check the parameters of a chart.
+
+    Raises:
+        InputError: one is out of its range.
+    """
+    if not 0.0 < weight <= 1.0:
+        raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
+    positive("limit", limit)
 
 
 def _kernel(start: Array, end: Array, shift: float, weight: float) -> Array:

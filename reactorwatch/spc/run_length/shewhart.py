@@ -11,10 +11,12 @@ from math import inf
 import numpy as np
 from scipy import special
 
+from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Array, positive
-from reactorwatch.spc.charts.shewhart import checked_rules
 from reactorwatch.spc.run_length.chain import run_lengths, settled
 from reactorwatch.spc.run_length.limits import checked_shift, told
+
+RULES = (1, 2, 3, 4)
 
 State = tuple[tuple[int, ...], tuple[int, ...], int]
 """Sides of the last points beyond the inner line, of those beyond the middle line (0: not beyond), and the run."""
@@ -49,6 +51,18 @@ def shewhart(shift: float, width: float = 3.0, rules: Iterable[int] = (1,), *, s
     if steady_state:
         return float(settled(_transitions(following, width, 0.0)) @ lengths)
     return float(lengths[0])
+
+
+def checked_rules(rules: Iterable[int]) -> tuple[int, ...]:
+    """The rules, each once and in order.
+
+    Raises:
+        InputError: there is none, or one that does not exist.
+    """
+    wanted = tuple(sorted(set(rules)))
+    if not wanted or not set(wanted) <= set(RULES):
+        raise InputError(f"rules must be some of 1, 2, 3, 4, got {wanted}")
+    return wanted
 
 
 def _transitions(following: list[list[int]], width: float, shift: float) -> Array:

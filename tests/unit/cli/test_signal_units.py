@@ -8,7 +8,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from monitor_node.alarms.alarms import quantity
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.backtest import Backtest, run
 from plant_node.config import PlantConfig
@@ -21,6 +20,7 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import UNITS, Record
 from reactorwatch.runtime.model_file import write_extended_model
+from reactorwatch.spc.charts.base import quantity
 from recorder.columns.process_annotations import process_of, titled
 from recorder.columns.run_reader import read_run
 from recorder.panels.overview import draw

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Bank, SignalChart
 from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.compiled_chart import Bank, CompiledChart
 from tests.unit.spc.members import MEMBERS, Member, value
 
-SIGNAL_CHARTS = [chart for chart in CHARTS if issubclass(chart, SignalChart)]
+COMPILED_CHARTS = [chart for chart in CHARTS if issubclass(chart, CompiledChart)]
 
 
 @pytest.fixture(params=CHARTS, ids=lambda chart: chart.name)
@@ -98,11 +98,11 @@ def test_out_means_beyond_a_limit(member: Member) -> None:
         assert said.out == beyond or (isinstance(chart, Shewhart) and said.out)
 
 
-@pytest.mark.parametrize("kind", SIGNAL_CHARTS, ids=lambda chart: chart.name)
-def test_a_bank_gives_the_bits_of_the_single_chart(kind: type[SignalChart]) -> None:
+@pytest.mark.parametrize("kind", COMPILED_CHARTS, ids=lambda chart: chart.name)
+def test_a_bank_gives_the_bits_of_the_single_chart(kind: type[CompiledChart]) -> None:
     """131 plants, some absent at times, the bank stored and restored on the way: all as each plant alone."""
     rng = np.random.default_rng(7)
-    singles: list[SignalChart] = [MEMBERS[kind].new() for _ in range(131)]
+    singles: list[CompiledChart] = [MEMBERS[kind].new() for _ in range(131)]
     bank = Bank(singles)
     for _ in range(60):
         x, present = value(rng, 131), rng.random(131) < 0.8

@@ -9,11 +9,13 @@ from scipy.signal import lfilter
 from monitor_node.alarms.on_off_delay import Persistence
 from reactorwatch.errors import InputError
 from reactorwatch.spc import false_alarm_budget as budget
-from reactorwatch.spc.charts.base import Bank, SignalChart
+from reactorwatch.spc.charts import cusum, ewma, shewhart
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.compiled_chart import Bank, CompiledChart
+from reactorwatch.spc.joint_chart import joint_limit
 from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.spc.run_length.design import ewma_limit, mewma_limit
 
@@ -39,7 +41,7 @@ def prewhitened(z: np.ndarray) -> tuple[Prewhitening, np.ndarray]:
     return learned, e / learned.sd
 
 
-def rate_of_one(charts: list[SignalChart], e: np.ndarray) -> float:
+def rate_of_one(charts: list[CompiledChart], e: np.ndarray) -> float:
     """Alarms a row, over charts of many plants; each begins anew after its alarm."""
     bank, alarms = Bank(charts), 0
     for values in e.T:
@@ -55,14 +57,14 @@ def rate_of_one(charts: list[SignalChart], e: np.ndarray) -> float:
 def test_each_chart_alarms_as_often_as_its_share_allows(chart: str, phi: float) -> None:
     """300 trainings of 600 rows; 900 alarms are expected, clustered by training, so to a tenth or so."""
     pairs = [prewhitened(z[0]) for z in residuals(phi, seed=1)]
-    charts: list[SignalChart] = []
+    charts: list[CompiledChart] = []
     for learned, _ in pairs:
         if chart == "ewma":
-            charts.append(Ewma(0.0, 1.0, 0.1, budget.ewma_width(ARL0, 0.1, learned)))
+            charts.append(Ewma(0.0, 1.0, 0.1, ewma.designed_limit(ARL0, 0.1, learned)))
         elif chart == "cusum":
-            charts.append(Cusum(0.0, 1.0, 0.5, budget.cusum_height(ARL0, 0.5, learned)))
+            charts.append(Cusum(0.0, 1.0, 0.5, cusum.designed_limit(ARL0, 0.5, learned)))
         else:
-            charts.append(Shewhart(0.0, 1.0, budget.shewhart_width(1 / ARL0, learned)))
+            charts.append(Shewhart(0.0, 1.0, shewhart.designed_width(1 / ARL0, learned)))
     rate = rate_of_one(charts, np.array([e for _, e in pairs]))
     assert 1 / 1.3 < rate * ARL0 < 1.3
 
@@ -73,7 +75,7 @@ def test_without_the_correction_for_the_training_it_alarms_too_often() -> None:
     plain = ewma_limit(ARL0, 0.03)
     e = np.array([e for _, e in pairs])
     assert rate_of_one([Ewma(0.0, 1.0, 0.03, plain) for _ in pairs], e) * ARL0 > 1.5
-    corrected: list[SignalChart] = [Ewma(0.0, 1.0, 0.03, budget.ewma_width(ARL0, 0.03, item)) for item, _ in pairs]
+    corrected: list[CompiledChart] = [Ewma(0.0, 1.0, 0.03, ewma.designed_limit(ARL0, 0.03, item)) for item, _ in pairs]
     assert 1 / 1.4 < rate_of_one(corrected, e) * ARL0 < 1.4
 
 
@@ -82,9 +84,7 @@ def test_the_chart_of_all_outputs_alarms_as_often_as_its_share_allows() -> None:
     alarms = rows = 0
     for z in residuals(0.3, seed=2, signals=2)[:50]:
         pairs = [prewhitened(column) for column in z]
-        chart = Mewma(
-            [0.0, 0.0], np.eye(2), 0.05, budget.joint_limit(ARL0, 0.05, [item for item, _ in pairs], TRAINING)
-        )
+        chart = Mewma([0.0, 0.0], np.eye(2), 0.05, joint_limit(ARL0, 0.05, [item for item, _ in pairs], TRAINING))
         for values in np.column_stack([e for _, e in pairs]).tolist():
             rows += 1
             if chart.update(values).out:
@@ -114,7 +114,7 @@ def test_a_chart_of_any_number_of_outputs_keeps_its_share(
             e[row] = (lfilter([1.0, *(-a for a in item.coefficients)], [1.0], column) - item.constant) / item.sd
         known = e[:, 6:training]
         white = np.linalg.inv(np.linalg.cholesky(np.corrcoef(known))) @ e[:, training:]
-        limit = budget.joint_limit(arl0, weight, learned, known.shape[1])
+        limit = joint_limit(arl0, weight, learned, known.shape[1])
         least_freedom = min(least_freedom, *(0.5 / (item.sd_variance + item.passed_variance) for item in learned))
         first = 0
         while first < rows:
@@ -127,14 +127,14 @@ def test_a_chart_of_any_number_of_outputs_keeps_its_share(
 
 
 def test_when_all_is_known_limits_are_those_of_the_run_lengths() -> None:
-    assert budget.ewma_width(5000.0, 0.1, KNOWN) == pytest.approx(ewma_limit(5000.0, 0.1), rel=1e-6)
-    assert budget.joint_limit(5000.0, 0.1, [KNOWN, KNOWN], 1e12) == pytest.approx(mewma_limit(5000.0, 2, 0.1), rel=1e-4)
-    assert budget.shewhart_width(0.0026997960632602, KNOWN) == pytest.approx(3.0, abs=1e-6)
+    assert ewma.designed_limit(5000.0, 0.1, KNOWN) == pytest.approx(ewma_limit(5000.0, 0.1), rel=1e-6)
+    assert joint_limit(5000.0, 0.1, [KNOWN, KNOWN], 1e12) == pytest.approx(mewma_limit(5000.0, 2, 0.1), rel=1e-4)
+    assert shewhart.designed_width(0.0026997960632602, KNOWN) == pytest.approx(3.0, abs=1e-6)
 
 
 def test_the_width_of_a_rule_of_several_points_gives_its_rate() -> None:
     """Three of five points, on normal values: the rule itself is run."""
-    width = budget.shewhart_width(budget.point_probability(3000.0, 3, 5), KNOWN)
+    width = shewhart.designed_width(budget.point_probability(3000.0, 3, 5), KNOWN)
     out = np.abs(np.random.default_rng(5).normal(size=1_000_000)) > width
     alarms = 0
     rule = Persistence(3, 5, 1)
@@ -182,7 +182,7 @@ def test_the_bounds_in_a_refusal_can_be_asked_for(period_min: float, alarms: int
 def test_a_cusum_after_a_short_training_has_a_limit_and_a_higher_one(rows: int) -> None:
     """Its mean may be off by more than the allowance, and then the limit is what makes up for it."""
     heights = [
-        budget.cusum_height(1e6, 0.25, Prewhitening(0.0, (0.0,), 1.0, count, 0.5 / count, 1.0 / count))
+        cusum.designed_limit(1e6, 0.25, Prewhitening(0.0, (0.0,), 1.0, count, 0.5 / count, 1.0 / count))
         for count in (rows, 2 * rows)
     ]
     assert heights[0] > heights[1] > 0.0

@@ -8,9 +8,9 @@ from scipy import integrate, special, stats
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc import run_length
-from reactorwatch.spc.charts.base import Bank
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.compiled_chart import Bank
 from tests.unit.spc import published
 from tests.unit.spc.lattice import Lattice
 from tests.unit.spc.published import flat

@@ -1,0 +1,122 @@
+"""A check of the signals themselves: hooks on the way of a row, and the alarms that it raises.
+
+A row passes the hooks in this order. Before the end of the training only `on_row` and `measured` are called.
+"""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from monitor_node.alarms.alarms import ChartAlarm, Explanation, SuspectedCause
+from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.baseline.signal_range import SignalRange
+from monitor_node.config import MonitorConfig
+from reactorwatch.contract.codec import Publication
+from reactorwatch.spc.charts.base import Judgement
+
+PLANT = "plant"
+"""What an alarm of all signals together is of."""
+
+SENSOR = "sensor"
+
+Flags = tuple[bool, ...]
+
+
+class SignalCheck:
+    """One check of the signals of one plant.
+
+    Args:
+        config: of the monitor.
+        board: the alarms of the plant; the check declares its own there.
+        ranges: of the input and of each output.
+
+    Attributes:
+        name: of its alarms.
+        can_be_false: whether chance can raise its alarms, one an output, which then share the promised false alarms.
+    """
+
+    name: ClassVar[str]
+    can_be_false: ClassVar[bool] = False
+
+    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange]) -> None:
+        self.board, self.outputs = board, config.outputs
+
+    @property
+    def state(self) -> Any:
+        """All that was learned and is remembered, as bytes; the alarms are the board's."""
+        return b""
+
+    def restore(self, state: Any) -> None:
+        """Resume where a check with the same settings was when `state` was taken; after the board.
+
+        Raises:
+            ValueError: the state is damaged.
+        """
+
+    def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
+        """Learn from the training.
+
+        Args:
+            values: readings of each output, in order of time; NaN where missing, and in all of an output left out.
+            e: prewhitened residuals of each output; NaN where there are none.
+            arl0: run length of each alarm without a fault, in rows.
+        """
+
+    def on_row(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
+        """Check a row, input first; values are NaN where missing."""
+        return []
+
+    def measured(self, time_ns: int, values: tuple[float, ...], publications: list[Publication]) -> tuple[float, ...]:
+        """The values of a row, input first, with NaN in place of those that are no measurements."""
+        return values
+
+    def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
+        """Check the outputs of a row."""
+        return []
+
+    @property
+    def invalid(self) -> list[bool]:
+        """The outputs whose readings, by their alarms, are no measurements."""
+        return [False] * len(self.outputs)
+
+    def on_residuals(
+        self, time_ns: int, e: list[float], scales: list[float], units: list[str], publications: list[Publication]
+    ) -> Flags:
+        """Check the prewhitened residuals of a row; returns the outputs whose value must not enter a memory yet.
+
+        Args:
+            time_ns: of the row.
+            e: of each output; NaN where there is none.
+            scales: one standard deviation of each, in the outputs' units.
+            units: of the outputs.
+            publications: changes of alarms are added here.
+        """
+        return (False,) * len(self.outputs)
+
+    def on_gap(self) -> None:
+        """Forget what a gap in the rows makes undecidable."""
+
+    def on_restart(self) -> None:
+        """Forget the rows seen: the plant's publisher was restarted."""
+        self.on_gap()
+
+    def judge(
+        self, alarm: ChartAlarm, time_ns: int, judgement: Judgement, unit: str, text: str, signal: str, *, cause: str
+    ) -> list[Publication]:
+        """Take a point of an alarm in; returns the alarm if it changes.
+
+        Args:
+            alarm: of this check.
+            time_ns: of the row.
+            judgement: of the point.
+            unit: of its statistic.
+            text: of the alarm, if the point raises it.
+            signal: what the alarm is of.
+            cause: what the alarm comes from.
+        """
+
+        def explain(_: Judgement) -> Explanation:
+            return Explanation(
+                text, {} if signal == PLANT else {signal: 1.0}, [SuspectedCause(cause, 1.0, kind=SENSOR)]
+            )
+
+        return self.board.judge(alarm, time_ns, judgement, unit, explain)

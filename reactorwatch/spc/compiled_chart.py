@@ -1,0 +1,243 @@
+"""Charts of one signal by a compiled kernel, alone or as a bank.
+
+The charts of one signal also come as a `Bank`, one chart a plant for thousands of plants. A chart is a column of
+numbers, a bank is an array (number, plant), and one kernel a kind of chart serves both: its inner loop runs over the
+plants, every plant goes through the same operations, so the bits are the same. (Per-plant branches are written
+as selections, so that the compiler can turn the loop into vector instructions.)
+"""
+
+from abc import abstractmethod
+from collections.abc import Iterable, Sequence
+from struct import Struct
+from typing import Any, ClassVar, Generic, NamedTuple, Self, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from reactorwatch.errors import InputError
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, ChartState, Judgement, SignalChart, finite
+
+# The first rows of a chart's column: what comes in and what goes out. After them come its settings, where its memory
+# starts, and its memory.
+X, PRESENT, STATISTIC, CENTRE, LOWER, UPPER, OUT, SETTINGS = range(8)
+
+
+class Judgements(NamedTuple):
+    """The fields of `Judgement` for many plants, each of shape (plants,); NaN and False for an absent plant."""
+
+    statistic: Array
+    centre: Array
+    lower_limit: Array
+    upper_limit: Array
+    out: NDArray[np.bool_]
+
+
+class SignalState(ChartState, frozen=True):
+    """State of a chart of one signal, or of a bank of them.
+
+    Attributes:
+        chart: its name.
+        plants: number of plants.
+        numbers: little-endian doubles, shape (numbers of one chart, plants).
+    """
+
+    chart: str
+    plants: int
+    numbers: bytes
+
+
+class CompiledChart(SignalChart):
+    """A chart of one signal by a compiled kernel. A kind of chart gives its numbers, its start and its kernel.
+
+    Args:
+        settings: the numbers of its constructor, as its kernel wants them.
+        start: its memory before the first value.
+    """
+
+    State = SignalState
+    numbers: ClassVar[int]  # how many settings and twice how many memories it has
+    memories: ClassVar[int]
+
+    def __init__(self, settings: Iterable[float], start: Sequence[float]) -> None:
+        column = [0.0] * SETTINGS + [*settings, *start, *start]
+        self._columns: Array = np.array(column, dtype=np.float64).reshape(-1, 1)
+        self._columns[PRESENT] = 1.0
+
+    @staticmethod
+    @abstractmethod
+    def kernel(columns: Array) -> None:
+        """Judge X of every plant that is PRESENT.
+
+        Args:
+            columns: shape (SETTINGS + numbers, plants).
+        """
+
+    @classmethod
+    def from_state(cls, state: SignalState) -> Self:
+        """The chart that goes on, bit for bit, where `state` was taken.
+
+        Raises:
+            ValueError: the state is of another chart or of several plants, or damaged.
+        """
+        if state.plants != 1:
+            raise ValueError(f"state must be of one plant, got {state.plants}: use Bank")
+        return cls._of(_columns(cls, state))
+
+    @classmethod
+    def _of(cls, columns: Array) -> Self:
+        chart = cls.__new__(cls)
+        chart._columns = columns
+        return chart
+
+    @property
+    def state(self) -> SignalState:
+        """A copy of all that it is and remembers."""
+        return SignalState(self.name, 1, self._columns[SETTINGS:].astype("<f8").tobytes())
+
+    def update(self, x: float) -> Judgement:
+        """See `Chart`."""
+        columns = self._columns
+        columns[X, 0] = finite(x)
+        self.kernel(columns)
+        statistic, centre, lower, upper, out = columns[STATISTIC:SETTINGS, 0].tolist()
+        return Judgement(statistic, centre, lower, upper, out > 0.0)
+
+    def restart(self) -> None:
+        """Forget the values seen."""
+        _restart(self._columns, self.memories, slice(None))
+
+    def setting(self, row: int) -> float:
+        """A number of the column."""
+        return float(self._columns[row, 0])
+
+
+Kind = TypeVar("Kind", bound=CompiledChart)
+
+
+class Bank(Generic[Kind]):
+    """Charts of one kind, one a plant, updated in one call. A plant's numbers are the single chart's, bit for bit.
+
+    Args:
+        charts: at least one; each with settings and memory of its own.
+
+    Raises:
+        InputError: there is none, or they are of several kinds.
+    """
+
+    def __init__(self, charts: Sequence[Kind]) -> None:
+        kinds = {type(chart) for chart in charts}
+        if len(kinds) != 1:
+            raise InputError(f"charts must be one or more of one kind, got {sorted(kind.__name__ for kind in kinds)}")
+        (self._kind,) = kinds
+        self._hold(np.concatenate([chart._columns for chart in charts], axis=1))
+
+    @classmethod
+    def from_state(cls, kind: type[Kind], state: SignalState) -> Self:
+        """The charts that go on, bit for bit, where `state` was taken.
+
+        Raises:
+            ValueError: the state is of another chart, or damaged.
+        """
+        bank = cls.__new__(cls)
+        bank._kind = kind
+        bank._hold(_columns(kind, state))
+        return bank
+
+    def _hold(self, columns: Array) -> None:
+        self._columns = np.ascontiguousarray(columns)
+        self._plants = plants = columns.shape[1]
+        self._numbers = self._columns.reshape(-1).data  # all of them, one row after the other
+        self._come, self._out = Struct(f"{2 * plants}d").pack_into, Struct(f"{plants}d").unpack_from
+        self._out_offset = OUT * plants * self._columns.itemsize
+
+    @property
+    def state(self) -> SignalState:
+        """A copy of all that the charts are and remember."""
+        numbers = self._columns[SETTINGS:].astype("<f8").tobytes()
+        return SignalState(self._kind.name, self._columns.shape[1], numbers)
+
+    def update(self, values: ArrayLike, present: NDArray[np.bool_] | None = None) -> Judgements:
+        """Judge every plant's next value.
+
+        Args:
+            values: shape (plants,).
+            present: shape (plants,); False leaves a plant's chart as it is and its value unread. All, if not given.
+
+        Raises:
+            ValueError: a present value that is not finite, or a wrong shape; nothing is changed then, in no plant.
+        """
+        columns = self._columns
+        x = np.asarray(values, dtype=np.float64)
+        if x.shape != (columns.shape[1],):
+            raise ValueError(f"values must have shape ({columns.shape[1]},), got {x.shape}")
+        if present is None:
+            present = np.ones(x.shape, dtype=np.bool_)
+        if present.shape != x.shape or present.dtype != np.bool_:
+            raise ValueError(f"present must be {x.size} booleans, got {present.shape} of {present.dtype}")
+        refused = present & ~(np.abs(x) < LARGEST_VALUE)
+        if refused.any():
+            plant = int(np.argmax(refused))
+            raise ValueError(f"plant {plant}: a chart takes finite values below {LARGEST_VALUE:g}, got {x[plant]}")
+        columns[X] = np.where(present, x, 0.0)
+        columns[PRESENT] = present
+        self._kind.kernel(columns)
+        said = columns[STATISTIC:OUT].copy()
+        said[:, ~present] = np.nan
+        return Judgements(said[0], said[1], said[2], said[3], present & (columns[OUT] > 0.0))
+
+    def judge(self, values: list[float], present: list[bool]) -> bool:
+        """As `update`, for the few charts of one plant at every row: whether any is out; `judgement` says the rest.
+
+        Args:
+            values: one a chart, finite where present.
+            present: False leaves a chart as it is.
+        """
+        self._come(self._numbers, 0, *values, *present)  # X and PRESENT are the first rows
+        self._kind.kernel(self._columns)
+        out = self._out(self._numbers, self._out_offset)
+        return any(out) and any(here and much > 0.0 for here, much in zip(present, out, strict=True))
+
+    def judgement(self, plant: int) -> Judgement:
+        """What a chart said of its last value."""
+        plants = self._plants
+        told = self._numbers[STATISTIC * plants + plant : SETTINGS * plants : plants].tolist()
+        statistic, centre, lower, upper, out = told
+        return Judgement(statistic, centre, lower, upper, out > 0.0)
+
+    def restart(self, plants: NDArray[np.bool_] | None = None) -> None:
+        """Forget the values seen, of all plants or of those that are True."""
+        _restart(self._columns, self._kind.memories, slice(None) if plants is None else plants)
+
+    def chart(self, plant: int) -> Kind:
+        """A copy of one plant's chart, in the single form.
+
+        Raises:
+            IndexError: there is no such plant.
+        """
+        if not 0 <= plant < self._columns.shape[1]:
+            raise IndexError(f"plant must be in 0..{self._columns.shape[1] - 1}, got {plant}")
+        columns = self._columns[:, plant : plant + 1].copy()
+        columns[PRESENT] = 1.0
+        return self._kind._of(columns)
+
+
+def _restart(columns: Array, memories: int, plants: Any) -> None:
+    if memories:
+        columns[-memories:, plants] = columns[-2 * memories : -memories, plants]
+
+
+def _columns(kind: type[CompiledChart], state: SignalState) -> Array:
+    """The columns of charts of a kind, from their state."""
+    if state.chart != kind.name:
+        raise ValueError(f"state must be of the chart {kind.name}, got {state.chart}")
+    if state.plants < 1 or len(state.numbers) != 8 * kind.numbers * state.plants:
+        raise ValueError(
+            f"state of {state.plants} charts {kind.name} must have {8 * kind.numbers * state.plants} bytes, "
+            f"got {len(state.numbers)}"
+        )
+    columns = np.zeros((SETTINGS + kind.numbers, state.plants))
+    columns[PRESENT] = 1.0
+    columns[SETTINGS:] = np.frombuffer(state.numbers, dtype="<f8").reshape(kind.numbers, state.plants)
+    if not np.all(np.isfinite(columns)):
+        raise ValueError(f"state of the chart {kind.name} must hold finite numbers")
+    return columns

@@ -1,0 +1,105 @@
+"""Charts of all signals together: their limits, the reasons why there can be none, and what they say."""
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import special
+
+from reactorwatch.spc.baseline import Baseline
+from reactorwatch.spc.charts.base import Array, Chart, Judgement, Shown
+from reactorwatch.spc.estimated_t2 import estimated_t2_quantile
+from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
+from reactorwatch.spc.prewhitening import Prewhitening
+from reactorwatch.spc.run_length.design import mewma_limit
+from reactorwatch.spc.run_length.mewma import LARGEST_DIMENSION_WITHOUT_SHIFT as LARGEST_DIMENSION
+
+ROWS_A_SIGNAL = 2
+"""Rows of the training that a chart of all signals needs for each: with fewer their correlations are hardly known."""
+
+LEAST_VARIANCE = 1e-8
+"""Share of one signal's own variance that a combination of signals must have; with less it varies by rounding only."""
+
+
+class JointChart(Chart):
+    """A chart of all signals together; a sample is a vector."""
+
+    @classmethod
+    @abstractmethod
+    def design(cls, baseline: Baseline) -> Self:
+        """The chart for a training; there must be no obstacle to it."""
+
+    @abstractmethod
+    def update(self, x: ArrayLike) -> Judgement:
+        """See `Chart`; x has shape (p,)."""
+
+    @abstractmethod
+    def contributions(self, x: ArrayLike) -> Array:
+        """Each signal's part of the newest statistic, shape (p,); x is the newest sample."""
+
+    @classmethod
+    def obstacle(cls, e: Array, names: Sequence[str]) -> str:
+        """The reason why there can be no chart after a training; empty if there can.
+
+        Args:
+            e: prewhitened residuals without missing ones, shape (rows, signals).
+            names: of the signals.
+        """
+        count = len(names)
+        if count < 2:
+            return "it needs two outputs or more"
+        if count > LARGEST_DIMENSION:
+            return f"it takes at most {LARGEST_DIMENSION} outputs, got {count}"
+        if len(e) < ROWS_A_SIGNAL * count:
+            return (
+                f"the training has {len(e)} rows in which all {count} outputs could be learned from, "
+                f"{ROWS_A_SIGNAL * count} are needed"
+            )
+        sizes, directions = np.linalg.eigh(correlation(e))
+        if sizes[0] < LEAST_VARIANCE:
+            alike = [names[index] for index in np.flatnonzero(np.abs(directions[:, 0]) > 0.1).tolist()]
+            return f"one of the outputs {', '.join(alike)} follows from the others"
+        return ""
+
+    def explain(self, x: ArrayLike, signals: Sequence[Shown]) -> tuple[str, dict[str, float]]:
+        """The text of an alarm, and each signal's share of it.
+
+        Args:
+            x: the newest sample, which is out.
+            signals: of the sample, in order.
+        """
+        parts = np.maximum(self.contributions(x), 0.0)
+        shares = parts / np.sum(parts)
+        order = np.argsort(-shares)
+        names = " and ".join(f"{signals[index].name} ({100 * shares[index]:.0f} %)" for index in order)
+        text = f"what the model leaves unexplained is unlike the training: {names}"
+        return text, {signals[index].name: float(shares[index]) for index in order}
+
+
+def correlation(e: Array) -> Array:
+    """Of the columns, shape (columns, columns); 0 with one that does not vary."""
+    off = e - e.mean(axis=0) if len(e) else np.zeros((1, e.shape[1]))
+    lengths = np.linalg.norm(off, axis=0)
+    products = np.outer(lengths, lengths)
+    matrix = off.T @ off / np.where(products > 0, products, 1.0)
+    matrix = 0.5 * (matrix + matrix.T)
+    matrix[np.diag_indices(e.shape[1])] = 1.0
+    return np.asarray(matrix)
+
+
+def joint_limit(arl0: float, weight: float, learned: Sequence[Prewhitening], rows: float) -> float:
+    """The limit of a MEWMA's, or with the weight 1 of a T2's, statistic.
+
+    Args:
+        arl0: its run length without a fault.
+        weight: lambda.
+        learned: the training of each signal.
+        rows: from which the correlations of the signals were estimated.
+    """
+    dimension = len(learned)
+    known = mewma_limit(arl0, dimension, weight)
+    freedoms = np.array([degrees_of_freedom(item, weight) for item in learned])
+    limit = estimated_t2_quantile(float(special.chdtrc(dimension, known)), freedoms, rows)
+    return limit * (1.0 + (2.0 - weight) / (weight * min(item.rows for item in learned)))
