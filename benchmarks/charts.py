@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.chart_stage import OF_ALL, OF_EACH, ChartWatch
 from monitor_node.config import ChartName, MonitorConfig
 from reactorwatch.spc import run_length
@@ -73,7 +73,7 @@ def of_a_plant() -> None:
     kinds: tuple[tuple[ChartName, ...], ...] = (MonitorConfig().charts, (*OF_EACH, *OF_ALL))
     for charts in kinds:
         config = MonitorConfig(charts=charts)
-        watch = ChartWatch(config, AlarmBoard(config))
+        watch = ChartWatch(config, Annunciator(config))
         watch.start(learned, rng.standard_normal((1000, 2)), 2e6)
 
         def run(watch: ChartWatch = watch) -> None:

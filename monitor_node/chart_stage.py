@@ -17,8 +17,8 @@ from itertools import compress
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.alarms.alarms import ChartAlarm, Explanation, quantity
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.alarms import ChartAlarm, Explanation, format_quantity
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.chart_design import ChartDesign, VectorChart, joint_obstacle
 from monitor_node.config import ChartName, MonitorConfig, PriorityName
 from reactorwatch.contract import keys
@@ -118,11 +118,12 @@ class _OfEach:
         side = "above" if judgement.statistic > judgement.centre else "below"
         size = abs(judgement.statistic) * scales[place]
         if self._name == Shewhart.name:
-            allowed = quantity(judgement.upper_limit * scales[place], unit)
-            text = f"{signal} is {quantity(size, unit)} {side} what the model expects (allowed: {allowed})"
+            allowed = format_quantity(judgement.upper_limit * scales[place], unit)
+            text = f"{signal} is {format_quantity(size, unit)} {side} what the model expects (allowed: {allowed})"
         elif self._name == Ewma.name:
             # As the lasting shift of the output that would look like this.
-            text = f"{signal} is on average {quantity(size / self._passed[place], unit)} {side} what the model expects"
+            shift = format_quantity(size / self._passed[place], unit)
+            text = f"{signal} is on average {shift} {side} what the model expects"
         else:
             text = f"{signal} has been {side} what the model expects for long"
         return Explanation(text, {signal: 1.0})
@@ -206,11 +207,11 @@ class ChartWatch:
         board: the alarms of the plant; those of the charts are declared here.
     """
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator) -> None:
         self._config = config
         self._board = board
         self._alarms = {
-            pair: board.declare(*pair, at_once=pair[0] not in WITHOUT_MEMORY, priority=self._priority(pair[1]))
+            pair: board.declare(*pair, without_on_delay=pair[0] not in WITHOUT_MEMORY, priority=self._priority(pair[1]))
             for pair in alarm_names(config)
         }
         self._watched: dict[str, _Watched] = {}
@@ -305,7 +306,7 @@ class ChartWatch:
             pairs = [pair for pair in self._alarms if pair[0] == name]
             alarms = [self._alarms[pair] for pair in pairs]
             paths = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
-            self._watched[name] = _Watched(made(name), alarms, paths, all(alarm.at_rest for alarm in alarms))
+            self._watched[name] = _Watched(made(name), alarms, paths, all(alarm.is_idle for alarm in alarms))
 
     def update(
         self,
@@ -348,11 +349,11 @@ class ChartWatch:
                 if judgement.out or rule.standing or rule.recent:
                     stood = rule.standing
                     explain = None if stood else _explaining(watched.charts, place, scales, units)
-                    publications.extend(self._board.judge(alarm, time_ns, judgement, SD, explain))
+                    publications.extend(self._board.evaluate(alarm, time_ns, judgement, SD, explain))
                     raised |= rule.standing and not stood
                     if stood and not rule.standing:
                         watched.charts.restart(place)
-            watched.at_rest = all(alarm.at_rest for alarm in watched.alarms)
+            watched.at_rest = all(alarm.is_idle for alarm in watched.alarms)
         return raised
 
 

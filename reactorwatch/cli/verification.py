@@ -91,7 +91,7 @@ def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: 
 
 
 def _object(found: Verification, file: Path, plant: str, zero_ns: int) -> dict[str, Any]:
-    counts = found.comparison.counts
+    counts = found.diff.counts
     return {
         "file": str(file),
         "plant": plant,
@@ -102,9 +102,9 @@ def _object(found: Verification, file: Path, plant: str, zero_ns: int) -> dict[s
         "kinds": [
             {"kind": kind, "recorded": count.recorded, "equal": count.equal} for kind, count in sorted(counts.items())
         ],
-        "differing": found.comparison.differing,
-        "differences": [_difference(item, zero_ns) for item in found.comparison.differences],
-        "after_the_end": found.comparison.unrecorded,
+        "differing": found.diff.differing,
+        "differences": [_difference(item, zero_ns) for item in found.diff.differences],
+        "after_the_end": found.diff.unrecorded,
         "notes": found.notes,
     }
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from monitor_node.alarms.alarms import quantity
+from monitor_node.alarms.alarms import format_quantity
 from monitor_node.config import MonitorConfig
 from monitor_node.replay.backtest import Backtest, run
 from plant_node.config import PlantConfig
@@ -122,4 +122,8 @@ def test_a_renamed_column_has_the_unit_in_its_brackets_or_none(
 
 
 def test_a_number_without_a_unit_stands_alone() -> None:
-    assert (quantity(1.5, ""), quantity(1.5, "1"), quantity(1.5, "degC")) == ("1.5", "1.5", "1.5 degC")
+    assert (format_quantity(1.5, ""), format_quantity(1.5, "1"), format_quantity(1.5, "degC")) == (
+        "1.5",
+        "1.5",
+        "1.5 degC",
+    )
