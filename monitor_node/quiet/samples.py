@@ -46,7 +46,7 @@ def _follows(p: Any, signal: int, time_ns: int) -> bool:
 
 @compiled
 def _heard(p: Any, now_ns: int, silence_limit: float, least_ns: int) -> None:
-    """Note that something came; as `Silence.received`."""
+    """Note that something came; as `DataTimeout.on_receipt`."""
     before_ns, p.received_ns = p.counted_ns, now_ns
     spacing = now_ns - before_ns
     if spacing < 0:
@@ -150,7 +150,7 @@ def take_samples(
 
 @compiled
 def silent_from(plants: Records, silence_limit: float, least_ns: int) -> Ints:
-    """When it is too long since something came from each plant, as `Silence.due_ns`; never where there is none."""
+    """When it is too long since something came from each plant, as `DataTimeout.due_ns`; never where there is none."""
     found = np.empty(plants.size, np.int64)
     for slot in range(plants.size):
         p = plants[slot]

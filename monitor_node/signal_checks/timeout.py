@@ -28,10 +28,10 @@ is `UNKNOWN_ROWS` of their usual spacings.
 >>> plant, sensor = DataTimeout(), DataTimeout()
 >>> def on_row(time_ns: int, T: float) -> list[tuple[str, Change]]:
 ...     changes = [("plant", plant.update(time_ns, present=True))]
-...     if changes[0][1] != NOTHING:
-...         sensor.excuse(time_ns)
+...     if changes[0][1] != NO_CHANGE:
+...         sensor.suppress_until(time_ns)
 ...     changes.append(("T", sensor.update(time_ns, present=not isnan(T))))
-...     return [(name, change) for name, change in found if change != NOTHING]
+...     return [(name, change) for name, change in changes if change != NO_CHANGE]
 >>> [on_row(time_ns, 440.0) for time_ns in range(0, 4000, 100)] == [[]] * 40
 True
 >>> on_row(7000, 440.0)  # nothing for 3100 ns, where 500 are allowed
