@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.chart_stage import ChartWatch
 from monitor_node.config import ChartName, MonitorConfig
 from reactorwatch.spc import run_length
@@ -77,7 +77,7 @@ def of_a_plant() -> None:
     )
     for charts in kinds:
         config = MonitorConfig(charts=charts)
-        watch = ChartWatch(config, AlarmBoard(config))
+        watch = ChartWatch(config, Annunciator(config))
         e = rng.standard_normal((1000, 2))
         watch.choose([True, True], e)
         watch.start(learned, e, 2e6)

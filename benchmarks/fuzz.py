@@ -21,11 +21,11 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from monitor_node.baseline.signal_range import ranges_of
+from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.monitor import FleetMonitor
-from monitor_node.fleet.sharding import WHOLE, Crew
+from monitor_node.fleet.sharding import WHOLE, ShardGroup
 from plant_node.config import PlantConfig
 from plant_node.node import PlantNode
 from plant_node.record import plant_from, simulate_record
@@ -212,7 +212,7 @@ def fuzz_values(count: int, seed: int = 5) -> dict[str, int]:
     )
     for place, value in zip(places, bad, strict=True):
         bad_plant[place] = mutator.with_value(bad_plant[place], value)
-    fleet = FleetMonitor(MONITOR, 0, Crew("reactor/*", WHOLE, "a"))
+    fleet = FleetMonitor(MONITOR, 0, ShardGroup("reactor/*", WHOLE, "a"))
     alone = {plant: Monitor(msgspec.structs.replace(MONITOR, plant=plant), 0, points=False) for plant in PAIR}
     stored, fed_until, restarts = b"", 0, 0
     told, expected = list[Publication](), list[Publication]()
@@ -245,7 +245,7 @@ def _bad_values(draw: random.Random, count: int) -> tuple[list[float], list[int]
     row, values, places = 250, list[float](), list[int]()
     while len(values) < count:
         signal, rows = draw.randrange(len(signals)), draw.randrange(1, LONGEST_RUN + 1)
-        lower, upper, _ = ranges_of(cstr(), signals)[signal]
+        lower, upper, _ = signal_ranges(cstr(), signals)[signal]
         far = draw.choice((-1, 1)) * 10.0 ** draw.uniform(-3.0, 14.9)
         value = draw.choice((draw.uniform(lower, upper), lower, upper, far, -999.0, 65535.0))
         spread = draw.choice((0.0, 1e-3, 0.1)) * (upper - lower)

@@ -18,7 +18,7 @@ from collections.abc import Iterable
 from statistics import median
 from typing import NamedTuple
 
-from monitor_node.baseline.signal_range import ranges_of
+from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation, Suspect
@@ -97,7 +97,7 @@ def watch_bad_values(runs: int, looks: list[Look], seed: int = 1) -> list[float]
         bad = _bad_values(draw)
         monitor = Monitor(CONFIG, 0)
         monitor.from_bytes(state)
-        monitor.caught_up()
+        monitor.on_history_end()
         changed = []
         for at, (signal, sample) in enumerate(samples[3 * TRAINED :]):
             other = Sample()
@@ -114,7 +114,7 @@ def _bad_values(draw: random.Random) -> dict[tuple[str, int], float]:
     bad: dict[tuple[str, int], float] = {}
     for _ in range(draw.choice((1, 1, 2))):
         place = draw.randrange(len(SIGNALS))
-        lower, upper, _ = ranges_of(cstr(), SIGNALS)[place]
+        lower, upper, _ = signal_ranges(cstr(), SIGNALS)[place]
         far = draw.choice((-1.0, 1.0)) * 10.0 ** draw.uniform(-3.0, 14.9)
         value = draw.choice((draw.uniform(lower, upper), lower, upper, far, -999.0, 9999.0, 65535.0))
         spread = draw.choice((0.0, 0.0, 1e-3, 0.1)) * (upper - lower)

@@ -46,7 +46,7 @@ from benchmarks.fleet.traffic import (
 )
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.node import PASSING, FleetNode, watch
+from monitor_node.fleet.node import UNCACHED, FleetNode, watch
 from monitor_node.quiet.slots import NEVER_NS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
@@ -133,7 +133,7 @@ def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
     """Watch the fleet until so many samples have come, or until terminated."""
     alone_on_a_core(0)
     stop = StopSignal()
-    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, uncached=PASSING, many_keys=True)
+    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, uncached=UNCACHED, many_keys=True)
     assert bus is not None
     node = Counting(SHARP if sharp else FAST, bus, stop)
     core = 0.0 if sharp else without_bus(plants)
@@ -161,11 +161,11 @@ def held(endpoint: str, plants: int) -> None:
     alone_on_a_core(0)
     stop = StopSignal()
     bus_zenoh.bus.MAX_NEW_KEYS = plants  # as it is after some minutes
-    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, uncached=PASSING, many_keys=True)
+    bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, uncached=UNCACHED, many_keys=True)
     assert bus is not None
     node = Counting(FAST, bus, stop)
     node.learn(plants)
-    quiet = node._here._quiet
+    quiet = node._watched._quiet
     assert quiet is not None
     due_ns = quiet._slots.health_due_ns
     due_ns[plants // 2 : plants] = NEVER_NS

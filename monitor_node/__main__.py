@@ -36,34 +36,34 @@ from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sende
 log = structlog.get_logger()
 
 PREPARE_EVERY_NS = 100_000_000
-"""Samples are handled between two parts of what looks for causes need, which take some hundredths of a second each."""
+"""Interval between two steps of the preparation, some hundredths of a second each; samples are handled between them."""
 
 PREPARED = object()
-"""Returned where no part is left."""
+"""Marks the end of the preparation."""
 
 DRAIN_TIMEOUT_S = 0.5
-"""Silence on the bus after which a monitor that was asked to stop takes everything as heard."""
+"""Time without messages after which a stopping monitor has received everything."""
 
 
 class MonitorNode(Monitor):
-    """A monitor that keeps what it remembers in a file, and says in its log what an operator wants to read there.
+    """A monitor with its stored state and log.
 
     Args:
-        config: how the plant is watched.
-        start_ns: now.
+        config: settings of the monitor.
+        start_ns: present time.
 
     Raises:
-        InputError: a file that the settings name cannot be used; that of the alarms, if no other has them.
+        InputError: a file of the settings is unusable.
 
     Attributes:
-        resumed: whether it goes on from a stored state.
-        token: the liveliness token of this monitor, unlike any other's.
-        preparation: makes, item by item, what looks for causes need; None: there is nothing to make.
+        resumed: True if the monitor resumed from a stored state.
+        token: unique liveliness token of this monitor.
+        preparation: steps that prepare the search for causes; None: there are none left.
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int) -> None:
         super().__init__(config, start_ns, model=read_model_on_bus_clock(config.model))
-        self._said: dict[object, str] = {}
+        self._logged: dict[object, str] = {}
         self._rate = CommandRateLimiter()
         self.preparation: Iterator[None] | None = None
         self._prepare_ns = start_ns
@@ -100,31 +100,28 @@ class MonitorNode(Monitor):
         return publications
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """See `Monitor`; alarms are stored, before the answer goes out, and logged; too many commands are refused."""
+        """See `Monitor`; alarms are stored before the reply, and logged; too many commands are refused."""
         refusal = self._rate.check(sender_name(question), now_ns)
         if refusal is not None:
             self.received += 1
-            self.refusals.add("too_many_commands", refusal)
+            self.rejects.add("too_many_commands", refusal)
             return CommandReply(accepted=False, text=refusal), []
         reply, publications = super().on_command(question, now_ns)
         self._keep(publications, now_ns)
         return reply, publications
 
     def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
-        """Log that another monitor of the plant, or a fleet with the plant in it, came or went."""
-        log_report(self._others.note(token, is_alive=is_alive))
+        """Log that another monitor of the plant, or a fleet with the plant, was noticed or has gone."""
+        log_report(self._others.on_token(token, is_alive=is_alive))
         return []
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """See `Monitor`; what was refused is logged, at most once a minute; what could not be stored is tried again.
-
-        Until all is made that looks for causes need, a part of that is made.
-        """
+        """See `Monitor`; rejects are logged at most once a minute; failed storing is retried; a step is prepared."""
         if self.preparation is not None and now_ns >= self._prepare_ns:
             self._prepare_ns = now_ns + PREPARE_EVERY_NS
             if next(self.preparation, PREPARED) is PREPARED:
                 self.preparation = None
-        report = self.refusals.report(now_ns)
+        report = self.rejects.report(now_ns)
         if report is not None:
             log.warning(report)
         publications = super().on_tick(now_ns)
@@ -132,13 +129,13 @@ class MonitorNode(Monitor):
         return publications
 
     def next_tick_ns(self) -> int:
-        """See `Monitor`; or when it is to be stored, or the next part of what looks for causes need to be made."""
+        """See `Monitor`; or the time to store the state, or to prepare the next step."""
         stored_ns = None if self._file is None else self._file.due_ns()
         prepared_ns = None if self.preparation is None else self._prepare_ns
         return min(item for item in (super().next_tick_ns(), stored_ns, prepared_ns) if item is not None)
 
     def on_stop(self, now_ns: int) -> list[Publication]:
-        """See `Monitor`; it is stored for the last time."""
+        """See `Monitor`; the state is stored for the last time."""
         if self._file is not None:
             self._try(self._file.store)
         return super().on_stop(now_ns)
@@ -166,19 +163,19 @@ class MonitorNode(Monitor):
             self._try(self._file.store)
 
     def _try(self, store: Callable[[], None]) -> None:
-        """A full disk is no reason to stop watching the plant: it is said once, and tried again."""
+        """Store; log a failure once. A full disk must not stop the monitor: the next call retries."""
         try:
             store()
         except InputError as error:
-            if str(error) != self._said.get(store):
-                self._said[store] = str(error)
+            if str(error) != self._logged.get(store):
+                self._logged[store] = str(error)
                 log.warning(str(error))
         else:
-            self._said.pop(store, None)
+            self._logged.pop(store, None)
 
 
 def declare_tokens(node: MonitorNode, bus: Bus) -> None:
-    """Show that the plant has a monitor, and which."""
+    """Declare the liveliness tokens of the plant's monitor."""
     bus.declare_token(keys.key(node.config.plant, keys.ALIVE, NODE))
     bus.declare_token(node.token)
 
@@ -188,15 +185,15 @@ def run(
     bus_config: BusConfig,
     metrics_config: MetricsConfig = MetricsConfig(),  # noqa: B008 (it is frozen)
 ) -> None:
-    """Watch until SIGINT or SIGTERM.
+    """Run the monitor until SIGINT or SIGTERM.
 
     Args:
-        config: how the plant is watched.
-        bus_config: where the bus is.
-        metrics_config: where its counts are shown.
+        config: settings of the monitor.
+        bus_config: settings of the bus.
+        metrics_config: settings of the metrics.
 
     Raises:
-        InputError: settings that the bus cannot use, or a damaged file of alarm states.
+        InputError: the settings are inconsistent, or a file of the settings is unusable.
     """
     node = MonitorNode(config, time.time_ns())
     node.preparation = stage.preparation(config, node.model)
@@ -210,7 +207,7 @@ def run(
             loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
             # All samples published since the state was stored, however long ago; the node skips those it knows.
             history_s = inf if node.resumed else 0.0
-            loop.subscribe(keys.all_keys(config.plant, keys.SAMPLE), history_s=history_s, on_history_end=node.caught_up)
+            loop.subscribe(keys.all_keys(config.plant, keys.SAMPLE), history_s=history_s, on_history_end=node.on_history_end)
             loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
             loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))
             declare_tokens(node, bus)

@@ -183,11 +183,11 @@ class ChartWatch:
         board: the alarms of the plant; those of the charts are declared here.
     """
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator) -> None:
         self._config = config
         self._board = board
         self._alarms = {
-            pair: board.declare(*pair, at_once=chart(pair[0]).has_memory, priority=self._priority(pair[1]))
+            pair: board.declare(*pair, without_on_delay=chart(pair[0]).has_memory, priority=self._priority(pair[1]))
             for pair in alarm_names(config)
         }
         self._names = list[str](dict.fromkeys(name for name, _ in self._alarms))
@@ -294,7 +294,7 @@ class ChartWatch:
             pairs = [pair for pair in self._alarms if pair[0] == name]
             alarms = [self._alarms[pair] for pair in pairs]
             paths = [keys.key(self._config.plant, keys.CHART, keys.chart_name(*pair)) for pair in pairs]
-            self._watched[name] = _Watched(made(chart(name)), alarms, paths, all(alarm.at_rest for alarm in alarms))
+            self._watched[name] = _Watched(made(chart(name)), alarms, paths, all(alarm.is_idle for alarm in alarms))
 
     def update(
         self,
@@ -337,11 +337,11 @@ class ChartWatch:
                 if judgement.out or rule.standing or rule.recent:
                     stood = rule.standing
                     explain = None if stood else self._explaining(watched.charts, index, scales, units)
-                    publications.extend(self._board.judge(alarm, time_ns, judgement, SD, explain))
+                    publications.extend(self._board.evaluate(alarm, time_ns, judgement, SD, explain))
                     raised |= rule.standing and not stood
                     if stood and not rule.standing:
                         watched.charts.restart(index)
-            watched.at_rest = all(alarm.at_rest for alarm in watched.alarms)
+            watched.at_rest = all(alarm.is_idle for alarm in watched.alarms)
         return raised
 
     def _explaining(

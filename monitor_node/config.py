@@ -22,50 +22,48 @@ else:
 PriorityName = Literal["low", "medium", "high", "critical"]
 
 DEFAULT_PRIORITIES: dict[str, PriorityName] = {"T": "high"}
-"""Priorities where the settings give none; an entry holds where its signal is an output."""
+"""Default priorities of signals that are outputs."""
 
 
 SMALLEST_SD = {"C": 2e-4, "T": 0.05}
-"""Settings of the reactor's outputs; other outputs have none unless the settings say so."""
+"""Defaults for the reactor's outputs; other outputs have none."""
 
 
 class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
-    """How a plant is watched. The charts of the catalogue have keys of their own beside these: see `chart_settings`.
+    """Settings of a monitor. The charts of the catalogue have keys of their own beside these: see `chart_settings`.
 
     Attributes:
-        plant: its name.
-        input: the signal that drives the plant.
-        outputs: the signals that are predicted and watched.
-        order: of the ARX models.
-        delay: of the input, in samples; 1 means that it acts on the next sample.
-        forgetting: of the model that adapts, in (0, 1]; 1 forgets nothing.
-        training_min: how long it learns before it watches, in minutes of the plant.
-        reference: what a row is expected by: `process`, the filter of the reactor's equations; `arx`, the identified
-            model as it was at the end of its training; `auto`, the first where it predicts the training at least about
-            as well as the second, else the second.
-        model: file of an extended model (`diagnose -o`) whose equations they are; None: those of the nominal reactor.
-        charts: that watch the residuals.
-        false_alarms_per_30_days: how many alarms chance may raise in 30 days of the plant, all alarms together; None:
-            1, or the nearest number that the charts can keep for the number of alarms and the period of the rows.
-        smallest_sd: standard deviation of the residual that is taken at least, by output, in its unit: what is smaller
-            is of no interest.
-        isolation: whether the cause of an alarm is looked for, where the reference is the reactor's equations.
-        isolation_rows: the newest rows that it is looked for in.
-        raise_count: the Shewhart chart's alarm is raised when this many of the last `window` points are out ...
-        window: ... of so many ...
-        clear_count: ... and cleared after this many in a row are back in ...
-        dead_band: ... which they are within (1 - dead_band) of the limit, in [0, 0.9].
-        incident_min: how long after the last change of an incident's alarms another one still belongs to it, in minutes
-            of the plant.
-        longest_shelf_min: how long an alarm may be shelved at most, in minutes of the plant.
-        alarm_state_file: where the state of the alarms is kept, so that it survives a restart; None: nowhere.
-        state_file: where all that the monitor remembers is kept, so that it goes on after a restart; None: nowhere.
-        state_every_s: how often it is stored, in seconds; after a change of an alarm it is stored at once.
-        reorder_rows: how many newer rows may begin before an incomplete one is given up.
-        snapshot_min: how often the models are published, in minutes of the plant.
-        health_period_s: how often health is published, in seconds.
-        silence_periods: a plant that sends no row for so many sampling periods is silent.
-        priorities: of the alarms, by signal; those not named are medium.
+        plant: name of the plant.
+        input: signal that drives the plant.
+        outputs: signals that are predicted and monitored.
+        order: order of the ARX models.
+        delay: delay of the input in samples; with 1 it acts on the next sample.
+        forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
+        training_min: duration of the training, in minutes of the plant.
+        reference: model that predicts the rows: `process`, the filter of the reactor's equations; `arx`, the identified
+            model as fitted to the training; `auto`, the first if it predicts the training about as well as the second,
+            else the second.
+        model: file of an extended model (`diagnose -o`) for the equations; None: the nominal reactor.
+        charts: charts of the residuals.
+        false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
+            nearest number that the charts can keep for the number of alarms and the sampling period.
+        smallest_sd: least standard deviation of the residual by output, in its unit; smaller deviations do not matter.
+        isolation: true to search the cause of an alarm, if the reference is the reactor's equations.
+        isolation_rows: number of newest rows in that search.
+        raise_count: number of violating points among the last `window` that raises the Shewhart chart's alarm.
+        window: number of points in which `raise_count` is counted.
+        clear_count: number of normal points in a row that clears an alarm.
+        dead_band: a point is normal within (1 - dead_band) of the limit; in [0, 0.9].
+        incident_min: minutes of the plant after the last change of an incident in which an alarm still belongs to it.
+        longest_shelf_min: longest time for which an alarm may be shelved, in minutes of the plant.
+        alarm_state_file: file of the alarms' state, for a restart; None: it is not stored.
+        state_file: file of the monitor's full state, for a restart; None: it is not stored.
+        state_every_s: storage interval in seconds; after a change of an alarm the state is stored at once.
+        reorder_rows: number of newer rows that may start before an incomplete row is emitted.
+        snapshot_min: interval between published models, in minutes of the plant.
+        health_period_s: interval between health messages, in seconds.
+        silence_periods: number of sampling periods without a row after which the plant's data timeout is raised.
+        priorities: priority of the alarms by signal; medium for signals without an entry.
     """
 
     plant: str = "cstr"

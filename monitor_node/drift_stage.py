@@ -9,7 +9,7 @@ from collections.abc import Callable
 from itertools import compress
 
 from monitor_node.alarms.alarms import Explanation
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.predictor import ArxPredictor
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract import keys
@@ -38,12 +38,17 @@ class DriftWatch:
         told: whether the drift is to be published.
     """
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard, *, told: bool) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator, *, told: bool) -> None:
         self._outputs = config.outputs
         self._board = board
         self._alarms = {
             signal: board.declare(
-                ParameterT2.name, signal, at_once=True, over_at_once=True, priority="low", dead_band=DEAD_BAND
+                ParameterT2.name,
+                signal,
+                without_on_delay=True,
+                without_off_delay=True,
+                priority="low",
+                dead_band=DEAD_BAND,
             )
             for signal in self._outputs
             if ParameterT2.name in config.charts
@@ -78,7 +83,7 @@ class DriftWatch:
             return notes
         for signal, predictor in compress(zip(self._outputs, predictors, strict=True), evaluated):
             try:
-                predictor.compare(arl0)
+                predictor.start_drift_chart(arl0)
             except InputError as error:
                 notes.append(f"the drift of {signal} is not watched: {error}")
         return notes
@@ -104,7 +109,7 @@ class DriftWatch:
                 publications.append(Publication(key, _point(time_ns, judgement)))
             if signal in self._alarms:
                 explain = _explaining(signal, parts)
-                publications += self._board.judge(self._alarms[signal], time_ns, judgement, "", explain)
+                publications += self._board.evaluate(self._alarms[signal], time_ns, judgement, "", explain)
         return publications
 
 

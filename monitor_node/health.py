@@ -1,4 +1,4 @@
-"""How a plant's monitor does, as it tells."""
+"""Health message of a plant's monitor."""
 
 from collections.abc import Mapping
 
@@ -9,7 +9,7 @@ from reactorwatch.contract.messages_pb2 import Health
 NODE = "monitor"
 
 
-def health_of(
+def health_message(
     now_ns: int,
     phase: str,
     start_ns: int,
@@ -26,23 +26,23 @@ def health_of(
     reference: str,
     training: float,
 ) -> Health:
-    """How a plant's monitor does.
+    """Health message of a plant's monitor.
 
     Args:
-        now_ns: the time.
+        now_ns: present time.
         phase: as `Monitor.phase`, or `stopped`.
-        start_ns: when it was started.
-        counts: of samples on their way into rows.
-        refused: counts by reason.
-        received: messages so far.
-        published: likewise.
-        lag_ns: the longest that one has waited.
-        heard_from_ns: by signal, the time of its first sample.
-        not_stored: how often what is remembered could not be stored.
-        stalls: how often the clock was looked at more than a second late.
-        failures: number of contained errors of this software, by stage.
-        reference: what rows are judged by; empty before they are.
-        training: the share of the training that is done.
+        start_ns: start of the monitor.
+        counts: counts of samples and rows.
+        refused: number of rejected messages by reason.
+        received: number of messages received.
+        published: number of messages published.
+        lag_ns: longest delay of a message.
+        heard_from_ns: time of the first sample by signal.
+        not_stored: number of failures to store the state.
+        stalls: number of ticks that were more than a second late.
+        failures: number of contained errors of this software by stage.
+        reference: kind of the reference; empty before there is one.
+        training: share of the training that is done.
     """
     return Health(
         time_ns=now_ns,

@@ -1,8 +1,8 @@
 """Other monitors of the same plants, found by their liveliness tokens.
 
 Two monitors of one plant raise every alarm twice, and both answer commands. Monitors that divide plants among
-themselves are one group: the crew of a fleet (see `fleet.sharding`). A monitor of one plant is a group of its own. Each
-group is reported once, with the first plant that it watches as well, and once more when its last monitor has gone.
+themselves are one group: the shards of a fleet (see `fleet.sharding`). A monitor of one plant is a group of its own.
+Each group is reported once, with the first shared plant, and once more when its last monitor has gone.
 
 >>> ours, fleet = keys.monitor_token("a", "01"), keys.fleet_token("0f", "1", "1", keys.fleet_member("02", "reactor/*"))
 >>> others = OtherMonitors(ours, lambda: ["a"])
@@ -24,18 +24,18 @@ from reactorwatch.contract import keys
 log = structlog.get_logger()
 
 MOST_GROUPS = 1000
-"""Anyone may show tokens; those of further groups are ignored."""
+"""Largest number of groups; tokens of further ones are ignored, as anyone may declare tokens."""
 
 NOTICED = "another monitor watches this plant; stop one of them, or change which plants it watches"
 GONE = "the other monitor of this plant has gone"
 
 
 class Group(NamedTuple):
-    """Monitors among which each plant has one.
+    """Monitors that share plants, one monitor a plant.
 
     Attributes:
-        plants: the name of a plant, in which `*` stands for any letters.
-        name: distinguishes it from other groups of these plants.
+        plants: name of a plant; `*` stands for any letters.
+        name: name of the group, unique for these plants.
     """
 
     plants: str
@@ -46,12 +46,12 @@ class Group(NamedTuple):
 
 
 class Report(NamedTuple):
-    """Another group that watches a plant of ours.
+    """Another group with an own plant.
 
     Attributes:
-        plant: the first plant found to be watched by both.
-        other: the group's name.
-        is_alive: True when it was noticed, False when its last monitor has gone.
+        plant: the first plant that both monitor.
+        other: name of the group.
+        is_alive: True when the group was noticed, False when its last monitor has gone.
     """
 
     plant: str
@@ -60,7 +60,7 @@ class Report(NamedTuple):
 
 
 def group_of(token: str) -> Group | None:
-    """The group that a liveliness token is of; None if the token is not a monitor's or does not name its plants."""
+    """Group of a liveliness token; None if the token is not a monitor's or does not name its plants."""
     fleet = keys.parse_fleet_token(token)
     if fleet is not None:
         shards = f"{fleet.of} shard{'s' if fleet.of != '1' else ''}"
@@ -74,22 +74,22 @@ def group_of(token: str) -> Group | None:
 
 
 class OtherMonitors:
-    """The other groups that watch plants of this monitor.
+    """Other groups that monitor this monitor's plants.
 
     Args:
-        own: the liveliness token of this monitor; its group is ours.
-        plants: returns the plants that this monitor watches now.
+        own: liveliness token of this monitor.
+        plants: returns the plants of this monitor.
     """
 
     def __init__(self, own: str, plants: Callable[[], Collection[str]]) -> None:
         self._own, self._plants = group_of(own), plants
         self._tokens: dict[Group, set[str]] = {}
-        self._named: dict[str, list[Group]] = {}  # groups that watch one plant, by its name
-        self._wide: list[Group] = []  # groups that watch more
+        self._named: dict[str, list[Group]] = {}  # groups of one plant, by its name
+        self._wide: list[Group] = []  # groups of several plants
         self._reported: dict[Group, str] = {}  # plant by group
 
-    def note(self, token: str, *, is_alive: bool) -> Report | None:
-        """Take in that a liveliness token came or went; returns what is to be reported."""
+    def on_token(self, token: str, *, is_alive: bool) -> Report | None:
+        """Update with a liveliness token; returns a report, if there is one."""
         group = group_of(token)
         if group is None or group == self._own:
             return None
@@ -100,14 +100,14 @@ class OtherMonitors:
         return None if tokens else self._remove(group)
 
     def check(self, plant: str) -> Iterator[Report]:
-        """Report the unreported groups that watch a plant which this monitor watches from now on."""
+        """Report groups that monitor a plant which this monitor has adopted, unless reported."""
         wide = (group for group in self._wide if fnmatch.fnmatchcase(plant, group.plants))
         for group in (*self._named.get(plant, ()), *wide):
             if group not in self._reported:
                 yield self._report(group, plant)
 
     def count(self, plant: str) -> int:
-        """The number of groups, without ours, that watch a plant."""
+        """Number of other groups that monitor a plant."""
         return len(self._named.get(plant, ())) + sum(fnmatch.fnmatchcase(plant, item.plants) for item in self._wide)
 
     def _add(self, group: Group, token: str) -> Report | None:
@@ -140,7 +140,7 @@ class OtherMonitors:
 
 
 def log_report(report: Report | None) -> None:
-    """Log a report, if there is one: a warning when a group was noticed, a line of information when it has gone."""
+    """Log a report, if there is one: a warning when a group was noticed, an info line when it has gone."""
     if report is not None:
         write, text = (log.warning, NOTICED) if report.is_alive else (log.info, GONE)
         write(text, plant=report.plant, other=report.other)

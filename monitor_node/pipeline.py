@@ -1,15 +1,15 @@
-"""The watch over a plant, row by row: it learns what is normal, then judges what comes.
+"""Pipeline of a plant's rows: training, then monitoring.
 
-A row goes this way: the identified models predict it and learn from it; while the plant is in training it is kept, and
-afterwards the reference predicts it, its residuals are prewhitened, and the charts judge what remains. The reference is
-frozen: a model that goes on adapting would learn a fault and call it normal. It goes on adapting beside it, and how
-far it has gone from the reference is told as drift.
+The identified models predict each row and are updated with it. During training the row is kept. Afterwards the
+reference predicts it, its residuals are prewhitened, and the charts evaluate them. The reference is frozen: a model
+that keeps adapting would learn a fault as normal. The identified models keep adapting beside it; their distance from
+the reference is charted as drift.
 """
 
 from collections.abc import Iterator, Sequence
 from math import isfinite, nan
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.predictor import ArxPredictor
 from monitor_node.baseline.references import (
     ArxReference,
@@ -18,8 +18,8 @@ from monitor_node.baseline.references import (
     ProcessReferenceState,
     Reference,
 )
-from monitor_node.baseline.signal_range import ranges_of
-from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Trained, Training
+from monitor_node.baseline.signal_range import signal_ranges
+from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult
 from monitor_node.chart_stage import ChartWatch, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.drift_stage import DriftWatch
@@ -27,8 +27,8 @@ from monitor_node.failures import Failures
 from monitor_node.ingest.alignment import Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.isolation.stage import Suspicion, has_causes
-from monitor_node.signal_checks.stage import SignalWatch
-from monitor_node.state.pipeline_state import WatchedState, WatchState
+from monitor_node.signal_checks.stage import SignalChecks
+from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Check, Estimate, ModelSnapshot, Parameter
@@ -42,46 +42,46 @@ from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
 
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:
-    """Check that the false alarms that the settings promise can be kept where every output is watched.
+    """Check that charts can keep the promised number of false alarms, with every output monitored.
 
     Args:
-        config: how the plant is watched.
-        period_min: of the rows.
+        config: settings of the monitor.
+        period_min: sampling period in minutes.
 
     Raises:
         InputError: charts cannot keep the promise.
     """
     outputs = len(config.outputs)
     of_drift = outputs if ParameterT2.name in config.charts else 0
-    alarms = len(alarm_names(config)) + SignalWatch.CHANCE_ALARMS * outputs + of_drift
+    alarms = len(alarm_names(config)) + SignalChecks.CHANCE_ALARMS * outputs + of_drift
     false_alarm_budget.promise_per_30_days(config.false_alarms_per_30_days, alarms, period_min)
 
 
-class PlantWatch:
-    """Watches one plant.
+class PlantPipeline:
+    """Pipeline of one plant.
 
     Args:
-        config: of the monitor.
-        board: the alarms of the plant.
-        points: whether estimates, charts' points and models are to be published.
+        config: settings of the monitor.
+        board: alarms of the plant.
+        points: True to publish estimates, chart points and models.
         model: as for `Monitor`.
-        failures: where errors of the search for causes are counted; None: in an object of its own.
+        failures: counter of errors in the search for causes; None: a new one.
 
     Raises:
-        InputError: the settings ask for the process model of a plant that it is not of.
+        InputError: the settings ask for a process model that does not fit the plant's signals.
 
     Attributes:
-        model: that the plant may be watched by; None: there is none.
-        notes: what people are to be told, oldest first; whoever tells them empties it.
-        rows_watched: rows that were judged.
-        left_out: signals that are not watched, each with the reason; known when the training ends.
-        signals: the watch over the signals themselves.
+        model: process model of the plant; None if there is none.
+        notes: notes to log, oldest first; the caller empties the list.
+        rows_watched: number of evaluated rows.
+        left_out: signals that are not monitored, with the reason, after the training.
+        signals: signal checks.
     """
 
     def __init__(
         self,
         config: MonitorConfig,
-        board: AlarmBoard,
+        board: Annunciator,
         *,
         points: bool = True,
         model: ProcessModel | None = None,
@@ -92,10 +92,10 @@ class PlantWatch:
         self._board = board
         self._points = points
         self.model = _model(config, model)
-        self._is_process = self._is_said_to_be_process = model is not None or config.reference == "process"
+        self._is_process = self._is_process_given = model is not None or config.reference == "process"
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
-        self.signals = SignalWatch(config, board, ranges_of(self.model, (config.input, *config.outputs)))
+        self.signals = SignalChecks(config, board, signal_ranges(self.model, (config.input, *config.outputs)))
         self._drift = DriftWatch(config, board, told=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
@@ -106,31 +106,31 @@ class PlantWatch:
         self._whitened_sds: list[float] = []
         self._suspicion: Suspicion | None = None
         self._arl0 = 0.0
-        self._withheld = (False,) * len(config.outputs)
+        self._quarantined = (False,) * len(config.outputs)
         self._evaluated = [True] * len(config.outputs)
-        self._begin_training(None)
+        self._start_training(None)
         self._promise_checked = False
         self.notes: list[str] = []
         self.rows_watched = 0
         self.left_out: dict[str, str] = {}
 
-    # --- what survives a restart -----------------------------------------------------------------------------
+    # --- state -----------------------------------------------------------------------------------------------
 
     @property
-    def state(self) -> WatchState:
-        """A copy of all that is remembered, but for the alarms; between two rows."""
-        return WatchState(
-            self._sampling.copied(),
+    def state(self) -> PipelineState:
+        """A copy of the state between two rows, without the alarms."""
+        return PipelineState(
+            self._sampling.copy_state(),
             self.signals.state,
             [predictor.state for predictor in self._predictors],
             self._refusals,
             self._began_ns,
             self._training.state,
-            None if self._reference is None else self._watched(self._reference),
+            None if self._reference is None else self._trained_state(self._reference),
         )
 
-    def _watched(self, reference: Reference) -> WatchedState:
-        return WatchedState(
+    def _trained_state(self, reference: Reference) -> TrainedState:
+        return TrainedState(
             reference.state,
             [(check.name, check.result) for check in self._checks],
             dict(self.left_out),
@@ -138,17 +138,17 @@ class PlantWatch:
             self._charts.state,
             None if self._suspicion is None else self._suspicion.state,
             self._arl0,
-            list(self._withheld),
+            list(self._quarantined),
             self.rows_watched,
             self._drift.until_next,
         )
 
-    def restore(self, state: WatchState, now_ns: int) -> None:
-        """Go on, bit for bit, where a watch with the same settings was when `state` was taken; after the board.
+    def restore(self, state: PipelineState, now_ns: int) -> None:
+        """Resume bit-identically from a state of the same settings; the alarms are restored before.
 
         Args:
-            state: of the other watch.
-            now_ns: when the plant is listened to again.
+            state: the state.
+            now_ns: present time, from which the data timeout counts.
 
         Raises:
             ValueError: the state is damaged.
@@ -169,16 +169,16 @@ class PlantWatch:
         if not len(learned) == len(watched.withheld) == outputs:
             raise ValueError(f"the state must be of {outputs} outputs, got {len(learned)}")
         self._leave_out(watched.left_out)
-        self._judge_by(self._reference_of(watched.reference), learned, watched.arl0)
+        self._set_reference(self._restore_reference(watched.reference), learned, watched.arl0)
         self._whiteners = [Prewhitener.from_state(item) for item in watched.whiteners]
         self._charts.restore(watched.charts, self._evaluated)
         if (watched.suspicion is None) != (self._suspicion is None):
             raise ValueError("the state must tell of the search for causes as it is set")
         if self._suspicion is not None and watched.suspicion is not None:
             self._suspicion.restore(watched.suspicion)
-        self._withheld, self.rows_watched = tuple(watched.withheld), watched.rows_watched
+        self._quarantined, self.rows_watched = tuple(watched.withheld), watched.rows_watched
 
-    def _reference_of(self, state: ProcessReferenceState | ArxReferenceState) -> Reference:
+    def _restore_reference(self, state: ProcessReferenceState | ArxReferenceState) -> Reference:
         if isinstance(state, ArxReferenceState):
             return ArxReference.from_state(state)
         if self.model is None:
@@ -187,21 +187,21 @@ class PlantWatch:
 
     @property
     def watching(self) -> bool:
-        """Whether rows are judged."""
+        """True if rows are evaluated."""
         return self._reference is not None
 
     @property
     def reference(self) -> str:
-        """The kind of reference that judges rows: `equations` or `arx`; empty before there is one."""
+        """Kind of the reference: `equations` or `arx`; empty before there is one."""
         return "" if self._reference is None else self._reference.kind
 
     @property
     def noise_levels(self) -> dict[str, dict[str, float]] | None:
-        """The noise levels that the equations judge by, see `ProcessReference`; None where they do not judge."""
+        """Noise levels of the equations, see `ProcessReference`; None with another reference."""
         return self._reference.noise_levels if isinstance(self._reference, ProcessReference) else None
 
     def trained_share(self, last_ns: int | None) -> float:
-        """The share of the training that is done, 0 to 1, after a row."""
+        """Share of the training that is done after a row, 0 to 1."""
         if self.watching:
             return 1.0
         if self._began_ns is None or last_ns is None:
@@ -210,64 +210,65 @@ class PlantWatch:
 
     @property
     def refused_trainings(self) -> int:
-        """Number of trainings that were not fit to learn from."""
+        """Number of refused trainings."""
         return self._refusals
 
     @property
     def expected_false_alarms(self) -> float:
-        """Alarms that chance alone would have raised by now, on average."""
+        """Mean number of false alarms expected so far."""
         return self.rows_watched * self._chance_alarms / self._arl0 if self._arl0 else 0.0
 
     def update(self, row: Row, units: list[str], publications: list[Publication]) -> None:
-        """Take a row in.
+        """Process a row.
 
         Args:
-            row: input first, then the outputs.
-            units: of the outputs.
-            publications: what is to be published is added here.
+            row: values, the input first.
+            units: units of the outputs.
+            publications: list to which publications are added.
         """
         time_ns = row.time_ns
         follows = self._sampling.follows(time_ns) and not row.restarted
-        publications.extend(self.signals.hear(time_ns, row.values))
-        measured = self.signals.measured(time_ns, row.values, publications) if self._is_process else row.values
+        publications.extend(self.signals.check_timeouts(time_ns, row.values))
+        measured = self.signals.check_ranges(time_ns, row.values, publications) if self._is_process else row.values
         input_value, *values = measured
         if self._reference is None:
             self._train(time_ns, input_value, values, units, publications, follows=follows)
         else:
             if row.restarted:
-                self.signals.begin_anew()
-            self._judge(time_ns, input_value, values, units, publications, follows=follows)
+                self.signals.reset()
+            self._evaluate(time_ns, input_value, values, units, publications, follows=follows)
 
     def snapshots(self, time_ns: int) -> list[Publication]:
-        """The models of each output as they are now: the one that adapts, the one held since the training, the judge.
+        """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
 
-        Where the equations judge, the held one is compared with the one that adapts, and judges nothing.
+        With the equations as reference, the fitted model is only compared with the adaptive one.
         """
-        told: list[Publication] = []
+        publications: list[Publication] = []
         if not self._points:
-            return told
+            return publications
         reference = self._reference
         for key, output, predictor in zip(self._model_keys, self._config.outputs, self._predictors, strict=True):
-            adaptive, held = predictor.adaptive(), predictor.reference()
-            equations = _judge_of(reference, output) if isinstance(reference, ProcessReference) else None
-            if held is not None:
-                held.held, held.reference = True, isinstance(reference, ArxReference)
-            for snapshot in (held, equations):
+            adaptive, fitted = predictor.adaptive_snapshot(), predictor.reference_snapshot()
+            equations = _filter_snapshot(reference, output) if isinstance(reference, ProcessReference) else None
+            if fitted is not None:
+                fitted.held, fitted.reference = True, isinstance(reference, ArxReference)
+            for snapshot in (fitted, equations):
                 if snapshot is not None:
                     snapshot.checks.extend(self._checks)
-            for snapshot in (adaptive, held, equations):
+            for snapshot in (adaptive, fitted, equations):
                 if snapshot is not None:
                     snapshot.time_ns = time_ns
-                    told.append(Publication(key, snapshot))
-        return told
+                    publications.append(Publication(key, snapshot))
+        return publications
 
     # --- training --------------------------------------------------------------------------------------------
 
-    def _begin_training(self, time_ns: int | None) -> None:
+    def _start_training(self, time_ns: int | None) -> None:
         config = self._config
         self._began_ns = time_ns
         self._predictors: list[ArxPredictor] = [
-            ArxPredictor(config.order, config.delay, config.forgetting, described=self._points) for _ in config.outputs
+            ArxPredictor(config.order, config.delay, config.forgetting, with_snapshots=self._points)
+            for _ in config.outputs
         ]
         self._training: Training = Training(config, self.model, self._predictors)
 
@@ -288,21 +289,21 @@ class PlantWatch:
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
         trained_min = (time_ns - self._began_ns) / MINUTE_NS
-        if trained_min >= config.training_min and self._training.is_enough(self.signals.silent[1:]):
+        if trained_min >= config.training_min and self._training.is_enough(self.signals.timed_out[1:]):
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
                 self._refusals += 1
                 self.notes.append(f"the training begins anew: {trained.refused}")
-                self._begin_training(time_ns)
+                self._start_training(time_ns)
             else:
                 self._start(trained)
-                self._judge(time_ns, input_value, values, units, publications, follows=follows)
+                self._evaluate(time_ns, input_value, values, units, publications, follows=follows)
                 publications.extend(self.snapshots(time_ns))
                 return
         self._training.add(time_ns, input_value, values)
         if not self._points:
             for predictor, value in zip(self._predictors, values, strict=True):
-                predictor.put_by(time_ns, input_value, value, follows=follows)
+                predictor.buffer(time_ns, input_value, value, follows=follows)
         else:
             predictions = [
                 predictor.update(time_ns, input_value, value, follows=follows)
@@ -314,17 +315,17 @@ class PlantWatch:
                     publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
 
     def _leave_out(self, left_out: dict[str, str]) -> None:
-        """Watch all signals but these."""
+        """Exclude signals from monitoring."""
         self.left_out = dict(left_out)
         self._evaluated = [name not in left_out for name in self._config.outputs]
 
     @property
     def _chance_alarms(self) -> int:
-        """Number of alarms that chance can raise."""
-        of_signals = SignalWatch.CHANCE_ALARMS * sum(self._evaluated)
+        """Number of alarms that can be false alarms."""
+        of_signals = SignalChecks.CHANCE_ALARMS * sum(self._evaluated)
         return self._charts.chance_alarms + of_signals + self._drift.chance_alarms(self._evaluated)
 
-    def _start(self, trained: Trained) -> None:
+    def _start(self, trained: TrainingResult) -> None:
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e)
         trained.checks.extend(
@@ -341,7 +342,7 @@ class PlantWatch:
             trained.checks.append(Check(name="promise", result=text))
         arl0 = false_alarm_budget.share_arl0(promised, self._chance_alarms, period_min)
         self._checks = trained.checks
-        self._judge_by(trained.reference, trained.learned, arl0)
+        self._set_reference(trained.reference, trained.learned, arl0)
         self._whiteners = [Prewhitener(item) for item in trained.learned]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
@@ -349,10 +350,10 @@ class PlantWatch:
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
 
-    def _judge_by(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
-        """From now on rows are judged by this reference."""
+    def _set_reference(self, reference: Reference, learned: list[Prewhitening], arl0: float) -> None:
+        """Set the reference for the rows to come."""
         self._reference, self._arl0 = reference, arl0
-        self._is_process = self._is_said_to_be_process or isinstance(reference, ProcessReference)
+        self._is_process = self._is_process_given or isinstance(reference, ProcessReference)
         self._whitened_sds = [item.sd for item in learned]
         self._suspicion = self._new_suspicion(reference)
 
@@ -364,7 +365,7 @@ class PlantWatch:
     def _search_causes(
         self, time_ns: int, input_value: float, values: list[float], units: list[str], stuck: list[bool]
     ) -> list[Publication]:
-        """Look for the causes of alarms; an error there costs what the search remembers, and no alarm."""
+        """Search the causes of alarms; an error there costs the state of the search, and no alarm."""
         assert self._suspicion is not None
         try:
             return self._suspicion.update(time_ns, input_value, values, units, stuck)
@@ -374,9 +375,9 @@ class PlantWatch:
             self._suspicion = self._new_suspicion(self._reference)
             return []
 
-    # --- watching --------------------------------------------------------------------------------------------
+    # --- monitoring ------------------------------------------------------------------------------------------
 
-    def _judge(
+    def _evaluate(
         self,
         time_ns: int,
         input_value: float,
@@ -392,7 +393,7 @@ class PlantWatch:
             self._note_late_signals(input_value, values)
             input_value = 0.0 if self._config.input in self.left_out else input_value  # as in the training
             values = [value if evaluated else nan for value, evaluated in zip(values, self._evaluated, strict=True)]
-        publications.extend(self.signals.look(time_ns, values, units))
+        publications.extend(self.signals.check_stuck(time_ns, values, units))
         stuck = self.signals.stuck
         if True in stuck:
             values = [nan if still else value for value, still in zip(values, stuck, strict=True)]
@@ -403,14 +404,14 @@ class PlantWatch:
             ]
         elif self._drift.wanted:
             for predictor, value in zip(self._predictors, values, strict=True):
-                predictor.put_by(time_ns, input_value, value, follows=follows)
-        if self._sampling.gap:  # nobody knows what the input did in it
+                predictor.buffer(time_ns, input_value, value, follows=follows)
+        if self._sampling.gap:  # the input in it is unknown
             reference.restart()
             self.signals.restart()
             for whitener in self._whiteners:
                 whitener.restart()
         missing = self._sampling.missing
-        predictions, sds = reference.update(time_ns, input_value, values, self._withheld, missing)
+        predictions, sds = reference.update(time_ns, input_value, values, self._quarantined, missing)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
             publications.extend(self._estimates(time_ns, values, predictions, sds, scales, units))
@@ -419,20 +420,18 @@ class PlantWatch:
             for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
         ]
         self.rows_watched += 1
-        withheld, told = self.signals.withheld(time_ns, e, scales, units)
-        self._withheld = withheld
-        publications.extend(told)
-        if True in withheld:
-            for whitener, outlier in zip(self._whiteners, withheld, strict=True):
+        self._quarantined = quarantined = self.signals.check_spikes(time_ns, e, scales, units, publications)
+        if True in quarantined:
+            for whitener, outlier in zip(self._whiteners, quarantined, strict=True):
                 if outlier:
                     whitener.withhold()
-        self._charts.update(time_ns, e, withheld, scales, units, publications, points=self._points)
+        self._charts.update(time_ns, e, quarantined, scales, units, publications, points=self._points)
         publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
             publications.extend(self._search_causes(time_ns, input_value, values, units, stuck))
 
     def _note_late_signals(self, input_value: float, values: list[float]) -> None:
-        """Say once of each signal that was left out for want of values that it comes now."""
+        """Note once each signal whose first value arrives after the training."""
         for name, value in zip((self._config.input, *self._config.outputs), (input_value, *values), strict=True):
             if self.left_out.get(name) == NO_VALUE and isfinite(value):
                 self.left_out[name] = "its first value came after the training"
@@ -449,7 +448,7 @@ class PlantWatch:
         scales: list[float],
         units: list[str],
     ) -> Iterator[Publication]:
-        """What was expected of a row, before it is taken into the residuals' past."""
+        """Estimates of a row, made before the prewhitening filter is updated with it."""
         for index, whitener in enumerate(self._whiteners):
             prediction, residual = predictions[index], values[index] - predictions[index]
             if isfinite(residual):
@@ -460,8 +459,8 @@ class PlantWatch:
                 yield Publication(self._estimate_keys[index], estimate)
 
 
-def _judge_of(reference: ProcessReference, output: str) -> ModelSnapshot:
-    """The filter of the equations as what judges an output: its noise levels."""
+def _filter_snapshot(reference: ProcessReference, output: str) -> ModelSnapshot:
+    """Snapshot of the equations' filter as reference of an output: its noise levels."""
     levels = reference.noise_levels
     sensor = Parameter(name="sensor_sd", value=levels["sensors"][output])
     states = [Parameter(name=f"{name}_sd", value=value) for name, value in levels["states"].items()]
@@ -469,7 +468,7 @@ def _judge_of(reference: ProcessReference, output: str) -> ModelSnapshot:
 
 
 def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
-    """The process model that the plant may be watched by."""
+    """Process model for the plant, as the settings ask for it."""
     if config.reference == "arx":
         return None
     given, model = model is not None, model or cstr()

@@ -8,7 +8,7 @@ from benchmarks.study_figures.canvas import GREEN, ORANGE, label, panels
 from benchmarks.study_figures.control_limits import draw_residuals, out_of, watched
 from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.study import TRAINING_ROWS, Study
-from monitor_node.alarms.on_off_delay import Persistence
+from monitor_node.alarms.on_off_delay import OnOffDelay
 from monitor_node.config import MonitorConfig
 from plant_node.presets import ONSET_MIN, PRESETS
 from reactorwatch.arrays import Array
@@ -70,7 +70,7 @@ def draw(study: Study, drawing: Drawing) -> Finding:
 
 def _alarms(time_min: Array, out: Array, rule: MonitorConfig) -> list[float]:
     """When the alarm is raised, in the rows that are watched."""
-    persistence = Persistence(rule.raise_count, rule.window, rule.clear_count)
+    persistence = OnOffDelay(rule.raise_count, rule.window, rule.clear_count)
     return [
         float(time)
         for time, is_out in zip(time_min[TRAINING_ROWS:], out[TRAINING_ROWS:], strict=True)

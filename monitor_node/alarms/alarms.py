@@ -1,4 +1,4 @@
-"""One alarm: the chart that it comes from, the rule that raises and clears it, and the state that the operator sees."""
+"""One alarm: its chart, the rule that raises and clears it, and the state that the operator sees."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, NamedTuple, TypeAlias
@@ -6,7 +6,7 @@ from typing import Annotated, NamedTuple, TypeAlias
 import msgspec
 
 from monitor_node.alarms.incidents import Count
-from monitor_node.alarms.on_off_delay import Persistence, PersistenceState
+from monitor_node.alarms.on_off_delay import OnOffDelay, OnOffDelayState
 from monitor_node.alarms.states import Event, State, next_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Contribution, Priority, Suspect
@@ -29,15 +29,15 @@ STATES: Mapping[State, AlarmState] = {
 }
 
 STUCK_SENSOR = "stuck_sensor"
-"""The cause that the check for stuck values names."""
+"""The cause named by the check for stuck values."""
 
 LAST_NS = 2**63 - 1
 TimeNs: TypeAlias = Annotated[int, msgspec.Meta(ge=-(2**63), le=LAST_NS)]
-"""A time that messages can carry."""
+"""A time that fits into a message."""
 
 
 class SuspectedCause(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A cause that an alarm may come from; the fields of a `Suspect` message."""
+    """A possible cause of an alarm; the fields of a `Suspect` message."""
 
     cause: str
     probability: float
@@ -51,30 +51,30 @@ class SuspectedCause(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
-    """Everything that is remembered of an alarm.
+    """The state of an alarm.
 
     Attributes:
-        state: what the operator sees.
-        rule: the points behind it; whether its condition stands.
-        raised_ns: time of the sample that raised it last; 0 before the first time.
-        cleared_ns: time of the sample that cleared it; 0 while it stands.
-        value: the chart's statistic when it was last raised or cleared.
-        limit: the one that was crossed.
-        above: whether it was the upper one.
-        unit: of both.
-        text: what is wrong, in one sentence; empty before the first time.
-        contributions: each signal's share of it.
-        suspects: what it may come from, the likeliest first; empty while nobody has looked.
-        incident: number of its incident; 0: it has not come up since it was raised.
-        first_in: whether it began that incident.
-        shelved_ns: when it was shelved; 0 if it is not.
-        shelved_until_ns: until when; 0 if it is not.
-        by: who acted on it last.
-        comment: what that person said.
+        state: state that the operator sees.
+        rule: recent points, and the alarm's condition.
+        raised_ns: time of the sample that raised the alarm last; 0 before the first.
+        cleared_ns: time of the sample that cleared the alarm; 0 while it is active.
+        value: statistic of the chart when the alarm was last raised or cleared.
+        limit: limit that was crossed.
+        above: True if that was the upper limit.
+        unit: unit of value and limit.
+        text: the deviation in one sentence; empty before the alarm was first raised.
+        contributions: share of the deviation by signal.
+        suspects: possible causes, the likeliest first; empty before a search.
+        incident: number of the incident; 0 if the alarm was not activated since it was raised.
+        first_in: True for the first-out alarm of the incident.
+        shelved_ns: time of shelving; 0 if the alarm is not shelved.
+        shelved_until_ns: end of shelving; 0 if the alarm is not shelved.
+        by: operator of the last action.
+        comment: the operator's comment.
     """
 
     state: State = State.NORMAL
-    rule: PersistenceState = msgspec.field(default_factory=PersistenceState)
+    rule: OnOffDelayState = msgspec.field(default_factory=OnOffDelayState)
     raised_ns: TimeNs = 0
     cleared_ns: TimeNs = 0
     value: float = 0.0
@@ -92,12 +92,12 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
     comment: str = ""
 
 
-def remembered(alarm: Alarm) -> AlarmMemory:
-    """What a monitor remembered of an alarm when it said this of it, as far as the message tells."""
-    standing = alarm.raised_ns != 0 and alarm.cleared_ns == 0
+def memory_from_message(alarm: Alarm) -> AlarmMemory:
+    """Reconstruct the state of an alarm from a message, as far as the message has it."""
+    active = alarm.raised_ns != 0 and alarm.cleared_ns == 0
     return AlarmMemory(
-        state=next((state for state, told in STATES.items() if told == alarm.state), State.NORMAL),
-        rule=PersistenceState(standing=standing),
+        state=next((state for state, code in STATES.items() if code == alarm.state), State.NORMAL),
+        rule=OnOffDelayState(standing=active),
         raised_ns=alarm.raised_ns,
         cleared_ns=alarm.cleared_ns,
         value=alarm.value,
@@ -120,12 +120,12 @@ def remembered(alarm: Alarm) -> AlarmMemory:
 
 
 class Explanation(NamedTuple):
-    """What an alarm says when it is raised.
+    """Text and causes of an alarm when it is raised.
 
     Attributes:
-        text: what is wrong, in one sentence.
-        contributions: each signal's share of it.
-        suspects: where the alarm itself says what it comes from.
+        text: the deviation in one sentence.
+        contributions: share of the deviation by signal.
+        suspects: causes, if the alarm names its cause itself.
     """
 
     text: str
@@ -137,18 +137,18 @@ class ChartAlarm:
     """The alarm of one chart.
 
     Args:
-        chart: the chart's name.
-        signal: what it is of: a signal's name, or another word in its key.
+        chart: name of the chart.
+        signal: name of the signal, or another word in the alarm's key.
         priority: a key of `PRIORITIES`.
-        rule: when points become an alarm.
-        dead_band: a point is back in if it is within (1 - dead_band) of the way from the centre to the limit that was
-            crossed.
-        tells_cause: whether it says itself what its cause is.
+        rule: on-delay and off-delay.
+        dead_band: a point is normal within (1 - dead_band) of the way from the centre to the limit that was crossed.
+        names_cause: True if the alarm names its cause itself.
 
     Attributes:
-        name: as in its key: `shewhart/T`.
-        priority: as in its messages.
-        tells_cause: as given.
+        name: name as in the key: `shewhart/T`.
+        priority: priority as in messages.
+        names_cause: as given.
+        memory: state; replace it by `restore`.
     """
 
     def __init__(
@@ -156,53 +156,47 @@ class ChartAlarm:
         chart: str,
         signal: str,
         priority: str,
-        rule: Persistence,
+        rule: OnOffDelay,
         dead_band: float,
         *,
-        tells_cause: bool = False,
+        names_cause: bool = False,
     ) -> None:
         self.name = keys.chart_name(chart, signal)
         self.priority = PRIORITIES[priority]
-        self.tells_cause = tells_cause
+        self.names_cause = names_cause
         self._signal = signal
         self._rule = rule
         self._reach = 1 - dead_band
-        self._memory = AlarmMemory(rule=rule.state)
+        self.memory = AlarmMemory(rule=rule.state)
+
+    def restore(self, memory: AlarmMemory) -> None:
+        """Resume from a state."""
+        self.memory, self._rule.state = memory, memory.rule
 
     @property
-    def memory(self) -> AlarmMemory:
-        """Everything that is remembered; to be replaced as a whole."""
-        return self._memory
-
-    @memory.setter
-    def memory(self, memory: AlarmMemory) -> None:
-        self._memory = memory
-        self._rule.state = memory.rule
-
-    @property
-    def at_rest(self) -> bool:
-        """Whether a point that is not out would change nothing."""
-        rule = self._memory.rule
+    def is_idle(self) -> bool:
+        """True if a point within the limits would change nothing."""
+        rule = self.memory.rule
         return not (rule.standing or rule.recent)
 
-    def judge(
+    def evaluate(
         self, time_ns: int, judgement: Judgement, unit: str, explain: Callable[[Judgement], Explanation] | None = None
     ) -> Event | None:
-        """Follow the condition.
+        """Update the alarm's condition with a point of the chart.
 
         Args:
-            time_ns: of the sample.
-            judgement: of the chart.
-            unit: of the statistic.
-            explain: asked for what to say if the alarm is raised; without it, what a residual's chart says.
+            time_ns: time of the sample.
+            judgement: point of the chart.
+            unit: unit of the statistic.
+            explain: returns the explanation if the alarm is raised; None: that of a residual's chart.
 
         Returns:
             `RAISED` or `CLEARED`, to be applied, if the condition changes.
         """
-        change = self._rule.update(judgement.out, self._is_back_in(judgement))
+        change = self._rule.update(judgement.out, self._is_normal(judgement))
         if change is None:
             return None
-        memory = self._memory
+        memory = self.memory
         memory.value, memory.unit = judgement.statistic, unit
         if not change:
             memory.cleared_ns = time_ns
@@ -214,30 +208,30 @@ class ChartAlarm:
         memory.incident, memory.first_in = 0, False
         if memory.state is State.NORMAL:
             memory.by = memory.comment = ""
-        explanation = explain(judgement) if explain is not None else self._plainly(judgement, unit)
+        explanation = explain(judgement) if explain is not None else self._residual_explanation(judgement, unit)
         memory.text, memory.contributions = explanation.text, explanation.contributions
         memory.suspects = list(explanation.suspects)
         return Event.RAISED
 
     def apply(self, event: Event) -> None:
-        """Let something happen to it.
+        """Apply an event to the state.
 
         Raises:
-            InputError: the table of states refuses it.
+            InputError: the table of states refuses the event.
         """
-        memory = self._memory
-        memory.state = next_state(memory.state, event, standing=memory.rule.standing)
+        memory = self.memory
+        memory.state = next_state(memory.state, event, active=memory.rule.standing)
         if memory.state is not State.SHELVED:
             memory.shelved_ns = memory.shelved_until_ns = 0
 
     def message(self, time_ns: int, event: str) -> Alarm:
-        """The alarm as it is.
+        """The alarm as a message.
 
         Args:
-            time_ns: of the change.
-            event: what made it.
+            time_ns: time of the change.
+            event: event that changed the alarm.
         """
-        memory = self._memory
+        memory = self.memory
         return Alarm(
             time_ns=time_ns,
             alarm=self.name,
@@ -259,19 +253,19 @@ class ChartAlarm:
             by=memory.by,
         )
 
-    def _plainly(self, judgement: Judgement, unit: str) -> Explanation:
-        off = judgement.statistic - judgement.centre
-        allowed = abs(self._memory.limit - judgement.centre)
+    def _residual_explanation(self, judgement: Judgement, unit: str) -> Explanation:
+        deviation = judgement.statistic - judgement.centre
+        size, allowed = abs(deviation), abs(self.memory.limit - judgement.centre)
         text = (
-            f"{self._signal} is {quantity(abs(off), unit)} {'above' if off > 0 else 'below'} what the model expects "
-            f"(allowed: {quantity(allowed, unit)})"
+            f"{self._signal} is {format_quantity(size, unit)} {'above' if deviation > 0 else 'below'} what the model "
+            f"expects (allowed: {format_quantity(allowed, unit)})"
         )
         return Explanation(text, {self._signal: 1.0})
 
-    def _is_back_in(self, judgement: Judgement) -> bool:
+    def _is_normal(self, judgement: Judgement) -> bool:
         if judgement.out:
             return False
-        off = judgement.statistic - judgement.centre
-        if self._memory.above:
-            return off <= self._reach * (judgement.upper_limit - judgement.centre)
-        return off >= self._reach * (judgement.lower_limit - judgement.centre)
+        deviation = judgement.statistic - judgement.centre
+        if self.memory.above:
+            return deviation <= self._reach * (judgement.upper_limit - judgement.centre)
+        return deviation >= self._reach * (judgement.lower_limit - judgement.centre)

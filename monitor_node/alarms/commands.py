@@ -1,10 +1,10 @@
-"""What people may ask of the alarms, by the queryables `reactor/{plant}/command/{name}`."""
+"""Alarm commands, the queryables `reactor/{plant}/command/{name}`."""
 
 from collections.abc import Mapping
 
 from google.protobuf.message import Message
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.alarms.states import Event
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.commands import check_signature, decode_command
@@ -27,17 +27,17 @@ COMMANDS: Mapping[str, type[Message]] = {
     "comment": AlarmCommand,
     "list_alarms": ListAlarms,
 }
-"""The commands and what they carry."""
+"""Message type by command."""
 
 
-def obey(board: AlarmBoard, question: Encoded) -> tuple[CommandReply, list[Publication]]:
-    """Do what is asked.
+def execute_command(board: Annunciator, question: Encoded) -> tuple[CommandReply, list[Publication]]:
+    """Execute a command.
 
     Returns:
-        The answer, with the alarms that were asked about, and what is to be published.
+        The reply, with the alarms it is about, and publications.
 
     Raises:
-        InputError: it cannot be done; nothing has changed.
+        InputError: the command is refused; nothing has changed.
         DecodeError: the payload is not what the command carries; nothing has changed.
     """
     name, command = decode_command(question, COMMANDS)
@@ -47,10 +47,10 @@ def obey(board: AlarmBoard, question: Encoded) -> tuple[CommandReply, list[Publi
     assert isinstance(command, AlarmCommand | ShelveAlarm), "the catalogue holds no others"
     by, comment = check_signature(command.by, command.comment)
     if isinstance(command, ShelveAlarm):
-        said = board.shelve(command.alarm, command.minutes, by, comment)
+        publications = board.shelve(command.alarm, command.minutes, by, comment)
     elif name == "comment":
-        said = board.comment(command.alarm, by, comment)
+        publications = board.comment(command.alarm, by, comment)
     else:
-        said = board.act(command.alarm, EVENTS[name], by, comment)
+        publications = board.act(command.alarm, EVENTS[name], by, comment)
     alarm = board.alarm(command.alarm)
-    return CommandReply(accepted=True, text=f"alarm {command.alarm}: {name} by {by}", alarms=[alarm]), said
+    return CommandReply(accepted=True, text=f"alarm {command.alarm}: {name} by {by}", alarms=[alarm]), publications

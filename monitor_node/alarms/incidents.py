@@ -1,13 +1,13 @@
-"""Which alarms belong together: one fault is one incident, not twenty alarms.
+"""Group alarms into incidents: one fault is one incident, not twenty alarms.
 
-A fault raises the alarm that feels it first, then others, and some of them come and go while it lasts. So an alarm that
-comes up within `incident_min` of the last change (raised or cleared) of an alarm of the latest incident belongs to that
-incident; later, or at an earlier time because the plant's clock was set back, it begins a new one. The alarm that
-begins it is its first-in alarm, the one to look at first.
+A fault raises the most sensitive alarm first, then others, and some of them are cleared and raised again while it
+lasts. So an alarm activated within `incident_min` of the last change (raised or cleared) of an alarm of the latest
+incident belongs to that incident. A later alarm, or an earlier one because the plant's clock was set back, starts a new
+incident. Its first alarm is the first-out alarm (ISA-18.1), the one to look at first.
 
-The window counts from the last change, and not from the last clearing: an alarm that has stood alone for days does not
-make every new fault part of its incident. A spike begins no incident while an alarm stands whose cause is not known: it
-belongs to the latest one.
+The window counts from the last change, and not from the last clearing: an alarm that has been active alone for days
+does not make every new fault part of its incident. A spike starts no incident while an alarm without a known cause is
+active: it joins the latest one.
 """
 
 from typing import Annotated, TypeAlias
@@ -17,16 +17,16 @@ import msgspec
 from reactorwatch.records.record import MINUTE_NS
 
 Count: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
-"""A number that messages can carry."""
+"""A count that fits into a message."""
 
 
 class Incident(msgspec.Struct, forbid_unknown_fields=True):
     """The latest incident.
 
     Attributes:
-        number: counted from 1; 0: there was none yet.
-        first_in: name of the alarm that began it.
-        changed_ns: when an alarm of it was last raised or cleared.
+        number: number of the incident from 1; 0 before the first.
+        first_in: name of the first-out alarm.
+        changed_ns: time when an alarm of the incident was last raised or cleared.
     """
 
     number: Count = 0
@@ -35,10 +35,10 @@ class Incident(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class Incidents:
-    """Gives alarms that come up their incident.
+    """Assigns activated alarms to incidents.
 
     Args:
-        incident_min: how long after the last change of an incident an alarm still belongs to it, in minutes.
+        incident_min: minutes after the last change of an incident in which an alarm still belongs to it.
 
     Attributes:
         state: the latest incident.
@@ -48,13 +48,13 @@ class Incidents:
         self._window_ns = int(incident_min * MINUTE_NS)
         self.state = Incident()
 
-    def came_up(self, time_ns: int, alarm: str, *, joins: bool = False) -> int:
-        """Number of the incident that an alarm which comes up now belongs to.
+    def assign(self, time_ns: int, alarm: str, *, joins: bool = False) -> int:
+        """Assign an activated alarm to an incident; returns the incident's number.
 
         Args:
-            time_ns: of the row.
-            alarm: its name.
-            joins: whether it belongs to the latest incident, however long ago that changed, and changes nothing of it.
+            time_ns: time of the row.
+            alarm: name of the alarm.
+            joins: True if the alarm joins the latest incident, however old, without changing it.
         """
         latest = self.state
         if joins and latest.number:
@@ -65,6 +65,6 @@ class Incidents:
         return latest.number
 
     def cleared(self, time_ns: int, number: int) -> None:
-        """Take note that an alarm of an incident was cleared."""
+        """Record that an alarm of an incident was cleared."""
         if number and number == self.state.number:
             self.state.changed_ns = time_ns

@@ -1,13 +1,12 @@
-"""How the alarms burden the operator: the figures of EEMUA 191 (2013) and ANSI/ISA-18.2 (2016).
+"""Alarm KPIs: the operator's load after EEMUA 191 (2013) and ANSI/ISA-18.2 (2016).
 
-One person can deal with about one alarm in ten minutes. More than ten in ten minutes are a *flood*, in which alarms are
-no longer read. An alarm that comes up three times within a minute *chatters*: its delays or its dead band are too
-small. One that has stood for more than a day is *stale*: nobody acts on it, so it should not be an alarm.
+An operator can deal with about one alarm in ten minutes. More than ten in ten minutes are a *flood*, in which alarms
+are no longer read. An alarm activated three times within a minute *chatters*: its delays or its dead band are too
+small. One that has been active for more than a day is *stale*: it calls for no action, so it should not be an alarm.
 
-What counts as an alarm here is that it comes up: it becomes unacknowledged. All of it is in plant time.
+An alarm is counted when it becomes unacknowledged. All times are plant time.
 """
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import msgspec
@@ -30,26 +29,22 @@ PRIORITIES = (
 STALE_AFTER_NS = 24 * 60 * MINUTE_NS
 
 
-def are_of_nothing(figures: AlarmKpis) -> bool:
-    """Whether figures say that no alarm ever came up, and that nobody keeps one out of sight.
-
-    Args:
-        figures: those.
-    """
+def is_empty(kpis: AlarmKpis) -> bool:
+    """True if no alarm was ever activated, and none is shelved, suppressed or out of service."""
     return not (
-        figures.alarms_10min
-        or figures.standing
-        or figures.unacknowledged
-        or figures.shelved
-        or figures.suppressed
-        or figures.out_of_service
-        or figures.incidents
-        or any(count.raised for count in figures.priorities)
+        kpis.alarms_10min
+        or kpis.standing
+        or kpis.unacknowledged
+        or kpis.shelved
+        or kpis.suppressed
+        or kpis.out_of_service
+        or kpis.incidents
+        or any(count.raised for count in kpis.priorities)
     )
 
 
-class Counted(NamedTuple):
-    """What the figures need to know of an alarm now."""
+class AlarmStatus(NamedTuple):
+    """Present status of an alarm, as KPIs need it."""
 
     name: str
     priority: Priority
@@ -57,66 +52,61 @@ class Counted(NamedTuple):
     raised_ns: int
 
 
-class CameUp(NamedTuple):
-    """An alarm that came up."""
+class Activation(NamedTuple):
+    """Activation of an alarm."""
 
     time_ns: int
     alarm: str
 
 
 class KpiState(msgspec.Struct, forbid_unknown_fields=True):
-    """What is remembered.
+    """State of the counter.
 
     Attributes:
-        recent: alarms that came up within the last ten minutes, the oldest first.
-        raised: how many came up so far, by the number of the priority.
+        recent: activations within the last ten minutes, the oldest first.
+        raised: number of activations so far, by priority code.
     """
 
-    recent: list[CameUp] = msgspec.field(default_factory=list)
+    recent: list[Activation] = msgspec.field(default_factory=list)
     raised: dict[int, Count] = msgspec.field(default_factory=dict)
 
 
 class KpiCounter:
-    """Counts alarms as they come up.
-
-    Attributes:
-        state: what it remembers.
-    """
+    """Counter of activations."""
 
     def __init__(self) -> None:
         self.state = KpiState()
 
-    def came_up(self, time_ns: int, alarm: str, priority: Priority) -> None:
-        """Count one."""
-        self._forget(time_ns)
-        self.state.recent.append(CameUp(time_ns, alarm))
+    def count(self, time_ns: int, alarm: str, priority: Priority) -> None:
+        """Count an activation."""
+        self._evict(time_ns)
+        self.state.recent.append(Activation(time_ns, alarm))
         self.state.raised[priority] = self.state.raised.get(priority, 0) + 1
 
-    def figures(self, time_ns: int, alarms: Iterable[Counted], incidents: int) -> AlarmKpis:
-        """The figures now.
+    def compute(self, time_ns: int, alarms: list[AlarmStatus], incidents: int) -> AlarmKpis:
+        """Compute the KPIs.
 
         Args:
-            time_ns: now, in plant time.
-            alarms: all of the plant.
-            incidents: how many there were so far.
+            time_ns: present plant time.
+            alarms: all alarms of the plant.
+            incidents: number of incidents so far.
         """
-        self._forget(time_ns)
-        alarms = list(alarms)
+        self._evict(time_ns)
         recent = self.state.recent
-        standing = [alarm for alarm in alarms if alarm.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)]
+        active = [alarm for alarm in alarms if alarm.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)]
         states = [alarm.state for alarm in alarms]
         return AlarmKpis(
             time_ns=time_ns,
             alarms_10min=len(recent),
             flood=len(recent) > FLOOD,
             chattering=sorted({item.alarm for item in recent if self._chatters(item.alarm)}),
-            standing=[alarm.name for alarm in standing],
-            stale=[alarm.name for alarm in standing if time_ns - alarm.raised_ns > STALE_AFTER_NS],
+            standing=[alarm.name for alarm in active],
+            stale=[alarm.name for alarm in active if time_ns - alarm.raised_ns > STALE_AFTER_NS],
             priorities=[
                 PriorityCount(
                     priority=priority,
                     raised=self.state.raised.get(priority, 0),
-                    standing=sum(alarm.priority == priority for alarm in standing),
+                    standing=sum(alarm.priority == priority for alarm in active),
                 )
                 for priority in PRIORITIES
             ],
@@ -127,8 +117,8 @@ class KpiCounter:
             incidents=incidents,
         )
 
-    def _forget(self, time_ns: int) -> None:
-        """Keep what came up in the ten minutes up to now; what lies ahead is from before the clock was set back."""
+    def _evict(self, time_ns: int) -> None:
+        """Evict activations older than ten minutes, and those in the future, from before the clock was set back."""
         self.state.recent = [item for item in self.state.recent if 0 <= time_ns - item.time_ns < RATE_WINDOW_NS]
 
     def _chatters(self, alarm: str) -> bool:

@@ -1,16 +1,15 @@
-"""The life of an alarm as a table: the alarm states of ANSI/ISA-18.2 (2016) and IEC 62682 (2014).
+"""State table of an alarm after ANSI/ISA-18.2 (2016) and IEC 62682 (2014).
 
-An alarm has a *condition*, which stands or does not and which only samples change, and a *state*, which is what the
-operator sees. Four states are in sight: normal; unacknowledged (it stands, nobody has said that he saw it);
-acknowledged (it stands, and somebody has); returned unacknowledged (it is over, and nobody has). Three are out of
-sight: shelved, by an operator and for a time; suppressed by design, while it means nothing, as in a start-up; out of
-service, for maintenance.
+An alarm has a *condition*, active or normal, which only samples change, and a *state*, which the operator sees. Four
+states are annunciated: normal; unacknowledged (active, not acknowledged); acknowledged (active); returned
+unacknowledged (normal again, not acknowledged). Three are not: shelved, by an operator and for a time; suppressed by
+design, while the alarm is meaningless, as in a start-up; out of service, for maintenance.
 
-Out of sight an alarm's condition is still followed. So when it comes back in sight it is unacknowledged if its
-condition stands then, whoever had acknowledged it before, and normal if not.
+The condition of an alarm that is not annunciated is still evaluated. An alarm that is annunciated again is
+unacknowledged if its condition is active then, even if it had been acknowledged before, and normal if not.
 
-The table has an entry for every pair of a state and an event: the next state, or why the event is refused there. The
-diagram of docs/alarms.md is drawn from it.
+The table has an entry for every pair of state and event: the next state, or why the event is refused there. The
+diagram in docs/alarms.md is drawn from it.
 """
 
 from collections.abc import Mapping
@@ -22,7 +21,7 @@ from reactorwatch.errors import InputError
 
 
 class State(StrEnum):
-    """What the operator sees; the names are those of `AlarmState` in messages.proto."""
+    """Alarm state that the operator sees; the names are those of `AlarmState` in messages.proto."""
 
     NORMAL = "normal"
     UNACKNOWLEDGED = "unacknowledged"
@@ -34,7 +33,7 @@ class State(StrEnum):
 
 
 class Event(StrEnum):
-    """What happens to an alarm: the first two by samples, the shelf's end by their time, the others by people."""
+    """Event of an alarm: the first two come from samples, `SHELF_TIME_OVER` from time, the others from operators."""
 
     RAISED = "raised"
     CLEARED = "cleared"
@@ -49,22 +48,22 @@ class Event(StrEnum):
 
 
 class ByCondition(NamedTuple):
-    """The next state depends on the condition.
+    """Next states by condition.
 
     Attributes:
-        standing: where it goes if the condition stands.
-        over: where it goes if not.
+        active: next state if the condition is active.
+        normal: next state if not.
     """
 
-    standing: State
-    over: State
+    active: State
+    normal: State
 
 
 class Refused(NamedTuple):
-    """The event is not possible in this state.
+    """Refusal of an event in a state.
 
     Attributes:
-        reason: to be read after "the alarm": "is not shelved".
+        reason: text after "the alarm": "is not shelved".
     """
 
     reason: str
@@ -73,7 +72,7 @@ class Refused(NamedTuple):
 Outcome: TypeAlias = State | ByCondition | Refused
 
 OUT_OF_SIGHT = frozenset({State.SHELVED, State.SUPPRESSED_BY_DESIGN, State.OUT_OF_SERVICE})
-"""Where the operator is not bothered."""
+"""States that are not annunciated."""
 
 _IN_SIGHT_AGAIN = ByCondition(State.UNACKNOWLEDGED, State.NORMAL)
 _NOT_SHELVED = Refused("is not shelved")
@@ -158,13 +157,13 @@ TABLE: Mapping[State, Mapping[Event, Outcome]] = MappingProxyType(
 )
 
 
-def next_state(state: State, event: Event, *, standing: bool) -> State:
-    """Where an alarm goes.
+def next_state(state: State, event: Event, *, active: bool) -> State:
+    """The next state of an alarm.
 
     Args:
-        state: where it is.
-        event: what happens to it.
-        standing: whether its condition stands, after the event.
+        state: present state.
+        event: event.
+        active: True if the condition is active after the event.
 
     Raises:
         InputError: the table refuses the event in this state; the text is the reason.
@@ -173,15 +172,13 @@ def next_state(state: State, event: Event, *, standing: bool) -> State:
     if isinstance(outcome, Refused):
         raise InputError(outcome.reason)
     if isinstance(outcome, ByCondition):
-        return outcome.standing if standing else outcome.over
+        return outcome.active if active else outcome.normal
     return outcome
 
 
-def fits(state: State, *, standing: bool) -> bool:
-    """Whether an alarm can be in this state while its condition stands, or does not."""
-    if state in OUT_OF_SIGHT:
-        return True
-    return standing == (state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED))
+def is_consistent(state: State, *, active: bool) -> bool:
+    """True if an alarm can be in this state with such a condition."""
+    return state in OUT_OF_SIGHT or active == (state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED))
 
 
 def diagram() -> str:
@@ -190,8 +187,8 @@ def diagram() -> str:
     for state, row in TABLE.items():
         for event, outcome in row.items():
             if isinstance(outcome, ByCondition):
-                arrows.setdefault((state, outcome.standing), []).append(f"{event}, stands")
-                arrows.setdefault((state, outcome.over), []).append(f"{event}, over")
+                arrows.setdefault((state, outcome.active), []).append(f"{event}, stands")
+                arrows.setdefault((state, outcome.normal), []).append(f"{event}, over")
             elif isinstance(outcome, State):
                 arrows.setdefault((state, outcome), []).append(event)
     names = [f'    state "{state}" as {state.name}' for state in State]

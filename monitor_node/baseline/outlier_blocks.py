@@ -1,14 +1,14 @@
-"""Which part of a training is fit to learn limits from: one stretch that was itself disturbed would teach wide limits.
+"""Screen a training's residuals for disturbed blocks and outliers; learned from, these would give too wide limits.
 
-The residual is cut into blocks of some rows each, and each block is compared with the median of all blocks, in its
-mean and in its spread; by how much blocks may differ is told by the median of the differences between neighbours
-(medians, after Hampel 1974, The influence curve and its role in robust estimation, J. Amer. Statist. Assoc. 69; of
-differences, after von Neumann 1941). Neither moves by much while less than half of the blocks are disturbed. When more
-than a third has to be left out, what remains is no longer surely the normal state, and the training is refused.
+The residual is cut into blocks of rows. The mean and spread of each block are compared with the median over all blocks,
+in units of the median difference between neighbours (medians, after Hampel 1974, The influence curve and its role in
+robust estimation, J. Amer. Statist. Assoc. 69; of differences, after von Neumann 1941). Neither moves much while less
+than half of the blocks are disturbed. If more than a third is left out, the rest may not be the normal state, and the
+training is refused.
 
-Single outliers are left out too: at most one value in twenty, for what more values do is how the signal is. (The
-residual of a sensor with coarse steps, or of an analyser that holds its value, is nearly 0 in most rows, so its median
-deviation says nothing of the rows in which it moves.)
+Single outliers are left out too, at most one value in twenty: more of them are a property of the signal. (The residual
+of a sensor with coarse steps, or of an analyser that holds its value, is nearly 0 in most rows, so its median deviation
+does not describe the rows in which it moves.)
 """
 
 from itertools import pairwise
@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 BLOCKS = 25
 SMALLEST_BLOCK = 20
-"""Rows. A training shorter than four such blocks is taken as it is, but for its outliers."""
+"""Rows. In a training shorter than four such blocks only outliers are left out."""
 
 LARGEST_DEVIATION = 5.0
 """Robust standard deviations by which a block may differ from the median block."""
@@ -33,60 +33,59 @@ OUTLIER = 6.0
 MOST_LEFT_OUT = 1.0 / 3.0
 
 USUAL_SHARE = 0.95
-"""Of the values that are no outliers, at least."""
+"""Least share of values that are no outliers."""
 
 _TO_SD = 1.4826  # of the median absolute deviation, for normal values
 _USUAL_TO_SD = 1.0 / 1.96  # of the absolute deviation that 95 % of normal values are within
 
 
-class Undisturbed(NamedTuple):
-    """What can be learned from.
+class Screening(NamedTuple):
+    """Result of screening n residuals.
 
     Attributes:
-        usable: shape (n,), False where it is left out or not known.
-        stretches: of disturbed rows, each (first, last), both included.
-        shifts: how far the mean of each stretch is from the usual, in robust standard deviations of single values.
+        usable: shape (n,), False where left out or missing.
+        disturbed_intervals: disturbed rows, each (first, last), both included.
+        shifts: deviation of each interval's mean, in robust standard deviations of single values.
         outliers: number of single values left out.
     """
 
     usable: Mask
-    stretches: list[tuple[int, int]]
+    disturbed_intervals: list[tuple[int, int]]
     shifts: list[float]
     outliers: int
 
     @property
     def refused(self) -> bool:
-        """Whether so much had to be left out that what remains cannot be trusted."""
-        left_out = sum(last - first + 1 for first, last in self.stretches)
+        """True if too much is left out to trust the rest."""
+        left_out = sum(last - first + 1 for first, last in self.disturbed_intervals)
         return left_out > MOST_LEFT_OUT * self.usable.size
 
 
-def undisturbed(z: Array, smallest_sd: float = 0.0) -> Undisturbed:
-    """The part of a residual that can be learned from.
+def screen_baseline(z: Array, smallest_sd: float = 0.0) -> Screening:
+    """Find the usable part of a residual.
 
     Args:
-        z: shape (n,), in order of time; NaN where it is not known.
-        smallest_sd: standard deviations of values, and of the means of blocks, are taken as at least this: what is
-            smaller is of no interest.
+        z: residuals in order of time, shape (n,); NaN if missing.
+        smallest_sd: least standard deviation of values and of blocks' means; smaller deviations do not matter.
     """
-    known = np.isfinite(z)
-    if not known.any():
-        return Undisturbed(known, [], [], 0)
-    centre, sd = _centre_and_sd(z[known], smallest_sd)
+    present = np.isfinite(z)
+    if not present.any():
+        return Screening(present, [], [], 0)
+    centre, sd = _centre_and_sd(z[present], smallest_sd)
     size = max(SMALLEST_BLOCK, z.size // BLOCKS)
     starts = np.arange(0, z.size - size + 1, size)
     disturbed = np.zeros(z.size, dtype=np.bool_)
     if starts.size >= 4 and sd > 0:
-        edges = [*starts.tolist(), z.size]  # the last block takes the rest
-        blocks = [z[a:b][known[a:b]] for a, b in pairwise(edges)]
-        for index in _strange(blocks, centre, sd, smallest_sd):
+        edges = [*starts.tolist(), z.size]  # the last block has the remainder
+        blocks = [z[a:b][present[a:b]] for a, b in pairwise(edges)]
+        for index in _outlying_blocks(blocks, centre, sd, smallest_sd):
             disturbed[edges[index] : edges[index + 1]] = True
-    stretches = _stretches(disturbed)
-    rest = known & ~disturbed
-    centre, sd = _centre_and_sd(z[rest], smallest_sd)
-    shifts = [float(np.nanmean(z[first : last + 1]) - centre) / max(sd, 1e-300) for first, last in stretches]
-    single = rest & (np.abs(np.where(known, z, centre) - centre) > OUTLIER * sd) & (sd > 0)
-    return Undisturbed(rest & ~single, stretches, shifts, int(np.count_nonzero(single)))
+    disturbed_intervals = _intervals(disturbed)
+    undisturbed = present & ~disturbed
+    centre, sd = _centre_and_sd(z[undisturbed], smallest_sd)
+    shifts = [float(np.nanmean(z[first : last + 1]) - centre) / max(sd, 1e-300) for first, last in disturbed_intervals]
+    single = undisturbed & (np.abs(np.where(present, z, centre) - centre) > OUTLIER * sd) & (sd > 0)
+    return Screening(undisturbed & ~single, disturbed_intervals, shifts, int(np.count_nonzero(single)))
 
 
 def _centre_and_sd(z: Array, smallest_sd: float) -> tuple[float, float]:
@@ -96,31 +95,29 @@ def _centre_and_sd(z: Array, smallest_sd: float) -> tuple[float, float]:
     return centre, max(_TO_SD * half, _USUAL_TO_SD * usual, smallest_sd)
 
 
-def _strange(blocks: list[Array], centre: float, sd: float, smallest_sd: float) -> list[int]:
-    """Numbers of the blocks whose mean or spread is unlike the others'."""
+def _outlying_blocks(blocks: list[Array], centre: float, sd: float, smallest_sd: float) -> list[int]:
+    """Indices of the blocks whose mean or spread is an outlier."""
     filled = [index for index, block in enumerate(blocks) if block.size >= SMALLEST_BLOCK // 2]
     if len(filled) < 4:
         return []
-    # Outliers are not what makes a block strange; without the clip a single one would.
+    # Single outliers do not make a block one; without the clip they would.
     clipped = [np.clip(blocks[index], centre - OUTLIER * sd, centre + OUTLIER * sd) for index in filled]
     means = np.array([block.mean() for block in clipped])
     spreads = np.log(np.array([max(float(block.std()), smallest_sd, 1e-3 * sd) for block in clipped]))
     rows = float(np.median([block.size for block in clipped]))
-    strange = _far(means, max(sd / np.sqrt(rows), smallest_sd)) | _far(spreads, 1.0 / np.sqrt(2.0 * rows))
-    return [filled[number] for number in np.flatnonzero(strange)]
+    outlying = _is_far(means, max(sd / np.sqrt(rows), smallest_sd)) | _is_far(spreads, 1.0 / np.sqrt(2.0 * rows))
+    return [filled[i] for i in np.flatnonzero(outlying)]
 
 
-def _far(values: Array, smallest_sd: float) -> Mask:
-    """Which values are far from the median, seen against how much neighbours differ, and white noise at the least.
+def _is_far(values: Array, smallest_sd: float) -> Mask:
+    """Flags of values far from the median, in units of the differences of neighbours, at least those of white noise.
 
-    Against neighbours, because a disturbance of two fifths of the blocks widens every measure of all the blocks, but
-    makes only two neighbours differ.
+    A disturbance of two fifths of the blocks widens every measure of all blocks, but makes only two neighbours differ.
     """
-    off = np.abs(values - np.median(values))
     sd = _TO_SD * float(np.median(np.abs(np.diff(values)))) / np.sqrt(2.0)
-    return np.asarray(off > LARGEST_DEVIATION * max(sd, smallest_sd))
+    return np.asarray(np.abs(values - np.median(values)) > LARGEST_DEVIATION * max(sd, smallest_sd))
 
 
-def _stretches(disturbed: Mask) -> list[tuple[int, int]]:
+def _intervals(disturbed: Mask) -> list[tuple[int, int]]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], disturbed, [False]]).astype(np.int8)))
     return [(int(first), int(end) - 1) for first, end in zip(edges[::2], edges[1::2], strict=True)]

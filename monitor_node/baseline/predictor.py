@@ -1,13 +1,13 @@
-"""One-step predictions of an output from its past and the input's, by two ARX models of the same structure.
+"""One-step-ahead predictions of an output by two ARX models of the same structure.
 
-One adapts at every row. The other is fitted to the whole training at its end, and held: the reference that residuals
-are judged by. Until then the prediction is that of the model that adapts, made before it sees the row.
+The adaptive model is updated with every row. The reference is fitted to the whole training at its end and then frozen.
+Until then the prediction is that of the adaptive model before the update.
 
-Where residuals are not judged by these models, the one that adapts has time: rows are put by, and learned from together
-when somebody asks what it has come to.
+Where these models are not the monitor's reference, rows are buffered, and the adaptive model is updated with all of
+them when it is read.
 
-Signals are scaled by the mean and the spread of the first rows, so that the estimator works with numbers of the order
-of one; what is told of the models is in the signals' own units again.
+Signals are scaled by mean and spread of the first rows, so that the estimator works with numbers of the order of one.
+Snapshots are in the signals' own units.
 """
 
 from math import inf, isfinite, nan
@@ -15,7 +15,7 @@ from math import inf, isfinite, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.baseline.training_record import checks_of
+from monitor_node.baseline.training_record import check_training
 from monitor_node.ingest.sampling import TOLERANCE
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
@@ -32,30 +32,30 @@ from reactorwatch.stored_state import StoredState, packed, unpacked
 Array = NDArray[np.float64]
 
 SCALING_ROWS = 50
-"""Rows that the scaling is made from; nothing is predicted before."""
+"""Rows from which the scaling is made; there is no prediction before."""
 
 ROWS_A_PARAMETER = 10
-"""The reference is not made from fewer rows than this times its parameters."""
+"""Least number of rows per parameter of the reference."""
 
-MOST_PUT_BY = 1000
-"""Rows that wait to be learned from; memory stays bounded."""
+MOST_BUFFERED = 1000
+"""Buffered rows; memory stays bounded."""
 
 _BREAK = (-(2**63), nan, nan)
-"""Stands between two rows of which the later does not follow the earlier."""
+"""Marks a gap between two buffered rows."""
 
 
 class PredictorState(StoredState, frozen=True):
-    """All that a predictor remembers.
+    """State of a predictor.
 
     Attributes:
-        buffer: the rows that the next regressor needs.
-        rls: the model that adapts.
-        first_rows: that the scaling will be made from: doubles, input and output of each.
-        scaling: of the signals; None before it is known.
-        reference: its parameters, doubles; None while there is none.
-        told: of the reference: a `ModelSnapshot`; None if nobody will ask.
-        drift: the chart that compares the models; None: they are not compared.
-        drifted: what it said last.
+        buffer: rows of the next regressor.
+        rls: the adaptive model.
+        first_rows: rows from which the scaling will be made: doubles, input and output of each.
+        scaling: scaling of the signals; None before it is known.
+        reference: parameters of the reference, doubles; None before the fit.
+        told: snapshot of the reference, a serialized `ModelSnapshot`; None without snapshots.
+        drift: chart of the models' difference; None without one.
+        drifted: newest point of that chart.
     """
 
     buffer: BufferState
@@ -72,31 +72,31 @@ class ArxPredictor:
     """Predicts one output.
 
     Args:
-        order: of the models.
-        delay: of the input, in samples.
-        forgetting: of the model that adapts.
-        described: whether anybody will ask what the models are like.
+        order: order of the models.
+        delay: delay of the input in samples.
+        forgetting: forgetting factor of the adaptive model.
+        with_snapshots: True if a snapshot of the reference will be read.
     """
 
-    def __init__(self, order: int, delay: int, forgetting: float, *, described: bool = True) -> None:
+    def __init__(self, order: int, delay: int, forgetting: float, *, with_snapshots: bool = True) -> None:
         self._structure = Structure.of_order(order, delay)
         self._rls = RecursiveLeastSquares(self._structure.parameters, forgetting)
         self._buffer = RegressorBuffer(self._structure)
         self._first_rows: list[tuple[float, float]] = []
-        self._described = described
-        self._put_by: list[tuple[int, float, float]] = []
+        self._with_snapshots = with_snapshots
+        self._buffered: list[tuple[int, float, float]] = []
         self._scaling: Scaling | None = None
         self._scales = (0.0, 1.0, 0.0, 1.0)
         self._reference: Array | None = None
         self._reference_model: ModelSnapshot | None = None
         self._fitted: Rows | None = None
         self._drift: ParameterT2 | None = None
-        self._drifted: Judgement | None = None
+        self._newest_drift: Judgement | None = None
 
     @property
     def state(self) -> PredictorState:
-        """A copy of all that is remembered. Rows that were put by are learned from first, which changes nothing."""
-        self.catch_up()
+        """A copy of the state, after the buffered rows."""
+        self.replay_buffer()
         return PredictorState(
             self._buffer.state,
             self._rls.state,
@@ -105,11 +105,11 @@ class ArxPredictor:
             None if self._reference is None else packed(self._reference),
             None if self._reference_model is None else self._reference_model.SerializeToString(),
             None if self._drift is None else self._drift.state,
-            self._drifted,
+            self._newest_drift,
         )
 
     def restore(self, state: PredictorState) -> None:
-        """Go on, bit for bit, where a predictor of the same settings was when `state` was taken.
+        """Resume bit-identically from a state of the same settings.
 
         Raises:
             ValueError: the state is damaged.
@@ -126,25 +126,22 @@ class ArxPredictor:
         if state.told is not None:
             self._reference_model = ModelSnapshot.FromString(state.told)
         self._drift = None if state.drift is None else ParameterT2.from_state(state.drift)
-        self._drifted = state.drifted
+        self._newest_drift = state.drifted
 
     def update(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> float:
-        """Take a row in.
+        """Update with a row; returns the prediction made before it, NaN if there is none.
 
         Args:
-            time_ns: of the row; later than the last one's if it follows.
-            input_value: NaN if missing.
-            value: of the output, NaN if missing.
-            follows: whether the row before was one period ago.
-
-        Returns:
-            What was to be expected of the output before it was seen; NaN where that can't be said.
+            time_ns: time of the row; later than the last row's if it follows.
+            input_value: input; NaN if missing.
+            value: output; NaN if missing.
+            follows: True if the row before was one period ago.
         """
         if self._scaling is None:
             self._learn_scaling(input_value, value)
             return nan
-        if self._put_by:
-            self.catch_up()
+        if self._buffered:
+            self.replay_buffer()
         input_centre, input_spread, centre, spread = self._scales
         if not follows:
             self._buffer.restart()
@@ -158,52 +155,52 @@ class ArxPredictor:
             return centre + spread * float(self._reference @ regressor)
         return centre + spread * innovation.prediction
 
-    def hold(self, time_min: Array, inputs: Array, outputs: Array) -> Array:
-        """Fit the reference to a training, by least squares.
+    def fit_reference(self, time_min: Array, inputs: Array, outputs: Array) -> Array:
+        """Fit the reference to a training by least squares.
 
         Args:
-            time_min: shape (rows,).
-            inputs: shape (rows,); NaN where missing.
-            outputs: shape (rows,); NaN where missing or not to be learned from.
+            time_min: times in minutes, shape (rows,).
+            inputs: input values, shape (rows,); NaN if missing.
+            outputs: output values, shape (rows,); NaN if missing or left out.
 
         Returns:
-            The residual of each row, shape (rows,), as large as those of rows that it has not learned from; NaN where
-            there is none. Of too few rows there is no reference, and all are NaN.
+            Residuals, shape (rows,), scaled to the size of out-of-sample residuals; NaN if missing. With too few rows
+            there is no reference, and all are NaN.
         """
         residual = np.full(time_min.size, nan)
         if self._scaling is None:
             return residual
         input_centre, input_spread, centre, spread = self._scales
         rows = rows_of(self._structure, (inputs - input_centre) / input_spread, (outputs - centre) / spread)
-        rows = _following(rows, time_min, self._structure.history)
+        rows = _consecutive_rows(rows, time_min, self._structure.history)
         parameters = self._structure.parameters
         if len(rows.outputs) < ROWS_A_PARAMETER * parameters:
             return residual
         y = rows.outputs[:, 0]
         theta: Array = np.asarray(np.linalg.lstsq(rows.regressors, y, rcond=1e-10)[0], dtype=np.float64)
-        # With n parameters fitted to N rows, a row it has seen is off by sqrt((N - n) / (N + n)) of one it has not.
-        seen = np.sqrt((len(y) - parameters) / (len(y) + parameters))
-        residual[rows.position] = spread * (y - rows.regressors @ theta) / seen
+        # With n parameters fitted to N rows, in-sample residuals are sqrt((N - n) / (N + n)) of out-of-sample ones.
+        in_sample = np.sqrt((len(y) - parameters) / (len(y) + parameters))
+        residual[rows.position] = spread * (y - rows.regressors @ theta) / in_sample
         self._reference, self._fitted = theta, rows
-        if self._described:
+        if self._with_snapshots:
             covariance = _covariance(rows.regressors, y, theta)
             singular = np.linalg.svd(rows.regressors, compute_uv=False)
             condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else inf
-            checks = checks_of(self._structure, time_min, inputs, outputs, residual)
-            self._reference_model = self._told(theta, covariance, condition, len(y), 1.0)
+            checks = check_training(self._structure, time_min, inputs, outputs, residual)
+            self._reference_model = self._snapshot(theta, covariance, condition, len(y), 1.0)
             self._reference_model.checks.extend(checks)
         return residual
 
-    def compare(self, arl0: float) -> None:
-        """Begin to compare the model that adapts with the reference, by a chart on their parameters.
+    def start_drift_chart(self, arl0: float) -> None:
+        """Start the chart of the difference between the parameters of the adaptive model and the reference.
 
         Args:
-            arl0: its run length without a fault, in rows.
+            arl0: in-control run length of the chart, in rows.
 
         Raises:
             InputError: the training was too short for that, or the model does not forget.
         """
-        self.catch_up()
+        self.replay_buffer()
         rows, self._fitted = self._fitted, None
         if rows is None:
             raise InputError("there is no reference to compare with")
@@ -213,31 +210,31 @@ class ArxPredictor:
         self._drift = learn(rows.regressors, residual, self._rls.forgetting, len(residual), arl0, names, lags)
 
     def drift(self) -> tuple[Judgement, dict[str, float]] | None:
-        """How far the models are from each other, and each parameter's part of that; None: not compared."""
-        self.catch_up()
-        if self._drift is None or self._drifted is None or self._reference is None:
+        """Newest point of the drift chart, and each parameter's contribution; None without a chart."""
+        self.replay_buffer()
+        if self._drift is None or self._newest_drift is None or self._reference is None:
             return None
         parts = self._drift.contributions(self._rls.parameters - self._reference)
-        return self._drifted, dict(zip(self._drift.names, parts.tolist(), strict=True))
+        return self._newest_drift, dict(zip(self._drift.names, parts.tolist(), strict=True))
 
     def _compare(self, regressor: Array) -> None:
         if self._drift is not None and self._reference is not None:
-            self._drifted = self._drift.update(self._rls.parameters - self._reference, regressor)
+            self._newest_drift = self._drift.update(self._rls.parameters - self._reference, regressor)
 
-    def put_by(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> None:
-        """Take a row in that is to be learned from later, if ever; arguments as for `update`."""
+    def buffer(self, time_ns: int, input_value: float, value: float, *, follows: bool) -> None:
+        """Buffer a row for a later update; arguments as for `update`."""
         if self._scaling is None:
             self._learn_scaling(input_value, value)
             return
         if not follows:
-            self._put_by.append(_BREAK)
-        self._put_by.append((time_ns, input_value, value))
-        if len(self._put_by) >= MOST_PUT_BY:
-            self.catch_up()
+            self._buffered.append(_BREAK)
+        self._buffered.append((time_ns, input_value, value))
+        if len(self._buffered) >= MOST_BUFFERED:
+            self.replay_buffer()
 
-    def catch_up(self) -> None:
-        """Learn from the rows that were put by."""
-        rows, self._put_by = self._put_by, []
+    def replay_buffer(self) -> None:
+        """Update with the buffered rows."""
+        rows, self._buffered = self._buffered, []
         input_centre, input_spread, centre, spread = self._scales
         buffer, learn_row = self._buffer, self._rls.update
         for time_ns, input_value, value in rows:
@@ -250,18 +247,21 @@ class ArxPredictor:
                 learn_row(regressor, scaled)
                 self._compare(regressor)
 
-    def adaptive(self) -> ModelSnapshot | None:
-        """The model that adapts, without a time; None before it has learned anything."""
-        self.catch_up()
-        return self._describe() if self._rls.rows else None
+    def adaptive_snapshot(self) -> ModelSnapshot | None:
+        """Snapshot of the adaptive model, without a time; None before its first update."""
+        self.replay_buffer()
+        rls = self._rls
+        if not rls.rows:
+            return None
+        return self._snapshot(rls.parameters, rls.parameter_covariance, rls.condition, rls.rows, rls.forgetting)
 
-    def reference(self) -> ModelSnapshot | None:
-        """A copy of the reference, likewise; None while there is none."""
+    def reference_snapshot(self) -> ModelSnapshot | None:
+        """Snapshot of the reference, without a time; None before the fit."""
         if self._reference_model is None:
             return None
-        told = ModelSnapshot()
-        told.CopyFrom(self._reference_model)
-        return told
+        snapshot = ModelSnapshot()
+        snapshot.CopyFrom(self._reference_model)
+        return snapshot
 
     def _learn_scaling(self, input_value: float, value: float) -> None:
         if not (isfinite(input_value) and isfinite(value)):
@@ -281,11 +281,7 @@ class ArxPredictor:
             scaling.output_spreads[0],
         )
 
-    def _describe(self) -> ModelSnapshot:
-        rls = self._rls
-        return self._told(rls.parameters, rls.parameter_covariance, rls.condition, rls.rows, rls.forgetting)
-
-    def _told(
+    def _snapshot(
         self, scaled: Array, scaled_covariance: Array, condition: float, rows: int, forgetting: float
     ) -> ModelSnapshot:
         assert self._scaling is not None
@@ -308,18 +304,18 @@ class ArxPredictor:
 
 
 def fewest_rows(order: int, delay: int) -> int:
-    """Rows, one after the other, that a reference is made from at least.
+    """Least number of consecutive rows for a reference.
 
     Args:
-        order: of the models.
-        delay: of the input, in samples.
+        order: order of the models.
+        delay: delay of the input in samples.
     """
     structure = Structure.of_order(order, delay)
     return structure.history + ROWS_A_PARAMETER * structure.parameters
 
 
-def _following(rows: Rows, time_min: Array, history: int) -> Rows:
-    """Those rows that follow each other, with all their history, by one period, as is asked of the rows that come."""
+def _consecutive_rows(rows: Rows, time_min: Array, history: int) -> Rows:
+    """Select the rows whose whole history is evenly spaced by one period, as `update` requires it."""
     steps = np.diff(time_min)
     period = float(np.median(steps))
     late = np.abs(steps - period) > TOLERANCE * period
@@ -330,7 +326,7 @@ def _following(rows: Rows, time_min: Array, history: int) -> Rows:
 
 
 def _covariance(regressors: Array, outputs: Array, theta: Array) -> Array:
-    """Of the parameters, by least squares; NaN where the rows do not tell them."""
+    """Least-squares covariance of the parameters; NaN if the rows do not determine them."""
     residual = outputs - regressors @ theta
     variance = float(residual @ residual) / max(len(outputs) - theta.size, 1)
     gram = regressors.T @ regressors

@@ -1,9 +1,8 @@
-"""What a row is expected to be: the reference that residuals are taken against. It is frozen when the training ends.
+"""Reference that predicts rows; residuals are taken against it. It is frozen when the training ends.
 
-Two kinds. `ProcessReference` is the extended Kalman filter of the reactor's equations: it knows how the plant bends,
-so a coolant flow that it has never seen is no surprise to it, and irregular rows are none either. `ArxReference` is the
-identified model: it holds for any plant, but only where it was trained, so rows whose input lies outside of that
-are not judged.
+`ProcessReference` is the extended Kalman filter of the process model: it is nonlinear, so inputs beyond the training
+and irregular rows are no problem. `ArxReference` is the identified linear model: it serves any plant, but only within
+the inputs of its training; other rows are not evaluated.
 """
 
 from collections.abc import Sequence
@@ -24,21 +23,21 @@ from reactorwatch.stored_state import StoredState
 Array = NDArray[np.float64]
 
 GATE = 6.0
-"""A value so many standard deviations off does not correct the filter until the next one confirms it."""
+"""Standard deviations beyond which a residual does not correct the filter until the next one confirms it."""
 
 MOST_UNKNOWN = 1
-"""Rows in succession whose input may be unknown; behind more, the filter begins anew."""
+"""Rows in succession whose input may be unknown; after more, the filter restarts."""
 
 MARGIN = 0.1
-"""Of the range of the input in training, by which it may be left on either side."""
+"""Share of the input's range in training by which an input may be beyond it."""
 
 
-class Expected(NamedTuple):
-    """What was expected of a row before it was seen, and how sure that was.
+class RowPrediction(NamedTuple):
+    """One-step-ahead prediction of a row.
 
     Attributes:
-        prediction: one an output, in its unit; NaN where nothing can be said.
-        sd: of the residual, in the output's unit: as far as the reference knows it, 1 if it does not.
+        prediction: predicted outputs in their units; NaN where there is none.
+        sd: standard deviations of the residuals in the same units; 1 if unknown.
     """
 
     prediction: Sequence[float]
@@ -46,15 +45,15 @@ class Expected(NamedTuple):
 
 
 class ProcessReferenceState(StoredState, frozen=True, tag="process"):
-    """What a `ProcessReference` is and remembers.
+    """State of a `ProcessReference`.
 
     Attributes:
-        noise: of the plant and its sensors.
-        filter: what it remembers.
-        last_input: the newest that was not missing.
-        guessed: whether the input of the newest row that the filter took was missing.
+        noise: noise of the plant and its sensors.
+        filter: state of the filter.
+        last_input: the newest input that was not missing.
+        guessed: True if the input of the filter's newest row was missing.
         typical_sd: see `ProcessReference`.
-        held_rows: number of rows since then, which the filter did not take.
+        held_rows: number of rows since then, which the filter did not use.
         reach: see `input_reach`.
     """
 
@@ -68,49 +67,49 @@ class ProcessReferenceState(StoredState, frozen=True, tag="process"):
 
 
 class ArxReferenceState(StoredState, frozen=True, tag="arx"):
-    """What an `ArxReference` is: the range of the input in which it holds."""
+    """State of an `ArxReference`: the range of the input in which it is valid."""
 
     low: float
     high: float
 
 
 class Reference(Protocol):
-    """What rows are expected by.
+    """Predicts rows.
 
     Attributes:
-        kind: `equations` or `arx`, as it is published.
+        kind: `equations` or `arx`, as published.
     """
 
     kind: str
 
     def update(
         self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...], missing: int = 0
-    ) -> Expected:
-        """Take a row in.
+    ) -> RowPrediction:
+        """Predict a row, then update with it.
 
         Args:
-            time_ns: of the row.
-            input_value: of the plant's input; NaN if missing.
-            values: of the outputs; NaN where missing.
-            accept: outputs that the reference is to follow however far off they are.
-            missing: number of rows missing just before this one, whose inputs are not known.
+            time_ns: time of the row.
+            input_value: input; NaN if missing.
+            values: outputs; NaN if missing.
+            accept: outputs that correct the reference whatever their residual.
+            missing: number of rows missing just before this one.
         """
 
     def restart(self) -> None:
-        """Begin anew with the next row: the plant's clock was set, or it was away for long."""
+        """Restart with the next row: the plant's clock was set, or there was a gap."""
 
     @property
     def state(self) -> ProcessReferenceState | ArxReferenceState:
-        """All that it is and remembers, but for its model."""
+        """The state, without the model."""
 
 
 class ProcessReference:
-    """The filter of the reactor's equations.
+    """Extended Kalman filter of a process model.
 
     Args:
-        model: of the plant.
-        outputs: the names of those that are watched, in order.
-        noise: of the plant and its sensors.
+        model: process model.
+        outputs: names of the monitored outputs, in order.
+        noise: noise of the plant and its sensors.
 
     Raises:
         InputError: the model lacks an output.
@@ -121,19 +120,19 @@ class ProcessReference:
     def __init__(self, model: ProcessModel, outputs: tuple[str, ...], noise: NoiseLevels) -> None:
         self.model, self.noise = model, noise
         self._filter = Filter(model, noise)
-        self._places = places(model, outputs)
+        self._indices = output_indices(model, outputs)
         self._count = len(model.outputs)
-        self._accept_all = len(outputs) == self._count and self._places == list(range(self._count))
+        self._accept_all = len(outputs) == self._count and self._indices == list(range(self._count))
         self._last_input, self._guessed, self._held_rows = nan, False, 0
         self._reach = 0.0
         self.typical_sd = [1.0] * len(outputs)
-        """Standard deviation of a residual by the filter, in the outputs' units, as it mostly was in the last `run`."""
+        """Median standard deviation of each residual in the last `run`, in the outputs' units."""
 
     @classmethod
     def from_state(
         cls, state: ProcessReferenceState, model: ProcessModel, outputs: tuple[str, ...]
     ) -> "ProcessReference":
-        """The one that goes on, bit for bit, where `state` was taken.
+        """Resume bit-identically from a state.
 
         Raises:
             ValueError: the state is of another model.
@@ -170,12 +169,12 @@ class ProcessReference:
 
     def update(
         self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...], missing: int = 0
-    ) -> Expected:
+    ) -> RowPrediction:
         """See `Reference`.
 
-        An input is held until the next row. So where a row or its input is missing, nothing is predicted until the
-        input shows. Behind one such row the prediction is then as uncertain as the input was: it was as before or as
-        after, give or take what moves of the training that went back at once amount to.
+        An input is held until the next row. So where a row or its input is missing, there is no prediction until the
+        next input. After one such row the prediction includes the uncertainty of the input: it was as before or as
+        after, plus or minus the largest pulse of one row in the training.
         """
         time_min, between = time_ns / MINUTE_NS, None
         unknown = self._guessed + self._held_rows + missing
@@ -183,33 +182,29 @@ class ProcessReference:
             if unknown > MOST_UNKNOWN:
                 self._filter.restart()
             elif unknown:
-                between = self._between(time_min, input_value)
+                between = self._unknown_input(time_min, input_value)
             self._last_input, self._guessed, self._held_rows = input_value, False, 0
         elif unknown or not isfinite(self._last_input):
             self._held_rows += missing + 1
-            nothing = [nan] * len(values)
-            return Expected(nothing, nothing)
+            unknown_values = [nan] * len(values)
+            return RowPrediction(unknown_values, unknown_values)
         else:
             self._guessed = True
         if self._accept_all:
-            found = self._filter.update(
-                time_min, (self._last_input,), values, gate=GATE, accept=accept, between=between
-            )
-            return Expected(found.prediction, found.sd)
-        measured, followed = [nan] * self._count, [False] * self._count
-        for place, value, follow in zip(self._places, values, accept, strict=True):
-            measured[place], followed[place] = value, follow
-        found = self._filter.update(
-            time_min, (self._last_input,), measured, gate=GATE, accept=tuple(followed), between=between
+            step = self._filter.update(time_min, (self._last_input,), values, gate=GATE, accept=accept, between=between)
+            return RowPrediction(step.prediction, step.sd)
+        measured, accepted = [nan] * self._count, [False] * self._count
+        for i, value, is_accepted in zip(self._indices, values, accept, strict=True):
+            measured[i], accepted[i] = value, is_accepted
+        step = self._filter.update(
+            time_min, (self._last_input,), measured, gate=GATE, accept=tuple(accepted), between=between
         )
-        return Expected(
-            [found.prediction[place] for place in self._places], [found.sd[place] for place in self._places]
-        )
+        return RowPrediction([step.prediction[i] for i in self._indices], [step.sd[i] for i in self._indices])
 
-    def _between(self, time_min: float, input_value: float) -> tuple[float, list[tuple[float]]] | None:
-        """From when on the input is not known, and what it may have been: one row is missing, or its input.
+    def _unknown_input(self, time_min: float, input_value: float) -> tuple[float, list[tuple[float]]] | None:
+        """Start of the time in which the input is unknown, and its possible values: a row, or its input, is missing.
 
-        None: it was as before and after, or the filter begins with this row, so that nothing before it counts.
+        None: the input was as before and after, or the filter starts with this row.
         """
         before_min, ends = self._filter.state.time_min, {self._last_input, input_value}
         if before_min is None or (len(ends) == 1 and not self._reach):
@@ -225,66 +220,66 @@ class ProcessReference:
         self._guessed, self._held_rows = False, 0
 
     def run(self, time_min: Array, inputs: Array, measured: Array) -> tuple[Array, Array]:
-        """Take many rows in; returns the residuals, and the same in standard deviations, each of shape (n, outputs).
+        """Run over many rows; returns residuals and normalised residuals, each of shape (n, outputs).
 
-        How far the input goes and comes back at once is learned. Behind missing rows the filter begins anew.
+        The reach of the input is learned (`input_reach`). The filter restarts after missing rows.
 
         Args:
-            time_min: shape (n,).
-            inputs: shape (n,).
-            measured: shape (n, outputs).
+            time_min: times in minutes, shape (n,).
+            inputs: input values, shape (n,).
+            measured: output values, shape (n, outputs).
         """
         self._reach = input_reach(time_min, inputs)
         if self._accept_all and np.isfinite(inputs).all():
             times = np.round(time_min * MINUTE_NS) / MINUTE_NS
-            found = self._filter.run(times, _until_missing(time_min, inputs), measured, gate=GATE)
-            z = found.residual / found.sd
-            if not np.any(np.abs(z) > GATE):  # no value was to be followed or not because of the one before
+            steps = self._filter.run(times, _mask_before_missing(time_min, inputs), measured, gate=GATE)
+            z = steps.residual / steps.sd
+            if not np.any(np.abs(z) > GATE):  # no acceptance depended on the row before
                 self._last_input, self._guessed, self._held_rows = float(inputs[-1]), False, 0
-                self.typical_sd = _typical(found.sd)
-                return found.residual, z
+                self.typical_sd = _median_sds(steps.sd)
+                return steps.residual, z
             self._filter.restart()
         residuals, z = np.full(measured.shape, np.nan), np.full(measured.shape, np.nan)
         sds = np.full(measured.shape, np.nan)
-        accept, is_behind = (False,) * measured.shape[1], _are_behind_missing(time_min).tolist()
+        accept, is_after_missing = (False,) * measured.shape[1], _is_after_missing(time_min).tolist()
         for row, values in enumerate(measured.tolist()):
-            if is_behind[row]:
+            if is_after_missing[row]:
                 self.restart()
-            expected = self.update(round(time_min[row] * MINUTE_NS), float(inputs[row]), values, accept)
-            off = [value - prediction for value, prediction in zip(values, expected.prediction, strict=True)]
-            residuals[row], sds[row] = off, expected.sd
-            z[row] = [size / sd for size, sd in zip(off, expected.sd, strict=True)]
+            predicted = self.update(round(time_min[row] * MINUTE_NS), float(inputs[row]), values, accept)
+            residual = [value - prediction for value, prediction in zip(values, predicted.prediction, strict=True)]
+            residuals[row], sds[row] = residual, predicted.sd
+            z[row] = [size / sd for size, sd in zip(residual, predicted.sd, strict=True)]
             accept = tuple(abs(size) > GATE for size in z[row].tolist())
-        self.typical_sd = _typical(sds)
+        self.typical_sd = _median_sds(sds)
         return residuals, z
 
 
-def _typical(sds: Array) -> list[float]:
-    """What each column mostly is; 1 where it is not known."""
-    known = [column[np.isfinite(column)] for column in sds.T]
-    return [float(np.median(column)) if column.size else 1.0 for column in known]
+def _median_sds(sds: Array) -> list[float]:
+    """Median of each column; 1 for a column without finite values."""
+    finite = [column[np.isfinite(column)] for column in sds.T]
+    return [float(np.median(column)) if column.size else 1.0 for column in finite]
 
 
 class ArxReference:
-    """Identified models, one an output; their predictions are handed in.
+    """Identified models, one an output; the caller sets their predictions.
 
     Args:
-        inputs: that were seen in training, shape (n,).
+        inputs: inputs of the training, shape (n,).
     """
 
     kind = "arx"
 
     def __init__(self, inputs: Array) -> None:
-        known = inputs[np.isfinite(inputs)]
-        low, high = (float(known.min()), float(known.max())) if known.size else (-np.inf, np.inf)
+        finite = inputs[np.isfinite(inputs)]
+        low, high = (float(finite.min()), float(finite.max())) if finite.size else (-np.inf, np.inf)
         margin = MARGIN * (high - low)
         self._low, self._high = low - margin, high + margin
         self.predictions: list[float] = []
-        """Of the row that is to come, one an output."""
+        """Predictions of the next row, one an output."""
 
     @classmethod
     def from_state(cls, state: ArxReferenceState) -> "ArxReference":
-        """The one of that state."""
+        """Resume from a state."""
         reference = cls(np.zeros(0))
         reference._low, reference._high = state.low, state.high
         return reference
@@ -296,21 +291,18 @@ class ArxReference:
 
     def update(
         self, time_ns: int, input_value: float, values: list[float], accept: tuple[bool, ...], missing: int = 0
-    ) -> Expected:
-        """See `Reference`. Outside of what it was trained on, nothing can be said.
-
-        Nor behind a row that is missing: the models begin anew there by themselves.
-        """
+    ) -> RowPrediction:
+        """See `Reference`. There is no prediction with an input beyond the training, nor after a missing row."""
         if self._low <= input_value <= self._high:
-            return Expected(self.predictions, [1.0] * len(values))
-        return Expected([nan] * len(values), [1.0] * len(values))
+            return RowPrediction(self.predictions, [1.0] * len(values))
+        return RowPrediction([nan] * len(values), [1.0] * len(values))
 
     def restart(self) -> None:
-        """Nothing: the models begin anew by themselves."""
+        """Do nothing: the models restart by themselves."""
 
 
-def places(model: ProcessModel, outputs: tuple[str, ...]) -> list[int]:
-    """Where the outputs are among those of the model.
+def output_indices(model: ProcessModel, outputs: tuple[str, ...]) -> list[int]:
+    """Indices of the outputs in the model.
 
     Raises:
         InputError: one is not among them.
@@ -325,32 +317,32 @@ def places(model: ProcessModel, outputs: tuple[str, ...]) -> list[int]:
 
 
 def input_reach(time_min: Array, inputs: Array) -> float:
-    """Largest distance of the input of a row from those of the rows before and after it, whichever is nearer.
+    """Largest pulse of the input that lasts one row: distance from the nearer of the rows before and after.
 
-    It is 0 where each move lasts for two rows at least. Then the input of a missing row was that of a neighbour.
+    It is 0 if each move lasts for two rows at least. Then the input of a missing row was that of a neighbour.
 
     Args:
-        time_min: shape (n,).
-        inputs: shape (n,); NaN where missing.
+        time_min: times in minutes, shape (n,).
+        inputs: input values, shape (n,); NaN if missing.
     """
-    moved, is_next = np.abs(np.diff(inputs)), ~_are_behind_missing(time_min)[1:]
+    moved, is_next = np.abs(np.diff(inputs)), ~_is_after_missing(time_min)[1:]
     nearer = np.where(is_next[:-1] & is_next[1:], np.minimum(moved[:-1], moved[1:]), 0.0)
     return float(np.nanmax(nearer, initial=0.0))
 
 
-def _are_behind_missing(time_min: Array) -> NDArray[np.bool_]:
-    """Rows before which, by the usual period, rows are missing, shape (n,)."""
+def _is_after_missing(time_min: Array) -> NDArray[np.bool_]:
+    """Flags of rows before which rows are missing, by the median period, shape (n,)."""
     spacing = np.diff(time_min)
     period = float(np.median(spacing)) if spacing.size else 1.0
     return np.array([False, *(missing_rows(item / period) > 0 for item in spacing.tolist())])
 
 
-def _until_missing(time_min: Array, inputs: Array) -> Array:
-    """The inputs, with NaN in rows behind which rows are missing, so that a filter begins anew behind these."""
-    return np.where(np.append(_are_behind_missing(time_min)[1:], False), nan, inputs)
+def _mask_before_missing(time_min: Array, inputs: Array) -> Array:
+    """The inputs, with NaN in rows before missing rows, so that a filter restarts after these."""
+    return np.where(np.append(_is_after_missing(time_min)[1:], False), nan, inputs)
 
 
-def tuned(
+def estimate_training_noise(
     model: ProcessModel,
     outputs: tuple[str, ...],
     time_min: Array,
@@ -358,18 +350,18 @@ def tuned(
     measured: Array,
     smallest_sd: list[float],
 ) -> NoiseLevels:
-    """The noise of a plant and its sensors, from its training.
+    """Estimate the noise of a plant and its sensors from its training.
 
     Args:
-        model: of the plant.
-        outputs: the watched ones.
-        time_min: shape (n,).
-        inputs: shape (n,).
-        measured: shape (n, outputs); NaN where missing or not to be learned from.
-        smallest_sd: of the sensors, one an output.
+        model: process model.
+        outputs: names of the monitored outputs.
+        time_min: times in minutes, shape (n,).
+        inputs: input values, shape (n,).
+        measured: output values, shape (n, outputs); NaN if missing or left out.
+        smallest_sd: least standard deviation of each sensor.
     """
-    whole = np.full((time_min.size, len(model.outputs)), np.nan)
+    columns = np.full((time_min.size, len(model.outputs)), np.nan)
     smallest = [1e-6] * len(model.outputs)
-    for place, column, sd in zip(places(model, outputs), measured.T, smallest_sd, strict=True):
-        whole[:, place], smallest[place] = column, sd
-    return estimate_noise(model, time_min, _until_missing(time_min, inputs), whole, smallest)
+    for i, column, sd in zip(output_indices(model, outputs), measured.T, smallest_sd, strict=True):
+        columns[:, i], smallest[i] = column, sd
+    return estimate_noise(model, time_min, _mask_before_missing(time_min, inputs), columns, smallest)

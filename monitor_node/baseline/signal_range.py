@@ -1,8 +1,8 @@
-"""Range of a signal: what the process cannot be, its sensor cannot measure.
+"""Possible range of a signal, from the bounds of the process model.
 
-A state or an input of the process model has bounds. A value beyond them, such as 9999 of a broken wire or -999 of a
-converter, says nothing of the plant: it is no measurement, and enters neither filters nor charts nor the search for
-causes. A sensor of a plant near a bound may show a little more than the plant is, so the bounds are widened for it.
+A value beyond the bounds of a state or an input, such as 9999 of a broken wire or -999 of a converter, is no
+measurement. Filters, charts and the search for causes do not use it. Near a bound a sensor may read a little beyond it,
+so the bounds are widened.
 """
 
 from math import inf, isfinite
@@ -11,16 +11,16 @@ from typing import NamedTuple
 from reactorwatch.process.model import ProcessModel, Variable
 
 SENSOR_MARGIN = 0.05
-"""Share of the range by which its bounds are widened on either side: for the noise and the bias of a sensor."""
+"""Share of the range by which either bound is widened, for noise and bias of a sensor."""
 
 
 class SignalRange(NamedTuple):
-    """Values that a signal can have.
+    """Possible values of a signal.
 
     Attributes:
-        lower: the smallest, in the unit of the model.
-        upper: the largest, in the same unit.
-        unit: of both.
+        lower: smallest value.
+        upper: largest value.
+        unit: unit of both.
     """
 
     lower: float = -inf
@@ -29,20 +29,20 @@ class SignalRange(NamedTuple):
 
     @property
     def is_bounded(self) -> bool:
-        """Whether there are values that it cannot have."""
+        """True if the range is limited."""
         return self.lower > -inf or self.upper < inf
 
 
 ANY = SignalRange()
-"""The range of a signal of which no bounds are known."""
+"""Range of a signal without known bounds."""
 
 
-def ranges_of(model: ProcessModel | None, signals: tuple[str, ...]) -> list[SignalRange]:
-    """The range of each signal.
+def signal_ranges(model: ProcessModel | None, signals: tuple[str, ...]) -> list[SignalRange]:
+    """Range of each signal.
 
     Args:
-        model: of the plant; None: there is none, and nothing is known of the signals.
-        signals: their names. An output has the bounds of the state that it shows; if it shows anything else, none.
+        model: model of the plant; None: ranges are unbounded.
+        signals: names of the signals. An output that is not a state is unbounded.
     """
     if model is None:
         return [ANY] * len(signals)
@@ -51,10 +51,10 @@ def ranges_of(model: ProcessModel | None, signals: tuple[str, ...]) -> list[Sign
     for output in model.outputs:
         if output.expression.is_symbolic() and output.expression.name() in states:
             variables[output.name] = states[output.expression.name()]
-    return [_widened(variables[signal]) if signal in variables else ANY for signal in signals]
+    return [_widen(variables[signal]) if signal in variables else ANY for signal in signals]
 
 
-def _widened(variable: Variable) -> SignalRange:
+def _widen(variable: Variable) -> SignalRange:
     span = variable.upper - variable.lower
     margin = SENSOR_MARGIN * span if isfinite(span) else 0.0
     return SignalRange(variable.lower - margin, variable.upper + margin, variable.unit)

@@ -1,4 +1,4 @@
-"""The rows that a reference was learned from: were they fit to learn from?"""
+"""Checks of the rows and the residuals of a training."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,28 +13,30 @@ from reactorwatch.identification.structure import Structure
 Array = NDArray[np.float64]
 
 
-def checks_of(structure: Structure, time_min: Array, inputs: Array, outputs: Array, residual: Array) -> list[Check]:
-    """What can be said of the rows and of the model they gave.
+def check_training(
+    structure: Structure, time_min: Array, inputs: Array, outputs: Array, residual: Array
+) -> list[Check]:
+    """Check the rows of a training and the model fitted to them.
 
     Args:
-        structure: of the model.
-        time_min: shape (rows,).
-        inputs: shape (rows,).
-        outputs: shape (rows,).
-        residual: shape (rows,), of one step; NaN where there is none.
+        structure: structure of the model.
+        time_min: times in minutes, shape (rows,).
+        inputs: input values, shape (rows,).
+        outputs: output values, shape (rows,).
+        residual: one-step-ahead residuals, shape (rows,); NaN if missing.
     """
     try:
-        found = [
+        checks = [
             Check(name=check.name, result=check.result) for check in check_record(structure, inputs, outputs, time_min)
         ]
-        if found[-1].name != "variation":
-            found.append(_tested(whiteness(residual, fitted=structure.output_lags)))
-            found.append(_tested(independence(residual, inputs, structure.delay, time=time_min)))
-    except InputError as error:  # too few rows without a gap: no fault of the plant's, but worth being told
-        found = [Check(name="record", result=str(error))]
-    return found
+        if checks[-1].name != "variation":
+            checks.append(_residual_check(whiteness(residual, fitted=structure.output_lags)))
+            checks.append(_residual_check(independence(residual, inputs, structure.delay, time=time_min)))
+    except InputError as error:  # too few rows without a gap: no fault of the plant's, but worth reporting
+        checks = [Check(name="record", result=str(error))]
+    return checks
 
 
-def _tested(test: ResidualTest) -> Check:
+def _residual_check(test: ResidualTest) -> Check:
     left_out = f"the model leaves something out: -log10 p = {test.minus_log10_p:.1f}"
     return Check(name=test.name, result="ok" if test.minus_log10_p < WORST_MINUS_LOG10_P else left_out)

@@ -1,69 +1,69 @@
-"""Plants that nobody vouches for yet: a stranger may make up names, and each costs a monitor.
+"""Admission of unverified plants: anyone may publish under invented names, and each costs a monitor.
 
-A plant is vouched for by a liveliness token of one of its nodes, by a state that was stored of it, or by what it says:
-by rows that were lined up, or, if it is another's to watch, by messages. Until then it is one of a limited number. If
-there are so many already, others wait until one of them has proved itself, or is forgotten because it has said nothing
-for long. So names use up neither memory nor the places of plants that show a token.
+A plant is verified by a liveliness token of one of its nodes, by a stored state, or by its data: by aligned rows, or by
+messages if another shard owns it. The number of unverified plants is limited. At the limit, further plants wait until
+one is verified, or evicted because it has sent nothing for long. So invented names use up neither memory nor the
+capacity for plants with a token.
 """
 
 from dataclasses import dataclass
 
-MOST_STRANGERS = 1000
+MOST_UNVERIFIED = 1000
 
 PROVEN_ROWS, PROVEN_MESSAGES = 32, 96
 
-FORGET_NS = 600_000_000_000
-"""A plant without a token that says less than one thing in this time is not watched."""
+EVICT_NS = 600_000_000_000
+"""An unverified plant without a message in this time is evicted."""
 
 
 @dataclass(slots=True)
-class _Heard:
+class _Activity:
     at_ns: int
     messages: int = 0
 
 
-class Strangers:
-    """The plants that nobody vouches for.
+class UnverifiedPlants:
+    """The unverified plants.
 
     Attributes:
-        forgotten: how many of them were forgotten.
+        evicted: number of evicted plants.
     """
 
     def __init__(self) -> None:
-        self._heard: dict[str, _Heard] = {}  # by plant; who was heard last stands last
-        self.forgotten = 0
+        self._activity: dict[str, _Activity] = {}  # by plant, the least recent first
+        self.evicted = 0
 
     def __contains__(self, plant: str) -> bool:
-        return plant in self._heard
+        return plant in self._activity
 
     @property
-    def have_room(self) -> bool:
-        """Whether there may be one more."""
-        return len(self._heard) < MOST_STRANGERS
+    def has_capacity(self) -> bool:
+        """True below the limit."""
+        return len(self._activity) < MOST_UNVERIFIED
 
-    def meet(self, plant: str, now_ns: int) -> None:
-        """A plant was heard of that nobody vouches for."""
-        self._heard[plant] = _Heard(now_ns)
+    def add(self, plant: str, now_ns: int) -> None:
+        """Register an unverified plant."""
+        self._activity[plant] = _Activity(now_ns)
 
-    def hear(self, plant: str, now_ns: int) -> int:
-        """One of them said something; returns how often it has."""
-        heard = self._heard[plant] = self._heard.pop(plant)
+    def on_message(self, plant: str, now_ns: int) -> int:
+        """Count a message of an unverified plant; returns the count."""
+        heard = self._activity[plant] = self._activity.pop(plant)
         heard.at_ns = now_ns
         heard.messages += 1
         return heard.messages
 
-    def vouch(self, plant: str) -> None:
-        """A plant is none of them any more, if it was one."""
-        self._heard.pop(plant, None)
+    def verify(self, plant: str) -> None:
+        """Verify a plant."""
+        self._activity.pop(plant, None)
 
-    def forget(self, now_ns: int) -> list[str]:
-        """Forget those that have said nothing for long; returns them."""
+    def evict(self, now_ns: int) -> list[str]:
+        """Evict plants without recent messages; returns them."""
         plants: list[str] = []
-        for plant, heard in self._heard.items():
-            if now_ns - heard.at_ns < FORGET_NS:
+        for plant, heard in self._activity.items():
+            if now_ns - heard.at_ns < EVICT_NS:
                 break
             plants.append(plant)
         for plant in plants:
-            del self._heard[plant]
-        self.forgotten += len(plants)
+            del self._activity[plant]
+        self.evicted += len(plants)
         return plants

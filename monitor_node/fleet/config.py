@@ -1,4 +1,4 @@
-"""The settings of a fleet: which plants one monitor watches."""
+"""Settings of a fleet."""
 
 import msgspec
 
@@ -8,15 +8,15 @@ from reactorwatch.errors import InputError
 
 
 class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which plants are watched; how, the settings of the monitor say, the same for all.
+    """Settings of a fleet; those of the monitor apply to each of its plants.
 
     Attributes:
-        plants: their key expression, such as `reactor/*`; None: one plant, that of the monitor's settings.
-        shard: which part of them is ours, such as `2/5`; its plants, and those of shards that are gone.
-        state: folder where all that is remembered of each plant is kept, as often as the settings of the monitor say;
-            it is gone on from after a restart, and by who takes the plant over if he has the same one. None: nowhere.
-        points: whether estimates, points of charts and models are published for every row; each plant then costs as
-            much as in a monitor of its own.
+        plants: key expression of the plants, such as `reactor/*`; None: one plant, that of the monitor's settings.
+        shard: own shard, such as `2/5`: its plants, and those of shards whose monitors are gone.
+        state: folder of the plants' states, stored as often as the monitor's settings say. A restarted monitor, and one
+            that takes a plant over with the same folder, resumes from it. None: nothing is stored.
+        points: True to publish estimates, chart points and models for every row; each plant then costs as much as in a
+            monitor of its own.
     """
 
     plants: str | None = None
@@ -28,6 +28,6 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if self.plants is not None:
             keys.check_plants(self.plants)
         try:
-            sharding.parsed(self.shard)
+            sharding.parse_shard(self.shard)
         except InputError as error:
             raise ValueError(str(error)) from error

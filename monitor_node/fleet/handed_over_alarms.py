@@ -1,100 +1,100 @@
-"""What was said of the alarms of a fleet's plants by who watched them before.
+"""Alarms that the previous owners of a fleet's plants published.
 
-Monitors of a fleet hear each other's alarms. Who takes a plant over finds again what the one before had found, as far
-as its state does not know it; what was said already is left out. An alarm was said if something was said of it at its
-time or later, but for the end of a silence, which may be at the time at which it was raised.
+Monitors of a fleet subscribe to each other's alarms. A monitor that takes a plant over reproduces its predecessor's
+alarms since the stored state; those that were published already are filtered out. An alarm was published if there is a
+message on it of its time or later, except the end of a data timeout, which may be at the time at which it was raised.
 
-The one before may have been ourselves: others may have watched the plant for a while, and we go on from their state.
+The predecessor may have been this monitor: others may have owned the plant meanwhile, and it resumes from their state.
 """
 
 from collections.abc import Collection, Iterable
 
 from monitor_node.alarms.states import Event
-from monitor_node.replay.recorded_sessions import SILENCE
+from monitor_node.replay.recorded_sessions import TIMEOUT_ALARM
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import Alarm
 
 
-class AlarmsBefore:
-    """The newest of what was said of each alarm of plants, before they were ours to watch.
+class HandedOverAlarms:
+    """The newest message on each alarm of plants, published before they were adopted.
 
     Args:
-        names: of the alarms that a plant may have; others are passed over.
+        names: names of the alarms of a plant; others are ignored.
     """
 
     def __init__(self, names: Collection[str]) -> None:
         self._names = frozenset(names)
-        self._said: dict[str, dict[str, Alarm]] = {}  # by others, by plant and name
-        self._ours: dict[str, dict[str, Alarm]] = {}  # by ourselves, until that has been passed
+        self._by_others: dict[str, dict[str, Alarm]] = {}  # by others, by plant and name
+        self._ours: dict[str, dict[str, Alarm]] = {}  # by this monitor, until these rows have been processed again
 
-    def hear(self, plant: str, message: Encoded) -> None:
-        """Note what another monitor says of an alarm of a plant."""
+    def on_message(self, plant: str, message: Encoded) -> None:
+        """Record an alarm that another monitor published."""
         alarm = alarm_of(message)
         if alarm is not None and alarm.alarm in self._names:
-            self._said.setdefault(plant, {})[alarm.alarm] = alarm
+            self._by_others.setdefault(plant, {})[alarm.alarm] = alarm
 
     def of(self, plant: str) -> list[Alarm]:
-        """What was said last of each alarm of a plant."""
-        return list(self._said.get(plant, {}).values())
+        """The newest message on each alarm of a plant."""
+        return list(self._by_others.get(plant, {}).values())
 
-    def we_said(self, plant: str, alarms: Iterable[Alarm], last_ns: int | None) -> None:
-        """Note that all that there is to say of a plant's alarms up to a row was said by ourselves.
+    def publish_ours(self, plant: str, alarms: Iterable[Alarm], last_ns: int | None) -> None:
+        """Record that this monitor published all alarms of a plant up to a row.
 
         Args:
-            plant: its name.
-            alarms: as they were then.
-            last_ns: time of that row; None: there was none.
+            plant: name of the plant.
+            alarms: alarms at that row.
+            last_ns: time of the row; None: there was none.
         """
         for alarm in alarms:
-            stands = alarm.raised_ns and not alarm.cleared_ns
-            # Of a silence that another has raised by his clock rows tell nothing: only what was said of it was.
-            judged_ns = last_ns if last_ns is not None and alarm.alarm != SILENCE else 0
-            alarm.time_ns = max(judged_ns, alarm.raised_ns, alarm.cleared_ns)
-            alarm.event = (Event.RAISED if stands else Event.CLEARED).value
+            active = alarm.raised_ns and not alarm.cleared_ns
+            # Rows do not show a data timeout that another monitor raised in receive time.
+            evaluated_ns = last_ns if last_ns is not None and alarm.alarm != TIMEOUT_ALARM else 0
+            alarm.time_ns = max(evaluated_ns, alarm.raised_ns, alarm.cleared_ns)
+            alarm.event = (Event.RAISED if active else Event.CLEARED).value
             self._ours.setdefault(plant, {})[alarm.alarm] = alarm
 
-    def passed(self, plant: str) -> None:
-        """From now on what is found of a plant is later than all that we said before others watched it."""
+    def expire(self, plant: str) -> None:
+        """Drop this monitor's own messages on a plant: the rows to come are later."""
         self._ours.pop(plant, None)
 
-    def forget(self, plant: str) -> None:
-        """Nothing was said of a plant."""
-        self._said.pop(plant, None)
+    def remove(self, plant: str) -> None:
+        """Remove a plant."""
+        self._by_others.pop(plant, None)
         self._ours.pop(plant, None)
 
-    def silences_after(self, plant: str, known_ns: int) -> list[Alarm]:
-        """The silence that was raised last, if it is later than any that is known: no sample tells of it again.
+    def timeouts_after(self, plant: str, known_ns: int) -> list[Alarm]:
+        """The newest active data timeout, if it is later than `known_ns`: no sample reproduces it.
 
         Args:
-            plant: its name.
-            known_ns: when the last one was raised that is known.
+            plant: name of the plant.
+            known_ns: time at which the last known one was raised.
         """
-        said, ours = self._said.get(plant, {}).get(SILENCE), self._ours.get(plant, {}).get(SILENCE)
-        over_ns = said.raised_ns if said is not None and said.event == Event.CLEARED.value else 0
-        standing = [
+        theirs, ours = self._by_others.get(plant, {}).get(TIMEOUT_ALARM), self._ours.get(plant, {}).get(TIMEOUT_ALARM)
+        over_ns = theirs.raised_ns if theirs is not None and theirs.event == Event.CLEARED.value else 0
+        active = [
             alarm
-            for alarm in (said, ours)
+            for alarm in (theirs, ours)
             if alarm is not None and alarm.event == Event.RAISED.value and alarm.raised_ns > max(known_ns, over_ns)
         ]
-        return sorted(standing, key=lambda alarm: alarm.raised_ns)[-1:]
+        return sorted(active, key=lambda alarm: alarm.raised_ns)[-1:]
 
-    def new(self, publications: list[Publication]) -> list[Publication]:
-        """Those publications that were not said before."""
-        if not (self._said or self._ours) or not publications:
+    def filter_new(self, publications: list[Publication]) -> list[Publication]:
+        """Filter out publications that were published before."""
+        if not (self._by_others or self._ours) or not publications:
             return publications
-        return [item for item in publications if not self._was_said(item)]
+        return [item for item in publications if not self._was_published(item)]
 
-    def _was_said(self, publication: Publication) -> bool:
+    def _was_published(self, publication: Publication) -> bool:
         alarm, topic = publication.message, keys.parse(publication.key)
         if not isinstance(alarm, Alarm) or topic is None:
             return False
-        said = (before.get(topic.plant, {}).get(alarm.alarm) for before in (self._said, self._ours))
-        return any(_covers(before, alarm) for before in said if before is not None)
+        published = (before.get(topic.plant, {}).get(alarm.alarm) for before in (self._by_others, self._ours))
+        return any(_covers(before, alarm) for before in published if before is not None)
 
 
 def alarm_of(message: Encoded) -> Alarm | None:
-    """What a message says of an alarm; None: nothing."""
+    """Decode an alarm; None if the message is none."""
     try:
         alarm = decode(message.payload, message.encoding)
     except DecodeError:
@@ -105,5 +105,5 @@ def alarm_of(message: Encoded) -> Alarm | None:
 def _covers(before: Alarm, alarm: Alarm) -> bool:
     ends_it = before.event == Event.RAISED.value and alarm.event == Event.CLEARED.value
     if alarm.time_ns == before.time_ns:
-        return not ends_it  # a silence may end at the time at which it was raised
+        return not ends_it  # a data timeout may end at the time at which it was raised
     return alarm.time_ns < before.time_ns

@@ -1,12 +1,12 @@
-"""Whether others may have taken us for gone, so that our plants may be theirs.
+"""Detect that our lease may have expired while we were partitioned, so that others may own our plants.
 
-Whoever shares a fleet shows a token, and sees his own as well, by way of the router. When our link breaks it goes: the
-others do not see it any more either, or will not soon. When we are connected again they give our plants back, and store
-what they know of them; that takes a moment. Who was frozen for long learns of it only after what had waited for him, so
-the clock tells him first.
+Each monitor of a fleet shows a liveliness token, and sees its own by way of the router. When its link breaks the token
+is withdrawn, here and soon for the others. When it is connected again the others release its plants and store their
+states, which takes a moment. A stalled process receives that only after its delayed messages, so its clock decides
+first.
 
 >>> second, linked = 1_000_000_000, [True]
->>> absence = Absence(lambda: linked[-1])
+>>> absence = LeaseMonitor(lambda: linked[-1])
 >>> [absence.lasts(time_s * second) for time_s in (0, 1)]
 [False, False]
 >>> absence.begins(now_ns=second)
@@ -21,34 +21,34 @@ the clock tells him first.
 from collections.abc import Callable
 
 RETURN_NS = 2_000_000_000
-"""After we are connected again: by then the others have stored what they know."""
+"""Time after reconnection in which the others store their states."""
 
-FROZEN_NS = 5_000_000_000
-"""Who has not looked for so long was frozen, or has too much to do. The others wait twice as long."""
+STALLED_NS = 5_000_000_000
+"""A monitor without a check for this long was stalled or overloaded. The others wait twice as long."""
 
 
-class Absence:
-    """Tells how long nothing is to be judged.
+class LeaseMonitor:
+    """Lease on the own plants; while it may have expired, nothing is evaluated.
 
     Args:
-        is_connected: whether we are.
+        is_connected: returns True while there is a router.
     """
 
     def __init__(self, is_connected: Callable[[], bool]) -> None:
         self._is_connected = is_connected
-        self._until_ns = 0  # 0: others have no reason to
-        self._looked_ns: int | None = None
+        self._until_ns = 0  # 0: not expired
+        self._checked_ns: int | None = None
 
-    def begins(self, now_ns: int) -> None:
-        """Our token went, or our link."""
+    def expire(self, now_ns: int) -> None:
+        """Expire the lease: the own token or the link is gone."""
         self._until_ns = now_ns + RETURN_NS
 
-    def lasts(self, now_ns: int) -> bool:
-        """Look whether others may have our plants; to be called all the time."""
-        frozen = self._looked_ns is not None and now_ns - self._looked_ns > FROZEN_NS
-        self._looked_ns = now_ns
-        if frozen or (self._until_ns and not self._is_connected()):
-            self.begins(now_ns)
+    def is_expired(self, now_ns: int) -> bool:
+        """True if others may own our plants; to be called at every event."""
+        stalled = self._checked_ns is not None and now_ns - self._checked_ns > STALLED_NS
+        self._checked_ns = now_ns
+        if stalled or (self._until_ns and not self._is_connected()):
+            self.expire(now_ns)
         if now_ns >= self._until_ns:
             self._until_ns = 0
         return self._until_ns > 0

@@ -1,12 +1,11 @@
-"""Plants that were adopted lately, and the samples of them that come a second time.
+"""Recently adopted plants, and their samples that arrive a second time.
 
-Who adopts a plant is told what it said before, up to now. The same samples may still be on their way to him by
-themselves: they wait in his inbox, or for others that are being recovered after a cut. When they come he has judged
-them, and more of them than rows may be late would look like a plant that was started anew and has set its clock back.
-So for a while, which is longer than any recovery takes, a sample with a number and a time that are not beyond the
-newest that was told is taken as one that was told.
+A monitor that adopts a plant queries its history up to now. The same samples may still be on their way: in the inbox,
+or behind others that are being recovered after a partition. They are processed already, and many of them would look
+like a restart of the plant with its clock set back. So for a while, longer than any recovery, a sample with a number
+and a time not beyond the newest of the history is a repeat.
 
-A plant that is really started anew in that while, with a clock that was set back, is heard when the while is over.
+A plant that is really restarted in that while, with its clock set back, is processed when the while is over.
 """
 
 from typing import NamedTuple
@@ -18,7 +17,7 @@ from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
 
 AGAIN_NS = 60_000_000_000
-"""The bus waits for what is missing for half of it at most."""
+"""At least twice the longest time that the bus waits for missing messages."""
 
 
 class _Newest(NamedTuple):
@@ -26,19 +25,19 @@ class _Newest(NamedTuple):
     samples: dict[str, tuple[int, int]]  # by key, number and time
 
 
-class Recent:
-    """The plants that were adopted lately."""
+class RecentlyAdopted:
+    """The recently adopted plants."""
 
     def __init__(self) -> None:
-        self._newest: dict[str, _Newest] = {}  # by plant; the order is that of their adoption
+        self._newest: dict[str, _Newest] = {}  # by plant, in the order of adoption
 
-    def adopted(self, plant: str, monitor: Monitor, now_ns: int) -> None:
-        """What was told of a plant has been judged.
+    def add(self, plant: str, monitor: Monitor, now_ns: int) -> None:
+        """Add a plant whose history was processed.
 
         Args:
-            plant: its name.
-            monitor: its.
-            now_ns: now.
+            plant: name of the plant.
+            monitor: monitor of the plant.
+            now_ns: present time.
         """
         runs = zip((monitor.config.input, *monitor.config.outputs), monitor.state.runs, strict=True)
         samples = {
@@ -49,8 +48,8 @@ class Recent:
         self._newest.pop(plant, None)
         self._newest[plant] = _Newest(now_ns + AGAIN_NS, samples)
 
-    def again(self, plant: str, message: Encoded, now_ns: int) -> bool:
-        """Whether a message is a sample that was told before the plant was adopted."""
+    def is_repeat(self, plant: str, message: Encoded, now_ns: int) -> bool:
+        """True if a message is a sample of the history."""
         while self._newest and (first := next(iter(self._newest))) and self._newest[first].until_ns < now_ns:
             del self._newest[first]
         newest = self._newest[plant].samples.get(message.key) if plant in self._newest else None

@@ -1,15 +1,15 @@
-"""Which monitor of a fleet watches which plant.
+"""Sharding of a fleet: the assignment of plants to monitors.
 
-Several monitors may share a fleet: each has a shard of it, `2/5` is the second of five. Every plant is at home in one
-shard, by a digest of its name: all monitors know it without asking, on every machine and in every version. When the
-monitors of a shard are gone, its plants go to the shards that are alive, each plant to the one that its name ranks
-highest among them: rendezvous hashing (Thaler & Ravishankar 1998, Using name-based mappings to increase hit rates,
-IEEE/ACM Trans. Networking 6(1)). So the plants of the dead are spread over those that live, and no other plant moves.
+Several monitors may share a fleet: each has a shard of it, `2/5` is the second of five. Every plant has a home shard,
+by a digest of its name, the same on every machine and in every version. When the monitors of a shard are gone, each of
+its plants goes to the highest-ranked of the shards that are alive: rendezvous hashing (Thaler & Ravishankar 1998, Using
+name-based mappings to increase hit rates, IEEE/ACM Trans. Networking 6(1)). So these plants are spread over the other
+shards, and no other plant moves.
 
-Two monitors may have the same shard; then the one whose name sorts first is in charge, and the other stands by.
+Two monitors may have the same shard; the one whose name sorts first is active, and the other on standby.
 
-Who is alive is told by liveliness tokens, and each monitor draws the same conclusion from them. A shard whose token was
-never seen is taken for one that is being started, until `presume_gone`; then it counts as gone like any other.
+Liveliness tokens show which monitors are alive, and each monitor draws the same conclusion from them. A shard whose
+token was never seen is presumed to be starting, until `presume_gone`; then it counts as gone.
 """
 
 import re
@@ -21,15 +21,15 @@ from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 
 LARGEST = 1000
-"""Shards of a fleet."""
+"""Largest number of shards of a fleet."""
 
 
 class Shard(NamedTuple):
-    """A part of a fleet.
+    """A shard of a fleet.
 
     Attributes:
-        number: of the part, from 1 on.
-        of: how many parts there are.
+        number: number of the shard, from 1.
+        of: number of shards.
     """
 
     number: int
@@ -42,14 +42,14 @@ class Shard(NamedTuple):
 WHOLE = Shard(1, 1)
 
 
-def parsed(text: str) -> Shard:
-    """The shard that a text names.
+def parse_shard(text: str) -> Shard:
+    """Parse a shard.
 
     >>> parsed("2/5")
     Shard(number=2, of=5)
 
     Raises:
-        InputError: it names none.
+        InputError: the text is no shard.
     """
     match = re.fullmatch(r"(\d{1,4})/(\d{1,4})", text)
     shard = Shard(int(match[1]), int(match[2])) if match is not None else Shard(0, 0)
@@ -62,40 +62,40 @@ def _digest(text: str) -> int:
     return int.from_bytes(blake2b(text.encode(), digest_size=8).digest(), "big")
 
 
-def home(plant: str, of: int) -> int:
-    """The shard that a plant is at home in, from 1 on.
+def home_shard(plant: str, of: int) -> int:
+    """Home shard of a plant, from 1.
 
     Args:
-        plant: its name.
-        of: how many shards there are.
+        plant: name of the plant.
+        of: number of shards.
     """
     return _digest(plant) % of + 1
 
 
-def keeper(plant: str, of: int, living: Collection[int]) -> int | None:
-    """The shard whose monitor watches a plant now; None if there is none.
+def owner(plant: str, of: int, alive: Collection[int]) -> int | None:
+    """Shard that owns a plant now; None if no shard is alive.
 
     Args:
-        plant: its name.
-        of: how many shards there are.
-        living: those that are alive.
+        plant: name of the plant.
+        of: number of shards.
+        alive: shards that are alive.
     """
-    at_home = home(plant, of)
-    if at_home in living or not living:
-        return at_home if living else None
-    return max(living, key=lambda number: (_digest(f"{plant}/{number}"), number))
+    at_home = home_shard(plant, of)
+    if at_home in alive or not alive:
+        return at_home if alive else None
+    return max(alive, key=lambda number: (_digest(f"{plant}/{number}"), number))
 
 
-class Crew:
-    """The monitors that share a fleet, as one of them sees it.
+class ShardGroup:
+    """The monitors that share a fleet, as one of them sees them.
 
     Args:
-        fleet: what they share: the key expression of its plants.
-        shard: ours.
-        name: ours, unlike all others'.
+        fleet: key expression of the fleet's plants.
+        shard: own shard.
+        name: own unique name.
 
     Attributes:
-        is_shared: whether there is anybody else, or ever was.
+        is_shared: True if there is, or was, another monitor.
     """
 
     def __init__(self, fleet: str, shard: Shard, name: str) -> None:
@@ -107,36 +107,38 @@ class Crew:
 
     @property
     def token(self) -> str:
-        """The liveliness token that we show."""
+        """Own liveliness token."""
         return keys.fleet_token(self._fleet, str(self._shard.of), str(self._shard.number), self._name)
 
-    def note(self, token: str, *, is_alive: bool) -> bool:
-        """Take in that a monitor came or went; returns whether that was one of the fleet.
+    def on_token(self, token: str, *, is_alive: bool) -> bool:
+        """Update with a liveliness token; returns True if it is of this fleet.
 
         Args:
-            token: its.
-            is_alive: whether it came.
+            token: token of a monitor.
+            is_alive: True if the token was declared, False if it was undeclared.
         """
-        found = keys.parse_fleet_token(token)
-        if found is None or (found.fleet, found.of) != (self._fleet, str(self._shard.of)) or not found.number.isdigit():
+        member = keys.parse_fleet_token(token)
+        if member is None or (member.fleet, member.of) != (self._fleet, str(self._shard.of)):
             return False
-        names = self._names.setdefault(int(found.number), set())
-        self.is_shared = self.is_shared or found.name != self._name
+        if not member.number.isdigit():
+            return False
+        names = self._names.setdefault(int(member.number), set())
+        self.is_shared = self.is_shared or member.name != self._name
         if is_alive:
-            names.add(found.name)
-            self._unseen.discard(int(found.number))
-        elif found.name != self._name:  # ours is only gone if we are
-            names.discard(found.name)
+            names.add(member.name)
+            self._unseen.discard(int(member.number))
+        elif member.name != self._name:  # this monitor itself is alive
+            names.discard(member.name)
         return True
 
     def presume_gone(self) -> bool:
-        """Take shards that were never seen for gone; returns whether there was any."""
+        """Presume shards gone that were never seen; returns True if there are any."""
         unseen, self._unseen = self._unseen, set()
         return bool(unseen)
 
     def is_ours(self, plant: str) -> bool:
-        """Whether a plant is for us to watch now."""
-        living = {number for number, names in self._names.items() if names} | self._unseen
-        if keeper(plant, self._shard.of, living) != self._shard.number:
+        """True if this monitor owns a plant now."""
+        alive = {number for number, names in self._names.items() if names} | self._unseen
+        if owner(plant, self._shard.of, alive) != self._shard.number:
             return False
         return min(self._names[self._shard.number]) == self._name

@@ -1,7 +1,7 @@
-"""The plants that one monitor of a fleet watches, in one of two forms each.
+"""The plants that one monitor of a fleet owns, each in one of two forms.
 
-A plant in which nothing happens is with the quiet ones (`quiet`), any other has a monitor of its own, until it is seen
-that nothing happens in it any more. What is said is the same.
+A plant in its normal state is packed with the quiet ones (`quiet`); any other has an active monitor, until it is normal
+again. Publications are the same.
 """
 
 from collections.abc import Iterable, Iterator
@@ -10,7 +10,7 @@ import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.deadline_queue import Dues
+from monitor_node.fleet.deadline_queue import DeadlineQueue
 from monitor_node.isolation import stage
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.plants import QuietPlants
@@ -19,39 +19,39 @@ from reactorwatch.errors import InputError
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.process.model import ProcessModel
 
-LOOK_AGAIN_ROWS = 8
-"""After so many rows it is seen again whether a plant is quiet."""
+DEMOTE_EVERY_ROWS = 8
+"""Rows between two attempts to pack a plant."""
 
 State = bytes
-"""All that a monitor remembers of a plant."""
+"""State of a plant's monitor, serialized."""
 
 
 class WatchedPlants:
-    """The plants that are watched here.
+    """The plants of one monitor.
 
     Args:
-        config: how each is watched; its name of a plant is passed over.
-        start_ns: now.
+        config: settings of each plant's monitor; its plant name is ignored.
+        start_ns: present time.
         model: as for `Monitor`.
-        points: likewise.
+        points: as for `Monitor`.
 
     Attributes:
-        alarms: names of those that a plant has.
+        alarms: names of a plant's alarms.
 
     Raises:
-        InputError: settings that do not fit together.
+        InputError: the settings are inconsistent.
     """
 
     def __init__(self, config: MonitorConfig, start_ns: int, model: ProcessModel | None, *, points: bool) -> None:
         self._config, self._model, self._points = config, model, points
-        first = Monitor(config, start_ns, points=points, model=model)  # settings that make no monitor are refused now
+        first = Monitor(config, start_ns, points=points, model=model)  # inconsistent settings are refused here
         self._first_model = first.model
         self.alarms = tuple(alarm.alarm for alarm in first.alarms.all_alarms())
         form = None if points or first.model is None else QuietForm.of(config, first.model)
         self._quiet = None if form is None or first.model is None else QuietPlants(form, config, first.model)
-        self._monitors: dict[str, Monitor] = {}  # of those that are not quiet
-        self._look_at_row: dict[str, int] = {}  # of them: when to see whether it is quiet
-        self._dues = Dues()
+        self._monitors: dict[str, Monitor] = {}  # of plants that are not quiet
+        self._demote_at_row: dict[str, int] = {}  # row of the next attempt to pack
+        self._deadlines = DeadlineQueue()
         self._notes: list[tuple[str, str]] = []
 
     def __contains__(self, plant: str) -> bool:
@@ -59,19 +59,19 @@ class WatchedPlants:
 
     @property
     def plants(self) -> list[str]:
-        """All of them."""
+        """All plants."""
         return [*self._monitors, *self.quiet]
 
     @property
     def quiet(self) -> list[str]:
-        """Those in which nothing happens just now."""
+        """The packed plants."""
         return [] if self._quiet is None else self._quiet.plants
 
     def prepare(self) -> None:
-        """Have the machine code made that is made at its first use.
+        """Compile the machine code of the first use.
 
-        On a new machine that takes ten seconds and more, and would come while plants wait to be judged: the other
-        monitors of the fleet would take us for gone.
+        On a new machine that takes ten seconds and more. Later it would stall the evaluation, and the other monitors of
+        the fleet would presume this one gone.
         """
         RecursiveLeastSquares(1).update([1.0], 1.0)
         for _ in stage.preparation(self._config, self._first_model):
@@ -79,50 +79,48 @@ class WatchedPlants:
         if self._quiet is not None:
             self._quiet.prepare()
 
-    # --- coming and going ------------------------------------------------------------------------------------
+    # --- plants ----------------------------------------------------------------------------------------------
 
-    def unwatched(self, plant: str, now_ns: int) -> Monitor:
-        """A new monitor of a plant, which is not among these yet."""
+    def new_monitor(self, plant: str, now_ns: int) -> Monitor:
+        """Make a monitor for a plant; `add` adds it."""
         named = msgspec.structs.replace(self._config, plant=plant)
         monitor = Monitor(named, now_ns, points=self._points, model=self._model)
         monitor.failures.passes = ()
         return monitor
 
     def add(self, plant: str, monitor: Monitor) -> None:
-        """Watch a plant."""
+        """Add a plant."""
         self._monitors[plant] = monitor
-        self._dues.note(plant, monitor.next_tick_ns())
+        self._deadlines.schedule(plant, monitor.next_tick_ns())
 
     def remove(self, plant: str) -> Monitor | None:
-        """Watch a plant no longer; returns its monitor. None: it was not watched."""
-        monitor = self.alone(plant)
+        """Remove a plant; returns its monitor. None: there is no such plant."""
+        monitor = self.detach(plant)
         if monitor is not None:
             self._forget(plant)
         return monitor
 
     def copy(self, plant: str, name: str) -> None:
-        """Watch another plant that is, so far, like a quiet one: for trials with many plants."""
+        """Add a copy of a quiet plant, for trials with many plants."""
         assert self._quiet is not None
         self._quiet.copied(plant, name)
 
-    # --- one of them -----------------------------------------------------------------------------------------
-
-    def own(self, plant: str) -> Monitor | None:
-        """The monitor of a plant; None if it is quiet, or not among these."""
+    def active_monitor(self, plant: str) -> Monitor | None:
+        """Monitor of a plant; None if it is quiet, or there is no such plant."""
         return self._monitors.get(plant)
 
-    def alone(self, plant: str) -> Monitor | None:
-        """The monitor of a plant, which is not quiet from now on; None if it is not among these."""
+    def detach(self, plant: str) -> Monitor | None:
+        """Unpack a plant, if it is quiet; returns its monitor. None: there is no such plant."""
         if self._quiet is not None and plant in self._quiet:
-            self._given(plant, self._quiet.give(plant))
-            self._dues.note(plant, self._monitors[plant].next_tick_ns())
+            self._add_detached(plant, self._quiet.give(plant))
+            self._deadlines.schedule(plant, self._monitors[plant].next_tick_ns())
         return self._monitors.get(plant)
 
     def state_of(self, plant: str) -> State:
-        """All that is remembered of a plant.
+        """State of a plant.
 
         Raises:
-            InputError: it is not among these.
+            InputError: there is no such plant.
         """
         if self._quiet is not None and plant in self._quiet:
             return self._quiet.state_of(plant)
@@ -131,79 +129,75 @@ class WatchedPlants:
         return self._monitors[plant].to_bytes()
 
     def received_of(self, plant: str) -> int | None:
-        """How many messages of a plant came; None: it is not among these."""
+        """Number of messages of a plant; None: there is no such plant."""
         if self._quiet is not None and plant in self._quiet:
             return self._quiet.received_of(plant)
         monitor = self._monitors.get(plant)
         return None if monitor is None else monitor.received
 
-    def not_stored(self, plant: str) -> None:
-        """Count that what is remembered of a plant could not be stored."""
+    def count_not_stored(self, plant: str) -> None:
+        """Count a failure to store the state of a plant."""
         if self._quiet is not None and plant in self._quiet:
             self._quiet.not_stored(plant)
         elif (monitor := self._monitors.get(plant)) is not None:
             monitor.not_stored += 1
 
-    # --- samples, and the clock ------------------------------------------------------------------------------
+    # --- event loop ------------------------------------------------------------------------------------------
 
     def on_messages(self, messages: list[Encoded], now_ns: int) -> tuple[list[Publication], list[Encoded], set[str]]:
-        """Let the quiet plants judge; returns what is to be said, the other messages, and plants not quiet any more.
+        """Process messages of quiet plants; returns publications, the other messages, and plants unpacked for them.
 
-        These are to be told to `touched` when they have judged the other messages, too.
+        These plants are passed to `settle` after the other messages.
         """
         if not self._quiet:
             return [], messages, set()
         publications, others, given = self._quiet.on_messages(messages, now_ns)
         for plant, monitor in given.items():
-            self._given(plant, monitor)
+            self._add_detached(plant, monitor)
         return publications, others, set(given)
 
-    def touched(self, plants: Iterable[str]) -> list[str]:
-        """See which of the plants with a monitor of their own are quiet now, and when the others are due.
-
-        Returns:
-            Those that are quiet now.
-        """
+    def settle(self, plants: Iterable[str]) -> list[str]:
+        """Pack plants that are normal now, and schedule the others; returns the packed ones."""
         quiet: list[str] = []
         for plant in plants:
             monitor = self._monitors[plant]
-            if self._becomes_quiet(plant, monitor):
+            if self._demote(plant, monitor):
                 quiet.append(plant)
             else:
-                self._dues.note(plant, monitor.next_tick_ns())
+                self._deadlines.schedule(plant, monitor.next_tick_ns())
         return quiet
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """The health of the plants' monitors where it is due, and silences of plants."""
+        """Publish health where it is due; raise the alarms of plants without data."""
         publications: list[Publication] = []
         if self._quiet:
             for plant in self._quiet.overdue(now_ns):
-                self.alone(plant)
+                self.detach(plant)
             publications += self._quiet.healths(now_ns)
-        for plant in self._dues.taken(now_ns):
+        for plant in self._deadlines.pop_due(now_ns):
             monitor = self._monitors.get(plant)
             if monitor is not None:
                 if monitor.next_tick_ns() <= now_ns:
                     publications += monitor.on_tick(now_ns)
-                self._dues.note(plant, monitor.next_tick_ns())
+                self._deadlines.schedule(plant, monitor.next_tick_ns())
         return publications
 
     def next_tick_ns(self) -> int:
-        """When the first of the plants is due."""
-        due_ns = self._dues.first_ns()
+        """Earliest deadline of the plants."""
+        due_ns = self._deadlines.next_ns()
         return min(due_ns, self._quiet.next_due_ns()) if self._quiet else due_ns
 
     def on_stop(self, now_ns: int) -> list[Publication]:
-        """The health of all for the last time."""
-        said = [item for monitor in self._monitors.values() for item in monitor.on_stop(now_ns)]
-        return said + (self._quiet.last_healths(now_ns) if self._quiet else [])
+        """Publish the health of all plants' monitors for the last time."""
+        publications = [item for monitor in self._monitors.values() for item in monitor.on_stop(now_ns)]
+        return publications + (self._quiet.last_healths(now_ns) if self._quiet else [])
 
     def reports(self, now_ns: int) -> Iterator[tuple[str, str]]:
-        """What people are to be told: plant and line."""
+        """Notes to log: plant and line."""
         yield from self._notes
         self._notes.clear()
         for plant, monitor in self._monitors.items():
-            refused = monitor.refusals.report(now_ns)
+            refused = monitor.rejects.report(now_ns)
             if refused is not None:
                 yield plant, refused
             while monitor.notes:
@@ -220,22 +214,22 @@ class WatchedPlants:
     def _is_quiet(self, plant: str) -> bool:
         return self._quiet is not None and plant in self._quiet
 
-    def _given(self, plant: str, monitor: Monitor) -> None:
-        """A quiet plant has a monitor of its own from now on."""
+    def _add_detached(self, plant: str, monitor: Monitor) -> None:
+        """Add the monitor of an unpacked plant."""
         self._monitors[plant] = monitor
-        self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
+        self._demote_at_row[plant] = monitor.rows + DEMOTE_EVERY_ROWS
 
     def _forget(self, plant: str) -> None:
-        """A plant has no monitor of its own any more."""
+        """Remove the monitor of a plant."""
         del self._monitors[plant]
-        self._look_at_row.pop(plant, None)
-        self._dues.forget(plant)
+        self._demote_at_row.pop(plant, None)
+        self._deadlines.remove(plant)
 
-    def _becomes_quiet(self, plant: str, monitor: Monitor) -> bool:
-        """Hold a plant with the quiet ones, if it is one; whether it is."""
-        if self._quiet is None or monitor.rows < self._look_at_row.get(plant, 0):
+    def _demote(self, plant: str, monitor: Monitor) -> bool:
+        """Pack a plant, if it is normal; returns True if it is."""
+        if self._quiet is None or monitor.rows < self._demote_at_row.get(plant, 0):
             return False
-        self._look_at_row[plant] = monitor.rows + LOOK_AGAIN_ROWS
+        self._demote_at_row[plant] = monitor.rows + DEMOTE_EVERY_ROWS
         try:
             if not self._quiet.take(plant, monitor):
                 return False

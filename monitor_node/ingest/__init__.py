@@ -1,1 +1,1 @@
-"""From messages to rows: which samples are taken, and when a row of them is complete."""
+"""From messages to rows: sample checks, sequence numbers, alignment."""

@@ -1,32 +1,32 @@
-"""Signals arrive one by one; a model needs rows. This lines them up by the time of the sample.
+"""Align samples of single signals to rows by sample time.
 
-The policy, in sample times alone, so that a replay does exactly what the live run did:
+The policy uses sample times alone, so that a replay reproduces the live run exactly:
 
-- A row leaves when every signal of it has come and no older row is waited for. One is waited for that has begun, and
-  one that has not while the sequence numbers say that it is missing.
-- Nothing is waited for longer than until `reorder_rows` newer rows have begun. Then a row leaves with NaN for what is
-  missing in it, and is counted as incomplete.
-- A sample for a row that has left is late: counted, and dropped. The same sample twice counts as duplicated.
-- A sample older than one of its signal that came before it is out of order: counted, and used if its row is waiting.
-- Sequence numbers that jump forward mean lost samples (until they turn up). One that falls back by more than the
-  reordering could explain means that the publisher was restarted: what was waiting leaves, and the clock starts anew.
+- A row is emitted when it is complete and no older row is pending. Pending are incomplete rows, and rows that are
+  missing by their sequence numbers.
+- A row is pending until `reorder_rows` newer rows have started. Then it is emitted with NaN for missing values, and
+  counted as incomplete.
+- A sample of an emitted row is late: counted and dropped. The same sample twice is counted as duplicated.
+- A sample older than the newest of its signal is out of order: counted, and used if its row is pending.
+- A forward jump of sequence numbers means lost samples, until they arrive. A step back by more than reordering can
+  explain means a restart of the publisher: pending rows are emitted, and a new run starts.
 """
 
 from dataclasses import dataclass, field
 from math import nan
 from typing import NamedTuple
 
-MOST_LOST = 2**62  # more than any plant publishes: a number may be any nonsense, and a message has to hold the sum
-REMEMBERED = 4  # times the reordering: rows that a duplicate is known by, numbers that a restart falls back by
+MOST_LOST = 2**62  # more than any plant publishes; corrupt sequence numbers must not overflow the count in a message
+REMEMBERED = 4  # times the reordering: emitted rows kept to detect duplicates; step back that means a restart
 
 
 class Row(NamedTuple):
-    """What was measured at one time.
+    """Measured values of one time.
 
     Attributes:
-        time_ns: of the samples.
-        values: one a signal, in the order of the aligner's signals; NaN: missing.
-        restarted: whether this is the first row of a new run of the publisher.
+        time_ns: sample time.
+        values: one value a signal, in the order of the aligner's signals; NaN if missing.
+        restarted: True for the first row of a new run of the publisher.
     """
 
     time_ns: int
@@ -36,7 +36,7 @@ class Row(NamedTuple):
 
 @dataclass
 class Counts:
-    """What happened to samples on their way into rows."""
+    """Counts of samples and rows by what happened to them."""
 
     rows: int = 0
     incomplete_rows: int = 0
@@ -49,11 +49,11 @@ class Counts:
 
 @dataclass(slots=True)
 class Sequence:
-    """Where one signal's numbering is.
+    """Sequence numbers of one signal.
 
     Attributes:
-        expected: the number after the highest that has come; None before the first.
-        newest_ns: the latest time that has come; of no meaning before the first.
+        expected: the number after the highest received; None before the first.
+        newest_ns: the latest sample time received; meaningless before the first.
     """
 
     expected: int | None = None
@@ -61,13 +61,13 @@ class Sequence:
 
 
 @dataclass(slots=True)
-class Waiting:
-    """A row that waits.
+class PendingRow:
+    """A row that is not emitted yet.
 
     Attributes:
-        values: one a signal; NaN where the signal has not come.
-        numbers: of their samples; None where the signal has not come.
-        missing: how many signals have not come.
+        values: one value a signal; NaN where not received.
+        numbers: sequence number of each value; None where not received.
+        missing: number of values not received.
     """
 
     values: list[float]
@@ -77,20 +77,19 @@ class Waiting:
 
 @dataclass
 class AlignmentState:
-    """Everything that an aligner remembers.
+    """State of an aligner.
 
     Attributes:
-        pending: rows that wait, by time.
-        left: rows that left last, oldest first: by time, the numbers of their samples, None where one had not come.
-        newest_left_ns: time of the row that left last; None before the first.
-        newest_numbers: its number of each signal, and if that had not come, what it would have been; None before the
-            first.
-        sequences: by signal.
-        restarted: whether the next row is the first of a new run.
-        counts: of what happened so far.
+        pending: pending rows by time.
+        left: sequence numbers of the rows emitted last, by time, oldest first; None where a sample was missing.
+        newest_left_ns: time of the row emitted last; None before the first.
+        newest_numbers: sequence numbers of that row, extrapolated where missing; None before the first.
+        sequences: one entry a signal.
+        restarted: True if the next row is the first of a new run.
+        counts: counts so far.
     """
 
-    pending: dict[int, Waiting] = field(default_factory=dict)
+    pending: dict[int, PendingRow] = field(default_factory=dict)
     left: dict[int, list[int | None]] = field(default_factory=dict)
     newest_left_ns: int | None = None
     newest_numbers: list[int | None] = field(default_factory=list)
@@ -100,11 +99,11 @@ class AlignmentState:
 
 
 class Aligner:
-    """Lines samples up into rows.
+    """Aligns samples to rows.
 
     Args:
-        signals: names, in the order that rows have.
-        reorder_rows: how many newer rows may begin before an incomplete one is given up.
+        signals: names of the signals, in the order of the rows' values.
+        reorder_rows: number of newer rows that may start before an incomplete row is emitted.
 
     Raises:
         ValueError: `reorder_rows` is less than 1.
@@ -117,16 +116,16 @@ class Aligner:
         self._count = len(signals)
         self._reorder_rows = reorder_rows
         self.state = AlignmentState()
-        self._begin()
+        self._start_run()
 
     def update(self, signal: str, time_ns: int, sequence: int, value: float) -> list[Row]:
-        """Take a sample in; returns the rows that leave because of it, oldest first.
+        """Add a sample; returns the rows that are ready, oldest first.
 
         Args:
-            signal: one of the aligner's.
-            time_ns: of the sample.
-            sequence: the publisher's number of it.
-            value: finite.
+            signal: one of the aligner's signals.
+            time_ns: sample time.
+            sequence: sequence number.
+            value: finite value.
         """
         rows: list[Row] = []
         index, state = self._index[signal], self.state
@@ -135,7 +134,7 @@ class Aligner:
             position.expected, position.newest_ns = sequence + 1, time_ns
         else:
             rows = self._restart(index, time_ns, sequence)
-            if self._has_come(index, time_ns):
+            if self._is_duplicate(index, time_ns):
                 state.counts.duplicated += 1
                 return rows
             self._count_sequence(state.sequences[index], time_ns, sequence)
@@ -146,22 +145,22 @@ class Aligner:
                 state.counts.late += 1
                 return rows
             count = self._count
-            waiting = pending[time_ns] = Waiting([nan] * count, [None] * count, count)
+            waiting = pending[time_ns] = PendingRow([nan] * count, [None] * count, count)
         waiting.values[index] = value
         waiting.numbers[index] = sequence
         waiting.missing -= 1
         if len(pending) > 1:
             return rows + self._release()
-        if not waiting.missing and self._may_leave(waiting):
-            rows.append(self._leave(time_ns))
+        if not waiting.missing and self._is_ready(waiting):
+            rows.append(self._emit(time_ns))
         return rows
 
     def flush(self) -> list[Row]:
-        """Let everything leave that still waits, as at the end of a record."""
-        return [self._leave(time_ns) for time_ns in sorted(self.state.pending)]
+        """Emit all pending rows, as at the end of a record."""
+        return [self._emit(time_ns) for time_ns in sorted(self.state.pending)]
 
-    def _has_come(self, index: int, time_ns: int) -> bool:
-        """Whether a sample of that signal and that time came before."""
+    def _is_duplicate(self, index: int, time_ns: int) -> bool:
+        """True if a sample of that signal and time was received before."""
         waiting = self.state.pending.get(time_ns)
         numbers = waiting.numbers if waiting is not None else self.state.left.get(time_ns)
         return numbers is not None and numbers[index] is not None
@@ -172,13 +171,13 @@ class Aligner:
         times = sorted(pending)
         for position, time_ns in enumerate(times):
             newer = len(times) - 1 - position
-            if newer < self._reorder_rows and not self._may_leave(pending[time_ns]):
+            if newer < self._reorder_rows and not self._is_ready(pending[time_ns]):
                 break
-            rows.append(self._leave(time_ns))
+            rows.append(self._emit(time_ns))
         return rows
 
-    def _may_leave(self, waiting: Waiting) -> bool:
-        """Whether a row is complete, and follows by any of its numbers the row that left last."""
+    def _is_ready(self, waiting: PendingRow) -> bool:
+        """True if a row is complete, and follows the row emitted last by any of its sequence numbers."""
         if waiting.missing:
             return False
         for before, number in zip(self.state.newest_numbers, waiting.numbers, strict=True):
@@ -186,7 +185,7 @@ class Aligner:
                 return True
         return False
 
-    def _leave(self, time_ns: int) -> Row:
+    def _emit(self, time_ns: int) -> Row:
         state = self.state
         waiting = state.pending.pop(time_ns)
         numbers, left = waiting.numbers, state.left
@@ -204,23 +203,23 @@ class Aligner:
         return row
 
     def _restart(self, index: int, time_ns: int, sequence: int) -> list[Row]:
-        """If the publisher was restarted, begin anew; returns the rows that were waiting."""
+        """Start a new run if the publisher was restarted; returns the rows that were pending."""
         position = self.state.sequences[index]
         if position.expected is None:
             return []
         ahead = sequence >= position.expected
         set_back = ahead and time_ns < position.newest_ns  # a late sample has an old number, too
         fell_back = sequence < position.expected - REMEMBERED * self._reorder_rows
-        began_again = not ahead and sequence == 0 and time_ns > position.newest_ns
-        if not (set_back or fell_back or began_again):
+        from_zero = not ahead and sequence == 0 and time_ns > position.newest_ns
+        if not (set_back or fell_back or from_zero):
             return []
         rows = self.flush()
         self.state.counts.restarts += 1
-        self._begin()
+        self._start_run()
         return rows
 
-    def _begin(self) -> None:
-        """Begin a new run of the publisher."""
+    def _start_run(self) -> None:
+        """Start a new run of the publisher."""
         state = self.state
         state.left, state.newest_left_ns, state.newest_numbers = {}, None, [None] * self._count
         state.sequences, state.restarted = [Sequence() for _ in range(self._count)], True

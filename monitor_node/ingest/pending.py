@@ -1,6 +1,6 @@
-"""Plants that are to be watched as soon as their past is known: what was stored of them, and what they said since.
+"""Plants that are adopted as soon as their history is recovered: the stored state, and messages since.
 
-What comes of a plant meanwhile is kept, and follows what was told of before. A sample may be in both; it is taken once.
+Messages of such a plant are buffered and follow its history. A sample that is in both is used once.
 """
 
 from collections.abc import Iterable
@@ -11,15 +11,14 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 
 MOST_KEPT = 100_000
-"""Messages of all such plants; what comes beyond that is lost, unless it is told as being of before."""
-
+"""Buffered messages of all such plants; further ones are lost, unless the history has them."""
 
 LARGEST_KEPT = 1 << 16
-"""Of other payloads than samples: no alarm is as large."""
+"""Bytes of other payloads than samples: no alarm is as large."""
 
 
-def cut(message: Encoded) -> Encoded:
-    """So much of a message that it is refused if it is too large: what waits must take no more room."""
+def truncate(message: Encoded) -> Encoded:
+    """Truncate a message that is too large: it is still rejected, and buffers stay bounded."""
     if len(message.payload) <= LARGEST_SAMPLE:
         return message
     topic = keys.parse(message.key)
@@ -27,13 +26,13 @@ def cut(message: Encoded) -> Encoded:
     return message._replace(payload=message.payload[: largest + 1])
 
 
-class Past(NamedTuple):
-    """What is known of a plant from before.
+class PlantHistory(NamedTuple):
+    """Recovered history of a plant.
 
     Attributes:
-        plant: its name.
-        state: as its monitor stored it last; None: there is none.
-        messages: that it published, as far as it remembers, in their order.
+        plant: name of the plant.
+        state: state that its monitor stored last; None if there is none.
+        messages: messages that its publishers still remember, in order.
     """
 
     plant: str
@@ -41,8 +40,8 @@ class Past(NamedTuple):
     messages: list[Encoded]
 
 
-class Arrivals:
-    """The plants that are waited for, and what has come of them."""
+class PendingPlants:
+    """Plants whose history is being recovered, and their buffered messages."""
 
     def __init__(self) -> None:
         self._kept: dict[str, list[Encoded]] = {}
@@ -51,24 +50,19 @@ class Arrivals:
     def __contains__(self, plant: str) -> bool:
         return plant in self._kept
 
-    def begin(self, plant: str) -> None:
-        """From now on what comes of a plant is kept."""
+    def start(self, plant: str) -> None:
+        """Start to buffer a plant's messages."""
         self._kept[plant] = []
 
-    def keep(self, plant: str, message: Encoded) -> None:
-        """Keep what came of a plant that is waited for."""
+    def add(self, plant: str, message: Encoded) -> None:
+        """Buffer a message of a plant."""
         if self._count < MOST_KEPT:
-            self._kept[plant].append(cut(message))
+            self._kept[plant].append(truncate(message))
             self._count += 1
 
-    def end(self, plant: str, told: Iterable[Encoded] = ()) -> list[Encoded]:
-        """Wait for a plant no longer; returns what was told of before, and then what came since.
-
-        Args:
-            plant: its name.
-            told: what it published before.
-        """
-        before, kept = list(told), self._kept.pop(plant)
+    def end(self, plant: str, history: Iterable[Encoded] = ()) -> list[Encoded]:
+        """Remove a plant; returns its history, followed by the buffered messages that are not in it."""
+        before, kept = list(history), self._kept.pop(plant)
         self._count -= len(kept)
-        known = {(message.key, message.payload) for message in before}
-        return before + [message for message in kept if (message.key, message.payload) not in known]
+        given = {(message.key, message.payload) for message in before}
+        return before + [message for message in kept if (message.key, message.payload) not in given]

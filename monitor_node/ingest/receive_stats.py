@@ -1,27 +1,27 @@
-"""How messages came to a monitor, by the clock of receipt."""
+"""Statistics of a monitor's messages by receive time."""
 
 from typing import NamedTuple
 
 HEARD_AGAIN_NS = 1_000_000
-"""Samples nearer to each other are one sign of life: the signals of a row come together."""
+"""Samples closer together than this count as one: the signals of a row arrive together."""
 
 STALL_NS = 1_000_000_000
-"""What is due is done within a millisecond; who is so late was frozen, or his clock was set."""
+"""Due work is done within a millisecond; a monitor this late was stalled, or its clock was set."""
 
 
-class Receipt(NamedTuple):
-    """How messages came, by the clock of receipt.
+class ReceiveStats(NamedTuple):
+    """Statistics by receive time. A restart resets them.
 
     Attributes:
-        start_ns: when the monitor was started.
-        heard_ns: of the newest sign of life that counted, see `HEARD_AGAIN_NS`.
-        received_ns: likewise, as the silence of the plant knows it; None: nothing has come.
-        counted_ns: of these, the one that the next spacing is counted from; None: what comes next is the first.
-        lag_ns: the longest that a message has waited since health was told.
-        health_due_ns: when it is told next.
-        ticked: whether the clock was looked at before.
-        stalls: how often that was more than a second late.
-        not_stored: how often what is remembered could not be stored.
+        start_ns: start of the monitor.
+        heard_ns: receive time of the newest sample that counted, see `HEARD_AGAIN_NS`.
+        received_ns: the same for the plant's `DataTimeout`; None before the first.
+        counted_ns: receive time from which the next spacing is counted; None before the first.
+        lag_ns: longest delay of a message since the last health message.
+        health_due_ns: time of the next health message.
+        ticked: True if there was a tick before.
+        stalls: number of ticks that were more than a second late.
+        not_stored: number of failures to store the state.
     """
 
     start_ns: int

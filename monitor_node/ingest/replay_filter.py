@@ -1,25 +1,24 @@
-"""Which samples a monitor that goes on from a stored state had heard before it stopped.
+"""Drop samples that were already processed before a restart.
 
-Between the last time that the state was stored and the end, a monitor heard samples that the state does not know. They
-come again if the plant still remembers them, and before them others which the state does know. A plant counts the
-samples of each signal, so these are told by their numbers. A sample was heard before the stop
+A resumed monitor queries the history of its plant. It starts with samples that the stored state includes, followed by
+those since the state was stored. A plant numbers the samples of each signal. So a sample was processed before
 
-- if the state knows the row of its time, and this number of the signal in it; or
-- if its row is older than any that the state knows, and neither its number nor its time is beyond the newest.
+- if the state has the row of its time, with this sequence number of the signal; or
+- if its row is older than any in the state, and neither its number nor its time is beyond the newest.
 
-The first sample of a signal that is beyond ends it for that signal, and so does one with another number than the state
-knows of its time: then it is another run of the plant, whose clock was set back. A sample whose row the state knows
-without it was missing then, and may be taken.
+The first sample beyond the newest ends the filter for its signal. So does one with another number than the state has
+for its time: then the plant was restarted with its clock set back. A sample that is missing in its row of the state was
+not processed, and passes.
 """
 
 from monitor_node.ingest.alignment import AlignmentState
 
 
-class ToldAgain:
-    """Knows the samples that were heard before a stop.
+class ReplayFilter:
+    """Filter of samples that were processed before a restart.
 
     Args:
-        state: of the alignment at the stop.
+        state: state of the alignment as stored.
     """
 
     def __init__(self, state: AlignmentState) -> None:
@@ -30,17 +29,17 @@ class ToldAgain:
         self._numbers = {time_ns: list(numbers) for time_ns, numbers in (state.left | waiting).items()}
 
     @property
-    def is_over(self) -> bool:
-        """Whether every signal has come beyond what was heard before."""
+    def is_done(self) -> bool:
+        """True if every signal has passed its newest processed sample."""
         return not any(self._newest)
 
-    def heard(self, index: int, time_ns: int, sequence: int) -> bool:
-        """Whether it was heard before.
+    def is_duplicate(self, index: int, time_ns: int, sequence: int) -> bool:
+        """True if a sample was processed before.
 
         Args:
-            index: of the signal, as in the rows.
-            time_ns: of the sample.
-            sequence: its number.
+            index: index of the signal in the rows.
+            time_ns: sample time.
+            sequence: sequence number.
         """
         newest = self._newest[index]
         if newest is None:

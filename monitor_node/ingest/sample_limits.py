@@ -1,4 +1,4 @@
-"""Which samples can be used at all."""
+"""Limits of usable samples."""
 
 from math import isfinite
 
@@ -6,17 +6,17 @@ from reactorwatch.contract.messages_pb2 import Quality, Sample
 from reactorwatch.records.record import LARGEST_VALUE as LARGEST_VALUE
 
 LARGEST_SAMPLE = 1000
-"""Bytes. A sample takes some thirty and its unit; what is larger is not even read."""
+"""Bytes. A sample takes some thirty and its unit; a larger payload is not decoded."""
 
 LARGEST_NUMBER = 2**62
-"""Of a sample, and of its time, 146 years from 1970: sums of them must still fit a message."""
+"""Limit of sequence numbers and of times in ns (146 years from 1970): sums of them must still fit into a message."""
 
 USABLE = frozenset({Quality.QUALITY_GOOD, Quality.QUALITY_UNCERTAIN})
-"""Looked up once, and not at every sample."""
+"""Qualities of samples that are used."""
 
 
-def unusable(signal: str, sample: Sample) -> tuple[str, str]:
-    """Why a sample cannot be used: a word to count by, and what it was."""
+def reject_reason(signal: str, sample: Sample) -> tuple[str, str]:
+    """Reason to reject a sample, and a description of it."""
     if sample.quality == Quality.QUALITY_UNSPECIFIED:
         return "payload", f"{signal}: the sample has no quality, so it is no Sample of ours"
     if not isfinite(sample.value):

@@ -1,8 +1,8 @@
-"""How often rows come, and what is between this one and the one before.
+"""Sampling period, and the interval between a row and its predecessor.
 
 A row *follows* if it is one sampling period after its predecessor, to a tenth: a linear model of lagged samples holds
-only then. A *gap* is more than two and a half periods, or a step back in time: what was known of the rows just
-before is then too old to tell chance from change.
+only then. A *gap* is more than two and a half periods, or a step back in time: the rows before it are then too old to
+tell chance from change.
 """
 
 from dataclasses import dataclass, field, replace
@@ -11,18 +11,18 @@ from statistics import median
 LEARN_FROM = 32  # spacings
 TOLERANCE = 0.1  # of the period
 LARGEST_GAP = 2.5  # periods
-WHOLE = 0.25  # of a period: rows that are so near to some whole periods apart have rows missing between them
+WHOLE = 0.25  # of a period: tolerance of an interval of several whole periods, in which rows are missing
 
 
 @dataclass
 class SamplingState:
-    """What is remembered.
+    """State of a sampling period.
 
     Attributes:
         last_ns: time of the last row; None before the first.
-        spacings_ns: seen while the period is being learned.
-        period_ns: learned; None before.
-        spacing_ns: between the last row and the one before it; None before the second.
+        spacings_ns: intervals from which the period will be learned.
+        period_ns: sampling period; None before it is learned.
+        spacing_ns: interval before the last row; None before the second.
     """
 
     last_ns: int | None = None
@@ -32,20 +32,20 @@ class SamplingState:
 
 
 class SamplingPeriod:
-    """Learns the period from the first rows, and tells how each row comes after the one before.
+    """Sampling period, learned from the first rows.
 
-    While the period is not known yet, a row follows if it comes no later than half again the shortest spacing so far.
+    Before it is learned, a row follows within 1.5 times the shortest interval so far.
     """
 
     def __init__(self) -> None:
         self.state = SamplingState()
 
-    def copied(self) -> SamplingState:
-        """A copy of all that is remembered."""
+    def copy_state(self) -> SamplingState:
+        """A copy of the state."""
         return replace(self.state, spacings_ns=list(self.state.spacings_ns))
 
     def follows(self, time_ns: int) -> bool:
-        """Take a row in; whether it follows the one before it by one period."""
+        """Update with a row; returns True if it follows its predecessor by one period."""
         state = self.state
         last, state.last_ns = state.last_ns, time_ns
         if last is None:
@@ -64,13 +64,13 @@ class SamplingPeriod:
 
     @property
     def period_ns(self) -> float:
-        """The sampling period; before it is known, the shortest spacing so far; 0 before the second row."""
+        """Sampling period; before it is learned, the shortest interval so far; 0 before the second row."""
         state = self.state
         return state.period_ns if state.period_ns is not None else float(min(state.spacings_ns, default=0))
 
     @property
     def missing(self) -> int:
-        """Number of rows missing between the newest row and the one before it, by their times."""
+        """Number of rows missing before the newest row, by its time."""
         spacing, period = self.state.spacing_ns, self.state.period_ns
         if spacing is None or period is None or spacing == period:
             return 0
@@ -78,7 +78,7 @@ class SamplingPeriod:
 
     @property
     def gap(self) -> bool:
-        """Whether there is a gap before the row that was taken in last."""
+        """True if there is a gap before the newest row."""
         spacing = self.state.spacing_ns
         if spacing is None or spacing == self.state.period_ns:
             return False
@@ -86,9 +86,9 @@ class SamplingPeriod:
 
 
 def missing_rows(periods: float) -> int:
-    """Number of rows missing between two rows that are so many usual periods apart.
+    """Number of rows missing between two rows that are `periods` sampling periods apart.
 
-    Where rows come irregularly, an interval that is no whole number of periods says nothing of a row that was lost.
+    With irregular rows, an interval that is no whole number of periods is no evidence of a lost row.
 
     >>> [missing_rows(periods) for periods in (0.9, 1.4, 2.0, 2.4, 3.1)]
     [0, 0, 1, 0, 2]

@@ -1,28 +1,27 @@
-"""Which samples of a signal are of the plant that is being watched, told by their numbers and times alone.
+"""Reject samples of another publisher of the same signal, by sequence numbers and times alone.
 
-A plant counts the samples of each signal, and its clock goes on as it counts. So a sample *follows* another if the time
-between them, for each number between them, is within a quarter of the usual spacing, and four times the mean deviation
-from it where spacings differ; a late one follows backwards, as far as rows are remembered. A sample that does not
-follow is of another plant of the same name, or of somebody who plays with the bus, or damaged; or the plant was started
-anew, its clock was set, or it paused. One sample does not tell which, but the next ones do:
+A plant numbers the samples of each signal, and its clock advances with the numbers. So a sample *follows* another if
+the time between them, divided by the difference of their numbers, is within a quarter of the usual spacing plus four
+mean deviations from it. A late sample follows backwards, as far as rows are remembered. A sample that does not follow
+is corrupt, forged, or from another plant of the same name; or the plant was restarted, its clock was set, or it paused.
+Only the next samples decide:
 
-- It is held back. As soon as one comes that follows the run as it was, the held ones are refused, but for those between
-  the two in number and time: nothing was wrong with them but how soon they came.
-- Two with the very numbers that come next, at later times, are of the run: the plant has paused. So are three with
-  these numbers at other times, as evenly spaced as the run was: its clock was set.
-- Eight that go on from each other, as evenly as the run did, without any of it between them, are the run from now on:
-  the plant was started anew. (Fewer where rows wait for fewer others: those of one signal must find the others'.)
+- The sample is held. When one arrives that follows the run, held samples are rejected, except those between the two in
+  number and time, which only arrived early.
+- Two samples with the next numbers, at later times, belong to the run: the plant has paused. So do three with these
+  numbers at other times, as evenly spaced as the run: its clock was set.
+- Eight samples that follow each other as evenly as the run, without any sample of it between them, are the new run: the
+  plant was restarted. (Fewer with a smaller `reorder_rows`: the samples of one signal must meet the others' in rows.)
 
-None of these is lost: a pause costs a delay of one sample, a clock that was set one of two, a plant that begins anew
-one of seven; and of two plants with one name the first is watched on as long as its samples keep coming. What is
-decided depends on the samples alone, so a replay decides the same.
+No sample is lost: a pause delays one sample, a clock that was set two, a restart seven. Of two plants with one name the
+first is monitored as long as its samples arrive. The decision depends on the samples alone, so a replay decides the
+same.
 
-The limit of that: where the first of two plants is held up, by a busy machine, while eight samples of the second come,
-the second is watched, and the first refused when it is back. Until then all that a sample holds, and a recording of it,
-is the same as after a restart of the first. Its liveliness token does not tell: both plants show the same, recordings
-hold none, and that of a killed plant may outlast it by a lease of ten seconds. A larger `CONFIRMED` would only trade
-longer stalls for a later start after each restart. To tell the two apart at once, a sample would have to name the
-process that published it.
+Limit: if the first of two plants stalls while eight samples of the second arrive, the second is monitored, and the
+first is rejected when it resumes. Until then its samples, and a recording of them, look like a restart of the first.
+Liveliness tokens do not help: both plants show the same, recordings hold none, and that of a killed plant may outlast
+it by a lease of ten seconds. A larger `CONFIRMED` would only trade longer stalls for a later start after each restart.
+To tell the two apart at once, a sample would have to name the process that published it.
 """
 
 from dataclasses import dataclass, field
@@ -32,24 +31,24 @@ from typing import NamedTuple
 from monitor_node.ingest.alignment import REMEMBERED
 
 CONFIRMED, COUNTED = 8, 3
-"""So many samples that go on from each other are the run: of any numbers, and of those that come next by their count.
-What one publisher says may be held up, and another's come in a bunch meanwhile, so a few of any numbers say little."""
+"""Samples that confirm a new run: with any numbers, and with the next numbers. One publisher's samples may be delayed
+while another's arrive in a burst, so a few with any numbers are weak evidence."""
 
 TOLERANCE, DEVIATIONS = 0.25, 4.0
-"""Of the usual spacing, and mean deviations from it."""
+"""Allowed deviation: share of the usual spacing, and mean deviations."""
 
 MEMORY = 16
-"""Spacings over which the usual one is forgotten, and that must be known before it is told how even they are."""
+"""Spacings in the exponential mean, and needed before their evenness is judged."""
 
 AT_FIRST = 4.0
-"""Times the usual spacing, up to which it may be before that is known."""
+"""Times the mean spacing, allowed before it is known."""
 
 ALIKE = 0.01
-"""Of the usual spacing: a sample that is off by less is as usual, and teaches nothing."""
+"""Share of the usual spacing: a smaller deviation does not update the mean."""
 
 
-class Held(NamedTuple):
-    """A sample that waits: when it was taken, its number, value and unit."""
+class HeldSample(NamedTuple):
+    """A held sample: time, sequence number, value and unit."""
 
     time_ns: int
     number: int
@@ -58,16 +57,16 @@ class Held(NamedTuple):
 
 
 @dataclass(slots=True)
-class SampleRun:
-    """The run of one signal; all of it is its state.
+class SequenceCheck:
+    """The run of samples of one signal; the object is its own state.
 
     Attributes:
-        number: of the newest sample; None before the first.
-        time_ns: of the newest sample.
-        spacing_ns: as it usually is; 0 before it is known.
-        deviation_ns: from it, in the mean.
-        spacings: that these were learned from, up to `MEMORY`.
-        held: samples that wait for the next ones.
+        number: sequence number of the newest sample; None before the first.
+        time_ns: time of the newest sample.
+        spacing_ns: usual spacing; 0 before it is known.
+        deviation_ns: mean deviation from it.
+        spacings: number of spacings in these means, up to `MEMORY`.
+        held: held samples.
     """
 
     number: int | None = None
@@ -75,10 +74,10 @@ class SampleRun:
     spacing_ns: float = 0.0
     deviation_ns: float = 0.0
     spacings: int = 0
-    held: list[Held] = field(default_factory=list)
+    held: list[HeldSample] = field(default_factory=list)
 
-    def goes_on(self, time_ns: int, number: int) -> bool:
-        """Take in the sample that comes next, if it is that, and comes when it usually does; whether it was taken."""
+    def accept_next(self, time_ns: int, number: int) -> bool:
+        """Accept a sample that has the next number at the usual time; returns True if it does."""
         if self.held or number - 1 != self.number:
             return False
         if self.spacings < MEMORY or abs(time_ns - self.time_ns - self.spacing_ns) > ALIKE * self.spacing_ns:
@@ -86,18 +85,18 @@ class SampleRun:
         self.number, self.time_ns = number, time_ns
         return True
 
-    def take(self, sample: Held, reorder_rows: int) -> tuple[list[Held], list[Held]]:
-        """Take a sample in; returns those that are of the run, and those that are refused.
+    def update(self, sample: HeldSample, reorder_rows: int) -> tuple[list[HeldSample], list[HeldSample]]:
+        """Update with a sample; returns accepted samples and rejected samples.
 
         Args:
-            sample: that came.
-            reorder_rows: of the alignment: how many newer rows one waits for.
+            sample: the new sample.
+            reorder_rows: as for the alignment.
         """
         held, window = self.held, REMEMBERED * reorder_rows
         follows = self._follows(sample, window)
         if not held:
             if follows:
-                self._go_on(sample)
+                self._advance(sample)
                 return [sample], []
             self.held = [sample]
             return [], []
@@ -105,12 +104,12 @@ class SampleRun:
         if follows:
             between = [item for item in held if self._is_between(item, sample)]
             for item in (*between, sample):
-                self._go_on(item)
+                self._advance(item)
             return [*between, sample], [item for item in held if item not in between]
         held.append(sample)
-        if self._counts_on(held):
+        if self._is_after_pause(held):
             for item in held:
-                self._go_on(item)
+                self._advance(item)
             return held, []
         if not self._is_run(held, window):
             self.held = [sample]
@@ -121,27 +120,25 @@ class SampleRun:
             return [], []
         self.number, self.spacing_ns, self.deviation_ns, self.spacings = None, 0.0, 0.0, 0
         for item in held:
-            self._go_on(item)
+            self._advance(item)
         return held, []
 
-    def released(self) -> list[Held]:
-        """The held ones, at the end of a record: nothing contradicts them."""
+    def release(self) -> list[HeldSample]:
+        """Release held samples at the end of a record: nothing contradicts them."""
         held, self.held = self.held, []
         return held
 
-    def _counts_on(self, held: list[Held]) -> bool:
-        """Whether samples have the very numbers that come next, and times that increase: the plant has paused."""
+    def _is_after_pause(self, held: list[HeldSample]) -> bool:
+        """True if samples have the next numbers at increasing times: the plant has paused."""
         times_ns = [self.time_ns, *(item.time_ns for item in held)]
         return self._are_next(held) and all(before < after for before, after in pairwise(times_ns))
 
-    def _are_next(self, held: list[Held]) -> bool:
-        """Whether samples have the very numbers that come next."""
-        return self.number is not None and all(
-            item.number == self.number + place for place, item in enumerate(held, start=1)
-        )
+    def _are_next(self, held: list[HeldSample]) -> bool:
+        """True if samples have the next numbers."""
+        return self.number is not None and all(item.number == self.number + i for i, item in enumerate(held, start=1))
 
-    def _is_run(self, held: list[Held], window: int) -> bool:
-        """Whether samples go on from each other, by spacings that are as like as those of the run."""
+    def _is_run(self, held: list[HeldSample], window: int) -> bool:
+        """True if samples follow each other as evenly as the run."""
         pairs = [(item.number - last.number, item.time_ns - last.time_ns) for last, item in pairwise(held)]
         if any(abs(numbers) > window or numbers * time_ns <= 0 for numbers, time_ns in pairs):
             return False
@@ -151,12 +148,12 @@ class SampleRun:
         spacings = [time_ns / numbers for numbers, time_ns in pairs]
         return max(spacings) - min(spacings) <= unlike * max(spacings)
 
-    def _is_between(self, item: Held, sample: Held) -> bool:
-        """Whether number and time of an item are between the newest of the run and a sample."""
+    def _is_between(self, item: HeldSample, sample: HeldSample) -> bool:
+        """True if number and time of an item are between the newest of the run and a sample."""
         newest = self.number if self.number is not None else item.number
         return newest < item.number < sample.number and self.time_ns < item.time_ns < sample.time_ns
 
-    def _go_on(self, sample: Held) -> None:
+    def _advance(self, sample: HeldSample) -> None:
         if self.number is None or sample.number > self.number:
             if self.number is not None:
                 self._learn((sample.time_ns - self.time_ns) / (sample.number - self.number))
@@ -166,13 +163,13 @@ class SampleRun:
         if spacing_ns <= 0.0:
             return
         self.spacings = min(self.spacings + 1, MEMORY)
-        off = spacing_ns - self.spacing_ns
-        self.spacing_ns += off / self.spacings
+        deviation = spacing_ns - self.spacing_ns
+        self.spacing_ns += deviation / self.spacings
         if self.spacings > 1:
-            self.deviation_ns += (abs(off) - self.deviation_ns) / self.spacings
+            self.deviation_ns += (abs(deviation) - self.deviation_ns) / self.spacings
 
-    def _follows(self, sample: Held, window: int) -> bool:
-        """Whether a sample follows the newest of the run."""
+    def _follows(self, sample: HeldSample, window: int) -> bool:
+        """True if a sample follows the newest of the run."""
         if self.number is None:
             return True
         numbers, time_ns = sample.number - self.number, sample.time_ns - self.time_ns
@@ -183,5 +180,5 @@ class SampleRun:
         spacing_ns = time_ns / numbers
         if self.spacings < MEMORY:
             return not self.spacings or spacing_ns <= AT_FIRST * self.spacing_ns
-        off = abs(spacing_ns - self.spacing_ns)
-        return off <= TOLERANCE * self.spacing_ns + DEVIATIONS * self.deviation_ns
+        deviation = abs(spacing_ns - self.spacing_ns)
+        return deviation <= TOLERANCE * self.spacing_ns + DEVIATIONS * self.deviation_ns

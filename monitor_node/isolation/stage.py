@@ -11,8 +11,8 @@ from collections.abc import Iterable, Iterator
 from math import inf
 
 from monitor_node.alarms.alarms import STUCK_SENSOR, SuspectedCause
-from monitor_node.alarms.annunciator import AlarmBoard
-from monitor_node.baseline.references import ProcessReference, places
+from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.baseline.references import ProcessReference, output_indices
 from monitor_node.config import MonitorConfig
 from monitor_node.isolation.causes import CAUSES
 from monitor_node.isolation.fit import WayState
@@ -98,9 +98,9 @@ class Suspicion:
         reference: what its rows are expected by.
     """
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard, reference: ProcessReference) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator, reference: ProcessReference) -> None:
         self._config, self._board, self._reference = config, board, reference
-        self._places = places(reference.model, config.outputs)
+        self._places = output_indices(reference.model, config.outputs)
         self._all_watched = self._places == list(range(len(reference.model.outputs)))
         self._isolation: Isolation | None = None
         self._rows: deque[tuple[float, float, list[float]]] = deque(maxlen=config.isolation_rows)
@@ -178,7 +178,7 @@ class Suspicion:
             isolation = self._compared()
             suspects = isolation.suspects(-inf, self._since)
             told = [_told(item) for item in suspects if item.probability >= LEAST]
-            publications += board.suspect(time_ns, told, stopped=isolation.stopped)
+            publications += board.set_suspects(time_ns, told, stopped=isolation.stopped)
             self._follow(suspects[0])
         return publications
 

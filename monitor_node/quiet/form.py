@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from monitor_node.alarms.alarms import AlarmMemory
-from monitor_node.alarms.annunciator import AlarmBoard, BoardState
+from monitor_node.alarms.annunciator import Annunciator, AnnunciatorState
 from monitor_node.alarms.incidents import Incident
 from monitor_node.alarms.kpis import KpiState
 from monitor_node.alarms.states import State
@@ -44,7 +44,7 @@ from monitor_node.quiet.lining_up import (
 from monitor_node.quiet.ring import NewestRows, times_ns_of
 from monitor_node.signal_checks.catalogue import CHECKS
 from monitor_node.state.monitor_state import MonitorState
-from monitor_node.state.pipeline_state import WatchedState, WatchState
+from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import AlarmKpis
 from reactorwatch.contract.sample_bytes import unit_digest
@@ -80,7 +80,7 @@ class Rest(NamedTuple):
         cause: what was looked for last: number of the incident, output and cause.
     """
 
-    board: AlarmBoard | None
+    board: Annunciator | None
     refused: dict[str, int] | None
     failures: dict[str, int] | None
     runs: bytes
@@ -106,7 +106,7 @@ class QuietForm:
         places: of the first alarm of each kind of chart, see `rows.judge`.
         rules: of each chart's alarm, likewise.
         figures: of alarms that never came up, but for the time.
-        least_s: see `Silence`.
+        least_s: see `DataTimeout`.
     """
 
     def __init__(self, config: MonitorConfig, model: ProcessModel) -> None:
@@ -162,14 +162,14 @@ class QuietForm:
             monitor: of the plant.
             record: shape (1,).
         """
-        receipt = monitor.receipt
-        if monitor.is_catching_up or monitor.phase != "watching":
+        receive_stats = monitor.receive_stats
+        if monitor.is_replaying_history or monitor.phase != "watching":
             return None
-        if receipt.received_ns is None or receipt.counted_ns is None:
+        if receive_stats.received_ns is None or receive_stats.counted_ns is None:
             return None
         state = monitor.state
         watched, alignment = state.watch.watched, state.alignment
-        board = msgspec.msgpack.decode(state.board, type=BoardState)
+        board = msgspec.msgpack.decode(state.board, type=AnnunciatorState)
         if watched is None or not isinstance(watched.reference, ProcessReferenceState):
             return None
         if watched.left_out or set(watched.charts.charts) != self._charts_made:
@@ -181,7 +181,7 @@ class QuietForm:
             return None
         record[:] = np.zeros(1, self.record)
         p = record[0]
-        for name, known in receipt._asdict().items():
+        for name, known in receive_stats._asdict().items():
             p[name] = known
         write_runs(p, state.runs)
         p["received"], p["published"] = state.received, state.published
@@ -238,7 +238,7 @@ class QuietForm:
             return None
         return NewestRows(known, rows[:, 1:])
 
-    def _never_came_up(self, board: BoardState) -> bool:
+    def _never_came_up(self, board: AnnunciatorState) -> bool:
         plain = AlarmMemory()
         same = all(msgspec.structs.replace(memory, rule=plain.rule) == plain for memory in board.alarms.values())
         return same and board.incident == Incident() and board.kpis == KpiState() and not board.suspects
@@ -273,7 +273,7 @@ class QuietForm:
             looked = SuspicionState(known, rest.cause[0], None, None, rest.cause[1], rest.cause[2], None)
         equal = msgspec.msgpack.decode(rest.runs, type=list[EqualRuns])
         outputs = range(len(self.config.outputs))
-        watched = WatchedState(
+        watched = TrainedState(
             reference_of(p, len(self._model.states)),
             list(rest.checks),
             {},
@@ -285,7 +285,7 @@ class QuietForm:
             int(p["rows_watched"]),
             rest.until_drift,
         )
-        watch = WatchState(
+        watch = PipelineState(
             SamplingState(int(p["last_ns"]), [], float(p["period_ns"]), int(p["spacing_ns"])),
             signals_of(p, equal, self.config.silence_periods, self.least_s),
             self._predictors,
@@ -326,7 +326,9 @@ class QuietForm:
         return ChartsState(charts, p["width"].tolist(), passed)
 
     def _board_of(self, plant: str, p: np.void, rest: Rest) -> bytes:
-        board = msgspec.msgpack.decode(self._board if rest.board is None else rest.board.to_bytes(), type=BoardState)
+        board = msgspec.msgpack.decode(
+            self._board if rest.board is None else rest.board.to_bytes(), type=AnnunciatorState
+        )
         for place, name in enumerate(self._alarms):
             rule = board.alarms[name].rule
             rule.recent, rule.in_a_row = int(p["recent"][place]), int(p["in_a_row"][place])
@@ -340,7 +342,7 @@ class QuietForm:
         return msgspec.msgpack.encode(board)
 
 
-def _is_at_rest(board: BoardState, of_charts: list[str]) -> bool:
+def _is_at_rest(board: AnnunciatorState, of_charts: list[str]) -> bool:
     """Whether no alarm stands or is shelved, and none but those of charts has anything in its memory."""
     if board.kpis_changed or board.told is None or board.kpi_minute is None:
         return False

@@ -5,7 +5,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from monitor_node.signal_checks.stuck import STRETCH
+from monitor_node.signal_checks.stuck import MOVEMENT_STEPS
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.shewhart import Shewhart
@@ -98,7 +98,7 @@ def record_type(outputs: int, states: int, alarms: int) -> np.dtype[Any]:
         ("quietest", f, (outputs,)),
         ("last", f, (outputs,)),
         ("repeats", i, (outputs,)),
-        ("steps", f, (outputs, STRETCH)),  # oldest first
+        ("steps", f, (outputs, MOVEMENT_STEPS)),  # oldest first
         ("stepped", np.int32, (outputs,)),
         # charts, as the columns of a bank without what comes in and goes out, and their alarms
         ("shewhart", f, (Shewhart.numbers, outputs)),

@@ -8,10 +8,10 @@ import numpy as np
 
 from monitor_node.baseline.references import ProcessReferenceState
 from monitor_node.signal_checks.spike import SpikeState
-from monitor_node.signal_checks.stage import SignalsState
-from monitor_node.signal_checks.stuck import StuckState, most_equal
-from monitor_node.signal_checks.timeout import SilenceState, Spacing
-from monitor_node.state.pipeline_state import WatchedState, WatchState
+from monitor_node.signal_checks.stage import SignalChecksState
+from monitor_node.signal_checks.stuck import StuckState, longest_normal_run
+from monitor_node.signal_checks.timeout import DataTimeoutState, Spacing
+from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.kalman.ekf import FilterState, NoiseLevels, variances
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -21,7 +21,7 @@ EqualRuns: TypeAlias = tuple[dict[int, int], float]
 """How often an output read the same so many times in a row, in the training; and the run length of its alarm."""
 
 
-def is_usual(watch: WatchState, watched: WatchedState, reference: ProcessReferenceState, last_ns: int) -> bool:
+def is_usual(watch: PipelineState, watched: TrainedState, reference: ProcessReferenceState, last_ns: int) -> bool:
     """Whether the newest row was judged by all, and left nothing undecided."""
     sampling, signals = watch.sampling, watch.signals
     if sampling.last_ns != last_ns or sampling.period_ns is None or sampling.spacing_ns is None:
@@ -42,7 +42,7 @@ def is_usual(watch: WatchState, watched: WatchedState, reference: ProcessReferen
     )
 
 
-def write_signals(p: np.void, signals: SignalsState) -> None:
+def write_signals(p: np.void, signals: SignalChecksState) -> None:
     """Note what is remembered of silences, stuck sensors and spikes."""
     receipts = signals.silences[0].receipts
     p["receipt_count"], p["receipt_mean"], p["receipt_deviation"] = msgspec.structs.astuple(receipts)
@@ -51,20 +51,20 @@ def write_signals(p: np.void, signals: SignalsState) -> None:
         p["silence_count"][place], p["silence_mean"][place], p["silence_deviation"][place] = count, mean, deviation
     for place, (stuck, spike) in enumerate(zip(signals.stuck, signals.spikes, strict=True)):
         p["spike_limit"][place] = inf if spike is None else spike.limit
-        p["equal_limit"][place], p["quietest"][place] = most_equal(stuck.runs, stuck.arl0), stuck.quietest
+        p["equal_limit"][place], p["quietest"][place] = longest_normal_run(stuck.runs, stuck.arl0), stuck.quietest
         p["last"][place], p["repeats"][place] = stuck.last, stuck.repeats
         p["stepped"][place] = len(stuck.steps)
         p["steps"][place, : len(stuck.steps)] = stuck.steps
 
 
-def signals_of(p: np.void, runs: list[EqualRuns], silence_periods: float, least_s: float) -> SignalsState:
+def signals_of(p: np.void, runs: list[EqualRuns], silence_periods: float, least_s: float) -> SignalChecksState:
     """What is remembered of silences, stuck sensors and spikes.
 
     Args:
         p: record of the plant.
         runs: of equal readings in the training, of each output.
         silence_periods: as in the settings.
-        least_s: see `Silence`.
+        least_s: see `DataTimeout`.
     """
     receipts = Spacing(int(p["receipt_count"]), float(p["receipt_mean"]), float(p["receipt_deviation"]))
     silences = []
@@ -72,7 +72,7 @@ def signals_of(p: np.void, runs: list[EqualRuns], silence_periods: float, least_
     for place, (count, mean, deviation) in enumerate(spacings):
         heard = Spacing() if place else receipts
         spacing = Spacing(count, mean, deviation)
-        silences.append(SilenceState(silence_periods, least_s, spacing, heard, int(p["last_ns"]), False))
+        silences.append(DataTimeoutState(silence_periods, least_s, spacing, heard, int(p["last_ns"]), False))
     stuck = [
         StuckState(
             arl0,
@@ -88,7 +88,7 @@ def signals_of(p: np.void, runs: list[EqualRuns], silence_periods: float, least_
     spikes = [
         SpikeState(float(limit), "quiet", 0.0, []) if isfinite(limit) else None for limit in p["spike_limit"].tolist()
     ]
-    return SignalsState(silences, stuck, spikes)
+    return SignalChecksState(silences, stuck, spikes)
 
 
 def write_whitener(p: np.void, place: int, state: PrewhitenerState) -> None:

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from monitor_node.ingest.alignment import AlignmentState, Counts, Waiting
+from monitor_node.ingest.alignment import AlignmentState, Counts, PendingRow
 from monitor_node.ingest.alignment import Sequence as Numbering
 from monitor_node.ingest.sequence_check import MEMORY as FULL_RUN
-from monitor_node.ingest.sequence_check import SampleRun
+from monitor_node.ingest.sequence_check import SequenceCheck
 
 COUNTS = ("rows", "incomplete_rows", "late", "duplicated", "out_of_order", "lost", "restarts")
 
@@ -28,7 +28,7 @@ def is_in_order(alignment: AlignmentState) -> bool:
     return True
 
 
-def run_on(runs: list[SampleRun], alignment: AlignmentState) -> bool:
+def run_on(runs: list[SequenceCheck], alignment: AlignmentState) -> bool:
     """Whether no sample is held, the usual spacings are known, and the runs have come as far as the rows."""
     return all(
         not run.held
@@ -39,19 +39,19 @@ def run_on(runs: list[SampleRun], alignment: AlignmentState) -> bool:
     )
 
 
-def write_runs(p: np.void, runs: list[SampleRun]) -> None:
+def write_runs(p: np.void, runs: list[SequenceCheck]) -> None:
     """Note the runs of the signals' samples, which have come as far as the rows."""
     p["run_spacing_ns"] = [run.spacing_ns for run in runs]
     p["run_deviation_ns"] = [run.deviation_ns for run in runs]
 
 
-def runs_of(p: np.void) -> list[SampleRun]:
+def runs_of(p: np.void) -> list[SequenceCheck]:
     """The runs of the signals' samples."""
-    runs: list[SampleRun] = []
+    runs: list[SequenceCheck] = []
     for place in range(len(p["expected"])):
         newest_ns = int(p["pending_ns"] if p["have"] >> place & 1 else p["left_ns"])
         spacing_ns, deviation_ns = float(p["run_spacing_ns"][place]), float(p["run_deviation_ns"][place])
-        runs.append(SampleRun(int(p["expected"][place]) - 1, newest_ns, spacing_ns, deviation_ns, FULL_RUN))
+        runs.append(SequenceCheck(int(p["expected"][place]) - 1, newest_ns, spacing_ns, deviation_ns, FULL_RUN))
     return runs
 
 
@@ -85,7 +85,7 @@ def alignment_of(p: np.void, times_ns: list[int]) -> AlignmentState:
     if any(have):
         values = [float(value) if here else float("nan") for value, here in zip(p["values"], have, strict=True)]
         numbers = [number - 1 if here else None for number, here in zip(expected, have, strict=True)]
-        pending[pending_ns] = Waiting(values, numbers, have.count(False))
+        pending[pending_ns] = PendingRow(values, numbers, have.count(False))
     numbering = [
         Numbering(number, pending_ns if here else left_ns) for number, here in zip(expected, have, strict=True)
     ]

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.baseline.references import GATE, ProcessReference
-from monitor_node.baseline.signal_range import ranges_of
+from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.health import NODE, health_of
+from monitor_node.health import NODE, health_message
 from monitor_node.ingest.alignment import Counts, Row
-from monitor_node.ingest.receive_stats import STALL_NS, Receipt
+from monitor_node.ingest.receive_stats import STALL_NS, ReceiveStats
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE, USABLE
 from monitor_node.quiet.form import QuietForm
 from monitor_node.quiet.lining_up import COUNTS
@@ -20,7 +20,7 @@ from monitor_node.quiet.ring import kept_spacings, kept_values
 from monitor_node.quiet.rows import NEW_MINUTE, judge
 from monitor_node.quiet.samples import silent_from, take_samples
 from monitor_node.quiet.slots import NEVER_NS, Slots
-from monitor_node.state.monitor_state import sealed, settings_of
+from monitor_node.state.monitor_state import learning_settings, seal_state
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encoding_of
@@ -65,12 +65,12 @@ class QuietPlants:
 
     def __init__(self, form: QuietForm, config: MonitorConfig, model: ProcessModel) -> None:
         self._form, self._config, self._model = form, config, model
-        self._settings = settings_of(config, model, points=False)
+        self._settings = learning_settings(config, model, points=False)
         self._signals = (config.input, *config.outputs)
         self._slots = Slots(form, self._signals)
         self._rows = CompiledFunction(row_function(model))
         self._parameters = model.values()
-        self._ranges = np.array([[item.lower, item.upper] for item in ranges_of(model, self._signals)])
+        self._ranges = np.array([[item.lower, item.upper] for item in signal_ranges(model, self._signals)])
         self._scratch = np.zeros(1, form.record)
         self._shared: dict[Any, Any] = {}  # parts of `Rest`, which are equal for many plants, are kept once
         self._overdue_ns, self._looked_ns = NEVER_NS, 0  # when the first was overdue, and when that was seen
@@ -130,7 +130,7 @@ class QuietPlants:
         slot = self._slots.of[plant]
         rest, rows = self._slots.rest(slot), self._slots.newest(slot)
         state = self._form.read(plant, self._slots.plants[slot], rest, rows, [])
-        return sealed(msgspec.structs.replace(state, settings=self._settings | {"plant": plant}))
+        return seal_state(msgspec.structs.replace(state, settings=self._settings | {"plant": plant}))
 
     def received_of(self, plant: str) -> int:
         """How many messages of a plant came."""
@@ -166,9 +166,9 @@ class QuietPlants:
             monitor.restore(self._form.read(plant, p, self._slots.rest(slot), rows, [row.time_ns for row in waiting]))
         except Exception as error:  # noqa: BLE001 # the plant's border: an error here ends neither node nor fleet
             monitor.failures.add("promotion", error, "the plant is learned again")
-        monitor.caught_up()
+        monitor.on_history_end()
         p["health_due_ns"] = self._slots.health_due_ns[slot]
-        monitor.receipt = Receipt(*(p[name].item() for name in Receipt._fields))
+        monitor.receive_stats = ReceiveStats(*(p[name].item() for name in ReceiveStats._fields))
         self._slots.leave(plant)
         return monitor
 
@@ -311,7 +311,7 @@ class QuietPlants:
 
     def _health(self, slot: int, now_ns: int, phase: str) -> Publication:
         p, rest, plant = self._slots.plants[slot], self._slots.rest(slot), self._slots.names[slot]
-        health = health_of(
+        health = health_message(
             now_ns,
             phase,
             int(p["start_ns"]),

@@ -2,8 +2,8 @@
 
 Most rows of most plants are alike: every signal has come, in its order; the filter predicts them; no chart's alarm is
 raised and no signal is suspicious. For these, all that a monitor remembers of a plant is one record of numbers, and one
-loop takes them from row to row. It does what `PlantWatch` does with such a row, operation by operation, so the numbers
-are the same bits; the charts' own kernels judge here as well.
+loop takes them from row to row. It does what `PlantPipeline` does with such a row, operation by operation, so the
+numbers are the same bits; the charts' own kernels judge here as well.
 
 Whatever is out of the ordinary is not dealt with here. The record is then left as it was before the row, and the row is
 called *odd*: the plant's own monitor evaluates it (see `plants`).
@@ -22,7 +22,7 @@ from monitor_node.ingest.sampling import WHOLE
 from monitor_node.quiet.layout import LEVELS, Array, Bytes, Ints, Places, Records
 from monitor_node.quiet.ring import VALUE_BYTES, ZERO
 from monitor_node.quiet.samples import allowed_ns
-from monitor_node.signal_checks.stuck import AT_REST, STRETCH
+from monitor_node.signal_checks.stuck import AT_REST, MOVEMENT_STEPS
 from monitor_node.signal_checks.timeout import MEMORY
 from reactorwatch.codegen.numba_kernel import call_at, jit
 from reactorwatch.records.record import MINUTE_NS
@@ -42,7 +42,7 @@ ORDINARY, NEW_MINUTE, ODD = 0, 1, 2
 
 _MINUTE_NS = int(MINUTE_NS)
 _MOST_NUMBERS = max(Shewhart.numbers, Ewma.numbers, Cusum.numbers)
-_STRETCH, _ORDER, _MEMORY = STRETCH, LARGEST_ORDER, MEMORY
+_STRETCH, _ORDER, _MEMORY = MOVEMENT_STEPS, LARGEST_ORDER, MEMORY
 _MOST_PERIODS = 1.99 - WHOLE  # between rows that are further apart one may be missing
 
 
@@ -170,7 +170,7 @@ def _noted(
     rules: Places,
     reach: float,
 ) -> bool:
-    """Follow the rule of an alarm that does not stand; whether it is not raised. As `ChartAlarm.judge`."""
+    """Follow the rule of an alarm that does not stand; whether it is not raised. As `ChartAlarm.evaluate`."""
     if not (out or p.recent[alarm]):
         return True
     p.recent[alarm] = ((p.recent[alarm] << 1) | (1 if out else 0)) & rules[alarm, 1]

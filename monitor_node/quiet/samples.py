@@ -1,4 +1,4 @@
-"""Samples of many plants lined up into rows by compiled code, as `SampleRun`, `Aligner` and `Silence` do it.
+"""Samples of many plants lined up into rows by compiled code, as `SequenceCheck`, `Aligner` and `DataTimeout` do it.
 
 A sample that is not good, or not the very one that comes next of its signal, shuts the record: that one and all after
 it are for the plant's own monitor.
@@ -32,7 +32,7 @@ def allowed_ns(limit: float, count: int, mean: float, deviation: float) -> int:
 
 @jit
 def _follows(p: Any, signal: int, time_ns: int) -> bool:
-    """Take the sample with the number that comes next into the run of its signal; as `SampleRun` if none is held."""
+    """Accept the sample with the next number into the run of its signal; as `SequenceCheck` if none is held."""
     spacing_ns = float(time_ns - p.left_ns)
     off = spacing_ns - p.run_spacing_ns[signal]
     if abs(off) <= ALIKE * p.run_spacing_ns[signal]:
@@ -46,7 +46,7 @@ def _follows(p: Any, signal: int, time_ns: int) -> bool:
 
 @jit
 def _heard(p: Any, now_ns: int, silence_limit: float, least_ns: int) -> None:
-    """Note that something came; as `Silence.received`."""
+    """Note that something came; as `DataTimeout.on_receipt`."""
     before_ns, p.received_ns = p.counted_ns, now_ns
     spacing = now_ns - before_ns
     if spacing < 0:
@@ -150,7 +150,7 @@ def take_samples(
 
 @jit
 def silent_from(plants: Records, silence_limit: float, least_ns: int) -> Ints:
-    """When it is too long since something came from each plant, as `Silence.due_ns`; never where there is none."""
+    """When it is too long since something came from each plant, as `DataTimeout.due_ns`; never where there is none."""
     found = np.empty(plants.size, np.int64)
     for slot in range(plants.size):
         p = plants[slot]

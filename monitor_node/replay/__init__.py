@@ -1,1 +1,1 @@
-"""Records and recordings through the monitor again: back-test and verification."""
+"""Replay of records and recordings through the monitor: back-test and verification."""

@@ -1,4 +1,4 @@
-"""The monitor's core over a recording, as fast as it goes: what it would have said, or did say."""
+"""Back-test: run the monitor's core over a recording at full speed."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -17,26 +17,26 @@ RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
 @dataclass
 class Backtest:
-    """What came of it.
+    """Result of a back-test.
 
     Attributes:
         input: name of the input.
         outputs: names of the outputs.
-        rows: of samples.
+        rows: number of rows.
         first_ns: time of the first row; 0 without rows.
-        last_ns: time of the last row.
-        span_ns: that the rows span, summed over the runs of the plant.
-        runs: of the plant: one more than it was restarted, or its clock set back.
-        watching_since_ns: time of the first row that was judged; None if the record is shorter than the training.
+        last_ns: time of the last row; 0 without rows.
+        span_ns: time span of the rows, summed over the runs of the plant.
+        runs: number of runs of the plant: one more than restarts of the plant or its clock.
+        watching_since_ns: time of the first evaluated row; None if the record is shorter than the training.
         expected_false_alarms: see `Monitor.expected_false_alarms`.
         alarm_messages: every change of an alarm, in order.
-        refused: counts by reason.
-        notes: what people are to be told of the training.
-        left_out: signals that are not watched, each with the reason.
-        refused_trainings: number of trainings that were not fit to learn from.
-        reference: what rows were judged by, `equations` or `arx`; None if none was.
-        noise_levels: standard deviations that the equations judged by: of each sensor in its unit (`sensors`), of each
-            state in its unit per square root of a minute (`states`); None where they did not judge.
+        refused: number of rejected messages by reason.
+        notes: notes on the training.
+        left_out: signals that are not monitored, with the reason.
+        refused_trainings: number of refused trainings.
+        reference: kind of the reference, `equations` or `arx`; None if no row was evaluated.
+        noise_levels: standard deviations of the equations' filter: of each sensor in its unit (`sensors`), of each
+            state in its unit per square root of a minute (`states`); None with another reference.
     """
 
     input: str
@@ -58,39 +58,39 @@ class Backtest:
 
     @property
     def raised(self) -> list[tuple[Alarm, int | None]]:
-        """Each alarm as raised, with the suspects known last, and when it was cleared (None: it still stands)."""
-        found: list[tuple[Alarm, int | None]] = []
+        """Each alarm as raised, with its newest suspects, and the time when it was cleared (None: it is active)."""
+        alarms: list[tuple[Alarm, int | None]] = []
         last: dict[str, int] = {}
         for message in self.alarm_messages:
             if message.event == RAISED:
-                last[message.alarm] = len(found)
+                last[message.alarm] = len(alarms)
                 alarm = Alarm()
                 alarm.CopyFrom(message)
-                found.append((alarm, None))
+                alarms.append((alarm, None))
             elif message.alarm in last:
-                alarm, cleared_ns = found[last[message.alarm]]
+                alarm, cleared_ns = alarms[last[message.alarm]]
                 if message.raised_ns == alarm.raised_ns and message.suspects:
                     del alarm.suspects[:]
                     alarm.suspects.extend(message.suspects)
                 if cleared_ns is None and (message.cleared_ns or message.event == CLEARED):
                     cleared_ns = message.cleared_ns
-                found[last[message.alarm]] = (alarm, cleared_ns)
-        return found
+                alarms[last[message.alarm]] = (alarm, cleared_ns)
+        return alarms
 
 
 def run(
     messages: Iterable[Encoded], config: MonitorConfig, zero_ns: int = 0, model: ProcessModel | None = None
 ) -> Backtest:
-    """Run the monitor over messages in the order they were received; those that are no samples are passed over.
+    """Run the monitor over messages in the order of receipt.
 
     Args:
-        messages: of any plant; only samples of `config.plant` are looked at.
-        config: of the monitor.
-        zero_ns: the time that the minutes of the model count from, where its file does not say.
+        messages: messages; all but samples of `config.plant` are ignored.
+        config: settings of the monitor.
+        zero_ns: zero of the model's minutes, if its file does not have it.
         model: whose equations judge, its minutes counted from 1970-01-01 UTC; None: the one that the settings name.
 
     Raises:
-        InputError: settings that do not fit together, or a model's file that cannot be used.
+        InputError: the settings are inconsistent, or the model's file is unusable.
     """
     prefix = keys.key(config.plant, keys.SAMPLE, "")
     model = model or read_model_on_bus_clock(config.model, zero_ns)
@@ -118,7 +118,7 @@ def run(
         watching_since_ns=monitor.watching_since_ns,
         expected_false_alarms=monitor.expected_false_alarms,
         alarm_messages=alarms,
-        refused=dict(monitor.refusals.by_reason),
+        refused=dict(monitor.rejects.by_reason),
         notes=monitor.notes,
         left_out=monitor.left_out,
         refused_trainings=monitor.refused_trainings,

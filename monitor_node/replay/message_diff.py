@@ -1,7 +1,6 @@
-"""Two streams of messages held against each other, key by key: what was recorded, and what is said again. Pure.
+"""Difference between recorded and replayed messages, key by key.
 
-Both are in order on each key. Where one has a message that the other has not, its time says so: it is older than what
-the other has next.
+Both are in order on each key. A message that the other side does not have is older than the other side's next one.
 """
 
 from collections import deque
@@ -14,20 +13,20 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encode
 
 MOST_TOLD = 100
-"""Differences that are told one by one; the others are counted."""
+"""Differences that are listed; the others are counted."""
 
-NOT_RECORDED, NOT_SAID_AGAIN = "not recorded", "not said again"
+NOT_RECORDED, NOT_REPLAYED = "not recorded", "not said again"
 
 
 class Difference(NamedTuple):
-    """Something that differs.
+    """Difference of a message.
 
     Attributes:
-        key: the key it is on.
-        time_ns: of the sample that it speaks of.
-        what: the field that differs; or `NOT_RECORDED`, or `NOT_SAID_AGAIN`.
-        recorded: the field as recorded; empty if the message was not recorded.
-        again: the field as it is said again; empty if the message is not.
+        key: key of the message.
+        time_ns: sample time of the message.
+        what: name of the field; or `NOT_RECORDED`, or `NOT_REPLAYED`.
+        recorded: recorded value of the field; empty without a recorded message.
+        again: replayed value of the field; empty without a replayed message.
     """
 
     key: str
@@ -38,99 +37,99 @@ class Difference(NamedTuple):
 
 
 @dataclass
-class Count:
-    """How many messages of one kind were recorded, and how many of them are said again, value for value."""
+class MatchCount:
+    """Number of recorded messages of one kind, and of those that are replayed value for value."""
 
     recorded: int = 0
     equal: int = 0
 
 
-class _Said(NamedTuple):
+class _Replayed(NamedTuple):
     number: int
     publication: Publication
     payload: bytes
 
 
 @dataclass
-class Comparison:
-    """Holds what is recorded against what is said again.
+class MessageDiff:
+    """Compares recorded with replayed messages.
 
     Attributes:
-        counts: by kind of message.
-        differences: the first of them.
-        differing: how many there are.
-        unrecorded: messages that are said again after the last one that was recorded: the recording had ended.
+        counts: counts by kind of message.
+        differences: the first differences.
+        differing: number of differences.
+        unrecorded: number of replayed messages after the last recorded one, when the recording had ended.
     """
 
-    counts: dict[str, Count] = field(default_factory=dict)
+    counts: dict[str, MatchCount] = field(default_factory=dict)
     differences: list[Difference] = field(default_factory=list)
     differing: int = 0
     unrecorded: int = 0
-    _said: int = 0
+    _count: int = 0
     _last_matched: int = -1
-    _recorded_waits: dict[str, deque[tuple[Message, bytes]]] = field(default_factory=dict)
-    _again_waits: dict[str, deque[_Said]] = field(default_factory=dict)
+    _recorded: dict[str, deque[tuple[Message, bytes]]] = field(default_factory=dict)  # unmatched, by key
+    _replayed: dict[str, deque[_Replayed]] = field(default_factory=dict)  # unmatched, by key
 
-    def recorded(self, message: Encoded, kind: str) -> None:
-        """Take in what was recorded."""
-        count = self.counts.setdefault(kind, Count())
+    def add_recorded(self, message: Encoded, kind: str) -> None:
+        """Add a recorded message."""
+        count = self.counts.setdefault(kind, MatchCount())
         count.recorded += 1
         try:
             body = decode(message.payload, message.encoding)
         except DecodeError as error:
             self._differ(Difference(message.key, 0, "payload", str(error), ""))
             return
-        self._recorded_waits.setdefault(message.key, deque()).append((body, message.payload))
+        self._recorded.setdefault(message.key, deque()).append((body, message.payload))
         self._pair(message.key)
 
-    def again(self, publications: list[Publication]) -> None:
-        """Take in what is said again."""
+    def add_replayed(self, publications: list[Publication]) -> None:
+        """Add replayed messages."""
         for publication in publications:
-            said = _Said(self._said, publication, encode(publication).payload)
-            self._said += 1
-            self._again_waits.setdefault(publication.key, deque()).append(said)
+            item = _Replayed(self._count, publication, encode(publication).payload)
+            self._count += 1
+            self._replayed.setdefault(publication.key, deque()).append(item)
             self._pair(publication.key)
 
     def finish(self) -> None:
-        """Nothing more comes of either, or what does is of another run."""
-        for key, waiting in self._recorded_waits.items():
-            for body, _ in waiting:
-                self._differ(Difference(key, _time_ns(body), NOT_SAID_AGAIN, _text(body), ""))
-            waiting.clear()
-        for waits in self._again_waits.values():
-            for said in waits:
-                if said.number > self._last_matched:
+        """Count the unmatched messages, at the end of a run."""
+        for key, recorded in self._recorded.items():
+            for body, _ in recorded:
+                self._differ(Difference(key, _time_ns(body), NOT_REPLAYED, _text(body), ""))
+            recorded.clear()
+        for replayed in self._replayed.values():
+            for item in replayed:
+                if item.number > self._last_matched:
                     self.unrecorded += 1
                 else:
-                    self._is_not_recorded(said)
-            waits.clear()
+                    self._add_unrecorded(item)
+            replayed.clear()
         self.differences.sort(key=lambda item: item.time_ns)
 
     def _pair(self, key: str) -> None:
-        recorded, again = self._recorded_waits.get(key), self._again_waits.get(key)
-        while recorded and again:
+        recorded, replayed = self._recorded.get(key), self._replayed.get(key)
+        while recorded and replayed:
             body, payload = recorded[0]
-            said = again[0]
-            before, after = _time_ns(body), said.publication.message.time_ns
+            item = replayed[0]
+            before, after = _time_ns(body), item.publication.message.time_ns
             if before < after:
-                self._differ(Difference(key, before, NOT_SAID_AGAIN, _text(body), ""))
+                self._differ(Difference(key, before, NOT_REPLAYED, _text(body), ""))
             elif before > after:
-                self._is_not_recorded(said)
+                self._add_unrecorded(item)
             else:
-                self._last_matched = max(self._last_matched, said.number)
-                different = [] if payload == said.payload else _different(body, said.publication.message)
-                if different:
-                    self._differ(Difference(key, before, *different[0]))
+                self._last_matched = max(self._last_matched, item.number)
+                fields = [] if payload == item.payload else _differing_fields(body, item.publication.message)
+                if fields:
+                    self._differ(Difference(key, before, *fields[0]))
                 else:
                     self.counts[_kind(key)].equal += 1
             if before <= after:
                 recorded.popleft()
             if after <= before:
-                again.popleft()
+                replayed.popleft()
 
-    def _is_not_recorded(self, said: _Said) -> None:
-        body = said.publication.message
-        self._differ(Difference(said.publication.key, body.time_ns, NOT_RECORDED, "", _text(body)))
+    def _add_unrecorded(self, item: _Replayed) -> None:
+        body = item.publication.message
+        self._differ(Difference(item.publication.key, body.time_ns, NOT_RECORDED, "", _text(body)))
 
     def _differ(self, difference: Difference) -> None:
         self.differing += 1
@@ -151,17 +150,17 @@ def _text(message: Message) -> str:
     return " ".join(str(message).split())
 
 
-def _different(recorded: Message, again: Message) -> list[tuple[str, str, str]]:
-    """The fields that differ, each as recorded and as said again; NaN is equal to itself."""
+def _differing_fields(recorded: Message, again: Message) -> list[tuple[str, str, str]]:
+    """Differing fields: name, recorded and replayed value; NaN is equal to itself."""
     if recorded.DESCRIPTOR.full_name != again.DESCRIPTOR.full_name:
         return [("message", recorded.DESCRIPTOR.full_name, again.DESCRIPTOR.full_name)]
-    found = []
+    fields = []
     for item in recorded.DESCRIPTOR.fields:
-        before, after = (_shown(getattr(message, item.name)) for message in (recorded, again))
+        before, after = (_format(getattr(message, item.name)) for message in (recorded, again))
         if before != after:
-            found.append((item.name, before, after))
-    return found
+            fields.append((item.name, before, after))
+    return fields
 
 
-def _shown(value: Any) -> str:
+def _format(value: Any) -> str:
     return repr(value) if isinstance(value, str | int | float) else " ".join(str(value).split())

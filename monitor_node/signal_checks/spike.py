@@ -1,23 +1,22 @@
-"""Spike: one value far off, and the next one back. A sensor does that, a process does not.
+"""Spike: one outlier, followed by a normal value. A sensor does that, a process does not.
 
-A process that is disturbed stays disturbed for a while; so a standardised residual beyond `limit` says little until the
-next one has come. The first one beyond is withheld: from the charts that have a memory, which it would fill, and from
-the correction of a filter, which it would pull. The next value decides:
+A disturbed process stays disturbed for a while; so a standardised residual beyond `limit` is ambiguous until the next
+one. The first one beyond is quarantined: charts with a memory and the correction of a filter do not get it. The next
+value decides:
 
-- it is back: the one withheld was a spike, and is dropped for good; or
-- it is still off, on the same side: something has changed. Nothing more is withheld until it is over. All that a
-  change loses by this is one sample; or
-- it is beyond the limit on the other side: the first was a spike, and this one may be another, and is withheld. A
-  third one off, on whichever side, is not withheld: no more than two in a row ever are, so that growing noise or an
-  oscillation is not taken for spikes for long.
+- it is normal: the quarantined value was a spike, and is dropped; or
+- it is still off on the same side: a change. Nothing more is quarantined until the change is over. A change loses one
+  sample by this; or
+- it is beyond the limit on the other side: the first was a spike, and this one may be another, and is quarantined. A
+  third one, on either side, is not: at most two in a row are, so that growing noise or an oscillation is not taken for
+  spikes for long.
 
-Back, and over, means within half the limit, so that a change about as large as the limit is not taken for spikes each
-time it falls below it.
+Normal means within half the limit, so that a change about as large as the limit is not taken for a spike each time it
+falls below it.
 
-While an alarm stands whose cause is not known, a fault may have moved the residual for good, and then values about its
-new level are no spikes. So as long as it stands, a value is compared with the median of the newest ones, in units of
-their median deviation with a margin (but of no less than before), and nothing is a spike until `LEAST_RECENT` of them
-are there.
+While an alarm without a known cause is active, a fault may have moved the residual permanently, and values about its
+new level are no spikes. So a value is then compared with the median of recent ones, in units of their median deviation
+with a margin (but no less than before), and nothing is a spike before there are `LEAST_RECENT` of them.
 
 Normal values make a false spike at the rate of a small Markov chain, `false_spike_rate`; since every spike has its own
 value beyond the limit, it is never more than P(|z| > limit), and that bound holds for dependent values as well. Where
@@ -49,21 +48,21 @@ from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Judgement, finite, positive, quantity
 from reactorwatch.stored_state import StoredState
 
-BACK = 0.5
-"""Of the limit: within it, a value is back."""
+NORMAL = 0.5
+"""Share of the limit within which a value is normal."""
 
 RECENT, LEAST_RECENT = 100, 10
-"""Newest values with which a value is compared while an alarm stands, at most and at least."""
+"""Recent values with which a value is compared while an alarm is active, at most and at least."""
 
 ERRORS = 3.0
-"""Standard errors that the spread of these values may be larger than it looks: about 1 / sqrt(n) each."""
+"""Standard errors, each about 1 / sqrt(n), by which the spread of these values is taken larger than estimated."""
 
 TAIL_SHARE = 0.05
 LEAST_TAIL = 10
-"""The largest values of the training from which its tail is estimated: this share, and at least so many."""
+"""Share of the training's largest values from which its tail is estimated, and their least number."""
 
 SEEN_SHARE = 0.75
-"""Of these, the smaller ones whose size counts; the others count as larger."""
+"""Share of these, the smaller ones, whose size counts; the others count as larger."""
 
 FEWEST_ROWS = 5 * LEAST_TAIL
 
@@ -73,15 +72,15 @@ Phase: TypeAlias = Literal["quiet", "held", "held again", "changed"]
 
 
 class Verdict(NamedTuple):
-    """What a value shows.
+    """Result for a value.
 
     Attributes:
-        withhold: whether it is to be kept from filters and charts with a memory; they have a missing sample instead.
-        spike: whether the value *before* it was a spike.
-        size: that value; 0 if it was none.
+        quarantine: True if the value is a missing sample to filters and to charts with a memory.
+        spike: True if the value *before* it was a spike.
+        size: that value; 0 if it was no spike.
     """
 
-    withhold: bool
+    quarantine: bool
     spike: bool
     size: float
 
@@ -90,14 +89,14 @@ NO_SPIKE = Verdict(False, False, 0.0)
 
 
 class SpikeState(StoredState, frozen=True):
-    """All that is set and remembered.
+    """State of a check.
 
     Attributes:
         limit: see `Spike`.
-        phase: whether the value before was in (quiet), is withheld, is withheld right after a spike, or was part of a
+        phase: the value before was normal (quiet), is quarantined, is quarantined after a spike, or was part of a
             change.
-        held: the value that is withheld; 0 if none is.
-        recent: the newest values since an alarm stands, oldest first; none while none stands.
+        held: quarantined value; 0 if there is none.
+        recent: newest values since an alarm is active, oldest first; empty without one.
     """
 
     limit: float
@@ -107,16 +106,16 @@ class SpikeState(StoredState, frozen=True):
 
 
 class Spike:
-    """Tells spikes from changes, in one signal's standardised residuals.
+    """Distinguishes spikes from changes in the standardised residuals of one signal.
 
     >>> spike = Spike(limit=6.0)
     >>> [spike.update(z) for z in (0.3, 9.0, -0.5)][1:]
-    [Verdict(withhold=True, spike=False, size=0.0), Verdict(withhold=False, spike=True, size=9.0)]
-    >>> [spike.update(z).withhold for z in (9.0, 9.0, 9.0)]  # a change
+    [Verdict(quarantine=True, spike=False, size=0.0), Verdict(quarantine=False, spike=True, size=9.0)]
+    >>> [spike.update(z).quarantine for z in (9.0, 9.0, 9.0)]  # a change
     [True, False, False]
 
     Args:
-        limit: beyond it a value may be a spike, in standard deviations.
+        limit: limit in standard deviations, beyond which a value may be a spike.
 
     Raises:
         InputError: limit is not a positive number.
@@ -132,7 +131,7 @@ class Spike:
 
     @classmethod
     def from_state(cls, state: SpikeState) -> "Spike":
-        """The one that goes on where `state` was taken.
+        """Resume from a state.
 
         Raises:
             ValueError: the state is damaged.
@@ -144,18 +143,18 @@ class Spike:
 
     @property
     def state(self) -> SpikeState:
-        """A copy of all that is set and remembered."""
+        """A copy of the state."""
         return SpikeState(self.limit, self._phase, self._held, list(self._recent))
 
     def update(self, z: float, *, is_moved: bool = False) -> Verdict:
-        """Take the next standardised residual in. A missing one is left out: the next that comes decides.
+        """Update with the next standardised residual; leave missing ones out.
 
         Args:
             z: the residual.
-            is_moved: whether an alarm stands, so that a fault may have moved the residual.
+            is_moved: True if an alarm is active, so that a fault may have moved the residual.
 
         Raises:
-            ValueError: it is not finite.
+            ValueError: the residual is not finite.
         """
         recent = self._recent
         if not is_moved:
@@ -172,37 +171,37 @@ class Spike:
             self._phase, self._held = "changed", 0.0
             return NO_SPIKE
         verdict = self._decide((finite(z) - level) / spread)
-        if not verdict.withhold:
+        if not verdict.quarantine:
             recent.append(z)
         return verdict._replace(size=verdict.size * spread)
 
     def _decide(self, z: float) -> Verdict:
-        """The verdict on a residual about 0."""
+        """Decide on a residual about 0."""
         if self._phase == "quiet" and abs(z) <= self.limit:  # as nearly always
             return NO_SPIKE
-        beyond, back = abs(finite(z)) > self.limit, abs(z) <= BACK * self.limit
+        beyond, normal = abs(finite(z)) > self.limit, abs(z) <= NORMAL * self.limit
         held, self._held = self._held, 0.0
         if self._phase in ("quiet", "changed"):
-            if self._phase == "changed" and not back:
-                return Verdict(False, False, 0.0)
+            if self._phase == "changed" and not normal:
+                return NO_SPIKE
             self._phase = "held" if beyond else "quiet"
             self._held = z if beyond else 0.0
             return Verdict(beyond, False, 0.0)
-        if not back and (self._phase == "held again" or z * held > 0.0):
+        if not normal and (self._phase == "held again" or z * held > 0.0):
             self._phase = "changed"
-            return Verdict(False, False, 0.0)
+            return NO_SPIKE
         self._phase = "held again" if beyond else "quiet"
         self._held = z if beyond else 0.0
         return Verdict(beyond, True, held)
 
     def restart(self) -> None:
-        """Forget the values seen, as after a gap or a restart of the plant: what was withheld stays undecided."""
+        """Drop earlier values, as after a gap or a restart of the plant: a quarantined value stays undecided."""
         self._phase, self._held = "quiet", 0.0
         self._recent.clear()
 
 
 def false_spike_rate(limit: float) -> float:
-    """How often independent normal values make a spike, a value, in the long run.
+    """Rate of false spikes per value among independent normal values.
 
     The stationary rate of the Markov chain of `SpikeState.phase`.
 
@@ -210,7 +209,7 @@ def false_spike_rate(limit: float) -> float:
     1.97
     """
     beyond = 2.0 * float(ndtr(-limit))
-    off = 2.0 * float(ndtr(-BACK * limit))
+    off = 2.0 * float(ndtr(-NORMAL * limit))
     # Visits to each phase for one visit to `held`.
     held_again = beyond / 2.0
     changed = (off / 2.0 + held_again * off) / (1.0 - off)
@@ -219,14 +218,11 @@ def false_spike_rate(limit: float) -> float:
 
 
 def spike_limit(z: ArrayLike, arl0: float) -> float:
-    """The limit of `Spike` that a training asks for.
+    """Limit of `Spike` learned from a training; at least that of normal values.
 
     Args:
-        z: standardised residuals of a sound plant, shape (rows,), without missing ones; at least 50.
-        arl0: values between two false spikes in the mean, at least, if tails are exponential or lighter.
-
-    Returns:
-        Never less than normal values ask for.
+        z: standardised residuals without a fault, shape (rows,), without missing ones; at least 50.
+        arl0: least mean number of values between two false spikes, if tails are exponential or lighter.
 
     Raises:
         InputError: too few values, or one that is not finite, or arl0 is not a number above 1.

@@ -22,8 +22,8 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.stored_state import StoredState
 
 
-class SignalsState(StoredState, frozen=True, omit_defaults=True):
-    """All that was learned and is remembered of the signals of a plant.
+class SignalChecksState(StoredState, frozen=True, omit_defaults=True):
+    """State of the checks of a plant's signals.
 
     Attributes:
         silences: of the plant, of the input and of each output.
@@ -32,7 +32,7 @@ class SignalsState(StoredState, frozen=True, omit_defaults=True):
         others: the states of the other checks, by name.
     """
 
-    silences: list[SilenceState]
+    silences: list[DataTimeoutState]
     stuck: list[StuckState]
     spikes: list[SpikeState | None]
     others: dict[str, bytes] = msgspec.field(default_factory=dict)
@@ -42,8 +42,8 @@ FIELDS = {SilenceCheck.name: "silences", StuckCheck.name: "stuck", SpikeCheck.na
 """Checks with a field of their own in `SignalsState`. A check without a state has none at all."""
 
 
-class SignalWatch:
-    """Watches the signals of one plant.
+class SignalChecks:
+    """Checks the signals of one plant.
 
     Args:
         config: of the monitor.
@@ -52,7 +52,7 @@ class SignalWatch:
     """
 
     CHANCE_ALARMS = sum(check.can_be_false for check in CHECKS)
-    """Alarms of one output that chance can raise."""
+    """Number of an output's alarms that can be false alarms."""
 
     def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange] | None = None) -> None:
         self._board, self._outputs = board, config.outputs
@@ -90,7 +90,7 @@ class SignalWatch:
         for check in self._checks:
             check.start(values, e, arl0)
 
-    # --- what survives a restart -----------------------------------------------------------------------------
+    # --- state -----------------------------------------------------------------------------------------------
 
     @property
     def state(self) -> SignalsState:
@@ -99,12 +99,12 @@ class SignalWatch:
         own = {field: states.pop(name) for name, field in FIELDS.items()}
         return SignalsState(**own, others=states)
 
-    def restore(self, state: SignalsState, now_ns: int) -> None:
-        """Go on where a watch with the same settings was when `state` was taken; after the board.
+    def restore(self, state: SignalChecksState, now_ns: int) -> None:
+        """Resume from a state of the same settings; the alarms are restored before.
 
         Args:
-            state: of the other watch.
-            now_ns: when the plant is listened to again.
+            state: the state.
+            now_ns: present time, from which the data timeout counts.
 
         Raises:
             ValueError: the state is damaged, or of other checks.
@@ -161,8 +161,8 @@ class SignalWatch:
         for check in self._checks:
             check.on_gap()
 
-    def begin_anew(self) -> None:
-        """Forget the rows seen: the publisher began again."""
+    def reset(self) -> None:
+        """Drop earlier rows: the publisher was restarted."""
         for check in self._checks:
             check.on_restart()
 
@@ -170,7 +170,7 @@ class SignalWatch:
         """Take as silent what the alarms say is silent: the next sample ends it."""
         self._silence.go_on_from_alarms()
 
-    # --- the clock of receipt --------------------------------------------------------------------------------
+    # --- receive time ----------------------------------------------------------------------------------------
 
     def received(self, now_ns: int) -> None:
         """Note that something came from the plant."""

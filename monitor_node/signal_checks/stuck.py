@@ -1,31 +1,31 @@
-"""Stuck: a sensor that shows the same value again and again, which it would not do if it measured.
+"""Stuck sensor: too many equal readings in a row.
 
-Noise hardly ever gives the same reading twice; a sensor with coarse steps does it all the time, and if the signal is
-slow, for long. So how many equal readings in a row are too many is learned from the run lengths of the training. With n
-readings, of which c repeated the one before them, and m runs that reached j repeats, which s times of t went on beyond
-them, a run of k repeats comes in the long run once in
+Noise hardly ever gives the same reading twice; a sensor with coarse steps often repeats, and with a slow signal for
+long. So the limit of equal readings in a row is learned from the run lengths of the training. With n readings, of which
+c repeated the one before them, and m runs that reached j repeats and continued beyond them s times of t, a run of k
+repeats occurs on average once in
 
     1 / p^k              readings, p = c / n,                      if repeats are independent,
-    1 / (m/n p^(k - j))  readings, p = s / t, for any depth j,     if what is j deep goes on with probability p,
+    1 / (m/n p^(k - j))  readings, p = s / t, for any depth j,     if a run of depth j continues with probability p,
 
-the recurrence time of success runs (Feller 1968, An introduction to probability theory, vol. 1, XIII.7), at the second
+the recurrence time of success runs (Feller 1968, An introduction to probability theory, vol. 1, XIII.7), in the second
 line for a Markov chain. Depths are 1, 2, 4, ... as far as five runs reached: a slow signal near the middle of a step
-rests far longer than elsewhere, so its long runs go on more readily than its short ones, and the deeper lines see that.
-The limit is the largest k that any line asks for once in `arl0` readings. Shares are not taken as found but as their
-upper confidence bounds (Clopper & Pearson 1934, Biometrika 26(4)), so that with independent repeats 95 trainings of 100
-give a limit which keeps `arl0` or more, and with dependent ones about as many, if the training has seen long runs. A
-limit is also at least twice the longest run seen, and never so small that less than `SMALLEST` equal readings are a
-fault. If it would be more readings than the training had, there is none: the signal is not judged.
+rests far longer than elsewhere, so its long runs are more persistent than its short ones, which the deeper lines show.
+The limit is the largest k that any line gives for once in `arl0` readings. Shares are replaced by their upper
+confidence bounds (Clopper & Pearson 1934, Biometrika 26(4)), so that with independent repeats 95 of 100 trainings give
+a limit that keeps `arl0` or more, and with dependent ones about as many, if the training had long runs. A limit is at
+least twice the longest run of the training, and at least `SMALLEST` equal readings. If it exceeds the readings of the
+training, there is none: the signal is not checked.
 
-A signal without noise gives another reason for equal readings: a plant that has come to rest. Before it rests it slows
-down, and a sensor that sticks does not. So a run is judged only if the readings before it moved, in the mean of their
-last few steps, at least a quarter as much as in the quietest such stretch of the training. What is missed by this: a
-sensor with little noise that sticks while the plant is at rest; the charts of the residual see it when the plant moves.
-What is not helped by it: a sensor whose steps are coarser than twice its noise. It repeats as often as the plant is
-calm, and if the plant is calmer than it ever was in the training, a sound sensor can be called stuck.
+A plant at rest is another reason for equal readings of a signal without noise. It slows down before, and a stuck sensor
+does not. So a run is evaluated only if the readings before it moved, in the mean of their last few steps, at least a
+quarter as much as in the quietest interval of the training. This misses a sensor with little noise that sticks while
+the plant is at rest; the charts of the residual detect it when the plant moves. It does not help with steps coarser
+than twice the noise: such a sensor repeats as often as the plant is calm, and if the plant is calmer than ever in the
+training, a sound sensor can be called stuck.
 
-A run counts on over missing samples, since equal values are no likelier across a gap than within. After `restart` it
-counts from one. Signals that people set, like a valve position, rest as long as people like: judge measurements only.
+A run continues over missing samples, since equal values are no likelier across a gap than within. After `restart` it
+counts from one. Signals that operators set, like a valve position, rest for any time: check measurements only.
 """
 
 from collections import deque
@@ -48,16 +48,16 @@ SMALLEST = 5
 """Fewer equal readings in a row than this are never a fault."""
 
 ENOUGH_RUNS = 5
-"""A depth that fewer runs reached says nothing of how they go on."""
+"""Least number of runs at a depth for an estimate of their continuation."""
 
 MARGIN = 2
-"""Times the longest run seen: so long at least is a run that is no fault."""
+"""Least limit, in longest runs of the training."""
 
-STRETCH = 8
-"""Steps by which it is judged whether the signal was moving."""
+MOVEMENT_STEPS = 8
+"""Steps in the mean that shows whether the signal was moving."""
 
 AT_REST = 0.25
-"""Of the mean step in the quietest stretch of the training: with less, the plant was coming to rest."""
+"""Share of the mean step in the quietest interval of the training: with less, the plant was coming to rest."""
 
 CONFIDENCE = 0.95
 
@@ -66,16 +66,16 @@ READINGS = "readings"
 
 
 class StuckState(StoredState, frozen=True):
-    """All that is set, learned and remembered.
+    """State of a check.
 
     Attributes:
         arl0: see `Stuck`.
-        runs: of the training: how many runs had so many repeats.
-        quietest: mean absolute step in the quietest stretch of the training; infinite before the first.
-        last: the reading before; None before the first.
-        repeats: how many times in a row it has been repeated.
-        steps: the last absolute steps up to the first of the readings that are equal now, newest last.
-        learning: whether the present run belongs to the training.
+        runs: number of the training's runs by number of repeats.
+        quietest: mean absolute step in the quietest interval of the training; infinite before the first.
+        last: last reading; None before the first.
+        repeats: number of its repeats so far.
+        steps: the last absolute steps up to the first of the present equal readings, newest last.
+        learning: True if the present run belongs to the training.
     """
 
     arl0: float
@@ -88,7 +88,7 @@ class StuckState(StoredState, frozen=True):
 
 
 class Stuck:
-    """Counts equal readings in a row of one signal, against a limit learned from how it repeats when it is sound.
+    """Counts equal readings in a row of one signal, against a limit learned without a fault.
 
     >>> from random import Random
     >>> noise = Random(1)
@@ -99,7 +99,7 @@ class Stuck:
     [False, False, False, False, True, True]
 
     Args:
-        arl0: readings between two false alarms in the mean, at least.
+        arl0: least mean number of readings between two false alarms.
 
     Raises:
         InputError: arl0 is not a number above 1.
@@ -115,22 +115,24 @@ class Stuck:
         self._quietest = inf
         self._last: float | None = None
         self._repeats = 0
-        self._steps: deque[float] = deque(maxlen=STRETCH)
+        self._steps: deque[float] = deque(maxlen=MOVEMENT_STEPS)
         self._learning = False
         self._limit: float | None = None
-        self._single: Judgement | None = None  # of a reading that is unlike the one before, made once
+        self._single: Judgement | None = None  # of a reading that differs from the one before, made once
 
     @classmethod
     def from_state(cls, state: StuckState) -> "Stuck":
-        """The one that goes on where `state` was taken.
+        """Resume from a state.
 
         Raises:
             ValueError: the state is damaged.
         """
         stuck = cls(state.arl0)
         counts = [state.repeats, *state.runs, *state.runs.values()]
-        if min(counts) < 0 or len(state.steps) > STRETCH or not all(0.0 <= step < inf for step in state.steps):
-            raise ValueError(f"state of {cls.name} must hold counts and at most {STRETCH} sizes of steps, got {state}")
+        if min(counts) < 0 or len(state.steps) > MOVEMENT_STEPS or not all(0.0 <= step < inf for step in state.steps):
+            raise ValueError(
+                f"state of {cls.name} must hold counts and at most {MOVEMENT_STEPS} sizes of steps, got {state}"
+            )
         stuck._runs, stuck._quietest = dict(state.runs), state.quietest
         stuck._last, stuck._repeats, stuck._learning = state.last, state.repeats, state.learning
         stuck._steps.extend(state.steps)
@@ -138,33 +140,33 @@ class Stuck:
 
     @property
     def state(self) -> StuckState:
-        """A copy of all that is set, learned and remembered."""
+        """A copy of the state."""
         return StuckState(
             self._arl0, dict(self._runs), self._quietest, self._last, self._repeats, list(self._steps), self._learning
         )
 
     @property
     def limit(self) -> float:
-        """The most equal readings in a row that are no fault; infinite if, by what was learned, that can't be said."""
+        """Most equal readings in a row without a fault; infinite if the training cannot tell."""
         if self._limit is None:
-            self._limit = most_equal(self._runs, self._arl0)
+            self._limit = longest_normal_run(self._runs, self._arl0)
         return self._limit
 
     def learn(self, value: float) -> None:
-        """Take the next reading of the training in.
+        """Learn from the next reading of the training; leave missing ones out.
 
         Raises:
-            ValueError: it is not finite; leave a missing sample out.
+            ValueError: the reading is not finite.
         """
         self._learning, self._limit, self._single = True, None, None
-        if self._take(finite(value)) and len(self._steps) == STRETCH:
+        if self._take(finite(value)) and len(self._steps) == MOVEMENT_STEPS:
             self._quietest = min(self._quietest, self._movement())
 
     def update(self, value: float) -> Judgement:
-        """Judge the next reading: the statistic counts it and those before it that are equal.
+        """Evaluate the next reading; leave missing ones out. The statistic is the number of equal readings in a row.
 
         Raises:
-            ValueError: it is not finite; leave a missing sample out.
+            ValueError: the reading is not finite.
         """
         last = self._last
         if self._single and not self._repeats and last is not None and last != value and abs(value) < LARGEST_VALUE:
@@ -180,19 +182,19 @@ class Stuck:
                 self._single = Judgement(1.0, 0.0, 0.0, self.limit, False)
             return self._single
         equal = self._repeats + 1.0
-        moved = len(self._steps) == STRETCH and self._movement() >= AT_REST * self._quietest
+        moved = len(self._steps) == MOVEMENT_STEPS and self._movement() >= AT_REST * self._quietest
         limit = self.limit if moved else inf
         return Judgement(equal, 0.0, 0.0, limit, equal > limit)
 
     def restart(self) -> None:
-        """Forget the readings, as after a gap or a restart of the plant; what was learned stays."""
+        """Drop the last readings, as after a restart of the plant; the limit stays."""
         if self._learning:
             self._end_run()
         self._last, self._repeats, self._learning = None, 0, False
         self._steps.clear()
 
     def _take(self, value: float) -> bool:
-        """Count a reading; returns whether it differs from the one before."""
+        """Count a reading; returns True if it differs from the one before."""
         last, self._last = self._last, value
         if last is None:
             return False
@@ -201,7 +203,7 @@ class Stuck:
             return False
         if self._learning:
             self._end_run()
-        self._steps.extend([0.0] * min(self._repeats, STRETCH))
+        self._steps.extend([0.0] * min(self._repeats, MOVEMENT_STEPS))
         self._steps.append(abs(value - last))
         self._repeats = 0
         return True
@@ -211,22 +213,19 @@ class Stuck:
         self._runs[self._repeats] = self._runs.get(self._repeats, 0) + 1
 
     def _movement(self) -> float:
-        return sum(self._steps) / STRETCH
+        return sum(self._steps) / MOVEMENT_STEPS
 
 
-def most_equal(runs: dict[int, int], arl0: float) -> float:
-    """The most equal readings in a row that are no fault.
+def longest_normal_run(runs: dict[int, int], arl0: float) -> float:
+    """Most equal readings in a row without a fault: a whole number, or infinite if the runs are too few or too long.
 
     Args:
-        runs: of a sound signal: how many runs had so many repeats, the first reading of a run not counted.
-        arl0: readings between two longer runs in the mean, at least.
+        runs: number of runs by number of repeats, without a fault; the first reading of a run is no repeat.
+        arl0: least mean number of readings between two longer runs.
 
-    Returns:
-        A whole number; infinite if the runs are too few or too long to tell.
-
-    >>> most_equal({0: 1000}, 432_000)
+    >>> longest_normal_run({0: 1000}, 432_000)
     4.0
-    >>> most_equal({999: 1}, 432_000)
+    >>> longest_normal_run({999: 1}, 432_000)
     inf
     """
     readings = sum(count * (repeats + 1) for repeats, count in runs.items())
@@ -242,11 +241,11 @@ def most_equal(runs: dict[int, int], arl0: float) -> float:
         reached = sum(deep.values())
         if reached < ENOUGH_RUNS:
             break
-        went_on = sum(count * (repeats - depth) for repeats, count in deep.items())
+        continued = sum(count * (repeats - depth) for repeats, count in deep.items())
         # Two bounds that hold together with the confidence of one (Bonferroni).
         each = (1.0 + CONFIDENCE) / 2.0
         share = upper_bound(reached, readings, each)
-        limits.append(depth + _length(upper_bound(went_on, went_on + reached, each), arl0 * share))
+        limits.append(depth + _length(upper_bound(continued, continued + reached, each), arl0 * share))
         depth *= 2
     limit = max(limits)
     return limit if limit <= readings else inf
@@ -256,9 +255,9 @@ def upper_bound(successes: int, trials: int, confidence: float) -> float:
     """Upper confidence bound on a probability: Clopper & Pearson (1934), Biometrika 26(4).
 
     Args:
-        successes: how often it happened ...
-        trials: ... in so many independent trials.
-        confidence: with which the bound is not below the probability.
+        successes: number of successes.
+        trials: number of independent trials.
+        confidence: probability that the bound is not too low.
 
     >>> round(upper_bound(0, 100, 0.95), 4)  # 1 - 0.05^(1/100)
     0.0295
@@ -267,7 +266,7 @@ def upper_bound(successes: int, trials: int, confidence: float) -> float:
 
 
 def _length(probability: float, arl0: float) -> float:
-    """The least number of repeats, each of that probability, which come once in `arl0` or more."""
+    """Least number of repeats in a row, each with that probability, that occurs at most once in `arl0` readings."""
     if arl0 <= 1.0:
         return 0.0
     return float(ceil(log(arl0) / -log(probability))) if probability < 1.0 else inf

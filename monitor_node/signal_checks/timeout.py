@@ -1,38 +1,37 @@
-"""Silence: the plant, or one of its sensors, says nothing more.
+"""No data: a plant, or one of its sensors, has stopped sending.
 
-Two clocks tell it. Where samples come, their own times do: a row that comes later than is allowed after the one before
-ends a silence that began to count as one when the allowed time was over. So a replay and a back-test find the same
-silences, raised and cleared at the same times, as the live monitor. But while nothing comes at all no sample tells
-anything, and a live monitor must not wait for the plant to come back to say that it is gone. There the clock of receipt
-tells it: nothing has come for longer than is allowed in receipt time. What is then raised carries the time at which
-the next row, if there ever is one, will say that it was raised.
+There are two clocks. In sample time, a row later than allowed ends a timeout that was raised when the allowed time was
+over. So a replay and a back-test find the same timeouts, raised and cleared at the same times, as the live monitor. But
+without samples sample time stands still, and a live monitor must not wait for the plant's return to report its absence.
+Then receive time decides. An alarm raised by it carries the sample time at which the next row, if there is one, will
+find that it was raised.
 
-How long is allowed is learned, for each clock by itself, since a simulated plant may run sixty times as fast as its own
-time: `limit` times the usual spacing, which is the mean spacing and twice its mean deviation, both forgetting over 32
-samples, as in the retransmission timer of Jacobson (1988), Congestion avoidance and control, SIGCOMM. Regular samples
-are allowed `limit` periods; irregular ones and those that arrive in bursts more, by themselves. A silence is learned as
-no more than what was allowed, so that one does not spoil what was known; and yet a plant that goes on more slowly is
-taken as it is after two or three. In receipt time it is never less than `least_s`, within which networks and computers
-may hold anything up. Until `LEARN_FROM` spacings are known, the plant is not silent.
+The allowed time is learned for each clock separately, since a simulated plant may run sixty times as fast as its own
+time: `limit` times the usual spacing, which is the mean spacing plus twice its mean deviation, both exponential means
+over 32 samples, as in the retransmission timer of Jacobson (1988), Congestion avoidance and control, SIGCOMM. Evenly
+spaced samples are allowed `limit` periods, irregular ones and bursts accordingly more. A timeout enters the mean as no
+more than the allowed time, so that one does not spoil it; a plant that continues more slowly is learned after two or
+three. In receive time at least `least_s` is allowed, for delays of networks and computers. Before `LEARN_FROM` spacings
+are known there is no timeout.
 
-If the transport held samples up and the plant was never silent, the live alarm is cleared by the next row, as soon as
-it was raised, and a replay, rightly, does not have it.
+If the transport delayed samples and the plant never stopped, the next row clears the live alarm at the time at which it
+was raised, and a replay, rightly, does not have it.
 
-One `Silence` watches the plant: every row is a sign of life, and so is every sample received. One more a signal watches
-that signal in the rows, which go on without it, with NaN: a dead sensor. A gap in all rows is no fault of any single
-sensor, so these are excused then, and only one alarm is raised.
+One `DataTimeout` is for the plant: every row and every received sample restarts it. One more for each signal counts its
+values in the rows, which continue with NaN after a sensor has failed. A gap in all rows is no fault of a single sensor;
+these timeouts are suppressed then, and only one alarm is raised.
 
-A signal of which fewer than `LEARN_FROM` spacings are known, or that has never come at all, is measured by the plant's
-rows: it is silent after `UNKNOWN_ROWS` of their usual spacings without a value.
+A signal with fewer than `LEARN_FROM` known spacings, or without any value, is measured by the plant's rows: its timeout
+is `UNKNOWN_ROWS` of their usual spacings.
 
 >>> from math import isnan, nan
->>> plant, sensor = Silence(), Silence()
+>>> plant, sensor = DataTimeout(), DataTimeout()
 >>> def on_row(time_ns: int, T: float) -> list[tuple[str, Change]]:
-...     found = [("plant", plant.update(time_ns, present=True))]
-...     if found[0][1] != NOTHING:
-...         sensor.excuse(time_ns)
-...     found.append(("T", sensor.update(time_ns, present=not isnan(T))))
-...     return [(name, change) for name, change in found if change != NOTHING]
+...     changes = [("plant", plant.update(time_ns, present=True))]
+...     if changes[0][1] != NO_CHANGE:
+...         sensor.suppress_until(time_ns)
+...     changes.append(("T", sensor.update(time_ns, present=not isnan(T))))
+...     return [(name, change) for name, change in changes if change != NO_CHANGE]
 >>> [on_row(time_ns, 440.0) for time_ns in range(0, 4000, 100)] == [[]] * 40
 True
 >>> on_row(7000, 440.0)  # nothing for 3100 ns, where 500 are allowed
@@ -56,50 +55,49 @@ from reactorwatch.spc.charts.base import Judgement, positive
 from reactorwatch.stored_state import StoredState
 
 LEARN_FROM = 32
-"""Spacings that must be known before anything is silent."""
+"""Spacings that must be known before a timeout."""
 
 MEMORY = 32
-"""Spacings over which the usual one is forgotten."""
+"""Spacings in the exponential means."""
 
 UNKNOWN_ROWS = 100.0
-"""Usual spacings of the plant's rows within which every signal has to come. An analyser may give one value in fifty
-rows; a signal that does not come within these is not published, or its sensor is dead."""
+"""Usual spacings of the plant's rows within which every signal must have a value. An analyser may give one value in
+fifty rows; a signal without a value in these is not published, or its sensor has failed."""
 
 DEVIATIONS = 2.0
-"""Mean deviations that a usual spacing may be longer than the mean."""
+"""Mean deviations between the mean and the usual spacing."""
 
 BURST = 0.125
-"""Of the usual spacing: what comes sooner is one sign of life with what came before. After a cut, or a stop of ours,
-all that was held up comes at once, and says nothing of how often samples come."""
+"""Share of the mean spacing: a sooner sample belongs to a burst. After a partition, or a stall of this process,
+all delayed samples arrive at once, and their spacing is not learned."""
 
 LATE_NS = 1_000_000_000
-"""Who looks later than this after the plant was due cannot say that the plant was late."""
+"""If the check itself runs this late, the monitor was stalled; restart the timer instead of raising the alarm."""
 
 
 class Change(NamedTuple):
-    """What happens to the silence.
+    """Change of a timeout.
 
     Attributes:
-        raised_ns: when it began to be longer than is allowed, in the time of the samples; None: it was not raised now.
-        cleared_ns: time of the sample that ended it, or when it was raised if that is later; None: it was not ended
-            now.
+        raised_ns: sample time at which the allowed time was over; None: not raised now.
+        cleared_ns: time of the sample that ended the timeout, at least `raised_ns`; None: not cleared now.
     """
 
     raised_ns: int | None
     cleared_ns: int | None
 
 
-NOTHING = Change(None, None)
-"""The one that is returned, itself, when nothing happens."""
+NO_CHANGE = Change(None, None)
+"""Returned, the object itself, if nothing changes."""
 
 
 class Spacing(msgspec.Struct, forbid_unknown_fields=True):
-    """How far apart samples usually are, on one clock.
+    """Spacing of samples on one clock.
 
     Attributes:
-        count: of the spacings seen, up to `MEMORY`.
-        mean_ns: of the recent ones.
-        deviation_ns: of the recent ones from their mean, in the mean.
+        count: number of spacings, up to `MEMORY`.
+        mean_ns: exponential mean of the spacings.
+        deviation_ns: exponential mean of their absolute deviations.
     """
 
     count: int = 0
@@ -107,41 +105,38 @@ class Spacing(msgspec.Struct, forbid_unknown_fields=True):
     deviation_ns: float = 0.0
 
     def allowed_ns(self, limit: float) -> int | None:
-        """`limit` times the usual spacing; None while too little is known."""
-        if self.count < LEARN_FROM:
-            return None
-        return int(limit * (self.mean_ns + DEVIATIONS * self.deviation_ns))
+        """`limit` times the usual spacing; None before it is known."""
+        usual_ns = self.usual_ns()
+        return None if usual_ns is None else int(limit * usual_ns)
 
     def usual_ns(self) -> float | None:
-        """Usual spacing; None while too little is known."""
+        """Usual spacing; None before it is known."""
         return None if self.count < LEARN_FROM else self.mean_ns + DEVIATIONS * self.deviation_ns
 
     @property
     def steady_ns(self) -> float | None:
-        """The spacing, if all were the same."""
+        """The spacing, if all were equal; else None."""
         return self.mean_ns if self.count == MEMORY and self.deviation_ns == 0.0 else None
 
     def learn(self, spacing_ns: float) -> None:
-        """Take the next spacing in."""
+        """Update the means with a spacing."""
         self.count = min(self.count + 1, MEMORY)
-        off = spacing_ns - self.mean_ns
-        self.mean_ns += off / self.count
+        deviation = spacing_ns - self.mean_ns
+        self.mean_ns += deviation / self.count
         if self.count > 1:
-            self.deviation_ns += (abs(off) - self.deviation_ns) / self.count
+            self.deviation_ns += (abs(deviation) - self.deviation_ns) / self.count
 
 
-class SilenceState(StoredState, frozen=True):
-    """All that is set, learned and remembered.
-
-    The time of the last receipt is not: while a monitor was down it heard nothing, and the plant is not to blame.
+class DataTimeoutState(StoredState, frozen=True):
+    """State of a timeout, without the last receive time: a monitor that was down received nothing.
 
     Attributes:
-        limit: see `Silence`.
-        least_s: see `Silence`.
-        rows: spacing in the time of the samples.
-        receipts: spacing in the time of receipt.
-        last_ns: time of the last sample that was there; None before the first.
-        standing: whether it is silent.
+        limit: see `DataTimeout`.
+        least_s: see `DataTimeout`.
+        rows: spacing in sample time.
+        receipts: spacing in receive time.
+        last_ns: time of the last sample with a value; None before the first.
+        standing: True if the timeout is active.
     """
 
     limit: float
@@ -152,15 +147,15 @@ class SilenceState(StoredState, frozen=True):
     standing: bool
 
 
-class Silence:
-    """Tells when samples have stopped coming.
+class DataTimeout:
+    """Timeout of a plant's or a signal's samples.
 
     Args:
-        limit: usual spacings without a sample that are still allowed.
-        least_s: seconds of receipt time without anything that are always allowed.
+        limit: allowed time without a sample, in usual spacings.
+        least_s: least allowed receive time without a sample, in seconds.
 
     Attributes:
-        standing: whether it is silent.
+        standing: True if the timeout is active.
 
     Raises:
         InputError: limit is not a number above 1, or least_s not a positive one.
@@ -175,137 +170,137 @@ class Silence:
         self._rows, self._receipts = Spacing(), Spacing()
         self._last_ns: int | None = None
         self._received_ns: int | None = None
-        self._counted_ns: int | None = None  # of these, the one that the next spacing is counted from
+        self._counted_ns: int | None = None  # receive time from which the next spacing counts
         self._steady_ns: float | None = None
         self.standing = False
 
     @classmethod
-    def from_state(cls, state: SilenceState) -> "Silence":
-        """The one that goes on where `state` was taken."""
-        silence = cls(state.limit, state.least_s)
-        silence._rows, silence._receipts = msgspec.structs.replace(state.rows), msgspec.structs.replace(state.receipts)
-        silence._last_ns, silence.standing = state.last_ns, state.standing
-        silence._steady_ns = silence._rows.steady_ns
-        return silence
+    def from_state(cls, state: DataTimeoutState) -> "DataTimeout":
+        """Resume from a state."""
+        timeout = cls(state.limit, state.least_s)
+        timeout._rows, timeout._receipts = msgspec.structs.replace(state.rows), msgspec.structs.replace(state.receipts)
+        timeout._last_ns, timeout.standing = state.last_ns, state.standing
+        timeout._steady_ns = timeout._rows.steady_ns
+        return timeout
 
     @property
-    def state(self) -> SilenceState:
-        """A copy of all that is set, learned and remembered."""
+    def state(self) -> DataTimeoutState:
+        """A copy of the state."""
         rows, receipts = msgspec.structs.replace(self._rows), msgspec.structs.replace(self._receipts)
-        return SilenceState(self._limit, self._least_s, rows, receipts, self._last_ns, self.standing)
+        return DataTimeoutState(self._limit, self._least_s, rows, receipts, self._last_ns, self.standing)
 
-    # --- in the time of the samples --------------------------------------------------------------------------
+    # --- sample time -----------------------------------------------------------------------------------------
 
-    def unknown_allowed_ns(self) -> int | None:
-        """Longest gap of a signal whose own spacing is not known, in the time of this plant; None: not known yet."""
+    def fallback_allowed_ns(self) -> int | None:
+        """Allowed time of a signal whose own spacing is unknown, by this plant's rows; None if that is unknown."""
         usual_ns = self._rows.usual_ns()
         return None if usual_ns is None else int(max(UNKNOWN_ROWS, self._limit) * usual_ns)
 
-    def update(self, time_ns: int, *, present: bool, unknown_allowed_ns: int | None = None) -> Change:
-        """Take the next row in.
+    def update(self, time_ns: int, *, present: bool, fallback_allowed_ns: int | None = None) -> Change:
+        """Update with a row.
 
-        A row that is not later than the last sample means that the plant's clock was set back: spacings are counted
-        from this row on.
+        A row that is not later than the last sample means that the plant's clock was set back: spacings count from this
+        row on.
 
         Args:
-            time_ns: of the row.
-            present: whether what is watched has a value in it.
-            unknown_allowed_ns: how long it may be missing while its own spacing is not known; None: for ever.
+            time_ns: time of the row.
+            present: True if the signal has a value in it.
+            fallback_allowed_ns: allowed time while the signal's own spacing is unknown; None: unlimited.
         """
         last_ns = self._last_ns
         if last_ns is None or time_ns <= last_ns:
             self._last_ns = time_ns
-            return self._change(None, time_ns) if present else NOTHING
+            return self._change(None, time_ns) if present else NO_CHANGE
         rows, spacing_ns = self._rows, time_ns - last_ns
         if present and spacing_ns == self._steady_ns and not self.standing:
             self._last_ns = time_ns  # there is nothing to learn
-            return NOTHING
+            return NO_CHANGE
         allowed_ns = rows.allowed_ns(self._limit)
-        if allowed_ns is None and unknown_allowed_ns is not None:
-            allowed_ns = max(unknown_allowed_ns, int(self._limit * rows.mean_ns))
+        if allowed_ns is None and fallback_allowed_ns is not None:
+            allowed_ns = max(fallback_allowed_ns, int(self._limit * rows.mean_ns))
         raised_ns = None
         if allowed_ns is not None and spacing_ns > allowed_ns and not self.standing:
             self.standing, raised_ns = True, last_ns + allowed_ns
         if not present:
-            return NOTHING if raised_ns is None else Change(raised_ns, None)
+            return NO_CHANGE if raised_ns is None else Change(raised_ns, None)
         rows.learn(spacing_ns if allowed_ns is None else min(spacing_ns, allowed_ns))
         self._steady_ns = rows.steady_ns
         self._last_ns = time_ns
         return self._change(raised_ns, max(time_ns, last_ns + (allowed_ns or 0)))
 
-    def excuse(self, time_ns: int) -> None:
-        """Begin to count anew: up to now everything was silent, not only what is watched here."""
+    def suppress_until(self, time_ns: int) -> None:
+        """Restart the timer: until now all signals had no data, not only this one."""
         if not self.standing:
             self._last_ns = time_ns
 
-    # --- in the time of receipt ------------------------------------------------------------------------------
+    # --- receive time ----------------------------------------------------------------------------------------
 
-    def listen(self, now_ns: int) -> None:
-        """Begin to wait, after a stop, for what comes next; how long it takes is no spacing."""
+    def arm(self, now_ns: int) -> None:
+        """Restart the timer after a stop; the time to the next sample is no spacing."""
         self._received_ns, self._counted_ns = now_ns, None
 
     @property
     def receipts_ns(self) -> tuple[int | None, int | None]:
-        """When something came last, and from when the next spacing is counted; None: what comes next is the first."""
+        """Receive time of the last sample, and of the one from which the next spacing counts; None before the first."""
         return self._received_ns, self._counted_ns
 
     @receipts_ns.setter
     def receipts_ns(self, receipts_ns: tuple[int | None, int | None]) -> None:
         self._received_ns, self._counted_ns = receipts_ns
 
-    def received(self, now_ns: int) -> None:
-        """Note that something came, whatever it was. A clock that was set back is no spacing, nor is one in a burst."""
+    def on_receipt(self, now_ns: int) -> None:
+        """Restart the timer: a sample was received. A step back of the clock is no spacing, nor is one in a burst."""
         before_ns, self._received_ns = self._counted_ns, now_ns
         if before_ns is None or now_ns < before_ns:
             self._counted_ns = now_ns
         elif self._receipts.count < MEMORY or now_ns - before_ns >= BURST * self._receipts.mean_ns:
             self._counted_ns = now_ns
-            self._receipts.learn(min(now_ns - before_ns, self._patience_ns() or now_ns - before_ns))
+            self._receipts.learn(min(now_ns - before_ns, self._timeout_ns() or now_ns - before_ns))
 
     def due_ns(self) -> int | None:
-        """When to `check` unless something comes before; None: there is nothing to wait for."""
-        patience_ns = self._patience_ns()
-        if self._received_ns is None or patience_ns is None or self.standing or self.deadline_ns() is None:
+        """Time to `check`, unless a sample arrives before; None: no timeout is set."""
+        timeout_ns = self._timeout_ns()
+        if self._received_ns is None or timeout_ns is None or self.standing or self.deadline_ns() is None:
             return None
-        return self._received_ns + patience_ns
+        return self._received_ns + timeout_ns
 
     def check(self, now_ns: int) -> Change:
-        """Look whether it is silent.
+        """Check the timeout in receive time.
 
-        Who looks much later than it was due was not there himself: frozen, or his clock was set. What was said
-        meanwhile may still be on its way, so it is waited for anew.
+        A check much later than due means that the monitor was stalled, or its clock was set. Samples may still be on
+        their way, so the timer is restarted.
 
         Args:
-            now_ns: by the clock that `received` was told.
+            now_ns: present time, on the clock of `on_receipt`.
         """
         due_ns = self.due_ns()
         if due_ns is None or now_ns < due_ns:
-            return NOTHING
+            return NO_CHANGE
         if now_ns - due_ns > LATE_NS:
-            self.listen(now_ns)
-            return NOTHING
-        return self.begin()
+            self.arm(now_ns)
+            return NO_CHANGE
+        return self.declare_timeout()
 
-    def begin(self) -> Change:
-        """It is silent from now on, whoever says so."""
+    def declare_timeout(self) -> Change:
+        """Make the timeout active."""
         if self.standing or self.deadline_ns() is None:
-            return NOTHING
+            return NO_CHANGE
         self.standing = True
         return Change(self.deadline_ns(), None)
 
     def deadline_ns(self) -> int | None:
-        """Until when the next row is allowed, in the time of the samples; None while too little is known."""
+        """Deadline of the next row in sample time; None before the spacing is known."""
         allowed_ns = self._rows.allowed_ns(self._limit)
         return None if self._last_ns is None or allowed_ns is None else self._last_ns + allowed_ns
 
-    def _patience_ns(self) -> int | None:
+    def _timeout_ns(self) -> int | None:
         allowed_ns = self._receipts.allowed_ns(self._limit)
         return None if allowed_ns is None else max(allowed_ns, int(self._least_s * 1e9))
 
     def _change(self, raised_ns: int | None, heard_ns: int) -> Change:
-        """What it means that something was heard."""
+        """Change due to a sample."""
         if not self.standing:
-            return NOTHING
+            return NO_CHANGE
         self.standing = False
         return Change(raised_ns, heard_ns)
 

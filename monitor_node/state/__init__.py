@@ -1,1 +1,1 @@
-"""The monitor's state as one structure, and its seal."""
+"""State of a monitor as one structure, and its seal."""

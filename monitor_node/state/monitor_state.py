@@ -1,7 +1,7 @@
-"""All that a monitor remembers, as bytes: what they are made of, and how they are known to be whole and of this plant.
+"""Serialised state of a monitor.
 
-The bytes are MessagePack behind a seal (see `seal`): whatever is not exactly what was stored is refused. What was
-learned with other settings, or with another model of the plant, is refused as well, and the difference is named.
+The bytes are MessagePack behind a seal (see `seal`): damaged bytes are refused. A state learned with other settings, or
+with another model of the plant, is refused as well, and the difference is named.
 """
 
 from hashlib import blake2b
@@ -12,8 +12,8 @@ import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import AlignmentState
-from monitor_node.ingest.sequence_check import SampleRun
-from monitor_node.state.pipeline_state import WatchState
+from monitor_node.ingest.sequence_check import SequenceCheck
+from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.state.seal import DIGEST_BYTES, Seal
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
@@ -23,39 +23,39 @@ MAGIC = b"reactorwatch monitor"
 SEAL = Seal(MAGIC, 2, "state of a monitor")
 
 NOT_LEARNED_BY = frozenset({"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s"})
-"""Settings that what is learned does not depend on; the model is known by its equations, not by its file."""
+"""Settings that do not change the state; the model is identified by its equations, not by its file."""
 
 
 class OtherSettingsError(InputError):
-    """A state that is whole, but was learned with other settings."""
+    """The state is intact, but was learned with other settings."""
 
 
 class MonitorState(StoredState, frozen=True):
-    """All that a monitor remembers.
+    """State of a monitor.
 
     Attributes:
-        settings: that it was learned with, see `settings_of`.
-        runs: of the samples of each signal, the input first.
-        alignment: samples on their way into rows.
-        board: the alarms, see `AlarmBoard.to_bytes`.
-        watch: all that was learned.
-        units: by signal, as heard last.
-        heard_from_ns: by signal, the time of the first sample that was heard.
+        settings: settings of the training, see `learning_settings`.
+        runs: sequence checks of the signals, the input first.
+        alignment: state of the alignment.
+        board: state of the alarms, see `Annunciator.to_bytes`.
+        watch: state of the pipeline.
+        units: newest unit by signal.
+        heard_from_ns: time of the first accepted sample by signal.
         first_ns: time of the first row; None before it.
-        last_ns: time of the last row.
-        watching_since_ns: time of the first row that was judged.
-        snapshot_due_ns: when the models are told next.
-        received: messages so far.
-        published: likewise.
-        refused: by reason, likewise.
-        failures: contained errors of this software, by stage.
+        last_ns: time of the last row; None before the first.
+        watching_since_ns: time of the first evaluated row; None before it.
+        snapshot_due_ns: plant time of the next model snapshots; None before the first row.
+        received: number of messages received.
+        published: number of messages published.
+        refused: number of rejected messages by reason.
+        failures: number of contained errors of this software by stage.
     """
 
     settings: dict[str, Any]
-    runs: list[SampleRun]
+    runs: list[SequenceCheck]
     alignment: AlignmentState
     board: bytes
-    watch: WatchState
+    watch: PipelineState
     units: dict[str, str]
     heard_from_ns: dict[str, int]
     first_ns: int | None
@@ -68,49 +68,49 @@ class MonitorState(StoredState, frozen=True):
     failures: dict[str, int] = msgspec.field(default_factory=dict)
 
 
-def settings_of(config: MonitorConfig, model: ProcessModel | None, *, points: bool) -> dict[str, Any]:
-    """What has to be the same for a state to be gone on from.
+def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, points: bool) -> dict[str, Any]:
+    """Settings that must be equal to resume from a state.
 
     Args:
-        config: of the monitor.
-        model: of the plant.
+        config: settings of the monitor.
+        model: process model.
         points: as for `Monitor`.
     """
-    said = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
-    said |= {"points": points, "equations": fingerprint(model)}
-    settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(said))  # as they are read back
+    fields = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
+    fields |= {"points": points, "equations": fingerprint(model)}
+    settings: dict[str, Any] = msgspec.msgpack.decode(msgspec.msgpack.encode(fields))  # as they are read back
     return settings
 
 
 def fingerprint(model: ProcessModel | None) -> str:
-    """What a model is known by: its equations, names and numbers; empty without a model."""
+    """Digest of a model's equations, names and numbers; empty without a model."""
     if model is None:
         return ""
     x, u, p = model.arguments()
     memory = [*model.at_rest.values(), *model.resets.values()]
     function = ca.Function("memory", [x, u, p], memory, {"allow_free": True})
     words = (model.name, *model.state_names, *model.input_names, *model.output_names, *model.parameter_names)
-    said = (*words, *model.breakpoints, *model.at_rest, *model.resets, model.function().serialize())
+    texts = (*words, *model.breakpoints, *model.at_rest, *model.resets, model.function().serialize())
     values = model.values().tobytes()
-    return blake2b("\0".join((*said, function.serialize())).encode() + values, digest_size=DIGEST_BYTES).hexdigest()
+    return blake2b("\0".join((*texts, function.serialize())).encode() + values, digest_size=DIGEST_BYTES).hexdigest()
 
 
-def sealed(state: MonitorState) -> bytes:
-    """The bytes of a state."""
+def seal_state(state: MonitorState) -> bytes:
+    """Serialise and seal a state."""
     return SEAL.close(state.to_bytes())
 
 
-def opened(data: bytes, settings: dict[str, Any]) -> MonitorState:
-    """The state of some bytes.
+def open_state(data: bytes, settings: dict[str, Any]) -> MonitorState:
+    """Open a sealed state.
 
     Args:
-        data: what `sealed` returned.
-        settings: see `settings_of`.
+        data: bytes from `seal_state`.
+        settings: see `learning_settings`.
 
     Raises:
         ForeignFileError: the bytes were never a state.
-        InputError: they are a damaged one, or of another version.
-        OtherSettingsError: they are a state, but learned with other settings.
+        InputError: the state is damaged, or of another version.
+        OtherSettingsError: the state was learned with other settings.
     """
     body = SEAL.open(data)
     try:

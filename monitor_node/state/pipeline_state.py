@@ -1,4 +1,4 @@
-"""What the watch over a plant remembers, put together from what its parts do."""
+"""State of a plant's pipeline, composed of its parts' states."""
 
 from monitor_node.baseline.predictor import PredictorState
 from monitor_node.baseline.references import ArxReferenceState, ProcessReferenceState
@@ -6,25 +6,25 @@ from monitor_node.baseline.training import TrainingState
 from monitor_node.chart_stage import ChartsState
 from monitor_node.ingest.sampling import SamplingState
 from monitor_node.isolation.stage import SuspicionState
-from monitor_node.signal_checks.stage import SignalsState
+from monitor_node.signal_checks.stage import SignalChecksState
 from reactorwatch.spc.prewhitening import PrewhitenerState
 from reactorwatch.stored_state import StoredState
 
 
-class WatchedState(StoredState, frozen=True):
-    """What a training came to, and what is remembered since.
+class TrainedState(StoredState, frozen=True):
+    """State after the training.
 
     Attributes:
-        reference: that rows are expected by.
-        checks: what was said of the training: name and result of each.
-        left_out: signals that are not watched, each with the reason.
-        whiteners: one an output.
-        charts: all of them.
-        suspicion: None: causes are not looked for.
-        arl0: run length of each alarm without a fault, in rows.
-        withheld: outputs whose newest value may be an outlier.
-        rows_watched: rows that were judged.
-        until_drift: rows until the next look at the drift.
+        reference: state of the reference.
+        checks: checks of the training: name and result of each.
+        left_out: signals that are not monitored, with the reason.
+        whiteners: prewhitening filters, one an output.
+        charts: state of the charts.
+        suspicion: state of the search for causes; None if there is none.
+        arl0: in-control run length of each alarm, in rows.
+        withheld: one flag an output: its newest value is quarantined as a possible spike.
+        rows_watched: number of evaluated rows.
+        until_drift: number of rows until the next drift point.
     """
 
     reference: ProcessReferenceState | ArxReferenceState
@@ -39,23 +39,23 @@ class WatchedState(StoredState, frozen=True):
     until_drift: int
 
 
-class WatchState(StoredState, frozen=True):
-    """All that the watch over a plant remembers, but for its alarms.
+class PipelineState(StoredState, frozen=True):
+    """State of a pipeline, without the alarms.
 
     Attributes:
-        sampling: how rows come.
-        signals: silence, stuck sensors and spikes.
-        predictors: one an output.
-        refusals: how many trainings were refused.
-        began_ns: when the present training, or the last, began; None before its first row.
-        training: its rows; none when it is over.
-        watched: None while it is not.
+        sampling: state of the sampling period.
+        signals: state of the signal checks.
+        predictors: identified models, one an output.
+        refusals: number of refused trainings.
+        began_ns: start of the present or last training; None before its first row.
+        training: rows of the training; empty after it.
+        watched: state after the training; None before its end.
     """
 
     sampling: SamplingState
-    signals: SignalsState
+    signals: SignalChecksState
     predictors: list[PredictorState]
     refusals: int
     began_ns: int | None
     training: TrainingState
-    watched: WatchedState | None
+    watched: TrainedState | None

@@ -1,7 +1,7 @@
-"""A word, a version and a digest in front of stored bytes.
+"""Seal of stored bytes: a magic word, a version and a digest.
 
-A wrong bit in a covariance, or in the name of an alarm, would otherwise be believed for months. The word tells a state
-from a file of the user's.
+Without it a wrong bit in a covariance, or in the name of an alarm, would stay unnoticed for months. The magic word
+distinguishes a state from a user's file.
 """
 
 from hashlib import blake2b
@@ -14,16 +14,16 @@ _VERSION_BYTES = 2
 
 
 class ForeignFileError(InputError):
-    """Bytes that are not a stored state, damaged or not: nothing that the software may rename or overwrite."""
+    """The bytes are no stored state, not even a damaged one: the software must not rename or overwrite the file."""
 
 
 class Seal(NamedTuple):
-    """The head of one kind of stored state.
+    """Header of one kind of stored state.
 
     Attributes:
-        word: the first bytes.
-        version: of the form that is written and read.
-        name: of what is stored, for messages.
+        word: magic word, the first bytes.
+        version: version of the layout that is written and read.
+        name: name of the kind, for messages.
     """
 
     word: bytes
@@ -31,22 +31,22 @@ class Seal(NamedTuple):
     name: str
 
     def close(self, body: bytes) -> bytes:
-        """The bytes to store: word, version, digest and body."""
+        """Seal a body: word, version, digest and body."""
         return self.word + self.version.to_bytes(_VERSION_BYTES, "big") + _digest(body) + body
 
     def open(self, data: bytes) -> bytes:
-        """The body of stored bytes.
+        """Body of sealed bytes.
 
         Raises:
             ForeignFileError: the bytes are not a state of this kind.
-            InputError: they are one that is cut, damaged or of another version.
+            InputError: the state is truncated, damaged or of another version.
         """
         head_bytes = len(self.word) + _VERSION_BYTES
         head, body = data[:head_bytes], data[head_bytes + DIGEST_BYTES :]
         is_intact = data[head_bytes : head_bytes + DIGEST_BYTES] == _digest(body)
         if not head.startswith(self.word) or len(head) < head_bytes:
             text = f"is no {self.name}: {len(data)} bytes that do not begin like one"
-            # A head that is cut or damaged before an intact rest, or what a power failure leaves: nothing or zeros.
+            # A damaged or truncated header before an intact body, or the remains of a power failure: nothing or zeros.
             is_ours = self.word.startswith(head[: len(self.word)]) or is_intact or not data.strip(b"\0")
             raise InputError(text) if is_ours else ForeignFileError(text)
         version = int.from_bytes(head[len(self.word) :], "big")

@@ -1,9 +1,9 @@
-"""The file that the state of the alarms is kept in, so that it survives a restart of the monitor."""
+"""File of the alarms' state, for a restart of the monitor."""
 
 import os
 from pathlib import Path
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.core import Monitor
 from monitor_node.state.seal import ForeignFileError, Seal
 from monitor_node.storage.kept_aside import DAMAGED, keep_aside, read_regular
@@ -16,22 +16,21 @@ _CURE = "move it away to begin with all alarms normal, or name another file"
 
 
 class AlarmFile:
-    """Keeps the state of the alarms in a file: whole or not at all, and on the disk when `store` returns.
+    """Stores the alarms' state in a file, atomically, and on the disk when `store` returns.
 
-    The file is read when this is made and changed by `load` at the earliest, so that one that is refused ends the start
-    before anything else is renamed.
+    The constructor only reads the file, so that a refused file ends the start before any file is renamed.
 
     Args:
         path: the file.
-        monitor: of the plant.
+        monitor: monitor of the plant.
 
     Raises:
-        InputError: the file cannot be read, is no alarm state, or is that of another plant; it is left as it is.
+        InputError: the file cannot be read, or is no alarm state of this plant; it is left unchanged.
     """
 
     def __init__(self, path: Path, monitor: Monitor) -> None:
         self._path, self._monitor = path, monitor
-        self._stored: tuple[AlarmBoard, int] | None = None
+        self._stored: tuple[Annunciator, int] | None = None
         self._body: bytes | None = None
         self._damage: InputError | None = None
         try:
@@ -54,20 +53,17 @@ class AlarmFile:
         except InputError as error:
             self._damage = error
             return
-        AlarmBoard(self._monitor.config).from_bytes(self._body)
+        Annunciator(self._monitor.config).from_bytes(self._body)
 
     def load(self, *, is_newest: bool) -> str | None:
-        """Restore the alarms from the file; one that does not exist is begun.
+        """Restore the alarms from the file, or create it; returns a line for the log, if there is something to report.
 
         Args:
-            is_newest: whether the monitor knows its alarms from nowhere else, or from an older state.
-
-        Returns:
-            A line for the log; None: there is nothing to report.
+            is_newest: True if the monitor has no other state of its alarms, or an older one.
 
         Raises:
-            InputError: the file is damaged and the alarms are known from nowhere else, or it will never be written.
-                That the disk is full just now ends nothing.
+            InputError: the file is damaged and there is no other state, or it cannot be written. A full disk is no
+                error.
         """
         line = None
         if self._damage is not None:
@@ -89,10 +85,10 @@ class AlarmFile:
         return line
 
     def store(self) -> None:
-        """Write what has changed, if anything has.
+        """Write the alarms, if they have changed.
 
         Raises:
-            InputError: the file cannot be written; what was there is still there.
+            InputError: the file cannot be written; it is unchanged.
         """
         board = self._monitor.alarms
         if self._stored == (board, board.changes):

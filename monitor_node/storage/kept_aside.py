@@ -1,7 +1,7 @@
-"""Files that cannot be used now are kept under other names, and never overwritten.
+"""Unusable files are kept under other names, and never overwritten.
 
-What was learned over months may be wanted back, with the settings that it was learned with; a damaged file may be worth
-a look.
+A state learned over months may be wanted back with the settings it was learned with; a damaged file may be worth a
+look.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ _NAME = re.compile(rf"(.+?)(?:{re.escape(DAMAGED)}|{re.escape(OTHER_SETTINGS)})(
 
 
 def keep_aside(path: Path, ending: str) -> Path:
-    """Rename a file to its name with the ending, and a number if there is such a file; returns the new path.
+    """Rename a file to its name with the ending, and a number if that name is taken; returns the new path.
 
     Raises:
         OSError: the file cannot be renamed.
@@ -38,7 +38,7 @@ def keep_aside(path: Path, ending: str) -> Path:
 
 
 def find_kept_aside(folder: Path) -> dict[str, list[Path]]:
-    """Files of a folder that were kept aside, the newest first, by the name that they had."""
+    """Kept files of a folder by their original name, the newest first."""
     found: dict[str, list[tuple[int, Path]]] = {}
     for path in folder.iterdir() if folder.is_dir() else []:
         match = _NAME.fullmatch(path.name)
@@ -49,15 +49,12 @@ def find_kept_aside(folder: Path) -> dict[str, list[Path]]:
 
 
 def put_back(path: Path, asides: Iterable[Path], use: Callable[[bytes], None]) -> Path | None:
-    """Use the first of the files kept aside that can be used now, and give it its name back.
+    """Use the first usable one of the kept files, and rename it back; returns the name it was kept under, or None.
 
     Args:
-        path: the name, which no file has now.
-        asides: the files.
-        use: takes the bytes of a file; raises InputError if they cannot be used.
-
-    Returns:
-        The name that the file was kept under; None: none of them can be used.
+        path: original name, which no file has now.
+        asides: kept files.
+        use: called with the bytes of a file; raises InputError if they are unusable.
 
     Raises:
         OSError: a file cannot be read or renamed.
@@ -66,14 +63,14 @@ def put_back(path: Path, asides: Iterable[Path], use: Callable[[bytes], None]) -
         try:
             use(aside.read_bytes())
         except InputError:
-            continue  # it stays aside: that is what it is kept aside for
+            continue
         aside.replace(path)
         return aside
     return None
 
 
 def read_regular(path: Path) -> bytes | None:
-    """The bytes of a file; None: there is none.
+    """Bytes of a regular file; None: there is none.
 
     Raises:
         InputError: the path is a device, a pipe or a folder, which can hold no state.

@@ -1,8 +1,7 @@
-"""The file that all a monitor remembers is kept in, so that it goes on where it was after a restart.
+"""File of a monitor's state, for a restart.
 
-It is written beside its place and renamed into it, so a kill at any moment leaves the one before or this one, whole. A
-state that cannot be used is kept aside, and used again when it fits (see `kept_aside`). A file that is no state is
-refused and left alone.
+It is written under a temporary name and renamed, so that a kill leaves the file before or this one, intact. An unusable
+state is kept aside, and used again when it fits (see `kept_aside`). A file that is no state is refused and left alone.
 """
 
 import os
@@ -17,15 +16,15 @@ from reactorwatch.records.atomic import atomic_write, is_disk_full
 
 
 class StateFile:
-    """Keeps what a monitor remembers: whole or not at all, and on the disk when `store` returns.
+    """Stores a monitor's state in a file, atomically, and on the disk when `store` returns.
 
     Args:
         path: the file.
-        monitor: its memory.
-        every_s: how often it is stored.
+        monitor: the monitor.
+        every_s: storage interval in seconds.
 
     Attributes:
-        was_aside: whether the monitor was restored from a file that had been kept aside.
+        was_aside: True if the monitor was restored from a file that had been kept aside.
     """
 
     def __init__(self, path: Path, monitor: Monitor, every_s: float) -> None:
@@ -36,11 +35,10 @@ class StateFile:
         self._due_ns: int | None = None
 
     def load(self) -> str:
-        """Restore the monitor from the file, or from one kept aside that fits; returns a line for the log.
+        """Restore the monitor from the file, or from a kept one that fits; returns a line for the log.
 
         Raises:
-            InputError: the file cannot be read, is no state, or will never be written: its folder is not there, for
-                instance. That the disk is full just now ends nothing.
+            InputError: the file cannot be read, is no state, or cannot be written. A full disk is no error.
         """
         try:
             line = self._restore(read_regular(self._path))
@@ -50,21 +48,21 @@ class StateFile:
             raise InputError(f"state_file {self._path}: {error}") from error
         except OSError as error:
             raise InputError(f"state_file {self._path}: cannot be read or renamed: {error.strerror}") from error
-        told = f"state_file {self._path}: {line}"
+        line = f"state_file {self._path}: {line}"
         try:
             self._write()
         except InputError as error:
             if not is_disk_full(error):
                 raise
-            told = f"{told}; {error}"
-        return told
+            line = f"{line}; {error}"
+        return line
 
     def due_ns(self) -> int | None:
-        """When to store what was heard; None: there is nothing to store."""
+        """Time of the next storage; None: nothing has changed."""
         return None if self._monitor.received == self._heard_stored else self._due_ns
 
     def is_due(self, now_ns: int) -> bool:
-        """Whether to store: an alarm has changed, or it is time and something was heard since."""
+        """True if an alarm has changed, or messages were received and the interval is over."""
         if self._due_ns is None or now_ns < self._due_ns - self._every_ns:  # the first time, or the clock was set back
             self._due_ns = now_ns + self._every_ns
         if self._monitor.alarms.changes == self._alarms_stored and now_ns < self._due_ns:
@@ -73,10 +71,10 @@ class StateFile:
         return self._monitor.alarms.changes != self._alarms_stored or self._monitor.received != self._heard_stored
 
     def store(self) -> None:
-        """Write all that is remembered now.
+        """Write the present state.
 
         Raises:
-            InputError: the file cannot be written; what was there is still there. It is due again in its time.
+            InputError: the file cannot be written; it is unchanged. The next try is after the interval.
         """
         self._alarms_stored, self._heard_stored = self._monitor.alarms.changes, None
         self._write()
@@ -96,7 +94,7 @@ class StateFile:
             raise InputError(f"state_file {self._path}: cannot be written: {error.strerror}") from error
 
     def _restore(self, data: bytes | None) -> str:
-        found = "there is none yet"
+        status = "there is none yet"
         if data is not None:
             try:
                 self._monitor.from_bytes(data)
@@ -104,12 +102,12 @@ class StateFile:
                 raise
             except InputError as error:
                 ending = OTHER_SETTINGS if isinstance(error, OtherSettingsError) else DAMAGED
-                found = f"{error}; it is kept as {keep_aside(self._path, ending).name}"
+                status = f"{error}; it is kept as {keep_aside(self._path, ending).name}"
             else:
                 return "the monitor goes on from it"
         asides = find_kept_aside(self._path.parent).get(self._path.name, [])
         fitting = put_back(self._path, asides, self._monitor.from_bytes)
         self.was_aside = fitting is not None
         if fitting is not None:
-            return f"{found}; {fitting.name} fits and is in use again"
-        return f"{found}{';' if data is None else ', and'} the monitor learns anew"
+            return f"{status}; {fitting.name} fits and is in use again"
+        return f"{status}{';' if data is None else ', and'} the monitor learns anew"

@@ -202,7 +202,7 @@ class _NodeListener:
 
     def _on_monitor(self, token: str, is_alive: bool) -> None:
         with self._changed:
-            self.monitors.note(token, is_alive=is_alive)
+            self.monitors.on_token(token, is_alive=is_alive)
 
     def _on_health(self, message: Encoded) -> None:
         topic = keys.parse(message.key)

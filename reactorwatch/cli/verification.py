@@ -93,7 +93,7 @@ def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: 
 
 
 def _object(verification: Verification, file: Path, plant: str, zero_ns: int) -> dict[str, Any]:
-    counts = verification.comparison.counts
+    counts = verification.diff.counts
     return {
         "file": str(file),
         "plant": plant,
@@ -104,9 +104,9 @@ def _object(verification: Verification, file: Path, plant: str, zero_ns: int) ->
         "kinds": [
             {"kind": kind, "recorded": count.recorded, "equal": count.equal} for kind, count in sorted(counts.items())
         ],
-        "differing": verification.comparison.differing,
-        "differences": [_difference(item, zero_ns) for item in verification.comparison.differences],
-        "after_the_end": verification.comparison.unrecorded,
+        "differing": verification.diff.differing,
+        "differences": [_difference(item, zero_ns) for item in verification.diff.differences],
+        "after_the_end": verification.diff.unrecorded,
         "notes": verification.notes,
     }
 

@@ -122,4 +122,8 @@ def test_a_renamed_column_has_the_unit_in_its_brackets_or_none(
 
 
 def test_a_number_without_a_unit_stands_alone() -> None:
-    assert (quantity(1.5, ""), quantity(1.5, "1"), quantity(1.5, "degC")) == ("1.5", "1.5", "1.5 degC")
+    assert (format_quantity(1.5, ""), format_quantity(1.5, "1"), format_quantity(1.5, "degC")) == (
+        "1.5",
+        "1.5",
+        "1.5 degC",
+    )

@@ -5,7 +5,7 @@ from typing import TypeVar
 from google.protobuf.message import Message
 
 from monitor_node.alarms.alarms import ChartAlarm
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
@@ -26,7 +26,7 @@ class Desk:
     """
 
     def __init__(self, config: MonitorConfig = AT_ONCE, signals: tuple[str, ...] = ("C", "T")) -> None:
-        self.board = AlarmBoard(config)
+        self.board = Annunciator(config)
         self.alarms = {signal: self.board.declare("shewhart", signal) for signal in signals}
         self.said: list[Publication] = []
 
@@ -34,7 +34,7 @@ class Desk:
         """A row: the statistic of each signal named."""
         for signal, value in values.items():
             judgement = Judgement(value, 0.0, -3.0, 3.0, abs(value) > 3.0)
-            self.said += self.board.judge(self.alarms[signal], to_time_ns(minutes), judgement, "K")
+            self.said += self.board.evaluate(self.alarms[signal], to_time_ns(minutes), judgement, "K")
         self.said += self.board.end_row(to_time_ns(minutes))
 
     def told(self, kind: type[M]) -> list[M]:

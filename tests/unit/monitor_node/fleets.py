@@ -7,7 +7,7 @@ import msgspec
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.monitor import FleetMonitor
-from monitor_node.fleet.sharding import WHOLE, Crew, Shard
+from monitor_node.fleet.sharding import WHOLE, Shard, ShardGroup
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Health
@@ -38,7 +38,7 @@ def row_by_row(runs: Iterable[list[Encoded]]) -> list[Encoded]:
 
 def fleet(config: MonitorConfig = QUICK, shard: Shard = WHOLE, name: str = "a", **others: object) -> FleetMonitor:
     """A monitor of all plants, or of a shard."""
-    return FleetMonitor(config, 0, Crew(PLANTS, shard, name), **others)  # type: ignore[arg-type]
+    return FleetMonitor(config, 0, ShardGroup(PLANTS, shard, name), **others)  # type: ignore[arg-type]
 
 
 def alone(plant: str, messages: Iterable[Encoded], config: MonitorConfig = QUICK) -> list[Publication]:
@@ -61,13 +61,13 @@ def alarms(said: list[Publication]) -> list[tuple[str, str, int]]:
 def noting(asked: list[tuple[str, bool]]) -> Callable[[str, bool], bool]:
     """Notes whose past is asked for, and promises that it will be told."""
 
-    def ask_past(plant: str, taken_over: bool) -> bool:
+    def request_history(plant: str, taken_over: bool) -> bool:
         asked.append((plant, taken_over))
         return True
 
-    return ask_past
+    return request_history
 
 
 def shard_token(number: int) -> str:
     """Of one of two monitors that share a fleet."""
-    return Crew(PLANTS, Shard(number, 2), str(number)).token
+    return ShardGroup(PLANTS, Shard(number, 2), str(number)).token

@@ -89,13 +89,13 @@ def test_an_alarm_long_after_the_last_change_is_an_incident_of_its_own() -> None
 def test_a_spike_takes_no_suspects_away_from_the_incident_that_stands(spike_min: float) -> None:
     """An alarm that follows it is of the incident that it would be of without the spike, with its suspects."""
     desk = Desk(msgspec.structs.replace(AT_ONCE, incident_min=60.0))
-    spike = desk.board.declare("spike", "T", at_once=True, tells_cause=True, is_passing=True)
+    spike = desk.board.declare("spike", "T", without_on_delay=True, names_cause=True, is_transient=True)
     desk.point(0.0, T=OUT)
-    desk.board.suspect(to_time_ns(1.0), [SuspectedCause("coolant_flow", 0.9)])
+    desk.board.set_suspects(to_time_ns(1.0), [SuspectedCause("coolant_flow", 0.9)])
     for minute, out in ((spike_min, True), (spike_min + 0.1, False)):
         judgement = Judgement(9.0 if out else 0.0, 0.0, -6.0, 6.0, out)
-        desk.said += desk.board.judge(spike, to_time_ns(minute), judgement, "sd")
-    desk.board.suspect(to_time_ns(spike_min + 1.0), [SuspectedCause("coolant_flow", 0.95)])
+        desk.said += desk.board.evaluate(spike, to_time_ns(minute), judgement, "sd")
+    desk.board.set_suspects(to_time_ns(spike_min + 1.0), [SuspectedCause("coolant_flow", 0.95)])
     assert [item.probability for item in desk.board.alarm("shewhart/T").suspects] == [0.95]
     assert desk.board.alarm("spike/T").incident == desk.board.incident == 1
     assert not desk.board.alarm("spike/T").first_in
@@ -107,8 +107,8 @@ def test_a_spike_takes_no_suspects_away_from_the_incident_that_stands(spike_min:
 
 def test_a_spike_alone_is_an_incident() -> None:
     desk = Desk()
-    spike = desk.board.declare("spike", "T", at_once=True, tells_cause=True, is_passing=True)
-    desk.said += desk.board.judge(spike, to_time_ns(1.0), Judgement(9.0, 0.0, -6.0, 6.0, True), "sd")
+    spike = desk.board.declare("spike", "T", without_on_delay=True, names_cause=True, is_transient=True)
+    desk.said += desk.board.evaluate(spike, to_time_ns(1.0), Judgement(9.0, 0.0, -6.0, 6.0, True), "sd")
     assert (desk.board.incident, desk.board.alarm("spike/T").first_in) == (1, True)
 
 
@@ -266,5 +266,5 @@ def test_a_state_of_another_plant_is_refused() -> None:
 def test_a_state_that_cannot_be_is_refused() -> None:
     stored = msgspec.msgpack.decode(busy_desk().board.to_bytes())
     stored["alarms"]["shewhart/T"]["state"] = "normal"
-    with pytest.raises(InputError, match="shewhart/T is normal, but its condition stands"):
+    with pytest.raises(InputError, match="shewhart/T is normal, but its condition is active"):
         Desk().board.from_bytes(msgspec.msgpack.encode(stored))

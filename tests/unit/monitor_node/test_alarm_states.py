@@ -15,7 +15,7 @@ from monitor_node.alarms.states import (
     Refused,
     State,
     diagram,
-    fits,
+    is_consistent,
     next_state,
 )
 from reactorwatch.contract.messages_pb2 import AlarmState
@@ -51,10 +51,10 @@ def test_every_pair_of_state_and_event_is_that_of_the_standard(
 ) -> None:
     if entry == ".":
         with pytest.raises(InputError, match=r"^(is|stands|does not stand)"):
-            next_state(state, event, standing=standing)
+            next_state(state, event, active=standing)
         return
     letter = ("B" if standing else "A") if entry == "?" else entry
-    assert next_state(state, event, standing=standing) is LETTERS[letter]
+    assert next_state(state, event, active=standing) is LETTERS[letter]
 
 
 def test_the_table_has_every_pair_and_no_other() -> None:
@@ -80,8 +80,8 @@ def test_no_sequence_of_events_leaves_the_table_or_loses_the_condition(events: l
             assert event not in (Event.RAISED, Event.CLEARED), "samples are never refused"
             continue
         standing = after
-        state = next_state(state, event, standing=standing)
-        assert fits(state, standing=standing)
+        state = next_state(state, event, active=standing)
+        assert is_consistent(state, active=standing)
         if before in OUT_OF_SIGHT and state not in OUT_OF_SIGHT:
             assert state is (State.UNACKNOWLEDGED if standing else State.NORMAL)
 
@@ -99,8 +99,8 @@ def test_the_diagram_has_an_arrow_for_every_entry_that_is_not_refused() -> None:
     for state, row in TABLE.items():
         for event, outcome in row.items():
             if isinstance(outcome, ByCondition):
-                assert f"{event}, stands" in arrows[f"{state.name} --> {outcome.standing.name}"]
-                assert f"{event}, over" in arrows[f"{state.name} --> {outcome.over.name}"]
+                assert f"{event}, stands" in arrows[f"{state.name} --> {outcome.active.name}"]
+                assert f"{event}, over" in arrows[f"{state.name} --> {outcome.normal.name}"]
                 count += 2
             elif isinstance(outcome, State):
                 assert event in arrows[f"{state.name} --> {outcome.name}"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor_node.baseline.outlier_blocks import undisturbed
+from monitor_node.baseline.outlier_blocks import screen_baseline
 from monitor_node.baseline.resolution import resolution
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -116,5 +116,5 @@ def test_what_many_values_do_is_no_outlier(share: float) -> None:
     z = 0.01 * generator.normal(size=1000) + 0.33 * generator.choice(
         [0.0, 1.0, -1.0], 1000, p=[1 - share, *[share / 2] * 2]
     )
-    assert undisturbed(z, 0.33 / np.sqrt(12.0)).outliers == 0
-    assert undisturbed(z).outliers == 0
+    assert screen_baseline(z, 0.33 / np.sqrt(12.0)).outliers == 0
+    assert screen_baseline(z).outliers == 0

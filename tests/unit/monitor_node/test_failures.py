@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.chart_stage import ChartWatch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -14,9 +14,9 @@ from monitor_node.isolation.fit import _begun
 from monitor_node.isolation.glr_scan import Scan
 from monitor_node.isolation.isolation import Isolation
 from monitor_node.isolation.window import Window
-from monitor_node.pipeline import PlantWatch
+from monitor_node.pipeline import PlantPipeline
 from monitor_node.quiet.form import QuietForm
-from monitor_node.signal_checks.stage import SignalWatch
+from monitor_node.signal_checks.stage import SignalChecks
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError
@@ -33,7 +33,7 @@ def fail_from(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, from_ns: 
     method = getattr(owner, name)
 
     def failing(self: Any, *arguments: Any, **others: Any) -> Any:
-        config = self._board._config if isinstance(self, SignalWatch) else self._config
+        config = self._board._config if isinstance(self, SignalChecks) else self._config
         times = [item for item in arguments if isinstance(item, int) and not isinstance(item, bool)]
         times += [item.time_ns for item in arguments if hasattr(item, "time_ns")]
         if config.plant == BROKEN and max(times, default=from_ns) >= from_ns:
@@ -43,7 +43,7 @@ def fail_from(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, from_ns: 
     monkeypatch.setattr(owner, name, failing)
 
 
-def health_of(said: list[Publication], plant: str) -> Health:
+def health_message(said: list[Publication], plant: str) -> Health:
     (found,) = [item.message for item in said if item.key == f"reactor/{plant}/health/monitor"]
     assert isinstance(found, Health)
     return found
@@ -52,11 +52,11 @@ def health_of(said: list[Publication], plant: str) -> Health:
 @pytest.mark.parametrize(
     ("owner", "name", "stage"),
     [
-        (PlantWatch, "update", "row"),
+        (PlantPipeline, "update", "row"),
         (ChartWatch, "update", "row"),
-        (SignalWatch, "hear", "row"),
-        (AlarmBoard, "end_row", "row"),
-        (PlantWatch, "snapshots", "models"),
+        (SignalChecks, "check_timeouts", "row"),
+        (Annunciator, "end_row", "row"),
+        (PlantPipeline, "snapshots", "models"),
         (QuietForm, "written", "demotion"),
         (QuietForm, "read", "promotion"),
     ],
@@ -90,7 +90,7 @@ def test_an_error_in_one_plant_of_a_fleet_changes_nothing_for_the_others(
         said += monitors.on_messages(messages[first : first + 450], first * SECOND_NS)
     assert of("a", said) == of("a", expected["a"])
     assert of("c", said) == of("c", expected["c"])
-    health = health_of(monitors.on_stop(0), BROKEN)
+    health = health_message(monitors.on_stop(0), BROKEN)
     assert health.failures[stage] >= 1
     assert health.rows == 401 or stage == "promotion"
     notes = [line for plant, line in monitors.reports(0) if plant == BROKEN]
@@ -145,7 +145,7 @@ def test_an_error_in_the_search_for_causes_costs_no_alarm_and_no_restart(
     assert monitor.phase == "watching"
     assert monitor.failures.by_stage["isolation"] > 1
     assert len([note for note in monitor.notes if "isolation" in note]) == 1
-    assert health_of(monitor.on_stop(0), BROKEN).failures["isolation"] == monitor.failures.by_stage["isolation"]
+    assert health_message(monitor.on_stop(0), BROKEN).failures["isolation"] == monitor.failures.by_stage["isolation"]
 
 
 def test_a_silence_that_cannot_be_checked_ends_no_monitor(
@@ -154,9 +154,9 @@ def test_a_silence_that_cannot_be_checked_ends_no_monitor(
     monitor = Monitor(MonitorConfig(plant=BROKEN, training_min=20.0, isolation=False), 0, points=False)
     for message in runs[BROKEN][:900]:
         monitor.on_message(message, 0)
-    fail_from(monkeypatch, SignalWatch, "check", 0)
+    fail_from(monkeypatch, SignalChecks, "check", 0)
     said = monitor.on_tick(10**18)
-    assert health_of(said, BROKEN).failures == {"silence": 1}
+    assert health_message(said, BROKEN).failures == {"silence": 1}
 
 
 def test_errors_from_different_places_are_each_reported_once() -> None:
@@ -194,6 +194,6 @@ def test_settings_that_cannot_be_kept_end_the_monitor_of_one_plant_and_no_fleet(
     error = InputError("false_alarms_per_30_days must be larger")
     with pytest.raises(InputError, match="must be larger"):
         Failures().add("row", error, "the plant is learned again")
-    one_of_many = fleet()._here.unwatched("b", 0).failures
+    one_of_many = fleet()._watched.new_monitor("b", 0).failures
     one_of_many.add("row", error, "the plant is learned again")
     assert one_of_many.by_stage == {"row": 1}

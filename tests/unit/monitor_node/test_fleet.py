@@ -3,7 +3,7 @@
 import pytest
 
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.sharding import Shard, home
+from monitor_node.fleet.sharding import Shard, home_shard
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, Health
 from reactorwatch.errors import InputError
@@ -33,7 +33,7 @@ def test_many_messages_together_say_what_each_would_alone(
 
 def test_a_plant_is_watched_as_soon_as_a_node_of_it_is_alive() -> None:
     shown: list[tuple[str, bool]] = []
-    monitor = fleet(in_charge=lambda plant, ours: shown.append((plant, ours)))
+    monitor = fleet(on_ownership=lambda plant, ours: shown.append((plant, ours)))
     monitor.on_alive("reactor/x/alive/plant", True, 0)
     assert monitor.plants == ["x"]
     assert shown == [("x", True)]
@@ -76,13 +76,13 @@ def test_a_plant_that_falls_silent_is_told_of_while_others_go_on(runs: dict[str,
 
 
 def test_a_command_goes_to_its_plant_and_to_who_watches_it(runs: dict[str, list[Encoded]]) -> None:
-    monitor = fleet(shard=Shard(home("a", 2), 2))
+    monitor = fleet(shard=Shard(home_shard("a", 2), 2))
     payload, encoding = encode_message(AlarmCommand(alarm="ewma/T", by="Ada", comment="seen"))
     monitor.on_messages(runs["a"][:3] + runs["a"][3:6], 0)
     reply, _ = monitor.on_command(Encoded("reactor/a/command/comment", payload, encoding), 0)
     assert isinstance(reply, CommandReply)
     assert reply.accepted
-    theirs = next(name for name in map(str, range(99)) if home(name, 2) != home("a", 2))
+    theirs = next(name for name in map(str, range(99)) if home_shard(name, 2) != home_shard("a", 2))
     assert monitor.on_command(Encoded(f"reactor/{theirs}/command/comment", payload, encoding), 0) == (None, [])
 
 

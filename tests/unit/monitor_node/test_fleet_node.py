@@ -10,8 +10,8 @@ import pytest
 from monitor_node.core import Monitor
 from monitor_node.fleet import node as fleet_node
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.node import LOOK_EVERY_NS, FleetNode
-from monitor_node.fleet.sharding import Crew, Shard, home
+from monitor_node.fleet.node import POLL_NS, FleetNode
+from monitor_node.fleet.sharding import Shard, ShardGroup, home_shard
 from monitor_node.storage import state_recovery
 from monitor_node.storage.fleet_states import FleetStates
 from reactorwatch.contract import keys
@@ -39,11 +39,11 @@ class Bench:
         config = msgspec.structs.replace(QUICK, state_every_s=0.1)
         self.node = FleetNode(config, FleetConfig(plants="reactor/*", shard=shard), self.bus, 0, self.states)
         for _ in self.node.subscriptions:
-            self.node.listens()
+            self.node.on_subscribed()
 
     def tick(self) -> None:
         """A moment later."""
-        self.now_ns += LOOK_EVERY_NS
+        self.now_ns += POLL_NS
         self.node.on_tick(self.now_ns)
 
     def tick_until_watched(self, plant: str) -> None:
@@ -57,7 +57,7 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Iterator[Bench]:
     """One of two monitors, both of whose shards it has, or a single one."""
-    for name in ("SETTLE_S", "RETURN_S", "LOOK_AGAIN_S"):
+    for name in ("HANDOVER_S", "RETURN_S", "POLL_S"):
         monkeypatch.setattr(state_recovery, name, 0.0)
     bench = Bench(tmp_path, getattr(request, "param", "1/2"))
     for _ in range(101):  # the other was never seen
@@ -94,11 +94,11 @@ def test_while_the_router_is_gone_and_until_the_others_had_their_time_nothing_is
         bench.node.on_messages(run[place : place + 3], bench.now_ns)
     assert bench.node.monitor("a").rows == 0
     bench.bus.has_router = True
-    while bench.node.holds:
+    while bench.node.paused:
         assert bench.node.monitor("a").rows == 0
         bench.tick()
         returned_at += 1
-    assert returned_at * LOOK_EVERY_NS == 2_000_000_000
+    assert returned_at * POLL_NS == 2_000_000_000
     assert bench.node.monitor("a").rows == 20
 
 
@@ -127,8 +127,8 @@ def test_an_alarm_that_is_found_in_what_was_held_back_is_logged_once(
     bench.node.on_messages(run, bench.now_ns)
     bench.bus.has_router = True
     said: list[Publication] = []
-    while bench.node.holds:
-        bench.now_ns += LOOK_EVERY_NS
+    while bench.node.paused:
+        bench.now_ns += POLL_NS
         said += bench.node.on_tick(bench.now_ns)
     told = sum(isinstance(item.message, Alarm) for item in said)
     assert told > 0
@@ -140,7 +140,7 @@ def test_who_is_alone_goes_on_while_the_router_is_gone(bench: Bench) -> None:
     bench.bus.has_router = False
     bench.tick()
     bench.tick()
-    assert not bench.node.holds
+    assert not bench.node.paused
 
 
 def test_commands_are_left_to_the_others_while_they_may_have_the_plant(bench: Bench) -> None:
@@ -159,7 +159,7 @@ def test_a_flood_of_commands_is_refused_and_leaves_quiet_plants_quiet(
     replies = [bench.node.on_command(question, bench.now_ns)[0] for _ in range(3000)]
     refused = [reply for reply in replies if reply is not None and "too many commands" in reply.text]
     assert len(refused) == 3000 - PER_NAME.at_once
-    assert bench.node.monitor("a").refusals.by_reason["too_many_commands"] == len(refused)
+    assert bench.node.monitor("a").rejects.by_reason["too_many_commands"] == len(refused)
     for _ in range(101):
         bench.tick()
     assert f"too_many_commands ({len(refused)} so far)" in capsys.readouterr().out
@@ -169,7 +169,7 @@ def test_a_flood_of_commands_is_refused_and_leaves_quiet_plants_quiet(
 def test_the_counts_and_alarms_of_each_plant_are_on_the_page_as_long_as_it_is_watched(bench: Bench) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     metrics = bench.node.metrics = FleetMetrics("monitor")
-    plant = next(name for name in map(str, range(99)) if home(name, 2) == 2)
+    plant = next(name for name in map(str, range(99)) if home_shard(name, 2) == 2)
     bench.node.on_alive(f"reactor/{plant}/alive/plant", True, bench.now_ns)
     bench.tick_until_watched(plant)
     run = run_of(plant, 1, span_min=1.0)
@@ -182,7 +182,7 @@ def test_the_counts_and_alarms_of_each_plant_are_on_the_page_as_long_as_it_is_wa
     assert (rows.labels, rows.value) == ({"plant": plant, "node": "monitor"}, len(run) // 3)
     normal = [sample.value for sample in shown["reactorwatch_alarms"] if sample.labels["state"] == "normal"]
     assert normal == [len(bench.node.monitor(plant).alarms.all_alarms())]
-    bench.node.on_alive(Crew(bench.node.expression, Shard(2, 2), "other").token, True, bench.now_ns)
+    bench.node.on_alive(ShardGroup(bench.node.expression, Shard(2, 2), "other").token, True, bench.now_ns)
     assert list(metrics.collect()) == []
 
 

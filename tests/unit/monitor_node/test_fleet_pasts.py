@@ -5,7 +5,7 @@ import threading
 import pytest
 
 from monitor_node.storage import state_recovery
-from monitor_node.storage.state_recovery import Pasts
+from monitor_node.storage.state_recovery import StateRecovery
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
@@ -34,15 +34,15 @@ class CutOff(MemoryBus):
 
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("SETTLE_S", "RETURN_S", "LOOK_AGAIN_S"):
+    for name in ("HANDOVER_S", "RETURN_S", "POLL_S"):
         monkeypatch.setattr(state_recovery, name, 0.0)
 
 
 def test_who_is_cut_off_takes_nobody_s_plants_over_until_the_others_are_to_be_seen_again() -> None:
     bus = CutOff()
-    state_recovery = Pasts(bus, None, lambda _plant, _line: None)
-    state_recovery.ask("a")
-    state_recovery.begin()
+    state_recovery = StateRecovery(bus, None, lambda _plant, _line: None)
+    state_recovery.request("a")
+    state_recovery.start()
     assert bus.asked.wait(WITHIN_S)
     state_recovery.close()
     assert bus.seen[:2] == ["no router", "no router"]

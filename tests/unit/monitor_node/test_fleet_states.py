@@ -51,7 +51,7 @@ def test_what_cannot_be_written_is_told_and_what_was_there_is_still_there(
     states = FleetStates(tmp_path)
     states.put("a", b"now")
     states.close()
-    ((plant, why),) = states.failures()
+    ((plant, why),) = states.pop_failures()
     assert plant == "a"
     assert "No space left on device" in why
     assert (tmp_path / "a.state").read_bytes() == b"before"
@@ -76,12 +76,12 @@ def test_who_was_replaced_writes_over_no_newer_state_and_is_told_so(tmp_path: Pa
     second.close()
     again = FleetStates(tmp_path)
     again._marks = first._marks  # it has not ended, but was cut off
-    assert again.of_others(["a", "b"]) == ["a"]
+    assert again.written_elsewhere(["a", "b"]) == ["a"]
     again.put("a", b"later, of the first")
     again.close()
-    assert (again.lost(), again.lost()) == (["a"], [])
+    assert (again.pop_lost(), again.pop_lost()) == (["a"], [])
     assert again.read("a") == b"of the second"
-    assert again.of_others(["a"]) == []
+    assert again.written_elsewhere(["a"]) == []
 
 
 def test_who_is_replaced_while_he_writes_writes_over_no_newer_state(
@@ -94,7 +94,7 @@ def test_who_is_replaced_while_he_writes_writes_over_no_newer_state(
     monkeypatch.setattr("os.fsync", lambda _descriptor: (tmp_path / "a.state").write_bytes(b"of another"))
     states.put("a", b"too late")
     states.close()
-    assert (states.lost(), (tmp_path / "a.state").read_bytes()) == (["a"], b"of another")
+    assert (states.pop_lost(), (tmp_path / "a.state").read_bytes()) == (["a"], b"of another")
     assert [path.name for path in tmp_path.iterdir()] == ["a.state"]
 
 
@@ -115,7 +115,7 @@ def test_a_state_that_was_removed_by_a_person_is_written_again(tmp_path: Path) -
     (tmp_path / "a.state").unlink()
     states.put("a", b"now")
     states.close()
-    assert (states.lost(), (tmp_path / "a.state").read_bytes()) == ([], b"now")
+    assert (states.pop_lost(), (tmp_path / "a.state").read_bytes()) == ([], b"now")
 
 
 def test_what_a_writer_has_left_that_was_killed_is_removed_at_the_next_start(tmp_path: Path) -> None:

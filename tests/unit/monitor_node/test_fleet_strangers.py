@@ -2,8 +2,8 @@
 
 import pytest
 
-from monitor_node.fleet.sharding import Shard, home
-from monitor_node.ingest.pending import Past
+from monitor_node.fleet.sharding import Shard, home_shard
+from monitor_node.ingest.pending import PlantHistory
 from reactorwatch.contract.codec import Encoded
 
 from .fleets import SECOND_NS, fleet, noting, run_of, shard_token
@@ -16,13 +16,18 @@ def first_sample(plant: str) -> Encoded:
 
 
 def test_there_is_room_for_a_thousand_names_that_nobody_vouches_for_and_for_all_plants_with_a_token() -> None:
-    monitor, sample = fleet(shard=Shard(3 - home("x", 2), 2)), first_sample("x")  # those of the other shard count, too
+    monitor, sample = (
+        fleet(shard=Shard(3 - home_shard("x", 2), 2)),
+        first_sample("x"),
+    )  # those of the other shard count, too
     for number in range(1500):
         monitor.on_message(sample._replace(key=f"reactor/made-up{number}/sample/T"), 0)
     assert 400 < len(monitor.plants) < 600
     before = set(monitor.plants)
     monitor.on_message(sample._replace(key="reactor/one-more/sample/T"), 0)
-    ours = [plant for plant in (f"with-token{number}" for number in range(20)) if home(plant, 2) != home("x", 2)]
+    ours = [
+        plant for plant in (f"with-token{number}" for number in range(20)) if home_shard(plant, 2) != home_shard("x", 2)
+    ]
     for plant in ours:
         monitor.on_alive(f"reactor/{plant}/alive/plant", True, 0)
     assert set(monitor.plants) == before | set(ours)
@@ -30,19 +35,19 @@ def test_there_is_room_for_a_thousand_names_that_nobody_vouches_for_and_for_all_
 
 def test_a_made_up_name_is_forgotten_when_nothing_more_is_said_of_it_and_makes_room() -> None:
     shown: list[tuple[str, bool]] = []
-    monitor = fleet(in_charge=lambda plant, ours: shown.append((plant, ours)))
+    monitor = fleet(on_ownership=lambda plant, ours: shown.append((plant, ours)))
     monitor.on_message(first_sample("x"), 0)
     monitor.on_tick(TEN_MINUTES_NS - 1)
-    assert (monitor.plants, monitor.forgotten) == (["x"], 0)
+    assert (monitor.plants, monitor.evicted) == (["x"], 0)
     monitor.on_tick(TEN_MINUTES_NS)
-    assert (monitor.plants, monitor.forgotten) == ([], 1)
+    assert (monitor.plants, monitor.evicted) == ([], 1)
     assert shown == [("x", True), ("x", False)]
     monitor.on_message(first_sample("x"), TEN_MINUTES_NS)
     assert monitor.plants == ["x"]
 
 
 def test_a_plant_with_a_token_with_a_state_or_with_rows_is_not_forgotten(runs: dict[str, list[Encoded]]) -> None:
-    monitor = fleet(ask_past=lambda plant, _: plant == "c")
+    monitor = fleet(request_history=lambda plant, _: plant == "c")
     monitor.on_message(first_sample("x"), 0)
     monitor.on_alive("reactor/x/alive/plant", True, 0)
     monitor.on_messages(runs["a"][: 3 * 32], 0)
@@ -50,7 +55,7 @@ def test_a_plant_with_a_token_with_a_state_or_with_rows_is_not_forgotten(runs: d
     state = fleet()
     state.on_messages(runs["c"][:3], 0)
     monitor.on_message(runs["c"][0], 0)
-    monitor.on_past(Past("c", state.state_of("c"), []), 0)
+    monitor.on_history(PlantHistory("c", state.state_of("c"), []), 0)
     monitor.on_tick(TEN_MINUTES_NS)
     assert sorted(monitor.plants) == ["a", "c", "x"]
 
@@ -60,8 +65,8 @@ def test_a_plant_of_another_shard_is_remembered_for_its_messages(
     messages: int, known: bool, runs: dict[str, list[Encoded]]
 ) -> None:
     asked: list[tuple[str, bool]] = []
-    at_home = home("a", 2)
-    monitor = fleet(shard=Shard(3 - at_home, 2), ask_past=noting(asked))
+    at_home = home_shard("a", 2)
+    monitor = fleet(shard=Shard(3 - at_home, 2), request_history=noting(asked))
     monitor.on_alive(shard_token(at_home), True, 0)
     for message in runs["a"][:messages]:
         monitor.on_message(message, 0)

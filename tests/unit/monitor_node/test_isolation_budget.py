@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor_node.alarms.annunciator import STOPPED
-from monitor_node.baseline.signal_range import ranges_of
+from monitor_node.baseline.signal_range import signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.isolation.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, UNKNOWN, Isolation
@@ -25,7 +25,7 @@ from .samples import leaking_run, samples
 SIGNALS = ("qc", "C", "T")
 CONFIG = MonitorConfig(training_min=20.0)
 TRAINED, ROWS = 240, 330
-RANGES = ranges_of(cstr(), SIGNALS)
+RANGES = signal_ranges(cstr(), SIGNALS)
 
 
 @pytest.fixture(scope="module")

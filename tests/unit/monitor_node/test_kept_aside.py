@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from monitor_node.__main__ import MonitorNode
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.node import LOOK_EVERY_NS, FleetNode
+from monitor_node.fleet.node import POLL_NS, FleetNode
 from monitor_node.storage import state_recovery
 from monitor_node.storage.alarm_file import SEAL
 from monitor_node.storage.fleet_states import FleetStates
@@ -289,7 +289,7 @@ def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: li
     node = MonitorNode(settings_, 0)
     for message in rows[:150]:
         node.on_message(message, 0)
-    node.fall_silent()
+    node.declare_timeout()
     node.on_tick(0)
     again = MonitorNode(settings_, 0)
     assert stands(again.alarms.alarm("silence/plant"))
@@ -303,7 +303,7 @@ def test_a_silence_that_stood_ends_with_the_next_sample(tmp_path: Path, rows: li
 
 @pytest.fixture(autouse=True)
 def _no_settling(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(state_recovery, "SETTLE_S", 0.0)
+    monkeypatch.setattr(state_recovery, "HANDOVER_S", 0.0)
 
 
 def fleet_of(folder: Path, order: int, rows: list[Encoded]) -> FleetNode:
@@ -311,13 +311,13 @@ def fleet_of(folder: Path, order: int, rows: list[Encoded]) -> FleetNode:
     config_ = MonitorConfig(order=order, isolation=False)
     node = FleetNode(config_, FleetConfig(plants="reactor/*"), MemoryBus(Exchange()), 0, FleetStates(folder))
     for _ in node.subscriptions:
-        node.listens()
+        node.on_subscribed()
     if rows:
         node.on_alive("reactor/a/alive/plant", True, 0)
     until_s, now_ns = time.monotonic() + WITHIN_S, 0
-    while node._pasts.is_waiting:
+    while node._recovery.is_pending:
         assert time.monotonic() < until_s
-        now_ns += LOOK_EVERY_NS
+        now_ns += POLL_NS
         node.on_tick(now_ns)
     node.on_messages(of_plant("a", rows), now_ns)
     node.on_stop(now_ns)

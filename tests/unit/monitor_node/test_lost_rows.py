@@ -75,7 +75,7 @@ def raised(state: bytes, reference: Reference, messages: list[Encoded]) -> set[s
     """The alarms that a monitor raises, but for those of silence."""
     monitor = Monitor(config(reference), 0, points=False)
     monitor.from_bytes(state)
-    monitor.caught_up()
+    monitor.on_history_end()
     said = [item.message for message in messages for item in monitor.on_message(message, 0)]
     said += [item.message for item in monitor.finish()]
     assert monitor.failures.by_stage == {}

@@ -245,7 +245,7 @@ def test_once_all_was_told_a_plant_that_repeats_itself_is_heard() -> None:
     for message in messages:
         monitor.on_message(message, 0)
     again.from_bytes(monitor.to_bytes())
-    again.caught_up()
+    again.on_history_end()
     for message in messages:
         again.on_message(message, 0)
     assert again.rows == 2 * monitor.rows

@@ -7,7 +7,7 @@ import pytest
 from monitor_node.__main__ import MonitorNode, declare_tokens
 from monitor_node.config import MonitorConfig
 from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.monitor import PATIENCE_NS
+from monitor_node.fleet.monitor import PRESUME_GONE_NS
 from monitor_node.fleet.node import FleetNode
 from monitor_node.other_monitors import GONE, MOST_GROUPS, NOTICED, OtherMonitors
 from reactorwatch.contract import keys
@@ -37,7 +37,7 @@ class Process:
         if isinstance(self.node, MonitorNode):
             declare_tokens(self.node, self.bus)
         else:
-            self.bus.declare_token(self.node.crew.token)
+            self.bus.declare_token(self.node.shards.token)
 
     def on_token(self, token: str, *, is_alive: bool) -> None:
         self.node.on_alive(token, is_alive, SECOND_NS)
@@ -53,7 +53,7 @@ def start(*kinds: str) -> tuple[list[Process], MemoryBus]:
     plant, processes = MemoryBus(exchange), [Process(kind, exchange, at) for at, kind in enumerate(kinds)]
     plant.declare_token(keys.key(PLANT, keys.ALIVE, "plant"))
     for process in processes:
-        process.node.on_tick(PATIENCE_NS)
+        process.node.on_tick(PRESUME_GONE_NS)
     return processes, plant
 
 
@@ -85,15 +85,15 @@ def test_a_crew_whose_members_take_over_from_each_other_reports_others_alone(
 ) -> None:
     """The monitor that takes the plant over reports the other crew when it does, and not the member that is gone."""
     (first, second, other), _ = start("reactor/* 1/2", "reactor/* 2/2", "reactor/c* 1/1")
-    keeper, rest = (first, second) if first.watches() else (second, first)
-    assert keeper.watches()
+    owner, rest = (first, second) if first.watches() else (second, first)
+    assert owner.watches()
     assert not rest.watches()
     assert sorted(line.partition("other=")[2].partition(" plant=")[0] for line in lines(capsys, NOTICED)) == [
         "'fleet reactor/* (2 shards)'",
         "'fleet reactor/c* (1 shard)'",
     ]
-    keeper.bus.close()
-    rest.node.adopt(PLANT, None, PATIENCE_NS)  # type: ignore[union-attr] # as when its past has been found
+    owner.bus.close()
+    rest.node.adopt(PLANT, None, PRESUME_GONE_NS)  # type: ignore[union-attr] # as when its past has been found
     (line,) = lines(capsys, NOTICED)
     assert "fleet reactor/c* (1 shard)" in line
     other.bus.close()
@@ -110,16 +110,16 @@ def test_monitors_of_other_plants_are_not_reported(kind: str, beside: str, capsy
 @pytest.mark.parametrize("name", ["01", "01@", "01@+/x", "01@a b", "01@++", "01@\n"])
 def test_a_fleet_s_token_that_names_no_plants_is_ignored(name: str) -> None:
     others = OtherMonitors("", lambda: (PLANT,))
-    assert others.note(keys.fleet_token("0f", "1", "1", name), is_alive=True) is None
+    assert others.on_token(keys.fleet_token("0f", "1", "1", name), is_alive=True) is None
     assert list(others.check(PLANT)) == []
 
 
 def test_there_is_room_for_so_many_groups_and_for_more_when_some_have_gone() -> None:
     others = OtherMonitors("", lambda: (PLANT,))
     for number in range(MOST_GROUPS):
-        assert others.note(keys.monitor_token(f"p{number}", "a"), is_alive=True) is None
+        assert others.on_token(keys.monitor_token(f"p{number}", "a"), is_alive=True) is None
     last = keys.monitor_token(PLANT, "a")
-    assert others.note(last, is_alive=True) is None
-    others.note(keys.monitor_token("p7", "a"), is_alive=False)
-    assert others.note(last, is_alive=True) is not None
+    assert others.on_token(last, is_alive=True) is None
+    others.on_token(keys.monitor_token("p7", "a"), is_alive=False)
+    assert others.on_token(last, is_alive=True) is not None
     assert others.count(PLANT) == 1

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from monitor_node.alarms.on_off_delay import Persistence
+from monitor_node.alarms.on_off_delay import OnOffDelay
 from reactorwatch.spc.charts.shewhart import probability_out
 from reactorwatch.spc.m_of_n import false_alarm_rate
 
 
-def changes(rule: Persistence, points: str) -> list[tuple[int, bool]]:
+def changes(rule: OnOffDelay, points: str) -> list[tuple[int, bool]]:
     """Points as text, x for out; returns (position, raised or cleared)."""
     found = [(position, rule.update(point == "x")) for position, point in enumerate(points)]
     return [(position, change) for position, change in found if change is not None]
@@ -27,7 +27,7 @@ def changes(rule: Persistence, points: str) -> list[tuple[int, bool]]:
     ],
 )
 def test_three_of_five_raise_and_three_in_a_row_clear(points: str, expected: list[tuple[int, bool]]) -> None:
-    assert changes(Persistence(3, 5, 3), points) == expected
+    assert changes(OnOffDelay(3, 5, 3), points) == expected
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def test_the_rate_is_what_simulation_finds() -> None:
     p, generator = 0.08, np.random.default_rng(5)
     lengths = []
     for _ in range(2000):
-        rule, length = Persistence(3, 5, 1), 1
+        rule, length = OnOffDelay(3, 5, 1), 1
         while rule.update(bool(generator.random() < p)) is None:
             length += 1
         lengths.append(length)
@@ -63,4 +63,4 @@ def test_the_rate_is_what_simulation_finds() -> None:
 @pytest.mark.parametrize("rule", [(0, 5, 1), (6, 5, 1), (3, 13, 1), (3, 5, 0)])
 def test_numbers_that_make_no_rule_are_refused(rule: tuple[int, int, int]) -> None:
     with pytest.raises(ValueError, match="must be"):
-        Persistence(*rule)
+        OnOffDelay(*rule)

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from monitor_node.alarms.annunciator import BoardState
+from monitor_node.alarms.annunciator import AnnunciatorState
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.state.monitor_state import MonitorState
@@ -229,7 +229,7 @@ def test_a_plant_with_a_sample_that_is_refused_is_quiet_no_longer_and_counts_it(
     for begin in range(900, len(run), 30):
         monitor.on_messages(run[begin : begin + 30], 10**9 * begin)
     assert monitor.quiet == ["x"]
-    assert monitor.monitor("x").refusals.by_reason == {reason: 1}
+    assert monitor.monitor("x").rejects.by_reason == {reason: 1}
 
 
 @pytest.mark.parametrize("config", [ALL, LOOKING])
@@ -248,7 +248,9 @@ def test_what_is_remembered_of_a_quiet_plant_is_what_its_own_monitor_remembers(c
     again = monitor.monitor("x")
     assert monitor.quiet == []
     assert comparable(again.state).to_bytes() == comparable(own.state).to_bytes()
-    assert again.receipt._replace(start_ns=0, health_due_ns=0) == own.receipt._replace(start_ns=0, health_due_ns=0)
+    assert again.receive_stats._replace(start_ns=0, health_due_ns=0) == own.receive_stats._replace(
+        start_ns=0, health_due_ns=0
+    )
 
 
 @pytest.mark.parametrize("rows", [950, 1050, 1690, 1760])
@@ -278,7 +280,7 @@ def comparable(state: MonitorState) -> MonitorState:
         sampling=replace(watch.sampling, spacings_ns=[]),
         watched=msgspec.structs.replace(watched, until_drift=0),
     )
-    board = msgspec.structs.replace(msgspec.msgpack.decode(state.board, type=BoardState), told=None)
+    board = msgspec.structs.replace(msgspec.msgpack.decode(state.board, type=AnnunciatorState), told=None)
     return msgspec.structs.replace(state, watch=watch, board=msgspec.msgpack.encode(board), snapshot_due_ns=None)
 
 

@@ -4,29 +4,29 @@ import random
 
 import pytest
 
-from monitor_node.ingest.sequence_check import CONFIRMED, Held, SampleRun
+from monitor_node.ingest.sequence_check import CONFIRMED, HeldSample, SequenceCheck
 
 PERIOD = 6_000_000_000
 REORDER_ROWS = 8
 
 
-def regular(first: int, count: int, begin_ns: int = 0) -> list[Held]:
+def regular(first: int, count: int, begin_ns: int = 0) -> list[HeldSample]:
     """A plant that counts from `first` on, one sample a period."""
-    return [Held(begin_ns + row * PERIOD, first + row, float(row), "K") for row in range(count)]
+    return [HeldSample(begin_ns + row * PERIOD, first + row, float(row), "K") for row in range(count)]
 
 
-def taken(samples: list[Held], run: SampleRun | None = None) -> tuple[list[Held], list[Held]]:
+def taken(samples: list[HeldSample], run: SequenceCheck | None = None) -> tuple[list[HeldSample], list[HeldSample]]:
     """Those that are believed, in order, and those that are refused."""
-    run = run or SampleRun()
-    believed, refused = list[Held](), list[Held]()
+    run = run or SequenceCheck()
+    believed, refused = list[HeldSample](), list[HeldSample]()
     for sample in samples:
-        if run.goes_on(sample.time_ns, sample.number):
+        if run.accept_next(sample.time_ns, sample.number):
             believed.append(sample)
         else:
-            of_run, strange = run.take(sample, REORDER_ROWS)
+            of_run, strange = run.update(sample, REORDER_ROWS)
             believed += of_run
             refused += strange
-    return believed + run.released(), refused
+    return believed + run.release(), refused
 
 
 @pytest.mark.parametrize(
@@ -38,12 +38,12 @@ def taken(samples: list[Held], run: SampleRun | None = None) -> tuple[list[Held]
         regular(0, 50),  # with the clock of before
         regular(100, 50, -5000 * PERIOD),  # its clock was set back
         regular(5000, 50, 5000 * PERIOD),  # we were away
-        [Held(item.time_ns // 10 + 100 * PERIOD, *item[1:]) for item in regular(100, 50)],  # ten times as fast
-        [Held(item.time_ns * 10 + 100 * PERIOD, *item[1:]) for item in regular(100, 50)],  # and as slow
+        [HeldSample(item.time_ns // 10 + 100 * PERIOD, *item[1:]) for item in regular(100, 50)],  # ten times as fast
+        [HeldSample(item.time_ns * 10 + 100 * PERIOD, *item[1:]) for item in regular(100, 50)],  # and as slow
     ],
     ids=["paused", "began anew later", "began anew", "same clock", "set back", "lost", "faster", "slower"],
 )
-def test_whatever_the_plant_does_none_of_its_samples_is_lost(more: list[Held]) -> None:
+def test_whatever_the_plant_does_none_of_its_samples_is_lost(more: list[HeldSample]) -> None:
     samples = regular(0, 100) + more
     assert taken(samples) == (samples, [])
 
@@ -51,10 +51,10 @@ def test_whatever_the_plant_does_none_of_its_samples_is_lost(more: list[Held]) -
 def test_a_plant_of_irregular_times_loses_none() -> None:
     """Times between samples are exponential: a few are a hundredth of the usual, a few ten times as much."""
     draw = random.Random(3)
-    time_ns, samples = 0, list[Held]()
+    time_ns, samples = 0, list[HeldSample]()
     for number in range(5000):
         time_ns += 1 + int(draw.expovariate(1.0) * PERIOD)
-        samples.append(Held(time_ns, number, 0.0, "K"))
+        samples.append(HeldSample(time_ns, number, 0.0, "K"))
     assert taken(samples) == (samples, [])
 
 
@@ -65,7 +65,7 @@ def test_a_plant_that_pauses_again_and_again_loses_none() -> None:
     for _ in range(50):
         time_ns += draw.randrange(10, 1000) * PERIOD
         for _ in range(draw.choice((1, 2, 3))):
-            samples.append(Held(time_ns, len(samples), 0.0, "K"))
+            samples.append(HeldSample(time_ns, len(samples), 0.0, "K"))
             time_ns += PERIOD
     assert taken(samples) == (samples, [])
 
@@ -115,9 +115,9 @@ def test_a_damaged_time_or_number_is_refused(seed: int) -> None:
     for place in range(50, 100):
         bit = draw.randrange(38, 62)  # of the time: 2**38 ns is 46 periods
         time_ns, number = samples[place - 1].time_ns, samples[place - 1].number
-        strange = Held(time_ns ^ (1 << bit), number, 0.0, "K")
+        strange = HeldSample(time_ns ^ (1 << bit), number, 0.0, "K")
         if draw.random() < 0.5:
-            strange = Held(time_ns, number ^ (1 << draw.randrange(3, 62)), 0.0, "K")
+            strange = HeldSample(time_ns, number ^ (1 << draw.randrange(3, 62)), 0.0, "K")
         believed, refused = taken([*samples[:place], strange, *samples[place : place + 3]])
         assert believed == samples[: place + 3]
         assert refused == [strange]
@@ -144,7 +144,7 @@ def test_a_first_plant_that_is_held_up_for_longer_cannot_be_told_from_one_that_w
 
 def test_memory_is_bounded() -> None:
     """Whatever comes, no more than the samples that would be a run are held."""
-    draw, run = random.Random(5), SampleRun()
+    draw, run = random.Random(5), SequenceCheck()
     for _ in range(10_000):
-        run.take(Held(draw.randrange(2**40), draw.randrange(1000), 0.0, "K"), REORDER_ROWS)
+        run.update(HeldSample(draw.randrange(2**40), draw.randrange(1000), 0.0, "K"), REORDER_ROWS)
         assert len(run.held) < CONFIRMED

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor_node.baseline.references import ArxReference, ProcessReference
-from monitor_node.baseline.signal_range import ANY, ranges_of
+from monitor_node.baseline.signal_range import ANY, signal_ranges
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.codec import Encoded, Publication
@@ -42,7 +42,7 @@ def trained(run: list[Encoded]) -> bytes:
 def resumed(state: bytes) -> Monitor:
     monitor = Monitor(CONFIG, 0, points=False)
     monitor.from_bytes(state)
-    monitor.caught_up()
+    monitor.on_history_end()
     return monitor
 
 
@@ -59,7 +59,7 @@ def with_value(message: Encoded, value: float) -> Encoded:
 
 
 def filter_state(monitor: Monitor) -> Any:
-    reference = monitor._watch._reference
+    reference = monitor._pipeline._reference
     assert isinstance(reference, ProcessReference)
     return reference.state
 
@@ -70,7 +70,7 @@ def test_any_value_out_of_range_is_as_good_as_missing_and_raises_one_alarm_at_on
     run: list[Encoded], trained: bytes, signal: int, size: float, above: bool
 ) -> None:
     """Filter, charts and prewhitening remember what they do when the sample is not there."""
-    lower, upper, _ = ranges_of(cstr(), SIGNALS)[signal]
+    lower, upper, _ = signal_ranges(cstr(), SIGNALS)[signal]
     value = upper + size if above else lower - size
     bad = range(3 * FIRST_BAD + signal, 3 * (FIRST_BAD + BAD_ROWS), 3)
     shown, missing = resumed(trained), resumed(trained)
@@ -114,14 +114,14 @@ def test_a_plant_that_is_not_the_process_is_watched_whatever_its_values(run: lis
     monitor = Monitor(CONFIG, 0, points=False)
     alarms = fed(monitor, celsius)
     assert monitor.phase == "watching"
-    assert isinstance(monitor._watch._reference, ArxReference)
+    assert isinstance(monitor._pipeline._reference, ArxReference)
     assert not [item.alarm for item in alarms if item.alarm.startswith("range/")]
 
 
 @pytest.mark.parametrize("signal", SIGNALS)
 def test_a_value_at_a_bound_is_a_measurement(signal: str) -> None:
     """A sensor of a plant at its bound may show a twentieth of the range more."""
-    (item,) = ranges_of(cstr(), (signal,))
+    (item,) = signal_ranges(cstr(), (signal,))
     variable = {v.name: v for v in (*cstr().states, *cstr().inputs)}[signal]
     span = variable.upper - variable.lower
     assert item.lower == pytest.approx(variable.lower - 0.05 * span)
@@ -131,10 +131,10 @@ def test_a_value_at_a_bound_is_a_measurement(signal: str) -> None:
 
 def test_without_a_model_and_for_an_output_that_is_no_state_no_range_is_known() -> None:
     """A biased thermometer shows the temperature plus a number, so the bounds of the temperature are not its own."""
-    assert ranges_of(None, SIGNALS) == [ANY] * 3
+    assert signal_ranges(None, SIGNALS) == [ANY] * 3
     biased = TemperatureBias().extend(cstr())
-    assert [item.is_bounded for item in ranges_of(biased, SIGNALS)] == [True, True, False]
-    assert [item.is_bounded for item in ranges_of(tanks(), ("u", "x2", "elsewhere"))] == [True, True, False]
+    assert [item.is_bounded for item in signal_ranges(biased, SIGNALS)] == [True, True, False]
+    assert [item.is_bounded for item in signal_ranges(tanks(), ("u", "x2", "elsewhere"))] == [True, True, False]
     assert isinstance(biased.outputs[1].expression, ca.SX)
 
 

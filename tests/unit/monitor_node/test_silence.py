@@ -5,18 +5,18 @@ from math import nan
 import numpy as np
 import pytest
 
-from monitor_node.signal_checks.timeout import NOTHING, Change, Silence, SilenceState
+from monitor_node.signal_checks.timeout import NO_CHANGE, Change, DataTimeout, DataTimeoutState
 from reactorwatch.errors import InputError
 
 PERIOD = 6_000_000_000  # ns of the plant's time
 LEAST_S = 1.0
 
 
-def heard(rows: int, period_ns: int = PERIOD, speed: float = 1.0) -> Silence:
+def heard(rows: int, period_ns: int = PERIOD, speed: float = 1.0) -> DataTimeout:
     """One that has heard a regular plant, received at `speed` times the plant's time from 0 on."""
-    silence = Silence(limit=5.0, least_s=LEAST_S)
+    silence = DataTimeout(limit=5.0, least_s=LEAST_S)
     for row in range(rows):
-        silence.received(int(row * period_ns / speed))
+        silence.on_receipt(int(row * period_ns / speed))
         silence.update(row * period_ns, present=True)
     return silence
 
@@ -26,7 +26,7 @@ def heard(rows: int, period_ns: int = PERIOD, speed: float = 1.0) -> Silence:
 
 @pytest.mark.parametrize("missing", [0, 1, 4])
 def test_up_to_four_missing_rows_are_no_silence(missing: int) -> None:
-    assert heard(100).update((100 + missing) * PERIOD, present=True) == NOTHING
+    assert heard(100).update((100 + missing) * PERIOD, present=True) == NO_CHANGE
 
 
 @pytest.mark.parametrize("missing", [5, 6, 1000])
@@ -40,7 +40,7 @@ def test_a_longer_gap_is_a_silence_from_five_periods_after_the_last_row_until_th
 def test_a_sensor_without_values_is_silent_while_the_rows_go_on() -> None:
     silence = heard(100)
     changes = [silence.update(row * PERIOD, present=False) for row in range(100, 120)]
-    assert [(row, change) for row, change in enumerate(changes, 100) if change != NOTHING] == [
+    assert [(row, change) for row, change in enumerate(changes, 100) if change != NO_CHANGE] == [
         (105, Change(raised_ns=104 * PERIOD, cleared_ns=None))
     ]
     assert silence.update(120 * PERIOD, present=True) == Change(raised_ns=None, cleared_ns=120 * PERIOD)
@@ -48,45 +48,45 @@ def test_a_sensor_without_values_is_silent_while_the_rows_go_on() -> None:
 
 def test_a_slow_sensor_is_measured_by_its_own_period() -> None:
     """An analyser with a value in every tenth row."""
-    silence = Silence(limit=5.0)
+    silence = DataTimeout(limit=5.0)
     changes = [silence.update(row * PERIOD, present=row % 10 == 0) for row in range(500)]
     changes += [silence.update(row * PERIOD, present=False) for row in range(500, 600)]
-    assert [change for change in changes if change != NOTHING] == [Change((490 + 50) * PERIOD, None)]
+    assert [change for change in changes if change != NO_CHANGE] == [Change((490 + 50) * PERIOD, None)]
 
 
 def test_a_gap_in_all_rows_is_no_fault_of_a_sensor() -> None:
     sensor = heard(100)
-    sensor.excuse(200 * PERIOD)
-    assert sensor.update(200 * PERIOD, present=False) == NOTHING
-    assert [sensor.update(row * PERIOD, present=False) for row in range(201, 206)] == [NOTHING] * 5
+    sensor.suppress_until(200 * PERIOD)
+    assert sensor.update(200 * PERIOD, present=False) == NO_CHANGE
+    assert [sensor.update(row * PERIOD, present=False) for row in range(201, 206)] == [NO_CHANGE] * 5
     assert sensor.update(206 * PERIOD, present=False) == Change(205 * PERIOD, None)
 
 
 def test_a_sensor_that_is_silent_already_stays_so_through_a_gap_in_all_rows() -> None:
     sensor = heard(100)
     sensor.update(110 * PERIOD, present=False)
-    sensor.excuse(200 * PERIOD)
+    sensor.suppress_until(200 * PERIOD)
     assert sensor.standing
     assert sensor.update(200 * PERIOD, present=True) == Change(None, 200 * PERIOD)
 
 
 def test_a_clock_that_is_set_back_is_no_silence_and_is_followed_from_there() -> None:
     silence = heard(100)
-    assert silence.update(-50 * PERIOD, present=True) == NOTHING
-    assert silence.update(-49 * PERIOD, present=True) == NOTHING
+    assert silence.update(-50 * PERIOD, present=True) == NO_CHANGE
+    assert silence.update(-49 * PERIOD, present=True) == NO_CHANGE
     assert silence.update(-40 * PERIOD, present=True) == Change(-44 * PERIOD, -40 * PERIOD)
 
 
 def test_a_silent_sensor_stays_so_when_the_clock_is_set_back_and_it_still_has_no_value() -> None:
     sensor = heard(100)
     sensor.update(110 * PERIOD, present=False)
-    assert sensor.update(20 * PERIOD, present=False) == NOTHING
+    assert sensor.update(20 * PERIOD, present=False) == NO_CHANGE
     assert sensor.standing
 
 
 def test_after_a_long_silence_the_next_is_noticed_nearly_as_soon() -> None:
     silence = heard(100)
-    silence.received(1100 * PERIOD)
+    silence.on_receipt(1100 * PERIOD)
     silence.update(1100 * PERIOD, present=True)
     due_ns = silence.due_ns()
     assert due_ns is not None
@@ -97,37 +97,37 @@ def test_after_a_long_silence_the_next_is_noticed_nearly_as_soon() -> None:
 def test_irregular_rows_are_no_silence() -> None:
     """Exponential spacings: allowed are 5 (1 + 2 * 2/e) = 12.4 means, which 4 in a million are longer than."""
     times = np.cumsum(np.random.default_rng(1).exponential(PERIOD, 20_000)).astype(int)
-    silence = Silence(limit=5.0)
-    assert all(silence.update(time_ns, present=True) == NOTHING for time_ns in times.tolist())
+    silence = DataTimeout(limit=5.0)
+    assert all(silence.update(time_ns, present=True) == NO_CHANGE for time_ns in times.tolist())
 
 
 def test_rows_that_get_lost_singly_are_no_silence() -> None:
     kept = np.flatnonzero(np.random.default_rng(2).random(20_000) > 0.05)
-    silence = Silence(limit=5.0)
-    assert all(silence.update(int(row) * PERIOD, present=True) == NOTHING for row in kept)
+    silence = DataTimeout(limit=5.0)
+    assert all(silence.update(int(row) * PERIOD, present=True) == NO_CHANGE for row in kept)
 
 
 def test_a_plant_that_goes_on_ten_times_slower_is_taken_as_it_is_after_a_few_rows() -> None:
     silence = heard(100)
     changes = [silence.update((99 + 10 * row) * PERIOD, present=True) for row in range(1, 100)]
-    silent = [row for row, change in enumerate(changes) if change != NOTHING]
+    silent = [row for row, change in enumerate(changes) if change != NO_CHANGE]
     assert silent == list(range(len(silent)))
     assert 1 <= len(silent) <= 4
 
 
 def test_nothing_is_silent_before_the_usual_spacing_is_known() -> None:
-    assert heard(20).update(10_000 * PERIOD, present=True) == NOTHING
+    assert heard(20).update(10_000 * PERIOD, present=True) == NO_CHANGE
     assert heard(20).due_ns() is None
-    assert Silence().due_ns() is None
+    assert DataTimeout().due_ns() is None
 
 
 def test_when_nothing_happens_it_is_nothing_itself_that_is_returned() -> None:
     """Whoever asks for it by identity is right."""
     silence = heard(100)
-    assert silence.update(100 * PERIOD, present=True) is NOTHING
-    assert silence.update(101 * PERIOD, present=False) is NOTHING
-    assert silence.update(0, present=True) is NOTHING
-    assert silence.check(0) is NOTHING
+    assert silence.update(100 * PERIOD, present=True) is NO_CHANGE
+    assert silence.update(101 * PERIOD, present=False) is NO_CHANGE
+    assert silence.update(0, present=True) is NO_CHANGE
+    assert silence.check(0) is NO_CHANGE
 
 
 # --- in the time of receipt ----------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ def test_a_plant_from_which_nothing_comes_is_silent_after_five_periods_of_receip
     silence = heard(100, speed=speed)
     due_ns = silence.due_ns()
     assert due_ns == 104 * PERIOD / speed
-    assert silence.check(due_ns - 1) == NOTHING
+    assert silence.check(due_ns - 1) == NO_CHANGE
     assert silence.check(due_ns) == Change(raised_ns=104 * PERIOD, cleared_ns=None)
 
 
@@ -154,13 +154,13 @@ def test_a_silence_is_asked_for_once_and_then_waited_out() -> None:
     assert due_ns is not None
     silence.check(due_ns)
     assert silence.due_ns() is None
-    assert silence.check(10**16) == NOTHING
+    assert silence.check(10**16) == NO_CHANGE
 
 
 def test_a_live_run_and_a_replay_tell_of_a_silence_with_the_same_times() -> None:
     live, replay = heard(100), heard(100, speed=1e6)
     said = [live.check(150 * PERIOD)]
-    live.received(200 * PERIOD)
+    live.on_receipt(200 * PERIOD)
     said.append(live.update(200 * PERIOD, present=True))
     at_once = replay.update(200 * PERIOD, present=True)
     assert [change.raised_ns for change in said if change.raised_ns is not None] == [at_once.raised_ns]
@@ -171,25 +171,25 @@ def test_rows_that_the_transport_held_up_end_the_silence_and_leave_none_in_a_rep
     live, replay = heard(100), heard(100, speed=1e6)
     raised_ns = live.check(150 * PERIOD).raised_ns
     assert live.update(100 * PERIOD, present=True) == Change(None, raised_ns)
-    assert [live.update(row * PERIOD, present=True) for row in range(101, 150)] == [NOTHING] * 49
-    assert [replay.update(row * PERIOD, present=True) for row in range(100, 150)] == [NOTHING] * 50
+    assert [live.update(row * PERIOD, present=True) for row in range(101, 150)] == [NO_CHANGE] * 49
+    assert [replay.update(row * PERIOD, present=True) for row in range(100, 150)] == [NO_CHANGE] * 50
 
 
 def test_samples_that_arrive_in_bursts_are_waited_for_between_them() -> None:
     """Ten rows every ten periods: the plant is not silent in between."""
-    silence = Silence(limit=5.0, least_s=LEAST_S)
+    silence = DataTimeout(limit=5.0, least_s=LEAST_S)
     for burst in range(100):
         now_ns = 10 * burst * PERIOD
         due_ns = silence.due_ns()
         assert burst < 5 or (due_ns is not None and now_ns < due_ns)
         for row in range(10 * burst, 10 * burst + 10):
-            silence.received(now_ns)
+            silence.on_receipt(now_ns)
             silence.update(row * PERIOD, present=True)
 
 
 def test_a_receipt_clock_that_is_set_back_is_followed_from_there() -> None:
     silence = heard(100)
-    silence.received(-(10**15))
+    silence.on_receipt(-(10**15))
     assert silence.due_ns() == -(10**15) + 5 * PERIOD
 
 
@@ -200,21 +200,21 @@ def test_a_receipt_clock_that_is_set_back_is_followed_from_there() -> None:
 def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(cut: int) -> None:
     rows = [*range(50), *range(70, 100)]
 
-    def step(silence: Silence, row: int) -> Change:
-        silence.received(row * PERIOD)
+    def step(silence: DataTimeout, row: int) -> Change:
+        silence.on_receipt(row * PERIOD)
         return silence.update(row * PERIOD, present=row % 7 != 0)
 
-    through, stopped = Silence(), Silence()
+    through, stopped = DataTimeout(), DataTimeout()
     expected = [step(through, row) for row in rows]
     said = [step(stopped, row) for row in rows[:cut]]
-    resumed = Silence.from_state(SilenceState.from_bytes(stopped.state.to_bytes()))
+    resumed = DataTimeout.from_state(DataTimeoutState.from_bytes(stopped.state.to_bytes()))
     assert said + [step(resumed, row) for row in rows[cut:]] == expected
 
 
 def test_a_monitor_that_was_down_does_not_call_the_plant_silent_for_it() -> None:
-    resumed = Silence.from_state(heard(100).state)
+    resumed = DataTimeout.from_state(heard(100).state)
     assert resumed.due_ns() is None
-    resumed.received(10**15)
+    resumed.on_receipt(10**15)
     assert resumed.due_ns() == 10**15 + 5 * PERIOD
 
 
@@ -228,7 +228,7 @@ def test_a_monitor_that_was_down_does_not_call_the_plant_silent_for_it() -> None
 )
 def test_settings_that_make_no_rule_are_refused(limit: float, least_s: float, text: str) -> None:
     with pytest.raises(InputError, match=text):
-        Silence(limit, least_s)
+        DataTimeout(limit, least_s)
 
 
 def test_what_comes_in_a_burst_after_a_cut_shortens_no_patience() -> None:
@@ -236,7 +236,7 @@ def test_what_comes_in_a_burst_after_a_cut_shortens_no_patience() -> None:
     silence, plain = heard(100), heard(100)
     end_ns = 100 * PERIOD
     for row in range(200):
-        silence.received(end_ns + row * 500_000)
+        silence.on_receipt(end_ns + row * 500_000)
     due_ns, usual_ns = silence.due_ns(), plain.due_ns()
     assert due_ns is not None
     assert usual_ns is not None
@@ -246,7 +246,7 @@ def test_what_comes_in_a_burst_after_a_cut_shortens_no_patience() -> None:
 def test_a_plant_that_goes_on_faster_is_waited_for_less_after_a_while() -> None:
     silence = heard(100)
     for row in range(3000):
-        silence.received(100 * PERIOD + row * PERIOD // 100)
+        silence.on_receipt(100 * PERIOD + row * PERIOD // 100)
     due_ns = silence.due_ns()
     assert due_ns is not None
     assert due_ns - (100 * PERIOD + 2999 * PERIOD // 100) <= 1.01 * LEAST_S * 1e9
@@ -258,7 +258,7 @@ def test_who_was_frozen_himself_or_whose_clock_was_set_does_not_blame_the_plant(
     due_ns = silence.due_ns()
     assert due_ns is not None
     late_ns = due_ns + 3600 * 10**9
-    assert silence.check(late_ns) == NOTHING
+    assert silence.check(late_ns) == NO_CHANGE
     again_ns = silence.due_ns()
     assert again_ns == late_ns + (due_ns - 99 * PERIOD)
     assert silence.check(again_ns) == Change(104 * PERIOD, None)

@@ -20,7 +20,7 @@ def story(values: list[float], limit: float = LIMIT) -> str:
     """A letter a value: w withheld; s the one before was a spike; b both; . neither."""
     spike = Spike(limit)
     verdicts = [spike.update(z) for z in values]
-    return "".join(".swb"[2 * verdict.withhold + verdict.spike] for verdict in verdicts)
+    return "".join(".swb"[2 * verdict.quarantine + verdict.spike] for verdict in verdicts)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_spike_beside_the_new_level_is_told_with_its_distance_from_it(level: f
     spike, noise = Spike(LIMIT), np.random.default_rng(8)
     for z in noise.normal(size=40).tolist():
         assert not spike.update(level + z, is_moved=True).spike
-    assert spike.update(level + 15.0, is_moved=True).withhold
+    assert spike.update(level + 15.0, is_moved=True).quarantine
     verdict = spike.update(level, is_moved=True)
     assert verdict.spike
     assert verdict.size == pytest.approx(15.0, abs=1.0)
@@ -119,16 +119,16 @@ def test_when_no_alarm_stands_any_more_values_are_judged_about_zero_again() -> N
     spike = Spike(LIMIT)
     for _ in range(40):
         spike.update(8.0, is_moved=True)
-    assert [spike.update(z).withhold for z in (0.2, 8.0, 0.1)] == [False, True, False]
+    assert [spike.update(z).quarantine for z in (0.2, 8.0, 0.1)] == [False, True, False]
     assert spike.state.recent == []
 
 
 def test_a_value_that_was_withheld_when_the_alarm_came_is_decided_by_the_next() -> None:
     spike = Spike(LIMIT)
-    assert spike.update(9.0).withhold
+    assert spike.update(9.0).quarantine
     assert spike.update(0.1, is_moved=True).spike
     spike.restart()
-    assert spike.update(9.0).withhold
+    assert spike.update(9.0).quarantine
     assert spike.update(9.0, is_moved=True) == (False, False, 0.0)
 
 
@@ -222,5 +222,5 @@ def test_it_goes_on_from_its_stored_state_as_if_it_had_never_stopped(
 @given(st.lists(st.tuples(st.floats(-20, 20), st.booleans()), max_size=60))
 def test_whether_an_alarm_stands_or_not_no_three_values_in_a_row_are_withheld(values: list[tuple[float, bool]]) -> None:
     spike = Spike(LIMIT)
-    said = "".join("w" if spike.update(z, is_moved=is_moved).withhold else "." for z, is_moved in values)
+    said = "".join("w" if spike.update(z, is_moved=is_moved).quarantine else "." for z, is_moved in values)
     assert "www" not in said

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import signal, stats
 
-from monitor_node.signal_checks.stuck import SMALLEST, Stuck, StuckState, most_equal, upper_bound
+from monitor_node.signal_checks.stuck import SMALLEST, Stuck, StuckState, longest_normal_run, upper_bound
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Judgement
 
@@ -169,7 +169,9 @@ def test_independent_repeats_keep_the_run_length_in_95_trainings_of_100(probabil
     """Feller (1968), vol. 1, XIII.7: the first run of k successes takes (1 - p^k) / (q p^k) trials in the mean."""
     generator, kept = np.random.default_rng(4), 0
     for _ in range(200):
-        k = most_equal(runs_of(readings_of(generator.random(800) < probability)), ARL0)  # k repeats are one too many
+        k = longest_normal_run(
+            runs_of(readings_of(generator.random(800) < probability)), ARL0
+        )  # k repeats are one too many
         kept += k == inf or (1 - probability**k) / ((1 - probability) * probability**k) >= ARL0
     assert kept >= 190
 
@@ -182,7 +184,7 @@ def test_repeats_that_come_in_runs_keep_the_run_length_in_95_trainings_of_100(fi
         draws, repeated = generator.random(1500), np.zeros(1500, dtype=np.bool_)
         for row in range(1, 1500):
             repeated[row] = draws[row] < (next_one if repeated[row - 1] else first)
-        k = most_equal(runs_of(readings_of(repeated)), ARL0)
+        k = longest_normal_run(runs_of(readings_of(repeated)), ARL0)
         rest = next_one ** (k - 1)
         kept += k == inf or (1 / first + (1 - rest) / (1 - next_one)) / rest >= ARL0
         judged += k < inf
@@ -201,7 +203,7 @@ def test_long_runs_that_are_few_among_short_ones_keep_the_run_length_in_95_train
         among = generator.random(2000) < share
         repeats = generator.geometric(np.where(among, 1 - calm, 0.7)) - 1
         runs = {int(length): int(count) for length, count in zip(*np.unique(repeats, return_counts=True), strict=True)}
-        k = most_equal(runs, ARL0)
+        k = longest_normal_run(runs, ARL0)
         kept += k == inf or mean / ((1 - share) * 0.3**k + share * calm**k) >= ARL0
         judged += k < inf
     assert kept >= 95
@@ -214,7 +216,7 @@ def test_slow_coarse_signals_are_called_stuck_no_more_often_than_promised(slowne
     arl0, runs_beyond, watched = 20_000.0, 0, 0
     for seed in range(30):
         readings = slow_and_coarse(seed, 51_000, slowness, resolution)
-        limit = most_equal(runs_of(readings[:1000]), arl0)
+        limit = longest_normal_run(runs_of(readings[:1000]), arl0)
         runs_beyond += sum(count for repeats, count in runs_of(readings[1000:]).items() if repeats + 1 > limit)
         watched += 50_000
     expected = watched / arl0
@@ -227,12 +229,12 @@ def test_the_limit_is_what_the_formula_gives_with_bounds_by_another_library() ->
     readings, long_runs, beyond_4 = 4000 + 2000 + 900 + 400 + 3010, 10, 3000 - 4 * 10
     share = stats.beta.ppf(0.975, long_runs + 1, readings - long_runs)
     goes_on = stats.beta.ppf(0.975, beyond_4 + 1, long_runs)
-    assert most_equal(runs, ARL0) == 4 + np.ceil(np.log(ARL0 * share) / -np.log(goes_on))
+    assert longest_normal_run(runs, ARL0) == 4 + np.ceil(np.log(ARL0 * share) / -np.log(goes_on))
 
 
 def test_more_false_alarms_allowed_is_never_a_longer_limit() -> None:
     runs = runs_of(slow_and_coarse(1, 2000, 0.99, 0.3))
-    limits = [most_equal(runs, arl0) for arl0 in (1e2, 1e3, 1e4, 1e6, 1e9)]
+    limits = [longest_normal_run(runs, arl0) for arl0 in (1e2, 1e3, 1e4, 1e6, 1e9)]
     assert limits == sorted(limits)
     assert limits[0] < limits[-1]
 
@@ -242,7 +244,7 @@ def test_the_training_counts_runs_as_numpy_does() -> None:
     stuck = trained(readings)
     stuck.update(1e6)  # ends the last run
     assert stuck.state.runs == runs_of(readings)
-    assert stuck.limit == most_equal(runs_of(readings), ARL0)
+    assert stuck.limit == longest_normal_run(runs_of(readings), ARL0)
 
 
 # --- state ---------------------------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from monitor_node.alarms.on_off_delay import Persistence
+from monitor_node.alarms.on_off_delay import OnOffDelay
 from reactorwatch.errors import InputError
 from reactorwatch.spc import false_alarm_budget as budget
 from reactorwatch.spc.charts import cusum, ewma, shewhart
@@ -137,11 +137,11 @@ def test_the_width_of_a_rule_of_several_points_gives_its_rate() -> None:
     width = shewhart.designed_width(budget.point_probability(3000.0, 3, 5), KNOWN)
     out = np.abs(np.random.default_rng(5).normal(size=1_000_000)) > width
     alarms = 0
-    rule = Persistence(3, 5, 1)
+    rule = OnOffDelay(3, 5, 1)
     for point in out.tolist():
         if rule.update(point):
             alarms += 1
-            rule = Persistence(3, 5, 1)
+            rule = OnOffDelay(3, 5, 1)
     assert alarms * 3000.0 / out.size == pytest.approx(1.0, abs=4 / np.sqrt(333))
 
 
