@@ -207,7 +207,9 @@ def run(
             loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
             # All samples published since the state was stored, however long ago; the node skips those it knows.
             history_s = inf if node.resumed else 0.0
-            loop.subscribe(keys.all_keys(config.plant, keys.SAMPLE), history_s=history_s, on_history_end=node.on_history_end)
+            loop.subscribe(
+                keys.all_keys(config.plant, keys.SAMPLE), history_s=history_s, on_history_end=node.on_history_end
+            )
             loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
             loop.accept_commands(*(keys.key(config.plant, keys.COMMAND, name) for name in COMMANDS))
             declare_tokens(node, bus)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from monitor_node.alarms.alarms import ChartAlarm, Explanation
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication

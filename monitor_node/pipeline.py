@@ -228,8 +228,8 @@ class PlantPipeline:
         """
         time_ns = row.time_ns
         follows = self._sampling.follows(time_ns) and not row.restarted
-        publications.extend(self.signals.check_timeouts(time_ns, row.values))
-        measured = self.signals.check_ranges(time_ns, row.values, publications) if self._is_process else row.values
+        publications.extend(self.signals.check_row(time_ns, row.values))
+        measured = self.signals.mask_values(time_ns, row.values, publications) if self._is_process else row.values
         input_value, *values = measured
         if self._reference is None:
             self._train(time_ns, input_value, values, units, publications, follows=follows)
@@ -393,7 +393,7 @@ class PlantPipeline:
             self._note_late_signals(input_value, values)
             input_value = 0.0 if self._config.input in self.left_out else input_value  # as in the training
             values = [value if evaluated else nan for value, evaluated in zip(values, self._evaluated, strict=True)]
-        publications.extend(self.signals.check_stuck(time_ns, values, units))
+        publications.extend(self.signals.check_values(time_ns, values, units))
         stuck = self.signals.stuck
         if True in stuck:
             values = [nan if still else value for value, still in zip(values, stuck, strict=True)]
@@ -420,7 +420,7 @@ class PlantPipeline:
             for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
         ]
         self.rows_watched += 1
-        self._quarantined = quarantined = self.signals.check_spikes(time_ns, e, scales, units, publications)
+        self._quarantined = quarantined = self.signals.check_residuals(time_ns, e, scales, units, publications)
         if True in quarantined:
             for whitener, outlier in zip(self._whiteners, quarantined, strict=True):
                 if outlier:

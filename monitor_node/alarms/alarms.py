@@ -10,7 +10,7 @@ from monitor_node.alarms.on_off_delay import OnOffDelay, OnOffDelayState
 from monitor_node.alarms.states import Event, State, next_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Contribution, Priority, Suspect
-from reactorwatch.spc.charts.base import Judgement, quantity
+from reactorwatch.spc.charts.base import Judgement, format_quantity
 
 PRIORITIES: Mapping[str, Priority] = {
     "low": Priority.PRIORITY_LOW,

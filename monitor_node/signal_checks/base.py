@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from monitor_node.alarms.alarms import ChartAlarm, Explanation, SuspectedCause
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract.codec import Publication
@@ -37,7 +37,7 @@ class SignalCheck:
     name: ClassVar[str]
     can_be_false: ClassVar[bool] = False
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange]) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         self.board, self.outputs = board, config.outputs
 
     @property
@@ -119,4 +119,4 @@ class SignalCheck:
                 text, {} if signal == PLANT else {signal: 1.0}, [SuspectedCause(cause, 1.0, kind=SENSOR)]
             )
 
-        return self.board.judge(alarm, time_ns, judgement, unit, explain)
+        return self.board.evaluate(alarm, time_ns, judgement, unit, explain)

@@ -6,7 +6,7 @@ What the process can have: `monitor_node.baseline.signal_range`.
 from collections.abc import Sequence
 from math import nan
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import SignalCheck
@@ -22,11 +22,13 @@ class RangeCheck(SignalCheck):
 
     name = "range"
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange]) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         super().__init__(config, board, ranges)
         self._ranges, self._names = ranges, (config.input, *config.outputs)
         self._alarms = [
-            board.declare(self.name, signal, at_once=True, dead_band=0.0, tells_cause=True) if item.is_bounded else None
+            board.declare(self.name, signal, without_on_delay=True, dead_band=0.0, names_cause=True)
+            if item.is_bounded
+            else None
             for signal, item in zip(self._names, ranges, strict=True)
         ]
 
@@ -37,7 +39,7 @@ class RangeCheck(SignalCheck):
                 continue
             (lower, upper, unit), name = self._ranges[index], self._names[index]
             out = not lower <= value <= upper
-            if not out and alarm.at_rest:
+            if not out and alarm.is_idle:
                 continue
             text = (
                 f"{name} reads {value:.6g} {unit}, which the process cannot be: a sensor of it shows {lower:g} to "

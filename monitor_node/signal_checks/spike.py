@@ -39,20 +39,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr, ndtri
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import Flags, SignalCheck
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Judgement, finite, positive, quantity
+from reactorwatch.spc.charts.base import Judgement, finite, format_quantity, positive
 from reactorwatch.stored_state import StoredState
 
 NORMAL = 0.5
 """Share of the limit within which a value is normal."""
 
 RECENT, LEAST_RECENT = 100, 10
-"""Recent values with which a value is compared while an alarm is active, at most and at least."""
+"""RecentlyAdopted values with which a value is compared while an alarm is active, at most and at least."""
 
 ERRORS = 3.0
 """Standard errors, each about 1 / sqrt(n), by which the spread of these values is taken larger than estimated."""
@@ -247,10 +247,10 @@ class SpikeCheck(SignalCheck):
     name = Spike.name
     can_be_false = True
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange]) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         super().__init__(config, board, ranges)
         self._alarms = [
-            board.declare(self.name, name, at_once=True, priority="low", tells_cause=True, is_passing=True)
+            board.declare(self.name, name, without_on_delay=True, priority="low", names_cause=True, is_transient=True)
             for name in self.outputs
         ]
         self._spikes: list[Spike | None] = []
@@ -279,13 +279,13 @@ class SpikeCheck(SignalCheck):
             if spike is None or not isfinite(e[index]):
                 continue
             alarm, verdict = self._alarms[index], spike.update(e[index], is_moved=is_moved)
-            if verdict.withhold:
+            if verdict.quarantine:
                 flags = (*flags[:index], True, *flags[index + 1 :])
-            if verdict.spike or not alarm.at_rest:
+            if verdict.spike or not alarm.is_idle:
                 name = self.outputs[index]
                 size = verdict.size if verdict.spike else 0.0
                 judgement = Judgement(size, 0.0, -spike.limit, spike.limit, verdict.spike)
-                spiked = quantity(size * scales[index], units[index], "+.3g")
+                spiked = format_quantity(size * scales[index], units[index], "+.3g")
                 text = f"{name} had a spike of {spiked} one row before; it was left out"
                 publications += self.judge(alarm, time_ns, judgement, "sd", text, name, cause=self.name)
         return flags

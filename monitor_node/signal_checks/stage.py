@@ -10,14 +10,14 @@ from typing import Any
 
 import msgspec
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import ANY, SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import Flags, SignalCheck
 from monitor_node.signal_checks.catalogue import CHECKS
 from monitor_node.signal_checks.spike import SpikeCheck, SpikeState
 from monitor_node.signal_checks.stuck import StuckCheck, StuckState
-from monitor_node.signal_checks.timeout import SilenceCheck, SilenceState
+from monitor_node.signal_checks.timeout import DataTimeoutState, SilenceCheck
 from reactorwatch.contract.codec import Publication
 from reactorwatch.stored_state import StoredState
 
@@ -39,7 +39,7 @@ class SignalChecksState(StoredState, frozen=True, omit_defaults=True):
 
 
 FIELDS = {SilenceCheck.name: "silences", StuckCheck.name: "stuck", SpikeCheck.name: "spikes"}
-"""Checks with a field of their own in `SignalsState`. A check without a state has none at all."""
+"""Checks with a field of their own in `SignalChecksState`. A check without a state has none at all."""
 
 
 class SignalChecks:
@@ -54,7 +54,7 @@ class SignalChecks:
     CHANCE_ALARMS = sum(check.can_be_false for check in CHECKS)
     """Number of an output's alarms that can be false alarms."""
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange] | None = None) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange] | None = None) -> None:
         self._board, self._outputs = board, config.outputs
         known = ranges or [ANY] * (1 + len(config.outputs))
         self._checks = [check(config, board, known) for check in CHECKS]
@@ -74,7 +74,7 @@ class SignalChecks:
         ]
 
     @property
-    def silent(self) -> list[bool]:
+    def timed_out(self) -> list[bool]:
         """Silence of each signal, the input first."""
         return self._silence.silent
 
@@ -93,11 +93,11 @@ class SignalChecks:
     # --- state -----------------------------------------------------------------------------------------------
 
     @property
-    def state(self) -> SignalsState:
+    def state(self) -> SignalChecksState:
         """A copy of all that is remembered; the alarms are the board's."""
         states = {check.name: state for check in self._checks if (state := check.state) != b""}
         own = {field: states.pop(name) for name, field in FIELDS.items()}
-        return SignalsState(**own, others=states)
+        return SignalChecksState(**own, others=states)
 
     def restore(self, state: SignalChecksState, now_ns: int) -> None:
         """Resume from a state of the same settings; the alarms are restored before.
@@ -121,40 +121,41 @@ class SignalChecks:
                 check.restore(getattr(state, FIELDS[check.name]))
             elif check.name in others:
                 check.restore(state.others[check.name])
-        self._silence.listen(now_ns)
+        self._silence.arm(now_ns)
 
     # --- rows ------------------------------------------------------------------------------------------------
 
-    def hear(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
+    def check_row(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
         """Check a row, input first; values are NaN where missing."""
         publications: list[Publication] = []
         for on_row in self._on_row:
             publications += on_row(time_ns, values)
         return publications
 
-    def measured(self, time_ns: int, values: tuple[float, ...], publications: list[Publication]) -> tuple[float, ...]:
+    def mask_values(
+        self, time_ns: int, values: tuple[float, ...], publications: list[Publication]
+    ) -> tuple[float, ...]:
         """The values of a row, with NaN in place of those that are no measurements; see `SignalCheck.measured`."""
         for measured in self._measured:
             values = measured(time_ns, values, publications)
         return values
 
-    def look(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
+    def check_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
         """Check the outputs of a row."""
         publications: list[Publication] = []
         for on_values in self._on_values:
             publications += on_values(time_ns, values, units)
         return publications
 
-    def withheld(
-        self, time_ns: int, e: list[float], scales: list[float], units: list[str]
-    ) -> tuple[Flags, list[Publication]]:
-        """Check the residuals of a row; returns the outputs whose value must not enter a memory yet.
+    def check_residuals(
+        self, time_ns: int, e: list[float], scales: list[float], units: list[str], publications: list[Publication]
+    ) -> Flags:
+        """Check the residuals of a row; returns the outputs whose value is quarantined.
 
         Arguments as for `SignalCheck.on_residuals`.
         """
-        publications: list[Publication] = []
         flags = [on_residuals(time_ns, e, scales, units, publications) for on_residuals in self._on_residuals]
-        return flags[0] if len(flags) == 1 else tuple(any(each) for each in zip(*flags, strict=True)), publications
+        return flags[0] if len(flags) == 1 else tuple(any(each) for each in zip(*flags, strict=True))
 
     def restart(self) -> None:
         """Forget what is withheld, as after a gap."""
@@ -166,15 +167,15 @@ class SignalChecks:
         for check in self._checks:
             check.on_restart()
 
-    def go_on_from_alarms(self) -> None:
+    def resume_from_alarms(self) -> None:
         """Take as silent what the alarms say is silent: the next sample ends it."""
-        self._silence.go_on_from_alarms()
+        self._silence.resume_from_alarms()
 
     # --- receive time ----------------------------------------------------------------------------------------
 
-    def received(self, now_ns: int) -> None:
+    def on_receipt(self, now_ns: int) -> None:
         """Note that something came from the plant."""
-        self._silence.of_plant.received(now_ns)
+        self._silence.of_plant.on_receipt(now_ns)
 
     @property
     def receipts_ns(self) -> tuple[int | None, int | None]:
@@ -198,6 +199,6 @@ class SignalChecks:
         """Look whether the plant is silent, by the clock of receipt."""
         return self._silence.publish(0, self._silence.of_plant.check(now_ns))
 
-    def fall_silent(self) -> list[Publication]:
+    def declare_timeout(self) -> list[Publication]:
         """Take the plant as silent, as the clock of receipt told it when this was recorded."""
-        return self._silence.publish(0, self._silence.of_plant.begin())
+        return self._silence.publish(0, self._silence.of_plant.declare_timeout())

@@ -35,13 +35,13 @@ from math import ceil, inf, isfinite, log
 from scipy.special import betaincinv
 
 from monitor_node.alarms.alarms import STUCK_SENSOR
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import SignalCheck
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, quantity
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, finite, format_quantity
 from reactorwatch.stored_state import StoredState
 
 SMALLEST = 5
@@ -278,9 +278,11 @@ class StuckCheck(SignalCheck):
     name = Stuck.name
     can_be_false = True
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange]) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         super().__init__(config, board, ranges)
-        self._alarms = [board.declare(self.name, name, at_once=True, tells_cause=True) for name in self.outputs]
+        self._alarms = [
+            board.declare(self.name, name, without_on_delay=True, names_cause=True) for name in self.outputs
+        ]
         self._stuck: list[Stuck] = []
         self._note_alarms()
 
@@ -310,9 +312,10 @@ class StuckCheck(SignalCheck):
             if not isfinite(value):
                 continue
             alarm, judgement = self._alarms[index], self._stuck[index].update(value)
-            if judgement.out or not alarm.at_rest:
+            if judgement.out or not alarm.is_idle:
                 name, times = self.outputs[index], judgement.statistic
-                text = f"{name} is stuck: it has read {quantity(value, units[index], '.6g')} {times:.0f} times in a row"
+                reading = format_quantity(value, units[index], ".6g")
+                text = f"{name} is stuck: it has read {reading} {times:.0f} times in a row"
                 publications += self.judge(alarm, time_ns, judgement, READINGS, text, name, cause=STUCK_SENSOR)
                 self._note_alarms()
         return publications

@@ -45,7 +45,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from monitor_node.alarms.annunciator import AlarmBoard
+from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
 from monitor_node.signal_checks.base import PLANT, SignalCheck
@@ -308,19 +308,21 @@ class DataTimeout:
 class SilenceCheck(SignalCheck):
     """Raises an alarm when the plant, or one of its signals, is silent."""
 
-    name = Silence.name
+    name = DataTimeout.name
 
-    def __init__(self, config: MonitorConfig, board: AlarmBoard, ranges: Sequence[SignalRange]) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange]) -> None:
         super().__init__(config, board, ranges)
         self._names = (PLANT, config.input, *config.outputs)
-        self._silences = [Silence(config.silence_periods) for _ in self._names]
+        self._silences = [DataTimeout(config.silence_periods) for _ in self._names]
         self._alarms = [
-            board.declare(self.name, name, at_once=True, over_at_once=True, priority="high", tells_cause=True)
+            board.declare(
+                self.name, name, without_on_delay=True, without_off_delay=True, priority="high", names_cause=True
+            )
             for name in self._names
         ]
 
     @property
-    def of_plant(self) -> Silence:
+    def of_plant(self) -> DataTimeout:
         """The silence of all signals together."""
         return self._silences[0]
 
@@ -330,19 +332,19 @@ class SilenceCheck(SignalCheck):
         return [silence.standing for silence in self._silences[1:]]
 
     @property
-    def state(self) -> list[SilenceState]:
+    def state(self) -> list[DataTimeoutState]:
         """Of the plant, of the input and of each output."""
         return [silence.state for silence in self._silences]
 
-    def restore(self, state: list[SilenceState]) -> None:
+    def restore(self, state: list[DataTimeoutState]) -> None:
         """See `SignalCheck`."""
-        self._silences = [Silence.from_state(item) for item in state]
+        self._silences = [DataTimeout.from_state(item) for item in state]
 
-    def listen(self, now_ns: int) -> None:
+    def arm(self, now_ns: int) -> None:
         """Wait, after a stop, for the plant's next sample."""
-        self.of_plant.listen(now_ns)
+        self.of_plant.arm(now_ns)
 
-    def go_on_from_alarms(self) -> None:
+    def resume_from_alarms(self) -> None:
         """Take as silent what the alarms say is silent: the next sample ends it."""
         for silence, alarm in zip(self._silences, self._alarms, strict=True):
             silence.standing = alarm.memory.rule.standing
@@ -352,15 +354,15 @@ class SilenceCheck(SignalCheck):
         silences = self._silences
         publications: list[Publication] = []
         change = silences[0].update(time_ns, present=True)
-        if change is not NOTHING:
+        if change is not NO_CHANGE:
             publications += self.publish(0, change)
             for silence in silences[1:]:
-                silence.excuse(time_ns)
+                silence.suppress_until(time_ns)
         is_complete = all(value == value for value in values)  # NaN is not equal to itself
-        unknown_ns = None if is_complete else silences[0].unknown_allowed_ns()
+        unknown_ns = None if is_complete else silences[0].fallback_allowed_ns()
         for index, value in enumerate(values, start=1):
-            change = silences[index].update(time_ns, present=value == value, unknown_allowed_ns=unknown_ns)
-            if change is not NOTHING:
+            change = silences[index].update(time_ns, present=value == value, fallback_allowed_ns=unknown_ns)
+            if change is not NO_CHANGE:
                 publications += self.publish(index, change)
         return publications
 

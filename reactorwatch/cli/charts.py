@@ -5,7 +5,7 @@ from typing import Annotated
 import typer
 
 from reactorwatch.cli.options import Json
-from reactorwatch.cli.printing import print_lines
+from reactorwatch.cli.printing import print_lines, print_text
 from reactorwatch.errors import InputError
 
 Shift = Annotated[float, typer.Option(help="Of the mean, in standard deviations; 0: the false alarms.")]
@@ -107,9 +107,9 @@ def listed() -> None:
     from reactorwatch.spc.charts.catalogue import CHARTS
 
     for kind in CHARTS:
-        say(f"{kind.name:<11} {(kind.__doc__ or '').partition(chr(10))[0]}")
+        print_text(f"{kind.name:<11} {(kind.__doc__ or '').partition(chr(10))[0]}")
         for item in kind.settings:
-            say(f"{'':<11} {item.key} = {item.default:g}, in [{item.lower:g}, {item.upper:g}]")
+            print_text(f"{'':<11} {item.key} = {item.default:g}, in [{item.lower:g}, {item.upper:g}]")
 
 
 def design(

@@ -142,12 +142,12 @@ class SignalChart(Chart):
         return f"{signal.name} is {judgement.side} the limit of its {self.name} chart", {signal.name: 1.0}
 
 
-def quantity(value: float, unit: str, form: str = ".3g") -> str:
+def format_quantity(value: float, unit: str, form: str = ".3g") -> str:
     """A number and its unit, as texts of alarms have it.
 
-    >>> quantity(7.25, "K")
+    >>> format_quantity(7.25, "K")
     '7.25 K'
-    >>> quantity(7.25, "", "+.1f")
+    >>> format_quantity(7.25, "", "+.1f")
     '+7.2'
 
     Args:

@@ -29,7 +29,7 @@ from scipy import special
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, Judgement, Shown, finite, positive, quantity
+from reactorwatch.spc.charts.base import Array, Judgement, Shown, finite, format_quantity, positive
 from reactorwatch.spc.compiled_chart import (
     CENTRE,
     LOWER,
@@ -126,8 +126,8 @@ class Shewhart(CompiledChart):
 
     def explain(self, judgement: Judgement, signal: Shown) -> tuple[str, dict[str, float]]:
         """See `SignalChart`."""
-        size = quantity(abs(judgement.statistic) * signal.scale, signal.unit)
-        allowed = quantity(judgement.upper_limit * signal.scale, signal.unit)
+        size = format_quantity(abs(judgement.statistic) * signal.scale, signal.unit)
+        allowed = format_quantity(judgement.upper_limit * signal.scale, signal.unit)
         text = f"{signal.name} is {size} {judgement.side} what the model expects (allowed: {allowed})"
         return text, {signal.name: 1.0}
 

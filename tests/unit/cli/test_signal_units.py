@@ -20,7 +20,7 @@ from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.record import UNITS, Record
 from reactorwatch.runtime.model_file import write_extended_model
-from reactorwatch.spc.charts.base import quantity
+from reactorwatch.spc.charts.base import format_quantity
 from recorder.columns.process_annotations import process_of, titled
 from recorder.columns.run_reader import read_run
 from recorder.panels.overview import draw

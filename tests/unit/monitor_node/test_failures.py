@@ -54,7 +54,7 @@ def health_message(said: list[Publication], plant: str) -> Health:
     [
         (PlantPipeline, "update", "row"),
         (ChartWatch, "update", "row"),
-        (SignalChecks, "check_timeouts", "row"),
+        (SignalChecks, "check_row", "row"),
         (Annunciator, "end_row", "row"),
         (PlantPipeline, "snapshots", "models"),
         (QuietForm, "written", "demotion"),
