@@ -425,7 +425,7 @@ class PlantWatch:
         if True in withheld:
             for whitener, outlier in zip(self._whiteners, withheld, strict=True):
                 if outlier:
-                    whitener.withhold()
+                    whitener.reject_last()
         self._charts.update(time_ns, e, withheld, scales, units, publications, points=self._points)
         publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:

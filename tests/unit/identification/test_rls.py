@@ -212,12 +212,12 @@ def test_moving_the_parameters_keeps_their_covariance(forgetting: float) -> None
     rng = np.random.default_rng(14)
     rls = learned(rng.standard_normal((50, 3)), 1e9 * rng.standard_normal(50), forgetting=forgetting)
     covariance = rls.covariance
-    rls.move_to([1.0, 2.0, 3.0])
+    rls.set_parameters([1.0, 2.0, 3.0])
     np.testing.assert_array_equal(rls.covariance, covariance)
     rls.update([0.0, 0.0, 0.0], 0.0)
     np.testing.assert_allclose(rls.parameters, [1.0, 2.0, 3.0], rtol=1e-13)
     with pytest.raises(ValueError, match=r"forgetting can only rise, from .*, got 0.5"):
-        rls.remember_longer(0.5)
+        rls.raise_forgetting(0.5)
 
 
 @pytest.mark.parametrize("forgetting", [1.0, 0.97])

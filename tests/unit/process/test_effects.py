@@ -96,8 +96,6 @@ def test_its_facts_make_sense(effect: Effect) -> None:
     assert effect.typical != effect.neutral
     assert all(effect.lower <= size <= effect.upper for size in effect.start_values)
     assert set(effect.labels) <= {profile.name for profile in PROFILES}
-    for profile in PROFILES:
-        assert effect.label_with(profile) == effect.labels.get(profile.name, effect.label)
 
 
 @of_every_effect
