@@ -10,7 +10,7 @@ from reactorwatch.identification.structure import REPORT_ROWS, Structure
 from tests.unit.identification.truth import Array, Daisy, oscillating_plant
 
 
-def simulated(parameters: Array, inputs: Array, structure: Structure, start: Array) -> Array:
+def recursion(parameters: Array, inputs: Array, structure: Structure, start: Array) -> Array:
     """The recursion of one input and output, written out."""
     y = list(start)
     n, m, d = structure.output_lags, structure.input_lags, structure.delay
@@ -103,7 +103,7 @@ def test_the_free_run_is_the_recursion_on_its_own_output() -> None:
     model = LinearModel(structure, parameters[None, :], np.zeros((1, 6, 6)), np.zeros(1), 1.0, 60, simulates=True)
     run = model.simulate(u, y)[:, 0]
     assert np.all(np.isnan(run[:4]))
-    np.testing.assert_allclose(run[4:], simulated(parameters, u, structure, y[:4])[4:], rtol=1e-12)
+    np.testing.assert_allclose(run[4:], recursion(parameters, u, structure, y[:4])[4:], rtol=1e-12)
 
 
 def test_a_free_run_goes_over_missing_outputs_and_starts_anew_after_gaps() -> None:
