@@ -424,7 +424,7 @@ class PlantPipeline:
         if True in quarantined:
             for whitener, outlier in zip(self._whiteners, quarantined, strict=True):
                 if outlier:
-                    whitener.withhold()
+                    whitener.reject_last()
         self._charts.update(time_ns, e, quarantined, scales, units, publications, points=self._points)
         publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:

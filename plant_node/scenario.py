@@ -8,7 +8,6 @@ The default levels keep the nominal plant on its operating branch; a large or fa
 extinguishes it.
 """
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -19,7 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.records.record import Record
 
 SIGNAL = "qc"
@@ -234,11 +233,11 @@ def scenario_settings(setting: str | Mapping[str, Any]) -> Settings:
         raise InputError(f"scenario must have a 'kind' (valid: {', '.join(kinds)}), got {dict(setting)}")
     kind, values = setting["kind"], {key: value for key, value in setting.items() if key != "kind"}
     if kind not in kinds:
-        raise InputError(f"scenario: {_unknown('kind', str(kind), tuple(kinds))}")
+        raise InputError(f"scenario: {describe_unknown('kind', str(kind), kinds)}")
     fields = tuple(field.name for field in msgspec.structs.fields(kinds[kind]))
     for key in values:
         if key not in fields:
-            raise InputError(f"scenario {kind}: {_unknown('key', key, fields)}")
+            raise InputError(f"scenario {kind}: {describe_unknown('key', key, fields)}")
     if kind == FromFile.kind and "path" not in values:
         raise InputError("scenario file: 'path' must say which .csv record drives the plant")
     try:
@@ -252,12 +251,6 @@ def scenario_settings(setting: str | Mapping[str, Any]) -> Settings:
 def _uniform(seed: int, index: int) -> float:
     """Draw a uniform number in [0, 1), a deterministic function of the arguments."""
     return float(np.random.default_rng(np.random.SeedSequence([seed, _STREAM, index])).random())
-
-
-def _unknown(what: str, name: str, valid: tuple[str, ...]) -> str:
-    close = difflib.get_close_matches(name, valid, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"unknown {what} {name!r}{hint} (valid: {', '.join(valid)})"
 
 
 def _check_levels(**levels: float) -> None:

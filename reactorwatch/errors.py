@@ -1,4 +1,7 @@
-"""What a person did wrong, told in one line."""
+"""Errors in the user's input, each reported in one line."""
+
+import difflib
+from collections.abc import Iterable
 
 
 class InputError(ValueError):
@@ -7,3 +10,15 @@ class InputError(ValueError):
     Its text is one line that names the thing, the rule and the value, and the cure if it is known. Commands print
     that line and end with exit code 2; every other error is a fault of this software (`runtime/crash.py`).
     """
+
+
+def describe_unknown(what: str, name: str, valid: Iterable[str]) -> str:
+    """Describe an unknown name, with a hint at the closest valid one, and the valid names.
+
+    >>> describe_unknown("input", "qq", ("qc",))
+    "unknown input 'qq'; did you mean 'qc'? (valid: qc)"
+    """
+    names = list(valid)
+    close = difflib.get_close_matches(name, names, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return f"unknown {what} {name!r}{hint} (valid: {', '.join(names) or 'none'})"

@@ -46,7 +46,7 @@ def _draw(study: Study, drawing: Drawing, family: str, free: bool) -> Finding:
         over.plot(t[shown], y[shown], ".", color=BLACK, markersize=3, label="measured")
         for order in ORDERS:
             model = study.fitted(family, order, output)
-            predicted = (model.free_run if free else model.one_step)(u, y, t)[:, 0]
+            predicted = (model.simulate if free else model.predict)(u, y, t)[:, 0]
             fits[order, output] = fit_percent(y, predicted)
             settled[order, output] = fit_percent(y[t > t[0] + _SETTLED_MIN], predicted[t > t[0] + _SETTLED_MIN])
             line: dict[str, Any] = {"linestyle": _STYLES[order], "color": BY_ORDER[order], "linewidth": 1.3}

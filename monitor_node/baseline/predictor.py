@@ -285,7 +285,7 @@ class ArxPredictor:
         self, scaled: Array, scaled_covariance: Array, condition: float, rows: int, forgetting: float
     ) -> ModelSnapshot:
         assert self._scaling is not None
-        matrix, shift = self._scaling.undoing(self._structure)
+        matrix, shift = self._scaling.unscaling(self._structure)
         values = matrix @ scaled + shift
         deviations = standard_deviations(scaled_covariance, matrix)
         return ModelSnapshot(

@@ -43,3 +43,10 @@ class ArrayFunction:
     def __call__(self) -> None:
         """Evaluate."""
         self._evaluate()
+
+    def call(self, *values: Array | float) -> list[Array]:
+        """Evaluate with these arguments; returns copies of the results."""
+        for argument, value in zip(self.arguments, values, strict=True):
+            argument[:] = value
+        self._evaluate()
+        return [item.copy() for item in self.results]

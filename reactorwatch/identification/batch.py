@@ -17,7 +17,7 @@ from reactorwatch.identification.regressor import Rows, rows_of
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 
 SINGULAR_CONDITION = 1e13
-"""Beyond this the parameters are rounding."""
+"""Condition number beyond which the parameters are rounding error."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class LeastSquares:
         parameters: shape (outputs, parameters).
         inverse: shape (parameters, parameters), (X'X)^-1.
         noise_variance: shape (outputs,), r'r / (rows - parameters); inf for as many rows as parameters.
-        condition: of the regressors.
+        condition: condition number of the regressors.
     """
 
     parameters: NDArray[np.float64]
@@ -38,7 +38,7 @@ class LeastSquares:
 
 
 def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
-    """The parameters that leave the smallest sum of squares.
+    """Solve a least squares problem.
 
     Args:
         regressors: shape (rows, parameters).
@@ -68,9 +68,9 @@ def least_squares(regressors: ArrayLike, outputs: ArrayLike) -> LeastSquares:
         )
     inverse_factor = np.linalg.inv(r)
     theta = np.linalg.solve(r, q.T @ y)
-    rest = y - x @ theta
+    residuals = y - x @ theta
     free = rows - parameters
-    squares = np.sum(rest * rest, axis=0)
+    squares = np.sum(residuals * residuals, axis=0)
     variance = squares / free if free > 0 else np.full(y.shape[1], np.inf)
     return LeastSquares(theta.T, inverse_factor @ inverse_factor.T, variance, condition)
 
@@ -82,25 +82,25 @@ def fit_arx(
     time: ArrayLike | None = None,
     choice: RowChoice = ALL_ROWS,
 ) -> LinearModel:
-    """The ARX model that predicts the next row best.
+    """Fit an ARX model by least squares.
 
-    Rows with a missing value, or just after a gap in time, are left out.
+    Rows with a missing value, or just after a gap in time, are excluded.
 
     Args:
         structure: its terms.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, outputs), likewise.
-        time: shape (rows,), increasing, in any unit; without it no gap is looked for.
-        choice: which rows are fitted.
+        outputs: shape (rows,) or (rows, outputs), NaN where nothing was measured.
+        time: shape (rows,), increasing, in any unit; None: gaps are not detected.
+        choice: rows that are fitted.
 
     Raises:
         InputError: too few rows, an output that is constant, or rows that don't determine the parameters.
     """
     u = as_columns(inputs, "inputs", structure.inputs)
     y = as_columns(outputs, "outputs", structure.outputs)
-    refuse_constant(y)
+    check_not_constant(y)
     scaling = Scaling.of(u, y, centred=structure.offset)
-    rows = enough_rows(rows_of(structure, scaling.inputs(u), scaling.outputs(y), time, choice), len(y))
+    rows = check_row_count(rows_of(structure, scaling.inputs(u), scaling.outputs(y), time, choice), len(y))
     return linear_model(structure, scaling, least_squares(rows.regressors, rows.outputs), rows.position.size)
 
 
@@ -112,21 +112,21 @@ def linear_model(
     simulates: bool = False,
     first_output: int = 0,
 ) -> LinearModel:
-    """A model in the signals' own units from a solution in scaled ones.
+    """Make a model in the signals' own units from a solution for scaled signals.
 
     Args:
         structure: its terms.
-        scaling: of the signals.
-        solution: of one or several of the outputs.
-        rows: how many rows it was fitted to.
-        simulates: whether it was fitted by its free run.
-        first_output: the output that the solution's first one is.
+        scaling: scaling of the signals.
+        solution: solution for one or several of the outputs.
+        rows: number of rows of the fit.
+        simulates: whether it was fitted by simulation.
+        first_output: index of the output that the solution's first one is.
     """
     solved, size = solution.parameters.shape
     parameters = np.empty((solved, size))
     covariance = np.full((solved, size, size), np.inf)
     for i in range(solved):
-        matrix, shift = scaling.undoing(structure, first_output + i)
+        matrix, shift = scaling.unscaling(structure, first_output + i)
         parameters[i] = matrix @ solution.parameters[i] + shift
         if np.isfinite(solution.noise_variance[i]) and np.all(np.isfinite(solution.inverse)):
             covariance[i] = solution.noise_variance[i] * matrix @ solution.inverse @ matrix.T
@@ -135,8 +135,8 @@ def linear_model(
     return LinearModel(structure, parameters, covariance, noise_sd, solution.condition, rows, simulates)
 
 
-def refuse_constant(outputs: NDArray[np.float64]) -> None:
-    """Raise if an output never changes.
+def check_not_constant(outputs: NDArray[np.float64]) -> None:
+    """Check that every output changes.
 
     Raises:
         InputError: an output whose measured values are all equal.
@@ -147,12 +147,12 @@ def refuse_constant(outputs: NDArray[np.float64]) -> None:
             raise InputError(f"output {o + 1} is constant, {values[0]:g} in all rows: there is nothing to identify")
 
 
-def enough_rows(rows: Rows, of: int) -> Rows:
-    """The rows, if they can determine the parameters.
+def check_row_count(rows: Rows, of: int) -> Rows:
+    """Check that there are enough rows to determine the parameters; returns them.
 
     Args:
-        rows: what can be used of a record.
-        of: how many rows the record has.
+        rows: usable rows of a record.
+        of: number of rows of the record.
 
     Raises:
         InputError: fewer rows than parameters.

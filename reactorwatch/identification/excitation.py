@@ -1,17 +1,17 @@
-"""Is a record good enough to learn a model from? Each check is a result, with the reason and the cure if it fails.
+"""Checks that a record suffices to identify a model; each failure names the reason and the cure.
 
 Persistence of excitation (Ljung, System Identification, 2nd ed., chapter 13): a linear model of n
 parameters on past outputs and m on past inputs needs an input of order n + m, one whose n + m lagged copies, less
 their means, are linearly independent. A sinusoid excites 2, a sum of k sinusoids 2k, however long it lasts; a square
 wave or random steps many more. Measured here as the smallest over the largest singular value of the lagged copies.
-As independence in itself does not depend on the spacing of the lags, but its size does (neighbouring samples of a slow
-input are nearly equal), the best of several spacings counts; how fast the samples come is another check's affair.
+Independence does not depend on the spacing of the lags, but this measure does (neighbouring samples of a slow input are
+nearly equal), so the best of several spacings counts; the sampling rate has a check of its own.
 
 The sampling rate is judged by the plant's response to a step, T95 in samples: 5 to 15 are advised (Isermann and
 Munchhof, Identification of Dynamic Systems, 2011, section 23.2). Above that neighbouring rows are nearly equal, the
 regressors become singular, and noise outweighs what a sample adds; below it the response is over between two
 samples. The step response is that of the instrumental variable model: least squares would take the noise for fast
-dynamics, and find every sampling rate good.
+dynamics, and accept every sampling rate.
 """
 
 import math
@@ -22,28 +22,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.instrumental_variable import instrumental_variable
-from reactorwatch.identification.linear_model import RunPlan, free_run, plan_run
-from reactorwatch.identification.regressor import rows_of, unbroken
+from reactorwatch.identification.linear_model import RunPlan, plan_run, simulate
+from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 INDEPENDENT = 0.01
-"""The weakest direction of the input's lagged copies must have this share of the strongest one's size."""
+"""Smallest ratio of the weakest to the strongest direction of the input's lagged copies."""
 LARGEST_CONDITION = 1e4
 SLOWEST_SAMPLES, BEST_SAMPLES, FASTEST_SAMPLES = 3.0, 10.0, 30.0
-"""T95 in samples: fewer is too slow, more too fast."""
+"""T95 in samples: sampling is too slow below, too fast above."""
 LEAST_AMPLITUDE = 3.0
 
 _LONGEST_STEP = 20_000
 
 
 class Check(msgspec.Struct, frozen=True):
-    """What a check found.
+    """Result of a check.
 
     Attributes:
-        name: of the check.
-        result: "ok", or what is wrong and what to do about it.
-        value: what was measured.
-        limit: what it was held against.
+        name: name of the check.
+        result: "ok", or the reason of a failure and its cure.
+        value: measured value.
+        limit: limit of the value.
     """
 
     name: str
@@ -53,7 +53,7 @@ class Check(msgspec.Struct, frozen=True):
 
     @property
     def passed(self) -> bool:
-        """Whether all is well."""
+        """True if the result is "ok"."""
         return self.result == "ok"
 
 
@@ -61,7 +61,7 @@ class SamplingCheck(Check, frozen=True):
     """A check of the sampling rate.
 
     Attributes:
-        decimation: take one row of so many; 1 if the rate is good, or too slow already.
+        decimation: advised decimation of the rows; 1 if the rate is good or too slow.
     """
 
     decimation: int = 1
@@ -70,13 +70,13 @@ class SamplingCheck(Check, frozen=True):
 def check_record(
     structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
 ) -> tuple[Check, ...]:
-    """All checks of a record for a structure, in the order in which they should be cured.
+    """Run all checks of a record for a structure, in the order in which to cure failures.
 
     Args:
-        structure: of the model that is to be learned; one output.
+        structure: structure of the model; one output.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, 1), likewise.
-        time: shape (rows,); without it no gap is looked for.
+        outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
+        time: shape (rows,); None: gaps are not detected.
 
     Raises:
         InputError: shapes that don't fit, times that don't increase, or too few rows.
@@ -98,7 +98,7 @@ def check_record(
 
 
 def variation(outputs: ArrayLike) -> Check:
-    """Whether the output moves at all, by more than its own rounding."""
+    """Check that the output varies by more than its rounding."""
     values = np.asarray(outputs, dtype=np.float64)
     values = values[np.isfinite(values)]
     if values.size == 0:
@@ -109,15 +109,15 @@ def variation(outputs: ArrayLike) -> Check:
 
 
 def persistence(inputs: ArrayLike, order: int, time: ArrayLike | None = None) -> Check:
-    """Whether the input excites a model of a given number of parameters.
+    """Check that the input excites a model of a given number of parameters.
 
     Args:
         inputs: shape (rows,) or (rows, inputs).
-        order: parameters on past outputs and past inputs together (for each input).
-        time: shape (rows,); without it no gap is looked for.
+        order: number of parameters on past outputs and past inputs together (for each input).
+        time: shape (rows,); None: gaps are not detected.
     """
     u = as_columns(inputs, "inputs")
-    run = unbroken(u, time)
+    run = consecutive_rows(u, time)
     found, spacing = 0, 1
     while found < order and spacing * (order - 1) <= max(len(u) // 4, order - 1):
         rows = np.flatnonzero(run > spacing * (order - 1))
@@ -135,7 +135,7 @@ def persistence(inputs: ArrayLike, order: int, time: ArrayLike | None = None) ->
 
 
 def _excited_order(copies: list[NDArray[np.float64]]) -> int:
-    """How many of the first lagged copies are independent."""
+    """Number of leading lagged copies that are linearly independent."""
     centred = [copy - copy.mean(axis=0) for copy in copies]
     size = np.linalg.norm(centred[0], axis=0)
     if np.any(size <= 1e-12 * np.max(np.abs(copies[0]), axis=0) * math.sqrt(len(copies[0]))):
@@ -150,7 +150,7 @@ def _excited_order(copies: list[NDArray[np.float64]]) -> int:
 
 
 def conditioning(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Check:
-    """Whether the scaled regressors determine the parameters.
+    """Check that the scaled regressors determine the parameters.
 
     Raises:
         InputError: shapes that don't fit, times that don't increase, or fewer rows than parameters.
@@ -165,7 +165,7 @@ def conditioning(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, ti
 
 
 def condition_check(condition: float) -> Check:
-    """The condition number of scaled regressors, from a record or from a recursive estimator, against its limit."""
+    """Check the condition number of scaled regressors, from a record or a recursive estimator."""
     value = condition if math.isfinite(condition) and condition < 1e16 else math.inf
     reason = (
         f"the regressors are nearly dependent, condition number {value:.1e}: "
@@ -177,13 +177,13 @@ def condition_check(condition: float) -> Check:
 def sampling(
     structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
 ) -> SamplingCheck:
-    """Whether the samples come neither too fast nor too slowly for the plant.
+    """Check that the sampling is neither too fast nor too slow for the plant.
 
     Args:
-        structure: of the model that is to be learned; one output.
+        structure: structure of the model; one output.
         inputs: shape (rows,) or (rows, inputs).
         outputs: shape (rows,) or (rows, 1).
-        time: shape (rows,); without it no gap is looked for.
+        time: shape (rows,); None: gaps are not detected.
 
     Raises:
         InputError: too few rows, or rows that don't determine the parameters.
@@ -213,12 +213,12 @@ def sampling(
 
 
 def response_samples(structure: Structure, parameters: NDArray[np.float64]) -> float:
-    """How many samples a step response takes to 95 % of its final value for the first time, beyond the delay.
+    """Number of samples until a step response first reaches 95 % of its final value, without the delay.
 
-    Of several inputs the one with the largest effect counts. NaN if there is no effect, or it does not settle.
+    Of several inputs the one with the largest gain counts. NaN if there is no effect, or it does not settle.
 
     Args:
-        structure: of the model; one output.
+        structure: structure of the model; one output.
         parameters: shape (parameters,), for scaled signals.
     """
     lags = structure.output_lags
@@ -236,13 +236,13 @@ def response_samples(structure: Structure, parameters: NDArray[np.float64]) -> f
     theta = parameters.copy()
     if structure.offset:
         theta[-1] = 0.0
-    response = free_run(structure, theta[None, :], step, np.zeros((length, 1)), plan)[structure.history :, 0]
+    response = simulate(structure, theta[None, :], step, np.zeros((length, 1)), plan)[structure.history :, 0]
     reached = np.flatnonzero(response / final >= 0.95)
     return float(reached[0] - structure.delay + 1) if reached.size else math.nan
 
 
 def amplitude(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Check:
-    """Whether the output moves by more than its noise: the residual of an ARX model of twice the order.
+    """Check that the output moves by more than its noise, the residual of an ARX model of twice the order.
 
     Raises:
         InputError: too few rows, or rows that don't determine the parameters.
@@ -258,11 +258,11 @@ def amplitude(structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time:
     u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
     scaling = Scaling.of(u, y, centred=structure.offset)
     rows = rows_of(rich, scaling.inputs(u), scaling.outputs(y), time)
-    # Nearly dependent columns leave the residual well determined, so they are no obstacle here.
+    # Nearly dependent columns do not affect the residual.
     theta = np.linalg.lstsq(rows.regressors, rows.outputs)[0]
-    rest = rows.outputs - rows.regressors @ theta
-    free = max(len(rest) - rich.parameters, 1)
-    noise = math.sqrt(float(np.sum(rest * rest)) / free)
+    residuals = rows.outputs - rows.regressors @ theta
+    free = max(len(residuals) - rich.parameters, 1)
+    noise = math.sqrt(float(np.sum(residuals * residuals)) / free)
     value = float(np.std(rows.outputs)) / noise if noise > 0.0 else math.inf
     reason = (
         f"the output moves by only {value:.1f} times its noise, {LEAST_AMPLITUDE:.0f} are needed: "

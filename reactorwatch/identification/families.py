@@ -1,4 +1,4 @@
-"""The kinds of model that can be compared: anything that can be fitted, predict the next row, and run freely."""
+"""Model families for comparison: anything that can be fitted, predict and simulate."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -19,34 +19,34 @@ class Model(Protocol):
     def parameter_count(self) -> int:
         """Number of parameters."""
 
-    def one_step(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Each row from the measured rows before it, shape (rows, outputs); NaN where they are not complete."""
+    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+        """One-step-ahead prediction, shape (rows, outputs); NaN where the rows before are incomplete."""
 
-    def free_run(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """The model on its own outputs, shape (rows, outputs); NaN in the rows that it starts from."""
+    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+        """Simulation, shape (rows, outputs); NaN in the rows that it starts from."""
 
     def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Measured minus predicted, by the prediction that the model was fitted for, shape (rows, outputs)."""
+        """Measured minus predicted or simulated, as in the fit, shape (rows, outputs)."""
 
 
 class Family(Protocol):
-    """A kind of model."""
+    """A model family."""
 
     @property
     def name(self) -> str:
-        """What people call it."""
+        """Name of the family."""
 
     def fit(self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Model:
-        """The model of a structure that explains a record best.
+        """Fit a model of a structure to a record.
 
         Raises:
-            InputError: a record that does not determine the model.
+            InputError: the record does not determine the model.
         """
 
 
 @dataclass(frozen=True)
 class Arx:
-    """Linear, fitted to predict the next row."""
+    """Linear, fitted by one-step-ahead prediction."""
 
     name: str = "arx"
 
@@ -59,7 +59,7 @@ class Arx:
 
 @dataclass(frozen=True)
 class OutputError:
-    """Linear, fitted to run freely."""
+    """Linear, fitted by simulation."""
 
     name: str = "oe"
 

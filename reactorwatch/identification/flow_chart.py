@@ -1,8 +1,8 @@
-"""From data to verdict: the report's flow chart, with the branch that was taken at each question and why.
+"""The report's flow chart from data to verdict, with the answer to each question and its reason.
 
     data -> is the sampling rate good? -no-> sample again
                  | yes
-            model, from the rows that are trusted; limits: mean +- 3 sigma of its residual there (SPC)
+            model, from the trusted rows; limits: mean +- 3 sigma of its residual there (SPC)
                  |
             is there a mismatch in the other rows? -no-> fault free
                  | yes
@@ -10,10 +10,10 @@
                  | yes
                fault
 
-A residual outside its limits happens, to a model that is true, in 0.27 % of rows; the share seen while training, if it
-is larger, is taken instead. There is a mismatch if the number outside is improbable under that share (binomial).
-Parameters are accurate for a row if their uncertainty adds less to its prediction than noise does, phi' cov phi <
-sigma^2: not so where the plant has gone where the model has never been.
+With a true model 0.27 % of the residuals are outside their limits; if the share in training is larger, it is used
+instead. There is a mismatch if the number outside is improbable under that share (binomial). Parameters are accurate
+for a row if their uncertainty contributes less to its prediction error than noise does, phi' cov phi < sigma^2; that
+fails outside the operating range of the training.
 """
 
 import math
@@ -38,9 +38,9 @@ class Branch(msgspec.Struct, frozen=True):
     """One question of the chart.
 
     Attributes:
-        question: as it stands in the chart.
+        question: the question.
         answer: "yes" or "no".
-        why: the numbers.
+        why: the numbers behind the answer.
     """
 
     question: str
@@ -50,14 +50,14 @@ class Branch(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Conclusion:
-    """Where the chart ended.
+    """Result of the chart.
 
     Attributes:
         verdict: "sample again", "fault free", "identify again" or "fault".
-        branches: the questions asked, in order.
-        model: None if the chart ended before it.
-        lower_limit: of the residual, in the output's unit; NaN likewise.
-        upper_limit: likewise.
+        branches: the questions in order.
+        model: the fitted model; None if the chart ended before it.
+        lower_limit: lower limit of the residual, in the output's unit; NaN without a model.
+        upper_limit: upper limit of the residual; NaN without a model.
     """
 
     verdict: str
@@ -74,14 +74,14 @@ def follow(
     time: ArrayLike | None = None,
     trusted_rows: int | None = None,
 ) -> Conclusion:
-    """Go through the chart with a record.
+    """Apply the chart to a record.
 
     Args:
-        structure: of the ARX model; one output.
+        structure: structure of the ARX model; one output.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, 1), likewise.
-        time: shape (rows,); without it no gap is looked for.
-        trusted_rows: how many rows at the start are known to be fault free; the first half, if not given.
+        outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
+        time: shape (rows,); None: gaps are not detected.
+        trusted_rows: number of rows at the start that are known to be fault free; None: the first half.
 
     Raises:
         InputError: a record that does not determine the model, or no rows on one side.
@@ -97,7 +97,7 @@ def follow(
         if check.name in ("variation", "excitation") and not check.passed:
             raise InputError(check.result)
     rate = sampling(structure, *training)
-    branches = [_asked("is the sampling rate good?", rate.passed, _sampling_text(rate))]
+    branches = [_branch("is the sampling rate good?", rate.passed, _sampling_text(rate))]
     if not rate.passed:
         return Conclusion("sample again", tuple(branches))
 
@@ -117,7 +117,7 @@ def follow(
         f"{outside.sum()} of {present.sum()} residuals are outside {lower:.3g} to {upper:.3g}, "
         f"{100 * usual:.2g} % are usual: -log10 p = {improbable:.1f}"
     )
-    branches.append(_asked("is there a mismatch?", mismatch, why))
+    branches.append(_branch("is there a mismatch?", mismatch, why))
     if not mismatch:
         return Conclusion("fault free", tuple(branches), model, lower, upper)
 
@@ -129,11 +129,11 @@ def follow(
     why = (
         f"uncertain parameters add {ratio:.2g} of the noise's standard deviation to those predictions, at most 1 may be"
     )
-    branches.append(_asked("are the parameters accurate?", accurate, why))
+    branches.append(_branch("are the parameters accurate?", accurate, why))
     return Conclusion("fault" if accurate else "identify again", tuple(branches), model, lower, upper)
 
 
-def _asked(question: str, answer: bool, why: str) -> Branch:
+def _branch(question: str, answer: bool, why: str) -> Branch:
     return Branch(question, "yes" if answer else "no", why)
 
 

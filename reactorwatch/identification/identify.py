@@ -1,4 +1,4 @@
-"""What `reactorwatch identify` tells: a model of one output from the first half of a record, judged by the second."""
+"""Identify a model of one output from the first half of a record, and validate it on the second."""
 
 import math
 from collections.abc import Iterable
@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, refuse_constant
+from reactorwatch.identification.batch import SINGULAR_CONDITION, check_not_constant, fit_arx
 from reactorwatch.identification.excitation import check_record
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.recursive_arx import model_of
 from reactorwatch.identification.recursive_output_error import RecursiveOutputError
-from reactorwatch.identification.regressor import rows_of, unbroken
+from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.residual_tests import independence, whiteness
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
@@ -25,7 +25,7 @@ WORST_MINUS_LOG10_P = 6.0
 
 
 class Deviations(msgspec.Struct, frozen=True):
-    """Standard deviations of the parameters; inf where the rows don't tell."""
+    """Standard deviations of the parameters; inf where the rows do not determine them."""
 
     a: tuple[float, ...]
     b: tuple[float, ...]
@@ -36,8 +36,8 @@ class FitPercent(msgspec.Struct, frozen=True):
     """Fits on the held-out half, 100 (1 - |y - yhat| / |y - mean y|).
 
     Attributes:
-        one_step: of the recursion on the measured rows before each row, whatever the model was fitted for.
-        free_run: of the recursion on its own output from the half's first rows on; -inf if it leaves for good.
+        one_step: fit of the one-step-ahead prediction, for either kind of model.
+        free_run: fit of the simulation from the half's first rows on; -inf if it diverges.
     """
 
     one_step: float
@@ -53,18 +53,18 @@ class Identification(msgspec.Struct, frozen=True):
     Attributes:
         model: "arx" or "oe".
         order: n.
-        delay: samples.
+        delay: delay in samples.
         output: name of the output.
-        rows: of the fitted half.
+        rows: number of rows of the fitted half.
         recursive: whether it was learned row by row.
-        a: n numbers.
-        b: n numbers.
+        a: n coefficients of past outputs.
+        b: n coefficients of past inputs.
         offset: the constant.
-        sd: their standard deviations.
-        fit_percent: on the held-out half; the free run starts from its first rows.
-        whiteness_minus_log10_p: of the residuals of the fitted half: one-step errors of an ARX model, errors of the
-            run of an output-error model.
-        checks: by name, "ok" or what is wrong.
+        sd: standard deviations of the parameters.
+        fit_percent: fits on the held-out half.
+        whiteness_minus_log10_p: whiteness test of the residuals of the fitted half: one-step errors of an ARX model,
+            simulation errors of an output-error model.
+        checks: result of each check by name, "ok" or the reason of its failure.
     """
 
     model: str
@@ -101,7 +101,7 @@ def identify(
     choice: RowChoice = ALL_ROWS,
     missing: Literal["refuse", "leave out"] = "refuse",
 ) -> Identification:
-    """Fit a model to the first half of a record and measure it on the second.
+    """Fit a model to the first half of a record and validate it on the second.
 
     Args:
         time: shape (rows,), increasing, in any unit. Rows after a gap are not predicted from rows before it.
@@ -110,17 +110,17 @@ def identify(
         model: "arx" or "oe".
         order: n, lags of output and input.
         delay: samples from a move of the input to its first effect, at least 1.
-        output: name of the output, to be told.
+        output: name of the output, for the result.
         recursive: learn row by row instead of from all rows at once.
-        forgetting: of the recursive methods, in (0, 1].
-        choice: which rows of the first half are fitted; `REPORT_ROWS` is the report's.
-        missing: what to do with values that are NaN.
+        forgetting: forgetting factor of the recursive methods, in (0, 1].
+        choice: rows of the first half that are fitted; `REPORT_ROWS` is the report's choice.
+        missing: treatment of NaN values.
 
     Raises:
         InputError: anything that keeps the model from being found, with the cause: an unknown model, an order or delay
             below 1, too few rows, missing values, a constant output, an input that does not excite the order.
     """
-    t, u, y = _checked(time, inputs, outputs, missing)
+    t, u, y = _check(time, inputs, outputs, missing)
     if model not in MODELS:
         raise InputError(f"model must be one of {', '.join(MODELS)}, got {model!r}")
     structure = Structure.of_order(order, delay)
@@ -133,7 +133,7 @@ def identify(
             f"half, got {len(y)} rows in all"
         )
     fitted, held_out = (u[:half], y[:half], t[:half]), (u[half:], y[half:], t[half:])
-    refuse_constant(y[:half])
+    check_not_constant(y[:half])
     checks = {check.name: check.result for check in check_record(structure, *fitted)}
     try:
         found = _fit(structure, model, fitted, recursive, forgetting, choice)
@@ -141,10 +141,10 @@ def identify(
         # Where the input is to blame, that is the cause to name.
         excitation = checks.get("excitation", "ok")
         raise refusal if excitation == "ok" else InputError(excitation) from refusal
-    rest = found.residuals(*fitted)[:, 0]
-    white = whiteness(rest, fitted=order if model == "arx" else 0) if _testable(rest) else None
+    residuals = found.residuals(*fitted)[:, 0]
+    white = whiteness(residuals, fitted=order if model == "arx" else 0) if _testable(residuals) else None
     if white is not None:
-        free = independence(rest, u[:half], delay, time=t[:half])
+        free = independence(residuals, u[:half], delay, time=t[:half])
         checks["whiteness"] = _verdict(white.minus_log10_p, "the residuals are correlated with each other")
         checks["independence"] = _verdict(free.minus_log10_p, "the residuals are correlated with past inputs")
     values, deviations = found.parameters[0], found.standard_deviations[0]
@@ -160,15 +160,15 @@ def identify(
         float(values[-1]),
         Deviations(_floats(deviations[:order]), _floats(deviations[order:-1]), float(deviations[-1])),
         FitPercent(
-            fit_percent(y[half:, 0], found.one_step(*held_out)[:, 0]),
-            fit_percent(y[half:, 0], found.free_run(*held_out)[:, 0]),
+            fit_percent(y[half:, 0], found.predict(*held_out)[:, 0]),
+            fit_percent(y[half:, 0], found.simulate(*held_out)[:, 0]),
         ),
         math.nan if white is None else white.minus_log10_p,
         checks,
     )
 
 
-def _checked(
+def _check(
     time: ArrayLike, inputs: ArrayLike, outputs: ArrayLike, missing: str
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     t = as_columns(time, "time", 1)
@@ -201,7 +201,7 @@ def _fit(
     scaling = Scaling.of(u, y)
     if model == "oe":
         running = RecursiveOutputError(structure, scaling, forgetting)
-        for k, unbroken_rows in enumerate(unbroken(np.concatenate([u, y], axis=1), t)):
+        for k, unbroken_rows in enumerate(consecutive_rows(np.concatenate([u, y], axis=1), t)):
             if unbroken_rows <= 1:
                 running.restart()
             if unbroken_rows:
@@ -217,7 +217,7 @@ def _fit(
 
 
 def _testable(residuals: NDArray[np.float64]) -> bool:
-    """Whether there are enough residuals for the tests with their 20 lags."""
+    """True if there are enough residuals for tests with 20 lags."""
     return int(np.isfinite(residuals).sum()) >= 100
 
 

@@ -8,7 +8,7 @@ form of Miller's algorithm AS 274, Applied Statistics 41 (1992) 458). For each p
     d' = d_i + w x_i^2     gain = w x_i / d'     w <- w d_i / d'     d_i <- d'
     x_j <- x_j - x_i r_ij    then    r_ij <- r_ij + gain x_j         (j > i, and likewise the output and z_i)
 
-What is left of the weight at the end is 1 - phi' A^-1 phi, and the parameters solve R theta = z.
+The remaining weight at the end is 1 - phi' A^-1 phi, and the parameters solve R theta = z.
 
 Without forgetting, r_ij and z_i are sums of ever more, ever smaller terms, and rounding them is what costs accuracy:
 at condition 1e8 the parameters lose a digit or two against LAPACK. A second number therefore holds what the first one
@@ -48,12 +48,12 @@ _WORK = 8
 
 
 def state_size(n: int) -> int:
-    """How many numbers the state of one plant with n parameters holds."""
+    """Size of the state of one plant with n parameters."""
     return 5 * n + _SUMS + n * (n - 1)
 
 
 def work_size(n: int) -> int:
-    """How many numbers the work space of one plant holds."""
+    """Size of the work space of one plant."""
     return n + _WORK
 
 
@@ -204,8 +204,8 @@ def learn(
 
 
 @jit
-def acceptable(regressor: NDArray[np.float64], output: float) -> bool:
-    """Whether every value is a number smaller in size than LARGEST_VALUE."""
+def is_acceptable(regressor: NDArray[np.float64], output: float) -> bool:
+    """True if every value is a number smaller in magnitude than LARGEST_VALUE."""
     fine = abs(output) < LARGEST_VALUE
     for i in range(regressor.size):
         fine = fine and abs(regressor[i]) < LARGEST_VALUE
@@ -213,10 +213,10 @@ def acceptable(regressor: NDArray[np.float64], output: float) -> bool:
 
 
 @jit
-def first_refused(regressors: NDArray[np.float64], outputs: NDArray[np.float64], present: NDArray[np.bool_]) -> int:
-    """The index of the first present plant whose row is not acceptable; -1 if there is none."""
+def first_invalid(regressors: NDArray[np.float64], outputs: NDArray[np.float64], present: NDArray[np.bool_]) -> int:
+    """Index of the first present plant whose row is not acceptable; -1 if there is none."""
     for plant in range(outputs.size):
-        if present[plant] and not acceptable(regressors[plant], outputs[plant]):
+        if present[plant] and not is_acceptable(regressors[plant], outputs[plant]):
             return plant
     return -1
 
@@ -235,7 +235,7 @@ def learn_one(
     Returns:
         Prediction, residual, its standard deviation and the leverage; four NaN if the row is not acceptable.
     """
-    if not acceptable(regressor, output):
+    if not is_acceptable(regressor, output):
         return np.nan, np.nan, np.nan, np.nan
     n = regressor.size
     work = tile[tile.shape[0] - n - _WORK :]
@@ -265,9 +265,9 @@ def learn_all(
         regressors: shape (plants, n).
         outputs: shape (plants,).
         present: shape (plants,); False leaves a plant as it is.
-        forgetting: as in `learn`.
-        renewal: as in `learn`.
-        rank_share: as in `learn`.
+        forgetting: see `learn`.
+        renewal: see `learn`.
+        rank_share: see `learn`.
         results: shape (4, plants), receives prediction, residual, its standard deviation and leverage; NaN for a
             plant that is not present.
     """

@@ -1,7 +1,7 @@
-"""Parameters that measurement noise does not bias, in closed form.
+"""Instrumental variable estimate: parameters without a bias from measurement noise, in closed form.
 
 Least squares on noisy lagged outputs is biased: the noise is in the regressors too. The instrumental variable method
-replaces them, on one side of the equations, by a free run of the last model, which no noise has touched: Z'X p = Z'y
+replaces them, on one side of the equations, by a simulation of the last model, which is free of noise: Z'X p = Z'y
 with Z the regressors of that run (Soderstrom and Stoica, System Identification, 1989, chapter 8; the iteration of
 Young, Automatica 6 (1970) 271). Z = Q S, so Q'X p = Q'y is solved, whose condition is not squared.
 """
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.identification.batch import least_squares
-from reactorwatch.identification.linear_model import RunPlan, free_run
+from reactorwatch.identification.linear_model import RunPlan, simulate
 from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.structure import Structure
 
@@ -27,11 +27,11 @@ def instrumental_variable(
     """The instrumental variable estimate, its poles inside the unit circle.
 
     Args:
-        structure: of the model; one output.
+        structure: structure of the model; one output.
         inputs: shape (rows, inputs), scaled.
         outputs: shape (rows, 1), scaled.
-        plan: of the free runs.
-        time: shape (rows,); without it no gap is looked for.
+        plan: plan of the simulations.
+        time: shape (rows,); None: gaps are not detected.
 
     Returns:
         Shape (parameters,).
@@ -40,10 +40,10 @@ def instrumental_variable(
         InputError: too few rows, or rows that don't determine the parameters.
     """
     rows = rows_of(structure, inputs, outputs, time)
-    theta = stabilised(structure, least_squares(rows.regressors, rows.outputs).parameters[0])
+    theta = stabilize(structure, least_squares(rows.regressors, rows.outputs).parameters[0])
     for _ in range(_ITERATIONS):
-        run = free_run(structure, theta[None, :], inputs, outputs, plan)
-        # The rows that a run starts from are measured ones.
+        run = simulate(structure, theta[None, :], inputs, outputs, plan)
+        # A simulation starts from measured rows.
         clean = np.where(np.isfinite(run), run, outputs)
         instruments = rows_of(structure, inputs, clean, time)
         both = np.intersect1d(rows.position, instruments.position, assume_unique=True)
@@ -52,15 +52,15 @@ def instrumental_variable(
         equations = q.T @ x
         if np.linalg.cond(equations) > 1e12:
             break
-        theta = stabilised(structure, np.asarray(np.linalg.solve(equations, q.T @ y)))
+        theta = stabilize(structure, np.asarray(np.linalg.solve(equations, q.T @ y)))
     return theta
 
 
-def stabilised(structure: Structure, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The parameters with poles on or outside the unit circle mirrored into it, and a little further.
+def stabilize(structure: Structure, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mirror poles on or outside the unit circle into it, with a small margin.
 
     Args:
-        structure: of the model; one output.
+        structure: structure of the model; one output.
         parameters: shape (parameters,).
     """
     lags = structure.output_lags

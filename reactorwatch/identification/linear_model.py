@@ -1,7 +1,8 @@
-"""A linear model with numbers in it: what it predicts one row ahead, and where it goes when left to run.
+"""A fitted linear model: one-step-ahead prediction and simulation.
 
-Both an ARX and an output-error model are the recursion of `structure.Structure`. They differ in what they were
-fitted for, the next row or the whole run, and so in which residuals ought to be white: `simulates` says which.
+Both an ARX and an output-error model are the recursion of `structure.Structure`. An ARX model is fitted by its
+one-step-ahead prediction, an output-error model by its simulation, and these are the residuals that should be white:
+`simulates` tells them apart.
 """
 
 from dataclasses import dataclass
@@ -10,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.identification.regressor import rows_of, unbroken
+from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.structure import Structure, as_columns
 
-_AWAY = 1e100  # a free run beyond this has left for good
+_DIVERGED = 1e100  # a simulation beyond this has diverged
 
 
 def standard_deviations(
@@ -22,12 +23,11 @@ def standard_deviations(
     """Standard deviations of linear combinations of parameters; never NaN.
 
     Args:
-        covariance: of the parameters, shape (n, n); inf and NaN where the data tell nothing.
-        matrix: of the combinations, shape (m, n); None: the parameters themselves.
+        covariance: covariance of the parameters, shape (n, n); inf and NaN where the data do not determine them.
+        matrix: the combinations, shape (m, n); None: the parameters themselves.
 
-    Returns:
-        Shape (m,); inf where a combination depends on what the data do not tell. Where rounding has left a negative
-        variance, the size of that rounding.
+    Returns: Shape (m,); inf where the data do not determine a combination. Where rounding makes a variance negative,
+        the size of that rounding.
 
     >>> standard_deviations(np.array([[4.0, np.nan], [np.nan, np.inf]]), np.array([[0.5, 0.0], [1.0, 1.0]])).tolist()
     [1.0, inf]
@@ -48,12 +48,12 @@ class LinearModel:
 
     Attributes:
         structure: its terms.
-        parameters: shape (outputs, parameters), ordered as `structure.parameter_names` says.
-        covariance: shape (outputs, parameters, parameters); inf where the data leave no doubt's size to estimate.
-        noise_sd: shape (outputs,), standard deviation of the residuals that it was fitted by.
+        parameters: shape (outputs, parameters), in the order of `structure.parameter_names`.
+        covariance: shape (outputs, parameters, parameters); inf where the data do not determine it.
+        noise_sd: standard deviation of the residuals of the fit, shape (outputs,).
         condition: condition number of the scaled regressors (or gradients).
-        rows: how many rows it was fitted to.
-        simulates: True if it was fitted by its free run (output error), False if by the next row (ARX).
+        rows: number of rows of the fit.
+        simulates: True if it was fitted by simulation (output error), False if by one-step-ahead prediction (ARX).
     """
 
     structure: Structure
@@ -66,17 +66,17 @@ class LinearModel:
 
     @property
     def parameter_count(self) -> int:
-        """Number of parameters, of all outputs."""
+        """Number of parameters of all outputs."""
         return int(self.parameters.size)
 
     @property
     def standard_deviations(self) -> NDArray[np.float64]:
-        """Of the parameters, shape (outputs, parameters)."""
+        """Standard deviations of the parameters, shape (outputs, parameters)."""
         return np.array([standard_deviations(covariance) for covariance in self.covariance])
 
     @property
     def poles(self) -> NDArray[np.complex128]:
-        """Of the recursion, in the z plane; outside the unit circle it runs away."""
+        """Poles of the recursion in the z plane; it is unstable if one is outside the unit circle."""
         structure = self.structure
         outputs, size = structure.outputs, structure.output_lags * structure.outputs
         companion = np.zeros((size, size))
@@ -84,51 +84,51 @@ class LinearModel:
         companion[outputs:, :-outputs] = np.eye(size - outputs)
         return np.asarray(np.linalg.eigvals(companion), dtype=np.complex128)
 
-    def one_step(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Each row from the measured rows before it.
+    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+        """Predict each row one step ahead from the measured rows before it.
 
         Args:
             inputs: shape (rows,) or (rows, inputs).
             outputs: shape (rows,) or (rows, outputs).
-            time: shape (rows,); without it no gap is looked for.
+            time: shape (rows,); None: gaps are not detected.
 
         Returns:
-            Shape (rows, outputs); NaN where the rows before are not complete.
+            Shape (rows, outputs); NaN where the rows before are incomplete.
         """
         rows = rows_of(self.structure, inputs, outputs, time)
         predicted = np.full(as_columns(outputs, "outputs").shape, np.nan)
         predicted[rows.position] = rows.regressors @ self.parameters.T
         return predicted
 
-    def free_run(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """The recursion on its own outputs, driven by the measured inputs.
+    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+        """Simulate: run the recursion on its own outputs, driven by the measured inputs.
 
-        It starts from the first rows that are complete and follow each other, as many as it reaches back, and goes
-        on over missing outputs. Where an input is missing, or time has a gap, it stops and starts anew.
+        It starts from the first complete consecutive rows, as many as its history has, and continues over missing
+        outputs. At a missing input or a gap in time it stops and restarts.
 
         Args:
-            inputs: as in `one_step`.
-            outputs: as in `one_step`.
-            time: as in `one_step`.
+            inputs: see `predict`.
+            outputs: see `predict`.
+            time: see `predict`.
 
         Returns:
-            Shape (rows, outputs); NaN in the rows it starts from and where it cannot run; inf once it has run away.
+            Shape (rows, outputs); NaN in the rows it starts from and where it cannot run; inf after it has diverged.
         """
         structure = self.structure
         u = as_columns(inputs, "inputs", structure.inputs)
         y = as_columns(outputs, "outputs", structure.outputs)
-        return free_run(structure, self.parameters, u, y, plan_run(structure, u, y, time))
+        return simulate(structure, self.parameters, u, y, plan_run(structure, u, y, time))
 
     def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """Measured minus predicted, by the prediction that the model was fitted for; shape (rows, outputs)."""
-        predict = self.free_run if self.simulates else self.one_step
+        """Measured minus predicted or simulated, as in the fit; shape (rows, outputs)."""
+        predict = self.simulate if self.simulates else self.predict
         return as_columns(outputs, "outputs") - predict(inputs, outputs, time)
 
 
 def fit_percent(measured: ArrayLike, predicted: ArrayLike) -> float:
     """100 (1 - |y - yhat| / |y - mean y|) over the rows that are measured and predicted.
 
-    100 is perfect, 0 as good as the mean, and -inf a run that has left for good.
+    100 is perfect, 0 as good as the mean, and -inf a diverged simulation.
 
     Args:
         measured: shape (rows,), NaN where nothing was measured.
@@ -149,11 +149,11 @@ def fit_percent(measured: ArrayLike, predicted: ArrayLike) -> float:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """Which rows of a record a free run covers.
+    """Rows of a record that a simulation covers.
 
     Attributes:
-        starts: shape (rows,), whether the run starts anew at a row, from the measured rows before it.
-        running: shape (rows,), whether it covers the row.
+        starts: rows at which the simulation restarts from the measured rows before, shape (rows,).
+        running: rows that it covers, shape (rows,).
     """
 
     starts: NDArray[np.bool_]
@@ -166,38 +166,38 @@ def plan_run(
     outputs: NDArray[np.float64],
     time: ArrayLike | None = None,
 ) -> RunPlan:
-    """Where a free run of a record can start and how far it goes.
+    """Plan the simulation of a record.
 
     Args:
-        structure: of the model.
+        structure: structure of the model.
         inputs: shape (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows, outputs), likewise.
-        time: shape (rows,); without it no gap is looked for.
+        outputs: shape (rows, outputs), NaN where nothing was measured.
+        time: shape (rows,); None: gaps are not detected.
     """
     starts, running = _plan(
         structure.history,
-        unbroken(inputs, time),
-        unbroken(np.concatenate([inputs, outputs], axis=1), time),
-        unbroken(np.zeros((len(inputs), 1)), time) == 1,
+        consecutive_rows(inputs, time),
+        consecutive_rows(np.concatenate([inputs, outputs], axis=1), time),
+        consecutive_rows(np.zeros((len(inputs), 1)), time) == 1,
     )
     return RunPlan(starts, running)
 
 
-def free_run(
+def simulate(
     structure: Structure,
     parameters: NDArray[np.float64],
     inputs: NDArray[np.float64],
     outputs: NDArray[np.float64],
     plan: RunPlan,
 ) -> NDArray[np.float64]:
-    """`LinearModel.free_run` for parameters and signals of any scale.
+    """`LinearModel.simulate` for parameters and signals of any scale.
 
     Args:
-        structure: of the model.
+        structure: structure of the model.
         parameters: shape (outputs, parameters).
         inputs: shape (rows, inputs).
         outputs: shape (rows, outputs).
-        plan: of this record and structure.
+        plan: plan for this record and structure.
     """
     return _run(
         np.ascontiguousarray(parameters),
@@ -216,7 +216,7 @@ def free_run(
 def _plan(
     reach: int, driven: NDArray[np.int64], complete: NDArray[np.int64], after_gap: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """`driven` and `complete` count the rows without a break up to each row, with inputs and with all values."""
+    """Plan from the counts of consecutive rows with inputs (`driven`) and with all values (`complete`)."""
     rows = driven.size
     starts, running = np.zeros(rows, np.bool_), np.zeros(rows, np.bool_)
     for k in range(1, rows):
@@ -259,7 +259,7 @@ def _run(
             for lag in range(input_lags):
                 for i in range(inputs):
                     total += parameters[o, output_lags * outputs + lag * inputs + i] * u[k - delay - lag, i]
-            # Once away it stays away: NaN would look like a row without a prediction.
-            own[k, o] = min(max(total, -_AWAY), _AWAY) if total == total else _AWAY
-            run[k, o] = own[k, o] if abs(own[k, o]) < _AWAY else np.inf
+            # A diverged simulation stays so: NaN would look like a row without a prediction.
+            own[k, o] = min(max(total, -_DIVERGED), _DIVERGED) if total == total else _DIVERGED
+            run[k, o] = own[k, o] if abs(own[k, o]) < _DIVERGED else np.inf
     return run

@@ -1,13 +1,13 @@
 """A neural network as predictor: NARX, y[k] = f(y[k-1], ..., y[k-n], u[k-d], ..., u[k-d-m+1]).
 
 f is a linear combination of the regressors plus a network with one hidden layer of tanh (Narendra and Parthasarathy,
-IEEE Trans. Neural Networks 1 (1990) 4, the series-parallel model). The network learns only what the ARX model of the
-same structure leaves over, so that it never has to imitate a straight line with bent ones, and does no harm to a plant
-that is linear. Its weights are found by scikit-learn's MLPRegressor (L-BFGS, an explicit seed); the prediction is
-computed here, because the free run needs one row at a time.
+IEEE Trans. Neural Networks 1 (1990) 4, the series-parallel model). The network learns the residual of the ARX model of
+the same structure, so it need not approximate a linear function, and does no harm for a linear plant. Its weights are
+found by scikit-learn's MLPRegressor (L-BFGS, an explicit seed); the prediction is computed here, because a simulation
+needs one row at a time.
 
-A network that predicts the next row well may still run away by itself. Of several networks from different starting
-weights the one is taken that runs best over the fitted rows.
+A network with a good one-step-ahead prediction may still diverge in simulation. Of several networks with different
+initial weights the one with the best simulation of the fitted rows is chosen.
 """
 
 import warnings
@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import enough_rows, fit_arx
+from reactorwatch.identification.batch import check_row_count, fit_arx
 from reactorwatch.identification.linear_model import LinearModel, fit_percent, plan_run
 from reactorwatch.identification.regressor import Rows, rows_of
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
-_AWAY = 1e6  # scaled outputs beyond this, a million times their usual spread, have left for good
+_DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has diverged
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class NeuralModel:
     """A fitted network beside the linear model whose residual it learned.
 
     Attributes:
-        linear: what the network corrects.
-        scaling: of the signals.
-        residual_sd: what the network's output is multiplied by, in the output's unit.
+        linear: the model that the network corrects.
+        scaling: scaling of the signals.
+        residual_sd: scale of the network's output, in the output's unit.
         hidden: shape (regressors, neurons), weights into the hidden layer.
         hidden_bias: shape (neurons,).
-        output: shape (neurons,), weights out of it.
-        output_bias: the last constant.
+        output: shape (neurons,), weights out of the hidden layer.
+        output_bias: constant of the output.
     """
 
     linear: LinearModel
@@ -52,20 +52,20 @@ class NeuralModel:
         """Number of parameters, the linear model's included."""
         return self.linear.parameter_count + self.hidden.size + self.hidden_bias.size + self.output.size + 1
 
-    def one_step(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """See `LinearModel.one_step`."""
-        predicted = self.linear.one_step(inputs, outputs, time)
+    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+        """See `LinearModel.predict`."""
+        predicted = self.linear.predict(inputs, outputs, time)
         rows = _network_rows(self.linear.structure, self.scaling, inputs, outputs, time)
         predicted[rows.position, 0] += self._correction(rows.regressors)
         return predicted
 
-    def free_run(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
-        """See `LinearModel.free_run`."""
+    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
+        """See `LinearModel.simulate`."""
         structure, scaling = self.linear.structure, self.scaling
         u = scaling.inputs(as_columns(inputs, "inputs", structure.inputs))
         y = scaling.outputs(as_columns(outputs, "outputs", 1))
         plan = plan_run(structure, u, y, time)
-        theta = scaling.redoing(structure, self.linear.parameters[0])
+        theta = scaling.scale_parameters(structure, self.linear.parameters[0])
         weights, constant = (theta[:-1], theta[-1]) if structure.offset else (theta, 0.0)
         spread = scaling.output_spreads[0]
         own, run = y[:, 0].copy(), np.full(y.shape, np.nan)
@@ -77,16 +77,16 @@ class NeuralModel:
             past_inputs = u[k - first - structure.input_lags : k - first][::-1].ravel()
             regressor = np.concatenate([past_outputs, past_inputs])
             value = float(weights @ regressor) + constant + self._correction(regressor) / spread
-            own[k] = min(max(float(value), -_AWAY), _AWAY)
-            run[k] = own[k] if abs(own[k]) < _AWAY else np.inf
+            own[k] = min(max(float(value), -_DIVERGED), _DIVERGED)
+            run[k] = own[k] if abs(own[k]) < _DIVERGED else np.inf
         return run * spread + scaling.output_centres[0]
 
     def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
         """Measured minus one-step prediction, shape (rows, 1)."""
-        return as_columns(outputs, "outputs") - self.one_step(inputs, outputs, time)
+        return as_columns(outputs, "outputs") - self.predict(inputs, outputs, time)
 
     def _correction(self, regressors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What the network adds, in the output's unit; the last axis counts the regressors."""
+        """Output of the network in the output's unit; the last axis is that of the regressors."""
         hidden = np.tanh(regressors @ self.hidden + self.hidden_bias)
         return np.asarray((hidden @ self.output + self.output_bias) * self.residual_sd)
 
@@ -96,9 +96,9 @@ class Neural:
     """The family of these models.
 
     Attributes:
-        neurons: in the hidden layer.
-        seeds: one network is fitted for each; it sets the weights that the search starts from.
-        iterations: at most, of each search.
+        neurons: number of neurons in the hidden layer.
+        seeds: seeds of the initial weights; one network is fitted for each.
+        iterations: largest number of iterations of each search.
     """
 
     neurons: int = 12
@@ -109,13 +109,13 @@ class Neural:
     def fit(
         self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
     ) -> NeuralModel:
-        """The network that predicts the next row best.
+        """Fit the networks and choose the one with the best simulation.
 
         Args:
             structure: lags and delay; one output.
             inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-            outputs: shape (rows,) or (rows, 1), likewise.
-            time: shape (rows,); without it no gap is looked for.
+            outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
+            time: shape (rows,); None: gaps are not detected.
 
         Raises:
             InputError: scikit-learn is not installed, several outputs, or a record that `fit_arx` refuses.
@@ -130,9 +130,9 @@ class Neural:
         linear = fit_arx(structure, inputs, outputs, time)
         scaling = Scaling.of(inputs, outputs, centred=structure.offset)
         rows = _network_rows(structure, scaling, inputs, outputs, time)
-        enough_rows(rows, len(as_columns(outputs, "outputs")))
-        left = linear.residuals(inputs, outputs, time)[rows.position, 0]
-        spread = float(np.std(left)) or 1.0
+        check_row_count(rows, len(as_columns(outputs, "outputs")))
+        residuals = linear.residuals(inputs, outputs, time)[rows.position, 0]
+        spread = float(np.std(residuals)) or 1.0
         models = []
         for seed in self.seeds:
             network = MLPRegressor(
@@ -145,15 +145,15 @@ class Neural:
                 random_state=seed,
             )
             with warnings.catch_warnings():
-                # The number of iterations is a choice, not a failure: more of them only follow the noise.
+                # Stopping at the number of iterations is intended: more of them fit the noise.
                 warnings.simplefilter("ignore", ConvergenceWarning)
-                network.fit(rows.regressors, left / spread)
+                network.fit(rows.regressors, residuals / spread)
             (hidden, output), (hidden_bias, output_bias) = network.coefs_, network.intercepts_
             models.append(
                 NeuralModel(linear, scaling, spread, hidden, hidden_bias, output[:, 0], float(output_bias[0]))
             )
         measured = as_columns(outputs, "outputs")[:, 0]
-        return max(models, key=lambda model: fit_percent(measured, model.free_run(inputs, outputs, time)[:, 0]))
+        return max(models, key=lambda model: fit_percent(measured, model.simulate(inputs, outputs, time)[:, 0]))
 
 
 def _network_rows(

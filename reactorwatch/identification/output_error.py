@@ -1,7 +1,7 @@
-"""Output-error models from a record: the recursion whose free run meets the measurements best.
+"""Output-error models from a record: the recursion with the smallest simulation error.
 
-With measurement noise on the output, an ARX model is biased: it weighs the noise as if the plant had felt it. The
-output-error model minimises the error of its own run,
+With measurement noise on the output, an ARX model is biased: it treats the noise as a disturbance of the plant. The
+output-error model minimises its simulation error,
 
     yhat[k] = a1 yhat[k-1] + ... + b1 u[k-d] + ... + c,      sum (y[k] - yhat[k])^2 -> min,
 
@@ -27,12 +27,12 @@ from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import (
     LeastSquares,
-    enough_rows,
+    check_not_constant,
+    check_row_count,
     least_squares,
     linear_model,
-    refuse_constant,
 )
-from reactorwatch.identification.instrumental_variable import instrumental_variable, stabilised
+from reactorwatch.identification.instrumental_variable import instrumental_variable, stabilize
 from reactorwatch.identification.linear_model import LinearModel, RunPlan, plan_run
 from reactorwatch.identification.regressor import rows_of
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
@@ -43,7 +43,7 @@ _FILTERINGS = 10
 
 
 class _Objective:
-    """The sum of squares of one record, its gradient, and where both are taken."""
+    """Simulation errors of one record and their gradient."""
 
     def __init__(
         self,
@@ -60,7 +60,7 @@ class _Objective:
         self.compared = compared
 
     def __call__(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Errors, shape (compared rows,), and the run's gradient, shape (compared rows, parameters)."""
+        """Errors, shape (compared rows,), and the gradient of the simulation, shape (compared rows, parameters)."""
         s = self.structure
         run, gradient = run_with_gradient(
             theta,
@@ -83,14 +83,14 @@ def fit_oe(
     time: ArrayLike | None = None,
     choice: RowChoice = ALL_ROWS,
 ) -> LinearModel:
-    """The output-error model of one output.
+    """Fit an output-error model of one output.
 
     Args:
         structure: its terms; one output.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, 1), likewise.
-        time: shape (rows,), increasing, in any unit; without it no gap is looked for.
-        choice: which rows the run is compared with.
+        outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
+        time: shape (rows,), increasing, in any unit; None: gaps are not detected.
+        choice: rows that the simulation is compared with.
 
     Raises:
         InputError: several outputs, too few rows, an output that is constant, or rows that don't determine the
@@ -100,12 +100,12 @@ def fit_oe(
         raise InputError(f"an output-error model has one output, got {structure.outputs}: fit one model for each")
     u = as_columns(inputs, "inputs", structure.inputs)
     y = as_columns(outputs, "outputs", 1)
-    refuse_constant(y)
+    check_not_constant(y)
     scaling = Scaling.of(u, y, centred=structure.offset)
     scaled_u, scaled_y = scaling.inputs(u), scaling.outputs(y)
     theta, objective = _fit(structure, scaled_u, scaled_y, time, choice)
     errors, gradient = objective(theta)
-    # The same algebra as for least squares: at the minimum the gradient stands for the regressors.
+    # As for least squares: at the minimum the gradient takes the place of the regressors.
     linear = least_squares(gradient, errors)
     return linear_model(
         structure,
@@ -123,14 +123,14 @@ def _fit(
     time: ArrayLike | None,
     choice: RowChoice,
 ) -> tuple[NDArray[np.float64], _Objective]:
-    enough_rows(rows_of(structure, u, y, time, choice), len(y))
+    check_row_count(rows_of(structure, u, y, time, choice), len(y))
     plan = plan_run(structure, u, y, time)
     number = np.arange(len(y))
     chosen = (number >= choice.skip) & ((number - choice.skip) % choice.every == 0)
     compared = plan.running & np.isfinite(y[:, 0]) & chosen
     if compared.sum() < structure.parameters:
         raise InputError(
-            f"{structure.parameters} parameters need at least {structure.parameters} rows of a free run, "
+            f"{structure.parameters} parameters need at least {structure.parameters} rows of a simulation, "
             f"got {int(compared.sum())} of {len(y)}"
         )
     objective = _Objective(structure, u, y, plan, compared)
@@ -149,7 +149,7 @@ def _starts(
     choice: RowChoice,
 ) -> list[NDArray[np.float64]]:
     rows = rows_of(structure, u, y, time)
-    arx = stabilised(structure, least_squares(rows.regressors, rows.outputs).parameters[0])
+    arx = stabilize(structure, least_squares(rows.regressors, rows.outputs).parameters[0])
     starts = [
         arx,
         instrumental_variable(structure, u, y, plan, time),
@@ -180,25 +180,25 @@ def _steiglitz_mcbride(
     time: ArrayLike | None,
     theta: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """ARX of signals filtered by 1 / (1 - a1 q^-1 - ...) of the model before, again and again."""
+    """Steiglitz-McBride iteration: ARX of signals filtered by 1 / (1 - a1 q^-1 - ...) of the model before."""
     lags = structure.output_lags
     for _ in range(_FILTERINGS):
         signals = np.concatenate([u, y, np.ones_like(y)], axis=1)
-        filtered = _filtered(np.ascontiguousarray(theta[:lags]), signals)
+        filtered = _filter(np.ascontiguousarray(theta[:lags]), signals)
         rows = rows_of(structure, filtered[:, :-2], filtered[:, -2], time)
         regressors = rows.regressors.copy()
         if structure.offset:
             regressors[:, -1] = filtered[rows.position, -1]
         try:
             solution = least_squares(regressors, rows.outputs)
-        except InputError:  # the filter has left too little to go on with: the last iterate is a start as well
+        except InputError:  # the filtered signals do not determine the parameters: take the last iterate
             break
-        theta = stabilised(structure, solution.parameters[0])
+        theta = stabilize(structure, solution.parameters[0])
     return theta
 
 
 def descend(objective: _Objective, start: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Marquardt's method from a start whose poles are inside the unit circle.
+    """Minimise by Marquardt's method from a start whose poles are inside the unit circle.
 
     Returns:
         The parameters and their sum of squares.
@@ -212,21 +212,21 @@ def descend(objective: _Objective, start: NDArray[np.float64]) -> tuple[NDArray[
         factor = _triangle(np.ascontiguousarray(np.concatenate([gradient, errors[:, None]], axis=1).T))[:size]
         scales = np.linalg.norm(factor[:, :size], axis=0)
         scales = np.where(scales > 0.0, scales, 1.0)
-        gained = math.inf
+        gain = math.inf
         while damping < 1e12:
             stacked = np.concatenate([factor[:, :size] / scales, math.sqrt(damping) * np.eye(size)])
             step = np.linalg.lstsq(stacked, np.concatenate([factor[:, size], np.zeros(size)]))[0] / scales
             candidate = theta + step
-            if stable(np.ascontiguousarray(candidate[:lags])):
+            if is_stable(np.ascontiguousarray(candidate[:lags])):
                 new_errors, new_gradient = objective(candidate)
                 new_squares = float(new_errors @ new_errors)
                 if new_squares <= squares:
-                    gained = squares - new_squares
+                    gain = squares - new_squares
                     theta, errors, gradient, squares = candidate, new_errors, new_gradient, new_squares
                     damping = max(0.1 * damping, 1e-12)
                     break
             damping *= 10.0
-        if not _PRECISION * squares < gained < math.inf:
+        if not _PRECISION * squares < gain < math.inf:
             break
     return theta, squares
 
@@ -237,8 +237,8 @@ def _variance(errors: NDArray[np.float64], parameters: int) -> NDArray[np.float6
 
 
 @jit
-def stable(a: NDArray[np.float64]) -> bool:
-    """Whether all poles of yhat[k] = a1 yhat[k-1] + ... lie inside the unit circle.
+def is_stable(a: NDArray[np.float64]) -> bool:
+    """True if all poles of yhat[k] = a1 yhat[k-1] + ... lie inside the unit circle.
 
     By the step-down recursion to the reflection coefficients, all of which must be below 1 (Schur and Cohn; Astrom and
     Wittenmark, Computer-Controlled Systems, 3rd ed., chapter 3).
@@ -268,21 +268,21 @@ def run_with_gradient(
     starts: NDArray[np.bool_],
     running: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The free run of one output and its derivatives.
+    """Simulate one output, with derivatives.
 
     Args:
         theta: shape (parameters,).
-        output_lags: of the structure.
-        input_lags: of the structure.
-        delay: of the structure.
-        offset: of the structure.
+        output_lags: see `Structure`.
+        input_lags: see `Structure`.
+        delay: see `Structure`.
+        offset: see `Structure`.
         u: shape (rows, inputs).
         y: shape (rows,).
-        starts: shape (rows,), of the plan.
-        running: shape (rows,), of the plan.
+        starts: see `RunPlan`.
+        running: see `RunPlan`.
 
     Returns:
-        The run, shape (rows,), and its gradient, shape (rows, parameters); NaN and 0 where it does not run.
+        The simulation, shape (rows,), and its gradient, shape (rows, parameters); NaN and 0 where it does not run.
     """
     rows, inputs = u.shape
     size = theta.size
@@ -349,8 +349,8 @@ def _triangle(columns: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @jit
-def _filtered(a: NDArray[np.float64], signals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each column filtered by 1 / (1 - a1 q^-1 - ...); it starts from rest again after a missing value."""
+def _filter(a: NDArray[np.float64], signals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Filter each column by 1 / (1 - a1 q^-1 - ...), from rest after a missing value."""
     filtered = np.empty_like(signals)
     for i in range(signals.shape[1]):
         for k in range(signals.shape[0]):

@@ -1,4 +1,4 @@
-"""What recursive least squares of one plant and of thousands share: settings, memory, and its storing."""
+"""Settings and state of recursive least squares, for one plant and for thousands."""
 
 import math
 
@@ -14,7 +14,7 @@ DEFAULT_COVARIANCE_LIMIT = 1e6
 
 
 class RlsState(StoredState, frozen=True):
-    """All that a recursive estimator remembers.
+    """State of a recursive estimator.
 
     Attributes:
         plants: number of plants.
@@ -32,7 +32,7 @@ class RlsState(StoredState, frozen=True):
 
 
 class Recursion:
-    """What the single and the vectorised form share: settings, memory and its storing."""
+    """Settings and state of the single and the vectorised form."""
 
     def __init__(
         self, plants: int, parameters: int, forgetting: float, covariance_limit: float | None, plants_in_tile: int
@@ -52,7 +52,7 @@ class Recursion:
         self._set_forgetting(forgetting)
         start = 1.0 / (self._covariance_limit * self._forgetting ** (parameters - 1))
         tiles = -(-plants // plants_in_tile)
-        # The single form carries its work space along: one array the fewer to hand over at each update.
+        # The single form includes its work space: one argument fewer at each update.
         work = information.work_size(parameters) if plants_in_tile == 1 else 0
         self._tiles = np.zeros((tiles, information.state_size(parameters) + work, plants_in_tile))
         self._tiles[:, 2 * parameters : 3 * parameters] = start
@@ -75,12 +75,12 @@ class Recursion:
 
     @property
     def covariance_limit(self) -> float:
-        """Bound on the eigenvalues of P; inf when nothing is assumed at the start."""
+        """Bound on the eigenvalues of P; inf without a prior."""
         return self._covariance_limit
 
     @property
     def state(self) -> RlsState:
-        """A copy of all that is remembered."""
+        """A copy of the full state."""
         size = information.state_size(self._parameters)
         memory = self._tiles[:, :size].transpose(0, 2, 1).reshape(-1, size)[: self._plants]
         return RlsState(
@@ -104,8 +104,8 @@ class Recursion:
         self._tiles[:, :size] = rows.reshape(tiles, plants_in_tile, size).transpose(0, 2, 1)
 
 
-def refusal(regressor: NDArray[np.float64], output: float) -> str:
-    """Why a row cannot be used."""
+def describe_invalid(regressor: NDArray[np.float64], output: float) -> str:
+    """Message for an invalid row."""
     for i, value in enumerate(regressor):
         if not abs(value) < LARGEST_VALUE:
             return f"regressor[{i}] must be a finite number below {LARGEST_VALUE:g} in size, got {value}"

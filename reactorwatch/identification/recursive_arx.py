@@ -1,4 +1,4 @@
-"""An ARX model that learns from every row as it comes: regressors, scaling and least squares in one."""
+"""Recursive identification of ARX models: regressors, scaling and least squares in one."""
 
 from typing import Self
 
@@ -9,16 +9,16 @@ from reactorwatch.identification.batch import LeastSquares, linear_model
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.recursion import RlsState
 from reactorwatch.identification.regressor import BufferState, RegressorBuffer
-from reactorwatch.identification.rls import Innovation, RecursiveLeastSquares
+from reactorwatch.identification.rls import RecursiveLeastSquares, RlsUpdate
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure
 from reactorwatch.stored_state import StoredState
 
 
 class RecursiveArxState(StoredState, frozen=True):
-    """All that a RecursiveArx remembers.
+    """State of a `RecursiveArx`.
 
     Attributes:
-        scaling: of the signals.
+        scaling: scaling of the signals.
         buffer: the rows that the next regressor needs.
         estimators: one for each output.
     """
@@ -33,11 +33,11 @@ class RecursiveArx:
 
     Args:
         structure: the model's terms.
-        scaling: of the signals; without it they are taken as they are, which suits signals of the order of 1.
+        scaling: scaling of the signals; without it they are taken as they are, which suits signals of the order of 1.
         forgetting: weight of a row relative to its successor, in (0, 1].
         covariance_limit: see `RecursiveLeastSquares`.
-        period_ns: time between rows; without it no gap is looked for.
-        choice: which rows are learned from.
+        period_ns: time between rows; None: gaps are not detected.
+        choice: rows to learn from.
         start: a model of the same structure to start from.
 
     Raises:
@@ -64,11 +64,11 @@ class RecursiveArx:
             if start.structure != structure:
                 raise ValueError(f"the model to start from must have the structure {structure}, got {start.structure}")
             for o, estimator in enumerate(self._estimators):
-                estimator.move_to(self._scaling.redoing(structure, start.parameters[o], o))
+                estimator.set_parameters(self._scaling.scale_parameters(structure, start.parameters[o], o))
 
     @classmethod
     def from_state(cls, state: RecursiveArxState) -> Self:
-        """The model that goes on, bit for bit, where `state` was taken.
+        """Resume, bit for bit from a state.
 
         Raises:
             ValueError: the state is damaged.
@@ -81,17 +81,17 @@ class RecursiveArx:
 
     @property
     def state(self) -> RecursiveArxState:
-        """A copy of all that is remembered."""
+        """A copy of the full state."""
         estimators = tuple(estimator.state for estimator in self._estimators)
         return RecursiveArxState(self._scaling, self._buffer.state, estimators)
 
-    def update(self, time_ns: int, inputs: ArrayLike, outputs: ArrayLike) -> tuple[Innovation, ...] | None:
+    def update(self, time_ns: int, inputs: ArrayLike, outputs: ArrayLike) -> tuple[RlsUpdate, ...] | None:
         """Predict the outputs of a row, then learn from it.
 
         Args:
-            time_ns: of the row.
+            time_ns: time of the row.
             inputs: shape (inputs,), NaN for what was not measured.
-            outputs: shape (outputs,), likewise.
+            outputs: shape (outputs,), NaN for what was not measured.
 
         Returns:
             One innovation an output, in its own unit. None for a row that cannot be predicted (not enough complete
@@ -104,18 +104,18 @@ class RecursiveArx:
         regressor = self._buffer.update(time_ns, self._scaling.inputs(inputs), measured)
         if regressor is None:
             return None
-        said = (
+        updates = (
             estimator.update(regressor, output) for estimator, output in zip(self._estimators, measured, strict=True)
         )
         return tuple(
-            own_unit(innovation, centre, spread)
+            unscale(innovation, centre, spread)
             for innovation, centre, spread in zip(
-                said, self._scaling.output_centres, self._scaling.output_spreads, strict=True
+                updates, self._scaling.output_centres, self._scaling.output_spreads, strict=True
             )
         )
 
     def predict(self) -> NDArray[np.float64] | None:
-        """The outputs of the row that will come next, shape (outputs,); None while the history fills."""
+        """Predict the outputs of the next row, shape (outputs,); None while the history fills."""
         regressor = self._buffer.upcoming
         if regressor is None:
             return None
@@ -124,18 +124,18 @@ class RecursiveArx:
 
     @property
     def rows(self) -> int:
-        """How many rows have been learned from."""
+        """Number of rows learned from."""
         return self._estimators[0].rows
 
     @property
     def model(self) -> LinearModel:
-        """What has been learned, in the signals' own units."""
+        """The learned model, in the signals' own units."""
         return model_of(self._structure, self._scaling, self._estimators, simulates=False)
 
 
-def own_unit(innovation: Innovation, centre: float, spread: float) -> Innovation:
-    """An innovation of a scaled output in that output's unit."""
-    return Innovation(
+def unscale(innovation: RlsUpdate, centre: float, spread: float) -> RlsUpdate:
+    """Convert an update of a scaled output to that output's unit."""
+    return RlsUpdate(
         innovation.prediction * spread + centre,
         innovation.residual * spread,
         innovation.residual_sd * spread,
@@ -146,7 +146,7 @@ def own_unit(innovation: Innovation, centre: float, spread: float) -> Innovation
 def model_of(
     structure: Structure, scaling: Scaling, estimators: list[RecursiveLeastSquares], simulates: bool
 ) -> LinearModel:
-    """The model that estimators of scaled signals have learned, one for each output."""
+    """Make a model from estimators of scaled signals, one for each output."""
     models = [
         linear_model(
             structure,

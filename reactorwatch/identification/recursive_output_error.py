@@ -1,4 +1,4 @@
-"""Output-error models that learn from every row as it comes.
+"""Recursive identification of output-error models.
 
 The recursive prediction error method (Ljung and Soderstrom, Theory and Practice of Recursive Identification, 1983,
 chapter 3, with the projection of chapter 6): the recursion runs on its own
@@ -10,9 +10,9 @@ with P the weighted least squares covariance of the g, as `RecursiveLeastSquares
 y - yhat + g' p. So its memory is bounded as there. phi holds the run computed with the new parameters, which converges
 better than with the old ones (the same, chapter 5).
 
-Three things keep it sound. A step that would put a pole on or outside the unit circle is halved until it doesn't. The
+Three things keep it stable. A step that would put a pole on or outside the unit circle is halved until it doesn't. The
 first rows count little: forgetting starts at 0.95 and rises, f <- 0.99 f + 0.01 (the same, chapter 5), because the
-first gradients belong to poor parameters. And after a gap the run starts anew from measured rows (`restart`).
+first gradients belong to poor parameters. And after a gap the run restarts from measured rows (`restart`).
 """
 
 from typing import Self
@@ -22,10 +22,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.output_error import stable
+from reactorwatch.identification.output_error import is_stable
 from reactorwatch.identification.recursion import RlsState
-from reactorwatch.identification.recursive_arx import model_of, own_unit
-from reactorwatch.identification.rls import Innovation, RecursiveLeastSquares
+from reactorwatch.identification.recursive_arx import model_of, unscale
+from reactorwatch.identification.rls import RecursiveLeastSquares, RlsUpdate
 from reactorwatch.identification.structure import Scaling, Structure
 from reactorwatch.stored_state import StoredState
 
@@ -36,16 +36,16 @@ _HALVINGS = 40
 
 
 class RecursiveOutputErrorState(StoredState, frozen=True):
-    """All that a RecursiveOutputError remembers.
+    """State of a `RecursiveOutputError`.
 
     Attributes:
         structure: the model's terms.
-        scaling: of the signals.
-        forgetting: the one that it rises to.
+        scaling: scaling of the signals.
+        forgetting: final forgetting factor.
         estimator: the parameters and their covariance.
-        own: the run's newest values, newest first; shorter while the history fills.
-        inputs: likewise.
-        gradients: likewise, each of as many numbers as parameters.
+        own: the simulation's newest outputs, newest first; fewer while the history fills.
+        inputs: newest inputs, newest first.
+        gradients: newest gradients, newest first, each of shape (parameters,).
     """
 
     structure: Structure
@@ -58,11 +58,11 @@ class RecursiveOutputErrorState(StoredState, frozen=True):
 
 
 class RecursiveOutputError:
-    """Runs freely on its own output, and lets each measured row correct its parameters.
+    """Simulates an output, and corrects its parameters by each measured row.
 
     Args:
         structure: the model's terms; one output.
-        scaling: of the signals; without it they are taken as they are, which suits signals of the order of 1.
+        scaling: scaling of the signals; without it they are taken as they are, which suits signals of the order of 1.
         forgetting: weight of a row relative to its successor, in (0, 1], once it has risen to it.
         covariance_limit: see `RecursiveLeastSquares`; also how far from the start the parameters may be.
         start: a model of the same structure to start from; forgetting does not rise then.
@@ -89,12 +89,12 @@ class RecursiveOutputError:
         if start is not None:
             if start.structure != structure:
                 raise ValueError(f"the model to start from must have the structure {structure}, got {start.structure}")
-            self._estimator.move_to(self._scaling.redoing(structure, start.parameters[0]))
+            self._estimator.set_parameters(self._scaling.scale_parameters(structure, start.parameters[0]))
         self.restart()
 
     @classmethod
     def from_state(cls, state: RecursiveOutputErrorState) -> Self:
-        """The model that goes on, bit for bit, where `state` was taken.
+        """Resume, bit for bit from a state.
 
         Raises:
             ValueError: the state is damaged.
@@ -110,7 +110,7 @@ class RecursiveOutputError:
 
     @property
     def state(self) -> RecursiveOutputErrorState:
-        """A copy of all that is remembered."""
+        """A copy of the full state."""
         filled = self._filled
         return RecursiveOutputErrorState(
             self._structure,
@@ -123,22 +123,22 @@ class RecursiveOutputError:
         )
 
     def restart(self) -> None:
-        """Forget the run, as after a gap in the rows; what was learned stays."""
+        """Clear the simulation, as after a gap in the rows; keep the parameters."""
         history = self._structure.history
         self._filled = 0
         self._own = np.zeros(history)
         self._inputs = np.zeros((history, self._structure.inputs))
         self._gradients = np.zeros((history, self._structure.parameters))
 
-    def update(self, inputs: ArrayLike, output: float) -> Innovation | None:
-        """Predict the output by the run, then learn from it.
+    def update(self, inputs: ArrayLike, output: float) -> RlsUpdate | None:
+        """Simulate the output, then learn from its measurement.
 
         Args:
             inputs: shape (inputs,), of the same row as the output.
-            output: what was measured.
+            output: the measured output.
 
         Returns:
-            The innovation, in the output's unit; None while the run's first rows are taken from measurements.
+            The innovation, in the output's unit; None while the first rows are taken from measurements.
 
         Raises:
             ValueError: a value that is NaN, infinite or beyond 1e30, or a wrong shape; nothing is changed then.
@@ -159,23 +159,23 @@ class RecursiveOutputError:
         lags = self._structure.output_lags
         gradient = regressor + old[:lags] @ self._gradients[:lags]
         prediction = float(regressor @ old)
-        said = self._estimator.update(gradient, measured - prediction + float(gradient @ old))
+        result = self._estimator.update(gradient, measured - prediction + float(gradient @ old))
         new = self._project(old)
         if self._estimator.forgetting < self._forgetting:
             risen = FORGETTING_RISE * self._estimator.forgetting + (1.0 - FORGETTING_RISE)
-            self._estimator.remember_longer(min(risen, self._forgetting))
+            self._estimator.raise_forgetting(min(risen, self._forgetting))
         self._push(float(regressor @ new), new_inputs, gradient)
-        innovation = Innovation(prediction, measured - prediction, said.residual_sd, said.leverage)
-        return own_unit(innovation, self._scaling.output_centres[0], self._scaling.output_spreads[0])
+        innovation = RlsUpdate(prediction, measured - prediction, result.residual_sd, result.leverage)
+        return unscale(innovation, self._scaling.output_centres[0], self._scaling.output_spreads[0])
 
     @property
     def rows(self) -> int:
-        """How many rows have been learned from."""
+        """Number of rows learned from."""
         return self._estimator.rows
 
     @property
     def model(self) -> LinearModel:
-        """What has been learned, in the signals' own units."""
+        """The learned model, in the signals' own units."""
         return model_of(self._structure, self._scaling, [self._estimator], simulates=True)
 
     def _regressor(self) -> NDArray[np.float64]:
@@ -188,16 +188,16 @@ class RecursiveOutputError:
         """Halve the step that was made from `old` until the poles are inside the unit circle."""
         lags = self._structure.output_lags
         new = self._estimator.parameters
-        if stable(new[:lags]):
+        if is_stable(new[:lags]):
             return new
         step = new - old
         for _ in range(_HALVINGS):
             step = 0.5 * step
-            if stable(old[:lags] + step[:lags]):
+            if is_stable(old[:lags] + step[:lags]):
                 break
         else:
             step = np.zeros_like(old)
-        self._estimator.move_to(old + step)
+        self._estimator.set_parameters(old + step)
         return self._estimator.parameters
 
     def _push(self, own: float, inputs: NDArray[np.float64], gradient: NDArray[np.float64]) -> None:

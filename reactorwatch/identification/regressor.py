@@ -1,7 +1,7 @@
-"""Regressors of a linear model: row by row as samples come, and all at once from a record.
+"""Regressors of a linear model, row by row or from a whole record.
 
-Both leave out what cannot be trusted: a row is only predicted from rows that are complete and follow each other
-without a gap. After a gap or a missing value the history starts anew.
+A row is only predicted from rows that are complete and follow each other without a gap. After a gap or a missing value
+the history restarts.
 """
 
 from collections.abc import Iterable
@@ -21,15 +21,15 @@ GAP_TOLERANCE = 0.25
 
 
 class BufferState(StoredState, frozen=True):
-    """All that a RegressorBuffer remembers.
+    """State of a `RegressorBuffer`.
 
     Attributes:
-        structure: of the model.
-        period_ns: between rows; None if gaps are not looked for.
-        choice: which rows are fitted.
-        outputs: the rows that the next regressor needs, newest first; shorter while the history fills.
-        inputs: likewise.
-        last_time_ns: of the newest row; None before the first.
+        structure: structure of the model.
+        period_ns: sampling period; None: gaps are not detected.
+        choice: rows that are fitted.
+        outputs: output rows that the next regressor needs, newest first; fewer while the history fills.
+        inputs: input rows that the next regressor needs, newest first.
+        last_time_ns: time of the newest row; None before the first.
         row: index of the next row, from 0.
     """
 
@@ -43,18 +43,18 @@ class BufferState(StoredState, frozen=True):
 
 
 class RegressorBuffer:
-    """Turns rows as they come into regressors.
+    """Turns rows into regressors, row by row.
 
     >>> buffer = RegressorBuffer(Structure.of_order(1))
-    >>> buffer.update(0, [10.0], [1.0]) is None  # nothing is known before the first row
+    >>> buffer.update(0, [10.0], [1.0]) is None  # no history before the first row
     True
     >>> buffer.update(1, [20.0], [2.0])  # y[k-1], u[k-1], 1
     array([ 1., 10.,  1.])
 
     Args:
-        structure: of the model.
-        period_ns: time between rows; without it no gap is looked for.
-        choice: which rows are fitted; rows are counted from the first that comes.
+        structure: structure of the model.
+        period_ns: sampling period; None: gaps are not detected.
+        choice: rows that are fitted; rows are counted from the first one.
 
     Raises:
         ValueError: a period that is not above 0.
@@ -66,8 +66,8 @@ class RegressorBuffer:
         self._structure = structure
         self._period_ns = period_ns
         self._choice = choice
-        # Lists, newest row first, one row after the other: a regressor is a dozen numbers, and a list of a dozen is
-        # cut and joined in a fraction of the time that NumPy needs to begin.
+        # Flat lists, newest row first: a regressor is a dozen numbers, and slicing a list of a dozen takes a fraction
+        # of the overhead of a NumPy call.
         self._outputs: list[float] = []
         self._inputs: list[float] = []
         self._last_time_ns: int | None = None
@@ -75,7 +75,7 @@ class RegressorBuffer:
 
     @classmethod
     def from_state(cls, state: BufferState) -> Self:
-        """The buffer that goes on where `state` was taken.
+        """Resume from a state.
 
         Raises:
             ValueError: the state does not fit its structure.
@@ -92,7 +92,7 @@ class RegressorBuffer:
 
     @property
     def state(self) -> BufferState:
-        """A copy of all that is remembered."""
+        """A copy of the full state."""
         return BufferState(
             self._structure,
             self._period_ns,
@@ -105,7 +105,7 @@ class RegressorBuffer:
 
     @property
     def upcoming(self) -> NDArray[np.float64] | None:
-        """The regressor of the row that will come next, shape (parameters,); None while the history fills."""
+        """Regressor of the next row, shape (parameters,); None while the history fills."""
         structure = self._structure
         if len(self._outputs) < structure.history * structure.outputs:
             return None
@@ -117,20 +117,19 @@ class RegressorBuffer:
         return np.array(values)
 
     def restart(self) -> None:
-        """Forget the rows so far, as after a gap."""
+        """Clear the history, as after a gap."""
         self._outputs, self._inputs, self._last_time_ns = [], [], None
 
     def update(self, time_ns: int, inputs: Iterable[float], outputs: Iterable[float]) -> NDArray[np.float64] | None:
-        """Take a row.
+        """Add a row.
 
         Args:
-            time_ns: of the row.
+            time_ns: time of the row.
             inputs: shape (inputs,), NaN for what was not measured.
-            outputs: shape (outputs,), likewise.
+            outputs: shape (outputs,), NaN for what was not measured.
 
-        Returns:
-            The regressor of this row, made of the rows before it, shape (parameters,). None for a row that cannot be
-            predicted (its history is not complete), has a missing value, or is not chosen.
+        Returns: The regressor of this row, from the rows before it, shape (parameters,). None for a row that cannot be
+            predicted (its history is incomplete), has a missing value, or is not chosen.
 
         Raises:
             ValueError: a time not after the last one's, or a wrong number of values; nothing is changed then.
@@ -161,7 +160,7 @@ class RegressorBuffer:
 
 
 def _rows(values: list[float], signals: int) -> tuple[tuple[float, ...], ...]:
-    """Values one row after the other, as rows."""
+    """Split a flat list into rows."""
     return tuple(tuple(values[first : first + signals]) for first in range(0, len(values), signals))
 
 
@@ -172,7 +171,7 @@ class Rows:
     Attributes:
         regressors: shape (rows, parameters).
         outputs: shape (rows, outputs).
-        position: shape (rows,), where in the record they are, from 0.
+        position: index of each row in the record, from 0, shape (rows,).
     """
 
     regressors: NDArray[np.float64]
@@ -187,14 +186,14 @@ def rows_of(
     time: ArrayLike | None = None,
     choice: RowChoice = ALL_ROWS,
 ) -> Rows:
-    """All rows of a record that can be predicted from complete rows without a gap between them.
+    """Rows of a record that can be predicted from complete rows without a gap between them.
 
     Args:
-        structure: of the model.
+        structure: structure of the model.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, outputs), likewise.
-        time: shape (rows,), increasing, in any unit; without it no gap is looked for.
-        choice: which rows are fitted.
+        outputs: shape (rows,) or (rows, outputs), NaN where nothing was measured.
+        time: shape (rows,), increasing, in any unit; None: gaps are not detected.
+        choice: rows that are fitted.
 
     Raises:
         InputError: shapes that don't fit, or times that don't increase.
@@ -204,7 +203,7 @@ def rows_of(
     if len(u) != len(y):
         raise InputError(f"inputs and outputs must have equally many rows, got {len(u)} and {len(y)}")
     count, reach = len(y), structure.history
-    run = unbroken(np.concatenate([u, y], axis=1), time)
+    run = consecutive_rows(np.concatenate([u, y], axis=1), time)
     wanted = np.arange(count)
     position = wanted[(run > reach) & (wanted >= choice.skip) & ((wanted - choice.skip) % choice.every == 0)]
     columns = [y[position - lag] for lag in range(1, structure.output_lags + 1)]
@@ -214,8 +213,8 @@ def rows_of(
     return Rows(np.concatenate(columns, axis=1), y[position], position)
 
 
-def unbroken(signals: NDArray[np.float64], time: ArrayLike | None = None) -> NDArray[np.int64]:
-    """How many complete rows, itself included, lie without a gap up to each row; 0 for an incomplete one.
+def consecutive_rows(signals: NDArray[np.float64], time: ArrayLike | None = None) -> NDArray[np.int64]:
+    """Number of complete rows without a gap up to and including each row; 0 for an incomplete one.
 
     Args:
         signals: shape (rows, signals), NaN where nothing was measured.

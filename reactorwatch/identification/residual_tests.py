@@ -1,4 +1,4 @@
-"""Is anything left in the residuals that a model should have explained?
+"""Tests of the residuals of a model: whiteness, and independence from past inputs.
 
 Whiteness: Ljung and Box (Biometrika 65 (1978) 297), Q = N (N+2) sum_k r_k^2 / (N-k), r_k the autocorrelation of the
 residuals at lag k, is chi-squared with as many degrees of freedom as lags, less the number of fitted parameters on the
@@ -8,8 +8,8 @@ Independence from past inputs: Soderstrom and Stoica (System Identification, 198
 x = N r' R^-1 r with r the cross-covariances of residual and past inputs over the residuals' standard deviation and R
 the covariance matrix of these past inputs, is chi-squared with as many degrees of freedom as there are of them.
 
-The answer is minus the decimal logarithm of the probability that a true model would do as badly: 0.3 is a coin's toss,
-6 is one in a million, and it stays a number where the probability itself underflows.
+The result is -log10 p, with p the probability of such a statistic under a true model: 6 is one in a million, and it
+stays finite where p itself underflows.
 """
 
 import math
@@ -19,20 +19,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.regressor import unbroken
+from reactorwatch.identification.regressor import consecutive_rows
 from reactorwatch.identification.structure import as_columns
 
 DEFAULT_LAGS = 20
 
 
 class ResidualTest(msgspec.Struct, frozen=True):
-    """What a test of residuals found.
+    """Result of a test of residuals.
 
     Attributes:
         name: "whiteness" or "independence".
-        statistic: chi-squared if nothing is left.
-        degrees: of freedom.
-        minus_log10_p: how improbable the statistic is then; 0 when there are no residuals at all.
+        statistic: test statistic, chi-squared under the null hypothesis.
+        degrees: degrees of freedom.
+        minus_log10_p: -log10 of its p-value; 0 when there are no residuals.
     """
 
     name: str
@@ -42,11 +42,11 @@ class ResidualTest(msgspec.Struct, frozen=True):
 
 
 def whiteness(residuals: ArrayLike, lags: int = DEFAULT_LAGS, fitted: int = 0) -> ResidualTest:
-    """The Ljung-Box test.
+    """Ljung-Box test of whiteness.
 
     Args:
-        residuals: shape (rows,), NaN where there is none; pairs with a missing one are left out.
-        lags: how many autocorrelations are tested.
+        residuals: shape (rows,), NaN where there is none; pairs with a missing one are excluded.
+        lags: number of autocorrelations.
         fitted: parameters on the output's own past that were fitted to these residuals (an ARX model's `a`).
 
     Raises:
@@ -54,7 +54,7 @@ def whiteness(residuals: ArrayLike, lags: int = DEFAULT_LAGS, fitted: int = 0) -
     """
     if lags <= fitted or lags < 1:
         raise InputError(f"lags must be above the {fitted} fitted parameters and at least 1, got {lags}")
-    values, present = _centred(residuals, lags)
+    values, present = _centre(residuals, lags)
     count = int(present.sum())
     variance = float(np.sum(values * values))
     if variance == 0.0:
@@ -76,31 +76,31 @@ def independence(
     lags: int = DEFAULT_LAGS,
     time: ArrayLike | None = None,
 ) -> ResidualTest:
-    """Whether the residuals are correlated with past inputs.
+    """Test that the residuals are uncorrelated with past inputs.
 
     Args:
         residuals: shape (rows,), NaN where there is none.
         inputs: shape (rows,) or (rows, inputs).
         delay: the first lag of the inputs that is tested.
-        lags: how many lags of each input are tested.
-        time: shape (rows,); without it no gap is looked for.
+        lags: number of lags of each input.
+        time: shape (rows,); None: gaps are not detected.
 
     Raises:
         InputError: fewer than two residuals a lag, or a delay or number of lags below 1.
     """
     if delay < 1 or lags < 1:
         raise InputError(f"delay and lags must be at least 1, got {delay} and {lags}")
-    values, present = _centred(residuals, lags)
+    values, present = _centre(residuals, lags)
     u = as_columns(inputs, "inputs")
     if len(u) != values.size:
         raise InputError(f"residuals and inputs must have equally many rows, got {values.size} and {len(u)}")
     reach = delay + lags - 1
-    rows = np.flatnonzero(present & (np.concatenate([[0], unbroken(u, time)[:-1]]) >= reach))
+    rows = np.flatnonzero(present & (np.concatenate([[0], consecutive_rows(u, time)[:-1]]) >= reach))
     if rows.size <= reach:
         raise InputError(f"{lags} lags need more than {reach} rows with a residual and past inputs, got {rows.size}")
     past = np.concatenate([u[rows - lag] for lag in range(delay, delay + lags)], axis=1)
     past = past - past.mean(axis=0)
-    # An input that never changes, or repeats another, adds no direction: the projection counts those that are there.
+    # A constant or duplicate input adds no direction; the projection counts independent ones.
     directions, sizes, _ = np.linalg.svd(past, full_matrices=False)
     directions = directions[:, sizes > 1e-9 * max(sizes[0], 1e-300)]
     errors = values[rows]
@@ -113,13 +113,13 @@ def independence(
 
 
 def minus_log10_p(statistic: float, degrees: int) -> float:
-    """-log10 of the probability that chi-squared exceeds a value, however small that probability is.
+    """-log10 of the upper tail of chi-squared, for any tail however small.
 
     Beyond double range it is the continued fraction of the incomplete gamma function, DLMF 8.9.2, in logarithms.
 
     Args:
-        statistic: at least 0.
-        degrees: of freedom, at least 1.
+        statistic: value of chi-squared, at least 0.
+        degrees: degrees of freedom, at least 1.
     """
     from scipy.special import gammaincc, gammaln
 
@@ -142,8 +142,8 @@ def minus_log10_p(statistic: float, degrees: int) -> float:
     return (x - a * math.log(x) + float(gammaln(a)) - math.log(fraction)) / math.log(10.0)
 
 
-def _centred(residuals: ArrayLike, lags: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Residuals less their mean, 0 where there is none, and where there is one."""
+def _centre(residuals: ArrayLike, lags: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Residuals less their mean, 0 where missing, and a mask of those present."""
     values = np.asarray(residuals, dtype=np.float64)
     if values.ndim != 1:
         raise InputError(f"residuals must have the shape (rows,), got {values.shape}")

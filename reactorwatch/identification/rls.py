@@ -5,8 +5,8 @@ The covariance form of the textbooks fails in service: without excitation its fo
 as factors R' D R (`information.py`). Three things follow.
 
 *Nothing need be assumed.* D = 0 is a valid start: no prior, no "large P(0)". Without forgetting the result is the QR
-solution of the batch problem, and as accurate. A column that adds nothing to those before it keeps the parameter 0
-and an infinite standard deviation until rows come that tell it apart.
+solution of the batch problem, and as accurate. A column that is dependent on those before it keeps the parameter 0
+and an infinite standard deviation until rows resolve it.
 
 *Forgetting costs n multiplications*, D <- forgetting D, and leaves the parameters exactly as they are.
 
@@ -25,7 +25,7 @@ to rounding for regressors scaled to the order of 1. (Sizes that differ by many 
 of the bound, as they do of any matrix, but never finiteness.)
 
 Forgetting so acts only along directions that the data excite. Along the others the covariance rises to its limit and
-rests there, the parameters stand still, and the first exciting rows identify them anew.
+remains there, the parameters stay constant, and the first exciting rows identify them again.
 
 *Innovation variance and standard deviations* allow for the weights. With W = sum of f^age and W2 = sum of f^(2 age),
 white noise of variance s2 gives cov(theta) = s2 P W2/W, and the weighted sum of squares, which grows by
@@ -41,17 +41,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.identification import information
-from reactorwatch.identification.recursion import Recursion, RlsState, refusal
+from reactorwatch.identification.recursion import Recursion, RlsState, describe_invalid
 
 
-class Innovation(msgspec.Struct, frozen=True, gc=False):
-    """What one row said.
+class RlsUpdate(msgspec.Struct, frozen=True, gc=False):
+    """Result of a row's update.
 
     Attributes:
-        prediction: of the output, made before the row was used.
+        prediction: prediction of the output before the update.
         residual: output - prediction.
-        residual_sd: standard deviation that such a residual has by the rows before: noise and uncertain parameters.
-            inf until there are more rows than parameters.
+        residual_sd: standard deviation of the residual by the rows before, from noise and uncertain parameters; inf
+            until there are more rows than parameters.
         leverage: share of this row in the prediction of its own output after the update, 0 to 1.
     """
 
@@ -93,11 +93,11 @@ class RecursiveLeastSquares(Recursion):
         super().__init__(1, parameters, forgetting, covariance_limit, plants_in_tile=1)
         self._tile: NDArray[np.float64] = self._tiles[0]
         if start is not None:
-            self.move_to(start)
+            self.set_parameters(start)
 
     @classmethod
     def from_state(cls, state: RlsState) -> Self:
-        """The estimator that goes on, bit for bit, where `state` was taken.
+        """Resume, bit for bit from a state.
 
         Raises:
             ValueError: the state is of several plants, or damaged.
@@ -108,12 +108,12 @@ class RecursiveLeastSquares(Recursion):
         estimator._load(state.memory)
         return estimator
 
-    def update(self, regressor: ArrayLike, output: float) -> Innovation:
+    def update(self, regressor: ArrayLike, output: float) -> RlsUpdate:
         """Predict the output, then learn from it.
 
         Args:
             regressor: shape (n,).
-            output: what was measured.
+            output: the measured output.
 
         Raises:
             ValueError: a value that is NaN, infinite or beyond 1e30, or a wrong shape; nothing is changed then.
@@ -121,17 +121,19 @@ class RecursiveLeastSquares(Recursion):
         row = np.ascontiguousarray(regressor, dtype=np.float64)
         if row.ndim != 1 or row.size != self._parameters:
             raise ValueError(f"regressor must have shape ({self._parameters},), got {row.shape}")
-        said = information.learn_one(self._tile, row, float(output), self._forgetting, self._renewal, self._rank_share)
-        if said[0] != said[0]:
-            raise ValueError(refusal(row, output))
-        return Innovation(*said)
+        result = information.learn_one(
+            self._tile, row, float(output), self._forgetting, self._renewal, self._rank_share
+        )
+        if result[0] != result[0]:
+            raise ValueError(describe_invalid(row, output))
+        return RlsUpdate(*result)
 
     def predict(self, regressor: ArrayLike) -> float:
-        """The output that the present parameters give; nothing is learned."""
+        """Predict an output with the present parameters."""
         return float(np.dot(np.asarray(regressor, dtype=np.float64), self._tile[: self._parameters, 0]))
 
-    def move_to(self, parameters: ArrayLike) -> None:
-        """Set the parameters and keep what is known about their uncertainty.
+    def set_parameters(self, parameters: ArrayLike) -> None:
+        """Set the parameters and keep their uncertainty.
 
         Args:
             parameters: shape (n,).
@@ -147,8 +149,8 @@ class RecursiveLeastSquares(Recursion):
         self._tile[n : 2 * n, 0] = self._factor() @ theta
         self._tile[4 * n : 5 * n, 0] = 0.0
 
-    def remember_longer(self, forgetting: float) -> None:
-        """Raise the forgetting factor from here on, as a recursion that starts far off does while it settles.
+    def raise_forgetting(self, forgetting: float) -> None:
+        """Raise the forgetting factor from here on, for a recursion that starts with poor parameters.
 
         Raises:
             ValueError: a value below the present one, for which the covariance's bound would not hold, or above 1.
@@ -159,12 +161,12 @@ class RecursiveLeastSquares(Recursion):
 
     @property
     def parameters(self) -> NDArray[np.float64]:
-        """Shape (n,); 0 for a parameter that no row has yet told apart."""
+        """Parameters, shape (n,); 0 for one that no row has resolved yet."""
         return self._tile[: self._parameters, 0].copy()
 
     @property
     def rows(self) -> int:
-        """How many rows have been learned from."""
+        """Number of rows learned from."""
         return int(self._sums()[information.ROWS])
 
     @property
@@ -175,7 +177,7 @@ class RecursiveLeastSquares(Recursion):
             spread = np.where(inverse != 0.0, inverse / np.sqrt(self._diagonal()), 0.0)
         if np.all(np.isfinite(spread)):
             return np.asarray(spread @ spread.T)
-        # Along a direction without information two infinities of unlike sign have no sum: only variances are told.
+        # Along a direction without information two infinities of opposite sign have no sum: only variances are defined.
         variances = np.sum(spread * spread, axis=1)
         covariance = np.where(np.isinf(variances)[:, None] | np.isinf(variances)[None, :], np.nan, 0.0)
         known = np.isfinite(variances)
@@ -185,26 +187,26 @@ class RecursiveLeastSquares(Recursion):
 
     @property
     def unit_covariance(self) -> NDArray[np.float64]:
-        """Of the parameters for noise of variance 1, P W2/W, shape (n, n)."""
+        """Covariance of the parameters for noise of variance 1, P W2/W, shape (n, n)."""
         return self.covariance * self._weight_share()
 
     @property
     def noise_variance(self) -> float:
-        """Of the residuals that the model leaves at its best; inf until there are more rows than parameters."""
+        """Variance of the residuals; inf until there are more rows than parameters."""
         sums = self._sums()
         free = sums[information.WEIGHT] - self._parameters * self._weight_share()
         return float(sums[information.SQUARES] / free) if free > 0.0 else math.inf
 
     @property
     def parameter_covariance(self) -> NDArray[np.float64]:
-        """Of the parameters, shape (n, n); NaN where nothing is known, or no more rows than parameters have come."""
+        """Covariance of the parameters, shape (n, n); NaN where unknown, or without more rows than parameters."""
         variance, covariance = self.noise_variance, self.unit_covariance
         known = np.isfinite(covariance) & math.isfinite(variance)
         return np.where(known, covariance, math.nan) * (variance if math.isfinite(variance) else 1.0)
 
     @property
     def standard_deviations(self) -> NDArray[np.float64]:
-        """Of the parameters, shape (n,); inf where nothing is known, and until there are more rows than parameters."""
+        """Standard deviations of the parameters, shape (n,); inf where unknown or with too few rows."""
         variances = np.diag(self.parameter_covariance)
         return np.sqrt(np.where(np.isnan(variances), math.inf, variances))
 

@@ -7,12 +7,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.identification import information
 from reactorwatch.identification.information import TILE_PLANTS
-from reactorwatch.identification.recursion import Recursion, RlsState, refusal
+from reactorwatch.identification.recursion import Recursion, RlsState, describe_invalid
 from reactorwatch.identification.rls import RecursiveLeastSquares
 
 
-class Innovations(NamedTuple):
-    """What one row a plant said: the fields of `Innovation`, each of shape (plants,); NaN for an absent plant."""
+class RlsUpdates(NamedTuple):
+    """Fields of `RlsUpdate` for one row of every plant, each of shape (plants,); NaN for an absent plant."""
 
     prediction: NDArray[np.float64]
     residual: NDArray[np.float64]
@@ -28,8 +28,8 @@ class RecursiveLeastSquaresBank(Recursion):
     Args:
         plants: their number.
         parameters: number of parameters of each, n.
-        forgetting: as in the single form.
-        covariance_limit: as in the single form.
+        forgetting: see the single form.
+        covariance_limit: see the single form.
 
     Raises:
         InputError: a setting out of its range.
@@ -42,7 +42,7 @@ class RecursiveLeastSquaresBank(Recursion):
 
     @classmethod
     def from_state(cls, state: RlsState) -> Self:
-        """The estimators that go on, bit for bit, where `state` was taken.
+        """Resume, bit for bit from a state.
 
         Raises:
             ValueError: the state is damaged.
@@ -51,9 +51,7 @@ class RecursiveLeastSquaresBank(Recursion):
         bank._load(state.memory)
         return bank
 
-    def update(
-        self, regressors: ArrayLike, outputs: ArrayLike, present: NDArray[np.bool_] | None = None
-    ) -> Innovations:
+    def update(self, regressors: ArrayLike, outputs: ArrayLike, present: NDArray[np.bool_] | None = None) -> RlsUpdates:
         """Predict every plant's output, then learn from it.
 
         Args:
@@ -76,14 +74,14 @@ class RecursiveLeastSquaresBank(Recursion):
             present = np.ones(self._plants, dtype=np.bool_)
         if present.shape != (self._plants,) or present.dtype != np.bool_:
             raise ValueError(f"present must be {self._plants} booleans, got {present.shape} of {present.dtype}")
-        refused = information.first_refused(rows, measured, present)
+        refused = information.first_invalid(rows, measured, present)
         if refused >= 0:
-            raise ValueError(f"plant {refused}: {refusal(rows[refused], measured[refused])}")
+            raise ValueError(f"plant {refused}: {describe_invalid(rows[refused], measured[refused])}")
         results = np.empty((4, self._plants))
         information.learn_all(
             self._tiles, rows, measured, present, self._forgetting, self._renewal, self._rank_share, results
         )
-        return Innovations(*results)
+        return RlsUpdates(*results)
 
     def plant(self, index: int) -> RecursiveLeastSquares:
         """A copy of one plant's estimator, in the single form.

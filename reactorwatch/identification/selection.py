@@ -1,12 +1,13 @@
-"""Which model? Families and orders in one table, and the reason for the choice in one sentence.
+"""Model selection: families and orders in one table, and the reason for the choice in one sentence.
 
-The first half of the rows is fitted, the second held out. A model for watching must run by itself: its free run on the
-held-out half is what it is chosen by. Fits that differ by less than half a percentage point are called equal, and
-of equals the one with the fewest parameters is taken: what a parameter adds less than that, the next record takes away.
+The first half of the rows is fitted, the second held out. A model for monitoring must simulate well: the choice is by
+its simulation of the held-out half. Fits that differ by less than half a percentage point count as equal, and of equals
+the one with the fewest parameters is chosen.
 
 BIC = N ln(S/N) + p ln N, with S the sum of squares of the residuals that the model was fitted by (Schwarz, Ann.
 Statist. 6 (1978) 461), compares orders of one family, not families: those of an ARX model are one-step errors, those of
-an output-error model errors of its run. With nearly noise-free data it always asks for more: everything is significant.
+an output-error model simulation errors. With nearly noise-free data it always prefers higher orders: everything is
+significant.
 """
 
 import math
@@ -34,16 +35,16 @@ UNSEEN_SHARE, BEYOND_SHARE = 0.05, 0.1
 
 
 class Candidate(msgspec.Struct, frozen=True):
-    """One row of the table.
+    """A candidate, one row of the table.
 
     Attributes:
         family: name of the family.
         order: lags of output and input.
         parameters: their number.
         one_step_percent: fit of the one-step prediction on the held-out half.
-        free_run_percent: fit of the free run on the held-out half; -inf if it ran away.
-        bic: on the fitted half; comparable within a family.
-        refusal: why there is no such model; empty if there is one.
+        free_run_percent: fit of the simulation on the held-out half; -inf if it diverged.
+        bic: BIC on the fitted half; comparable within a family.
+        refusal: reason why there is no such model; empty if there is one.
     """
 
     family: str
@@ -60,10 +61,10 @@ class Selection:
     """The table and the choice.
 
     Attributes:
-        candidates: in the order of families, then orders.
-        chosen: the candidate that was chosen.
-        model: it, fitted to the first half.
-        reason: one sentence; where no model fits, why.
+        candidates: candidates in the order of families, then orders.
+        chosen: the chosen candidate.
+        model: its model, fitted to the first half.
+        reason: one sentence; where no model fits, the cause.
     """
 
     candidates: tuple[Candidate, ...]
@@ -104,11 +105,11 @@ def select(
 
     Args:
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
-        outputs: shape (rows,) or (rows, 1), likewise.
-        time: shape (rows,); without it no gap is looked for.
-        families: what is compared.
-        orders: likewise.
-        delay: of the input, in samples.
+        outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
+        time: shape (rows,); None: gaps are not detected.
+        families: families to compare.
+        orders: orders to compare.
+        delay: delay of the input, in samples.
 
     Raises:
         InputError: no family, an order or delay below 1, or a record that no model can be fitted to.
@@ -133,26 +134,26 @@ def select(
                 family.name,
                 order,
                 model.parameter_count,
-                fit_percent(y[half:, 0], model.one_step(*held_out)[:, 0]),
-                fit_percent(y[half:, 0], model.free_run(*held_out)[:, 0]),
+                fit_percent(y[half:, 0], model.predict(*held_out)[:, 0]),
+                fit_percent(y[half:, 0], model.simulate(*held_out)[:, 0]),
                 bic(model.residuals(u[:half], y[:half], t[:half]), model.parameter_count),
             )
             candidates.append(candidate)
             fitted.append((candidate, model))
     judged = [pair for pair in fitted if math.isfinite(pair[0].free_run_percent)]
     if not judged:
-        reasons = "; ".join(f"{c.family} {c.order}: {c.refusal or 'its free run leaves for good'}" for c in candidates)
+        reasons = "; ".join(f"{c.family} {c.order}: {c.refusal or 'its simulation diverges'}" for c in candidates)
         raise InputError(f"no model can be chosen: {reasons or 'no family or order was given'}")
     best = max(judged, key=lambda pair: pair[0].free_run_percent)[0]
     equal = [pair for pair in judged if pair[0].free_run_percent >= best.free_run_percent - EQUAL_PERCENT]
     chosen, model = min(equal, key=lambda pair: (pair[0].parameters, -pair[0].free_run_percent))
-    found = Selection(tuple(candidates), chosen, model, _reason(chosen, best, candidates))
-    if found.fits:
-        return found
+    selection = Selection(tuple(candidates), chosen, model, _reason(chosen, best, candidates))
+    if selection.fits:
+        return selection
     family = next(family for family in families if family.name == chosen.family)
     structure = Structure.of_order(chosen.order, delay, u.shape[1])
     return replace(
-        found,
+        selection,
         reason=f"no model fits: {describe(best)} runs best on the held-out half, with "
         f"{best.free_run_percent:.1f} % where the mean alone has 0 %; {_why_none_fits(family, structure, u, y, t)}",
     )
@@ -164,10 +165,10 @@ def describe(candidate: Candidate) -> str:
 
 
 def bic(residuals: ArrayLike, parameters: int) -> float:
-    """Schwarz's criterion; the smaller the better.
+    """Schwarz's criterion; smaller is better.
 
     Args:
-        residuals: of the fitted rows, NaN where there is none.
+        residuals: residuals of the fitted rows, NaN where missing.
         parameters: their number.
     """
     values = np.asarray(residuals, dtype=np.float64)
@@ -179,7 +180,7 @@ def bic(residuals: ArrayLike, parameters: int) -> float:
 
 
 def _why_none_fits(family: Family, structure: Structure, u: Array, y: Array, t: Array) -> str:
-    """In which way the halves of a record differ, so that a model of the first does not run along the second."""
+    """Difference between the halves of a record that explains why a model of the first does not simulate the second."""
     half = len(y) // 2
     before, after = u[:half][np.isfinite(u[:half]).all(axis=1)], u[half:][np.isfinite(u[half:]).all(axis=1)]
     margin = BEYOND_SHARE * np.ptp(before, axis=0)
@@ -195,7 +196,7 @@ def _why_none_fits(family: Family, structure: Structure, u: Array, y: Array, t: 
         f"the output's mean went from {mean:.4g} to {later:.4g}, by {abs(later - mean) / max(spread, 1e-300):.1f} sd"
     )
     try:
-        own = family.fit(structure, u[half:], y[half:], t[half:]).free_run(u[half:], y[half:], t[half:])
+        own = family.fit(structure, u[half:], y[half:], t[half:]).simulate(u[half:], y[half:], t[half:])
         percent = fit_percent(y[half:, 0], own[:, 0])
     except InputError:
         percent = -math.inf
@@ -216,7 +217,7 @@ def _reason(chosen: Candidate, best: Candidate, candidates: Sequence[Candidate])
         text = f"{name} runs best on the held-out half, {percent:.1f} %"
     else:
         text = (
-            f"{name} is the smallest model whose free run on the held-out half, {percent:.1f} %, is within "
+            f"{name} is the smallest model whose simulation of the held-out half, {percent:.1f} %, is within "
             f"{EQUAL_PERCENT} of the best, {describe(best)} with {best.free_run_percent:.1f} %"
         )
     smallest = min(

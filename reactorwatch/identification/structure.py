@@ -1,4 +1,4 @@
-"""What a linear model looks like: its orders, its delay, its scaling, and which rows it is fitted to."""
+"""Structure of a linear model: orders, delay, scaling, and choice of rows."""
 
 from typing import Self
 
@@ -10,17 +10,17 @@ from reactorwatch.errors import InputError
 
 
 class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The terms of the model.
+    """Terms of a linear model.
 
     For each output
 
         y[k] = a1 y[k-1] + ... + a_na y[k-na] + b1 u[k-d] + ... + b_nb u[k-d-nb+1] + c.
 
-    With several outputs y[k-i] stands for all of them, and a_i has one value for each; inputs likewise.
+    With several outputs y[k-i] is their vector, and a_i has one value for each; the same holds for inputs.
 
     Attributes:
-        output_lags: na.
-        input_lags: nb.
+        output_lags: na, number of past outputs.
+        input_lags: nb, number of past inputs.
         delay: d, samples from a move of the input to its first effect. An input held over [t_k, t_k+1) first shows
             in row k+1: delay 1.
         inputs: number of inputs.
@@ -46,7 +46,7 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def of_order(cls, order: int, delay: int = 1, inputs: int = 1, outputs: int = 1, offset: bool = True) -> Self:
-        """As many lags of the output as of the input.
+        """Make a structure with equally many lags of output and input.
 
         Raises:
             InputError: order or delay below 1.
@@ -62,7 +62,7 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def history(self) -> int:
-        """How many rows before row k the equation for row k reaches back."""
+        """Number of rows before row k that its equation needs."""
         return max(self.output_lags, self.delay + self.input_lags - 1)
 
     def parameter_names(self, inputs: tuple[str, ...] = (), outputs: tuple[str, ...] = ()) -> tuple[str, ...]:
@@ -90,11 +90,11 @@ _TITLES = {
 
 
 class RowChoice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Which rows of a record are fitted; lags count in samples of the record's clock whatever is chosen.
+    """Choice of the rows of a record that are fitted; lags are counted in samples of the record.
 
     Attributes:
-        skip: rows passed over at the start.
-        every: of the others the first of each so many is taken.
+        skip: number of rows skipped at the start.
+        every: decimation of the others.
 
     Raises:
         InputError: a negative skip, or every below 1.
@@ -110,7 +110,7 @@ class RowChoice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise InputError(f"every must be at least 1, got {self.every}")
 
     def takes(self, row: int) -> bool:
-        """Whether the row of this index, from 0, is fitted."""
+        """True if the row of this index, from 0, is fitted."""
         return row >= self.skip and (row - self.skip) % self.every == 0
 
 
@@ -120,13 +120,13 @@ REPORT_ROWS = RowChoice(skip=99, every=6)
 
 
 class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Signals as (value - centre) / spread, and what that does to parameters.
+    """Scaling of signals, (value - centre) / spread, and of parameters.
 
     Attributes:
-        input_centres: one for each input, in its unit.
-        input_spreads: likewise, above 0.
-        output_centres: one for each output.
-        output_spreads: likewise, above 0.
+        input_centres: centre of each input, in its unit.
+        input_spreads: spread of each input, above 0.
+        output_centres: centre of each output, in its unit.
+        output_spreads: spread of each output, above 0.
 
     Raises:
         InputError: a spread that is not above 0, or a number that is not finite.
@@ -147,17 +147,17 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def none(cls, inputs: int = 1, outputs: int = 1) -> Self:
-        """Signals as they are."""
+        """Make the identity."""
         return cls((0.0,) * inputs, (1.0,) * inputs, (0.0,) * outputs, (1.0,) * outputs)
 
     @classmethod
     def of(cls, inputs: ArrayLike, outputs: ArrayLike, centred: bool = True) -> Self:
-        """Mean and standard deviation of the measured values; of a constant signal the spread is 1.
+        """Scale by mean and standard deviation of the measured values; the spread of a constant signal is 1.
 
         Args:
             inputs: shape (rows,) or (rows, inputs); NaN where nothing was measured.
-            outputs: likewise.
-            centred: False for a model without offset: all centres are 0 then.
+            outputs: shape (rows,) or (rows, outputs); NaN where nothing was measured.
+            centred: False for a model without offset: all centres are then 0.
 
         Raises:
             InputError: a signal without any measured value.
@@ -179,22 +179,22 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
     def inputs(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Inputs scaled; the last axis counts them."""
+        """Scale inputs along the last axis."""
         return (np.asarray(values, dtype=np.float64) - self.input_centres) / self.input_spreads
 
     def outputs(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Outputs scaled; the last axis counts them."""
+        """Scale outputs along the last axis."""
         return (np.asarray(values, dtype=np.float64) - self.output_centres) / self.output_spreads
 
-    def undoing(self, structure: Structure, output: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """How parameters for scaled signals turn into those for the signals' own units: M p + m.
+    def unscaling(self, structure: Structure, output: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Transform M p + m of parameters for scaled signals to those for the signals' own units.
 
         Args:
-            structure: of the model.
-            output: whose equation.
+            structure: structure of the model.
+            output: index of the output of the equation.
 
         Returns:
-            M, shape (parameters, parameters), and m, shape (parameters,). A covariance turns into M cov M'.
+            M, shape (parameters, parameters), and m, shape (parameters,). A covariance becomes M cov M'.
 
         Raises:
             InputError: a model without offset whose signals were centred.
@@ -223,18 +223,20 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         shift[-1] = centre
         return matrix, shift
 
-    def redoing(self, structure: Structure, parameters: NDArray[np.float64], output: int = 0) -> NDArray[np.float64]:
-        """Parameters for scaled signals from those for the signals' own units; `undoing` backwards.
+    def scale_parameters(
+        self, structure: Structure, parameters: NDArray[np.float64], output: int = 0
+    ) -> NDArray[np.float64]:
+        """Transform parameters for the signals' own units to those for scaled signals, the inverse of `unscaling`.
 
         Args:
-            structure: of the model.
+            structure: structure of the model.
             parameters: shape (parameters,).
-            output: whose equation.
+            output: index of the output of the equation.
 
         Raises:
             InputError: a model without offset whose signals were centred.
         """
-        matrix, shift = self.undoing(structure, output)
+        matrix, shift = self.unscaling(structure, output)
         return np.asarray(np.linalg.solve(matrix, parameters - shift))
 
 
@@ -243,8 +245,8 @@ def as_columns(values: ArrayLike, name: str, count: int | None = None) -> NDArra
 
     Args:
         values: shape (rows,) for one signal, or (rows, signals).
-        name: for messages.
-        count: how many signals are expected.
+        name: name for messages.
+        count: expected number of signals; None: any.
 
     Raises:
         InputError: another number of axes or of signals.

@@ -18,7 +18,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.kalman.ekf_step import MODEL_CACHE_SIZE, output_function
-from reactorwatch.process.effect_states import reset_function, rest_function
+from reactorwatch.process.effect_states import reset_function, rest_function, with_derivatives
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
@@ -80,7 +80,7 @@ class InitialState:
             return None
         p = self._model.values(changes)
         x = self._guess(y)
-        slope = _call(self._outputs, x, u, p, time_min)[1].T[present]
+        slope = self._outputs.call(x, u, p, time_min)[1].T[present]
         # far from the operating range a model may have no finite derivatives
         if not np.all(np.isfinite(slope)) or np.linalg.matrix_rank(slope) < slope.shape[1]:
             points = self._steady_states(u, time_min, changes)
@@ -88,16 +88,16 @@ class InitialState:
             x = points[int(np.argmin(distances))].state if points else x
         noise, wide = np.square(measurement_sd), self._wide
         for _ in range(MAX_ITERATIONS):
-            before, x = x, _call(self._correct, x, u, p, time_min, y, noise, wide)[0][0]
+            before, x = x, self._correct.call(x, u, p, time_min, y, noise, wide)[0][0]
             if np.array_equal(before, x):
                 break
-        P = _call(self._correct, x, u, p, time_min, y, START_SDS**2 * noise, wide)[1]
-        after, J = _call(self._complete, x, u, p, time_min)
+        P = self._correct.call(x, u, p, time_min, y, START_SDS**2 * noise, wide)[1]
+        after, J = self._complete.call(x, u, p, time_min)
         return self.reset(after[0], J.T @ P @ J + np.diag(np.square(self._rest_sd)), u, p, time_min)
 
     def reset(self, x: Array, P: Array, u: Array, p: Array, time_min: float) -> tuple[Array, Array]:
         """State and covariance after the jumps (`ProcessModel.resets`) at a row from which on inputs u hold."""
-        after, J = _call(self._reset, x, u, p, time_min)
+        after, J = self._reset.call(x, u, p, time_min)
         return after[0], J.T @ P @ J
 
     def _guess(self, y: Array) -> Array:
@@ -119,13 +119,6 @@ class InitialState:
     @cached_property
     def _search(self) -> SteadyStates:
         return SteadyStates(self._model)
-
-
-def _call(function: ArrayFunction, *values: Array | float) -> list[Array]:
-    for argument, value in zip(function.arguments, values, strict=True):
-        argument[:] = value
-    function()
-    return [item.copy() for item in function.results]
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
@@ -156,11 +149,4 @@ def correction_function(model: ProcessModel) -> ca.Function:
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
 def _memory_functions(model: ProcessModel) -> tuple[ca.Function, ca.Function]:
     """`rest_function` and `reset_function`, with their derivatives."""
-    return _with_derivative(rest_function(model)), _with_derivative(reset_function(model))
-
-
-def _with_derivative(function: ca.Function) -> ca.Function:
-    """Append the derivative of the only result with respect to the first argument."""
-    symbols = function.sx_in()
-    result = function(*symbols)
-    return ca.Function(function.name(), symbols, [result, ca.densify(ca.jacobian(result, symbols[0]))])
+    return with_derivatives(rest_function(model), 0), with_derivatives(reset_function(model), 0)

@@ -116,10 +116,6 @@ class Effect(ABC):
         """m(t) with a profile, as an expression of the clock and of the symbols of the profile's parameters."""
         return profile.expression(clock, symbols)
 
-    def label_with(self, profile: Profile) -> str:
-        """Usual name of this effect with a profile."""
-        return self.labels.get(profile.name, self.label)
-
     def prefix(self, model: ProcessModel) -> str:
         """Prefix of the names of the parameters and states that this effect adds to a model."""
         taken = set(model.parameter_names)
@@ -187,6 +183,14 @@ class ReadingEffect(SensorEffect):
     def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
         """See `SensorEffect`."""
         return model, self.reading(value, size)
+
+
+class BiasEffect(ReadingEffect):
+    """An effect that adds m to the reading of one sensor."""
+
+    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
+        """See `ReadingEffect`."""
+        return value + size
 
 
 def coolant_flow_of(effect: Effect, model: ProcessModel) -> Variable:

@@ -63,3 +63,11 @@ def _at_one_time(model: ProcessModel, expression: ca.SX) -> tuple[list[ca.SX], c
     t = ca.SX.sym("t")
     (result,) = ca.substitute([expression], [model.clock.now, model.clock.middle], [t, t])
     return [*model.arguments(), t], result
+
+
+def with_derivatives(function: ca.Function, *arguments: int) -> ca.Function:
+    """Append the derivatives of the only result with respect to some arguments, given by index."""
+    symbols = function.sx_in()
+    result = function(*symbols)
+    derivatives = (ca.densify(ca.jacobian(result, symbols[i])) for i in arguments)
+    return ca.Function(function.name(), symbols, [result, *derivatives])

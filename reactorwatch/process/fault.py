@@ -11,14 +11,13 @@ The text is cause, profile and size with colons between; where the profile has a
 its unit: s, min or h. The free profile is piecewise linear: after the size come two or more `time=share of the size`.
 """
 
-import difflib
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf, isfinite
 from typing import TypeVar
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.model import ProcessModel
@@ -186,9 +185,7 @@ def _curve(values: Mapping[str, float]) -> list[tuple[float, float]]:
 def _look_up(text: str, what: str, name: str, valid: Mapping[str, _Item]) -> _Item:
     if name in valid:
         return valid[name]
-    close = difflib.get_close_matches(name, valid, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    raise InputError(f"fault {text!r}: unknown {what} {name!r}{hint} (valid: {', '.join(valid) or 'none'})")
+    raise InputError(f"fault {text!r}: {describe_unknown(what, name, valid)}")
 
 
 def _parse_number(text: str, name: str, written: str, unit: str, bounds: tuple[float, float]) -> float:

@@ -210,10 +210,7 @@ class Stepper:
         """
         if self._reset is None:
             return x
-        for argument, value in zip(self._reset.arguments, (x, u, p, np.array([time_min])), strict=True):
-            argument[0] = value
-        self._reset()
-        after: Array = self._reset.results[0][0].copy()
+        after: Array = self._reset.call(x, u, p, time_min)[0][0]
         return after
 
     def advance(self, x: Array, u: Array, p: Array, start_min: float, end_min: float) -> Array:

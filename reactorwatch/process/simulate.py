@@ -22,7 +22,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import CompiledFunction
-from reactorwatch.process.effect_states import reset_function, rest_function
+from reactorwatch.process.effect_states import reset_function, rest_function, with_derivatives
 from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
 from reactorwatch.process.model import ProcessModel
 
@@ -184,12 +184,12 @@ class Simulator:
     @cached_property
     def _complete(self) -> ArrayFunction:
         """(x without the states of `at_rest`, u, p, t) -> (x, its derivatives with respect to the argument and p)."""
-        return ArrayFunction(_with_derivatives(rest_function(self.model)))
+        return ArrayFunction(with_derivatives(rest_function(self.model), 0, 2))
 
     @cached_property
     def _reset(self) -> ArrayFunction:
         """(x, u, p, t) -> (x after the jumps at a row, its derivatives with respect to x and p)."""
-        return ArrayFunction(_with_derivatives(reset_function(self.model)))
+        return ArrayFunction(with_derivatives(reset_function(self.model), 0, 2))
 
     # --- simulation ---------------------------------------------------------------------------------------------
 
@@ -198,11 +198,8 @@ class Simulator:
         x, by_start, by_p = start, np.eye(start.size), np.zeros((start.size, p.size))
         missing, model = start.size < len(self.model.states), self.model
         for function in (*((self._complete,) if missing else ()), *((self._reset,) if model.resets else ())):
-            for argument, value in zip(function.arguments, (x, inputs[0], p, time_min[:1]), strict=True):
-                argument[0] = value
-            function()
-            after, by_x, further = function.results
-            x, by_start, by_p = after[0].copy(), by_x.T @ by_start, by_x.T @ by_p + further.T
+            after, by_x, further = function.call(x, inputs[0], p, time_min[0])
+            x, by_start, by_p = after[0], by_x.T @ by_start, by_x.T @ by_p + further.T
         return x, by_start, by_p
 
     def _grid(self, time_min: Array, p: Array) -> StepGrid:
@@ -315,11 +312,3 @@ def _row_step(model: ProcessModel) -> ca.Function:
     after, error = step(x, u, p, t, middle, h)
     after = ca.if_else(last, reset_function(model)(after, following, p, t + h), after)
     return ca.Function("row_step", [x, ca.vertcat(u, following, last), p, t, middle, h], [after, error])
-
-
-def _with_derivatives(function: ca.Function) -> ca.Function:
-    """Append the derivatives of the only result with respect to the first and the third argument."""
-    symbols = function.sx_in()
-    result = function(*symbols)
-    derivatives = (ca.densify(ca.jacobian(result, symbols[i])) for i in (0, 2))
-    return ca.Function(function.name(), symbols, [result, *derivatives])

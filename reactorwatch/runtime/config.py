@@ -9,7 +9,6 @@ One file may serve all nodes, with a table for each:
     name = "cstr"
 """
 
-import difflib
 import tomllib
 from ipaddress import ip_address
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any, Literal, TypeVar
 
 import msgspec
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.runtime.setting_rules import LAST_PORT, check_endpoint, check_spans, check_values, valid_choices
 
 SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log")
@@ -133,7 +132,7 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
         raise InputError(f"settings file {path}: {error}") from error
     for name in tables:
         if name not in SECTIONS:
-            raise InputError(f"settings file {path}: {_unknown(name, SECTIONS, 'table')}")
+            raise InputError(f"settings file {path}: {describe_unknown('table', name, SECTIONS)}")
     bus = tables.get("bus", {})
     for name in IDENTITY:
         if isinstance(bus.get(name), str):  # a folder with settings and certificates can be moved
@@ -182,11 +181,11 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
         preset = values.pop("preset", None)
         if preset is not None:
             if not isinstance(preset, str) or preset not in presets:
-                raise InputError(f"settings [{name}]: {_unknown(str(preset), tuple(presets), 'preset')}")
+                raise InputError(f"settings [{name}]: {describe_unknown('preset', str(preset), tuple(presets))}")
             values = {**presets[preset], **values}
     for key in values:
         if key not in fields:
-            raise InputError(f"settings [{name}]: {_unknown(key, fields, 'key')}")
+            raise InputError(f"settings [{name}]: {describe_unknown('key', key, fields)}")
     try:
         check_values(values)
         settings = msgspec.convert(values, kind)
@@ -200,9 +199,3 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
     except (ValueError, OverflowError) as error:
         raise InputError(f"settings [{name}]: {error}") from error
     return settings
-
-
-def _unknown(name: str, valid: tuple[str, ...], what: str) -> str:
-    close = difflib.get_close_matches(name, valid, n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    return f"unknown {what} {name!r}{hint} (valid: {', '.join(valid)})"

@@ -5,11 +5,11 @@ it:
 
 - The standard deviation of signal i has the relative variance 1 / (2 nu_i). A signal divided by it is Student's t with
   nu_i degrees of freedom, so the squares of the signals sum to a sum of p independent F(1, nu_i). The density of this
-  sum is a convolution, which is computed with the fast Fourier transform on a grid; each F is put on the grid so that
-  its mean stays what it is.
+  sum is a convolution, which is computed with the fast Fourier transform on a grid; each F is discretised so that
+  its mean is preserved.
 - The correlations come from n rows. With the whole covariance estimated, T2 is chi-square times n / chi2(n - p + 1)
-  (Hotelling 1931, The generalization of Student's ratio, Ann. Math. Statist. 2). What the scales do not explain of this
-  factor's mean and variance multiplies the sum.
+  (Hotelling 1931, The generalization of Student's ratio, Ann. Math. Statist. 2). The part of this factor's mean and
+  variance that the scales do not explain multiplies the sum.
 
 With one signal this is the square of Student's limit. Hotelling's F with the least nu_i for all signals would be far
 too wide for many signals, and does not exist where nu_i < p.
@@ -24,33 +24,33 @@ from scipy import special
 Array = NDArray[np.float64]
 
 GRID = 2**13
-"""Points of the grid; the step is then about a thousandth of the quantile."""
+"""Number of grid points; the step is then about a thousandth of the quantile."""
 
 LARGEST_FREEDOM = 1e6
-"""More degrees of freedom than this are as good as infinitely many."""
+"""Degrees of freedom beyond which they count as infinite."""
 
 LARGEST = 1e7
-"""Quantiles beyond this are infinite: a chart with such a limit sees nothing."""
+"""Quantiles beyond this count as infinite: a chart with such a limit detects nothing."""
 
 _LEAST_TAIL = 1e-15  # rounding of the transform
 _DEVIATIONS, _NODES = 9.0, 121
 
 
 def estimated_t2_quantile(tail: float, freedoms: Array, rows: float) -> float:
-    """The value that T2 exceeds with a given probability.
+    """Upper quantile of T2.
 
     >>> round(estimated_t2_quantile(0.01, np.array([20.0]), 20), 2)  # F(1, 20)
     8.1
 
     Args:
-        tail: the probability, above 1e-12.
+        tail: probability that T2 exceeds the quantile, above 1e-12.
         freedoms: degrees of freedom of the scales, shape (p,), above 2.
-        rows: n, from which the correlations were estimated; more than p + 1.
+        rows: n, number of rows from which the correlations were estimated; more than p + 1.
 
     Returns:
         The quantile; infinite if it is beyond `LARGEST`.
     """
-    from scipy import optimize  # a fifth of a second, which a monitor need not take before it is there
+    from scipy import optimize  # takes a fifth of a second, which a monitor's start does not need
 
     p = freedoms.size
     factor, share = _factor(p, rows)

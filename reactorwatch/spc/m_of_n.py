@@ -20,15 +20,15 @@ def check_rule(raise_count: int, window: int, clear_count: int) -> None:
 
 
 def false_alarm_rate(raise_count: int, window: int, probability_out: float) -> float:
-    """How often chance raises an alarm, a point, in the long run and for independent points.
+    """False alarm rate per point, for independent points.
 
     The inverse of the mean number of points from a clean start to the alarm, from the absorbing Markov chain whose
     states are the last window - 1 points.
 
     Args:
         raise_count: points beyond the limit, among the last `window`, that raise the alarm.
-        window: points that are looked at.
-        probability_out: that a point is out.
+        window: number of points that count.
+        probability_out: probability that a point is beyond the limit.
 
     >>> round(1 / false_alarm_rate(1, 1, 0.0027))
     370

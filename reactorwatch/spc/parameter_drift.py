@@ -1,4 +1,4 @@
-"""How far chance takes the parameters of a model that adapts: what the chart on them is learned from.
+"""Design of the chart on the parameters of an adaptive model from a training record.
 
 A model y = phi' theta + e that is learned by least squares with the forgetting factor f obeys, with w = 1 - f and an
 average over the rows in memory on both sides,
@@ -20,7 +20,7 @@ difference of the two has the covariance
 
     C = w / (2 - w) (1 + r) V.
 
-The reference's error does not change any more. How the limit allows for that: `run_length/parameters.py`.
+The reference's error is constant. The limit allows for that, see `run_length/parameters.py`.
 
 Omega is learned by cosines, Omega = (c_1 c_1' + ... + c_K c_K') / K, with c_j the scores' coefficient of the j-th
 cosine over the record and K = 0.4 rows^(2/3) (Lazarus, Lewis, Stock & Watson 2018, HAR inference: recommendations for
@@ -39,7 +39,7 @@ from numpy.typing import ArrayLike
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Array
 from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.run_length.limits import within
+from reactorwatch.spc.run_length.limits import check_range
 from reactorwatch.spc.run_length.mewma import SMALLEST_WEIGHT_WITHOUT_SHIFT
 from reactorwatch.spc.run_length.parameters import parameter_limit
 
@@ -47,13 +47,13 @@ LEAST_EXCITATION = 1e-10
 """A direction whose mean square is below this share of the largest is not excited, regressors brought to unit size."""
 
 SMALLEST_SD = 1e-9
-"""Of the residual, in scaled units: without any noise rounding would be drift."""
+"""Smallest standard deviation of the residual, in scaled units: without any noise rounding would count as drift."""
 
 ROWS_A_DIRECTION = 10
-"""The memory of the model that adapts is at least this many rows a direction, else H is not what is in memory."""
+"""Smallest memory of the adaptive model, in rows a direction; with less, H is not the average in memory."""
 
 VECTORS_A_DIRECTION = 2
-"""Omega is learned from at least this many cosines a direction."""
+"""Smallest number of cosines a direction for Omega."""
 
 
 def learn(
@@ -65,17 +65,17 @@ def learn(
     names: Sequence[str],
     past_outputs: int,
 ) -> ParameterT2:
-    """The chart for a model, from a training.
+    """Design the chart of a model from a training record.
 
     Args:
-        regressors: shape (rows, p), in order of time, in scaled units: outputs of the order of 1.
-        residuals: shape (rows,), what any model with these regressors left of the output, in scaled units; what
-            they could still explain of it is taken out.
-        forgetting: f, of the model that adapts and of the reference while it was learned, in [0.9, 0.9999].
-        reference_rows: N, how many rows the reference was learned from.
-        arl0: rows to a false alarm, averaged over the references that such trainings give.
-        names: of the parameters, p of them.
-        past_outputs: how many of the regressors, the first ones, are past outputs; the others are inputs and offset.
+        regressors: shape (rows, p), by time, in scaled units: outputs of the order of 1.
+        residuals: residuals of any model with these regressors, in scaled units, shape (rows,); the part that the
+            regressors still explain is removed.
+        forgetting: forgetting factor f of the adaptive model, and of the reference in training, in [0.9, 0.9999].
+        reference_rows: N, number of training rows of the reference.
+        arl0: rows to a false alarm, averaged over the references of such trainings.
+        names: names of the p parameters.
+        past_outputs: number of leading regressors that are past outputs; the others are inputs and offset.
 
     Raises:
         InputError: an argument out of its range or of a wrong shape, a value that is not finite, or a training too
@@ -89,8 +89,8 @@ def learn(
         )
     if not (np.all(np.isfinite(phi)) and np.all(np.isfinite(e))):
         raise InputError("regressors and residuals must be finite numbers; leave out the rows that are not")
-    within("past_outputs", past_outputs, 0, len(names))
-    within("reference_rows", reference_rows, 1, float("inf"))
+    check_range("past_outputs", past_outputs, 0, len(names))
+    check_range("reference_rows", reference_rows, 1, float("inf"))
     rows = len(phi)
     white = _whitening(phi)
     m, vectors = len(white), floor(0.4 * rows ** (2.0 / 3.0))
@@ -99,14 +99,16 @@ def learn(
     if vectors < VECTORS_A_DIRECTION * m:
         least = (VECTORS_A_DIRECTION * m / 0.4) ** 1.5
         raise InputError(f"training must have at least {least:.0f} rows for {m} parameters, got {rows}")
-    within("forgetting", forgetting, max(0.9, 1.0 - 1.0 / (ROWS_A_DIRECTION * m)), 1.0 - SMALLEST_WEIGHT_WITHOUT_SHIFT)
+    check_range(
+        "forgetting", forgetting, max(0.9, 1.0 - 1.0 / (ROWS_A_DIRECTION * m)), 1.0 - SMALLEST_WEIGHT_WITHOUT_SHIFT
+    )
     weight = max(1.0 - forgetting, SMALLEST_WEIGHT_WITHOUT_SHIFT)
 
     z = phi @ white.T
     e = (e - z @ (z.T @ e) / rows) * sqrt(rows / (rows - m))
     omega = _long_run_covariance(z * e[:, None], vectors) + SMALLEST_SD**2 * np.eye(m)
-    remembered = forgetting**reference_rows
-    share = (1.0 + remembered) / (1.0 - remembered)
+    memory = forgetting**reference_rows
+    share = (1.0 + memory) / (1.0 - memory)
     # In coordinates that make the regressors white, V is Omega.
     root = np.linalg.inv(np.linalg.cholesky(omega)) @ (z.T @ phi) / rows
     limit = parameter_limit(arl0, m, weight, vectors, share)
@@ -118,7 +120,7 @@ def learn(
 
 
 def _whitening(rows: Array) -> Array:
-    """What makes rows white, without a mean being taken off: shape (directions that are excited, columns)."""
+    """Whitening matrix of rows, without removing a mean, shape (excited directions, columns)."""
     size = np.sqrt(np.mean(rows * rows, axis=0))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
     scaled = rows * unit
@@ -128,7 +130,7 @@ def _whitening(rows: Array) -> Array:
 
 
 def _long_run_covariance(scores: Array, vectors: int) -> Array:
-    """The sum of their covariances over all lags, shape (m, m), from their slowest cosines."""
+    """Sum of the scores' covariances over all lags, shape (m, m), from their slowest cosines."""
     rows = len(scores)
     phase = np.pi / rows * (np.arange(rows) + 0.5)
     coefficients = sqrt(2.0 / rows) * np.cos(np.outer(np.arange(1, vectors + 1), phase)) @ scores

@@ -1,17 +1,17 @@
-"""What chance does to a residual when nothing is wrong, and the residual with that taken out.
+"""Prewhitening: an autoregression of a residual, learned from the training, and its innovations for the charts.
 
-Run lengths hold for independent values. The residuals of a plant are not: the model leaves something out, noise has a
-memory. A CUSUM that promises a false alarm every 465 samples gives one every 118 if neighbours are correlated by 0.25
-(Johnson & Bagshaw 1974, The effect of serial correlation on the performance of CUSUM tests, Technometrics 16). So an
-autoregression of the residual on its own past is learned from the training, and what the charts see is what that
-cannot predict, in units of its standard deviation (Alwan & Roberts 1988, Time-series modeling for statistical process
-control, J. Business & Economic Statistics 6):
+Run lengths hold for independent values. The residuals of a plant are correlated: the model is incomplete, and noise is
+coloured. A CUSUM with a false alarm every 465 samples has one every 118 if neighbours are correlated by 0.25 (Johnson &
+Bagshaw 1974, The effect of serial correlation on the performance of CUSUM tests, Technometrics 16). So an
+autoregression of the residual on its own past is learned from the training, and the charts take its innovations, in
+units of their standard deviation (Alwan & Roberts 1988, Time-series modeling for statistical process control, J.
+Business & Economic Statistics 6):
 
     e[k] = (z[k] - c - a1 z[k-1] - ... - ap z[k-p]) / sigma.
 
-A lasting shift of z by d shows in e as d (1 - a1 - ... - ap) / sigma: a plant whose residual wanders by itself hides
-small faults, and that is honest. Mean, standard deviation and coefficients come from a finite training, and charts
-with a long memory feel their errors; how large these are is kept beside them, and limits are made wider by it (see
+A lasting shift of z by d appears in e as d (1 - a1 - ... - ap) / sigma: a residual that wanders by itself masks small
+faults. Mean, standard deviation and coefficients come from a finite training, and charts with a long memory are
+sensitive to their errors; the size of these is stored beside them, and limits are widened by it (see
 `false_alarm_budget`).
 """
 
@@ -28,21 +28,21 @@ Array = NDArray[np.float64]
 
 LARGEST_ORDER = 6
 ROWS_A_COEFFICIENT = 10
-"""An autoregression has at most one coefficient for so many rows."""
+"""Smallest number of rows for each coefficient."""
 
 BATCHES = 10
-"""That the squares of a training are averaged over: longer than what they have in common lasts."""
+"""Number of batches over which the squares of a training are averaged: longer than their correlation."""
 
 BLOCK, FEWEST_BLOCKS = 50, 8
-"""Rows that are compared with others, and how many such blocks there must be."""
+"""Rows of a block, and the smallest number of blocks, for comparing variances."""
 
 UNLIKE = 2.0
-"""Times the variance by chance, beyond which blocks are unlike."""
+"""Ratio of the blocks' variance to its expected value beyond which they differ."""
 
 WORST = 0.95
 
 LARGEST_SUM = 0.98
-"""Of the coefficients. Nearer to 1 the residual is a random walk, and nothing would ever be a shift."""
+"""Largest sum of the coefficients. Nearer to 1 the residual is a random walk, and no shift would be detected."""
 
 
 class Prewhitening(msgspec.Struct, frozen=True):
@@ -52,10 +52,10 @@ class Prewhitening(msgspec.Struct, frozen=True):
         constant: c, in the units of z.
         coefficients: a1, ..., ap.
         sd: sigma, in the units of z.
-        rows: that it was learned from.
+        rows: number of training rows.
         sd_variance: variance of the relative error of sigma.
-        passed_variance: variance of the relative error of 1 - a1 - ... - ap; a chart with a long memory feels it as if
-            it were one of sigma.
+        passed_variance: variance of the relative error of 1 - a1 - ... - ap; it acts on a chart
+            with a long memory like one of sigma.
     """
 
     constant: float
@@ -67,19 +67,19 @@ class Prewhitening(msgspec.Struct, frozen=True):
 
     @property
     def passed(self) -> float:
-        """The part of a lasting shift that is left in e, 1 - a1 - ... - ap."""
+        """Gain of a lasting shift in e, 1 - a1 - ... - ap."""
         return 1.0 - sum(self.coefficients)
 
 
 def learn(z: Array, smallest_sd: float) -> Prewhitening:
-    """The autoregression of a residual, its order by Akaike's criterion, at least 1.
+    """Learn the autoregression of a residual, its order by Akaike's criterion, at least 1.
 
-    The order is never 0: a correlation too small to be sure of still changes the run length of a chart with a long
-    memory, and a coefficient that is learned carries its uncertainty with it.
+    The order is never 0: even an insignificant correlation changes the run length of a chart with a long memory, and a
+    learned coefficient carries its uncertainty.
 
     Args:
-        z: shape (n,), in order of time; NaN where it is not known or not to be learned from.
-        smallest_sd: sigma is at least this.
+        z: shape (n,), by time; NaN where missing or to be ignored.
+        smallest_sd: lower bound of sigma.
     """
     known = int(np.count_nonzero(np.isfinite(z)))
     largest = min(LARGEST_ORDER, known // ROWS_A_COEFFICIENT - 1)
@@ -87,7 +87,7 @@ def learn(z: Array, smallest_sd: float) -> Prewhitening:
     if largest >= 1:
         lagged = np.column_stack([z[largest - lag : z.size - lag] for lag in range(largest + 1)])
         rows = lagged[np.all(np.isfinite(lagged), axis=1)]
-        fits = [_fitted(rows, order, smallest_sd) for order in range(1, largest + 1) if len(rows) > 3 * (order + 1)]
+        fits = [_fit(rows, order, smallest_sd) for order in range(1, largest + 1) if len(rows) > 3 * (order + 1)]
     if not fits:
         return _constant(z[np.isfinite(z)], smallest_sd)
     return min(fits, key=lambda fit: fit.rows * np.log(fit.sd) + len(fit.coefficients))
@@ -100,12 +100,12 @@ def _constant(z: Array, smallest_sd: float) -> Prewhitening:
     )
 
 
-def _fitted(rows: Array, order: int, smallest_sd: float) -> Prewhitening:
+def _fit(rows: Array, order: int, smallest_sd: float) -> Prewhitening:
     target, past = rows[:, 0], rows[:, 1 : order + 1]
     centre = past.mean(axis=0)
     centred = past - centre
     gram = centred.T @ centred
-    # A residual that does not vary has no past to learn from: the least ridge makes its coefficients 0.
+    # Regularisation makes the coefficients of a constant residual 0.
     gram[np.diag_indices(order)] += 1e-9 * np.trace(gram) / order + max(smallest_sd**2, 1e-30)
     a = np.linalg.solve(gram, centred.T @ (target - target.mean()))
     if a.sum() > LARGEST_SUM:
@@ -113,7 +113,7 @@ def _fitted(rows: Array, order: int, smallest_sd: float) -> Prewhitening:
     error = target - target.mean() - centred @ a
     freedom = len(rows) - order - 1
     variance = float(error @ error) / freedom
-    sd = max(variance**0.5 * _worst(error), smallest_sd)
+    sd = max(variance**0.5 * _worst_block(error), smallest_sd)
     passed = 1.0 - float(a.sum())
     of_sum = variance * float(np.sum(np.linalg.inv(gram)))
     return Prewhitening(
@@ -126,11 +126,11 @@ def _fitted(rows: Array, order: int, smallest_sd: float) -> Prewhitening:
     )
 
 
-def _worst(error: Array) -> float:
-    """How much larger the residual is where it is large than on the whole; 1 if it is alike everywhere.
+def _worst_block(error: Array) -> float:
+    """Ratio of the worst block's standard deviation to the overall one; 1 if the blocks do not differ.
 
-    A linear model of a plant that is not linear fits better here than there, and what fits worst makes the false
-    alarms. So where blocks of rows differ by more than chance lets them, sigma is that of the worst of them.
+    The fit of a linear model of a nonlinear plant varies with the operating point, and the worst fit makes the false
+    alarms. So where blocks of rows differ significantly, sigma is that of the worst of them.
     """
     blocks = error[: error.size // BLOCK * BLOCK].reshape(-1, BLOCK)
     size = np.sqrt(np.mean(error**2)) if error.size else 0.0
@@ -138,18 +138,18 @@ def _worst(error: Array) -> float:
         return 1.0
     sizes = np.sqrt(np.mean(blocks**2, axis=1)) / size
     fourth = float(np.mean(error**4)) / size**4
-    by_chance = max(fourth - 1.0, 1.0) / (4.0 * BLOCK)
-    if float(np.var(sizes, ddof=1)) <= UNLIKE * by_chance:
+    expected_variance = max(fourth - 1.0, 1.0) / (4.0 * BLOCK)
+    if float(np.var(sizes, ddof=1)) <= UNLIKE * expected_variance:
         return 1.0
     return max(float(np.quantile(sizes, WORST)), 1.0)
 
 
 def _sd_variance(error: Array, freedom: int) -> float:
-    """Variance of the relative error of the standard deviation of these values.
+    """Variance of the relative error of the standard deviation of some values.
 
     From their fourth moment, as for independent ones; and from the means of their squares over batches (Schmeiser 1982,
-    Batch size effects in the analysis of simulation output, Operations Research 30), because a model that fits here and
-    not there leaves squares that are alike for long. The larger of the two.
+    Batch size effects in the analysis of simulation output, Operations Research 30), because the squares of a
+    model whose fit varies with the operating point are correlated. The larger of the two.
     """
     squares = error**2
     mean = float(squares.mean())
@@ -164,40 +164,40 @@ def _sd_variance(error: Array, freedom: int) -> float:
 
 
 class PrewhitenerState(StoredState, frozen=True):
-    """What was learned, and the last values, newest first."""
+    """The autoregression, and the last values, newest first."""
 
     learned: Prewhitening
     past: list[float]
 
 
 class Prewhitener:
-    """Takes the predictable part out of a residual, value by value.
+    """Computes the innovations of a residual, value by value.
 
     Args:
-        learned: from the training.
+        learned: the autoregression.
     """
 
     def __init__(self, learned: Prewhitening) -> None:
         self.learned = learned
         self.past: deque[float] = deque(maxlen=max(len(learned.coefficients), 1))
-        """The last values, newest first: all that it remembers."""
+        """The last values, newest first: the full state."""
         self._expected = 0.0
         self._order, self._mean = len(learned.coefficients), learned.constant / learned.passed
 
     @classmethod
     def from_state(cls, state: PrewhitenerState) -> "Prewhitener":
-        """The one that goes on, bit for bit, where `state` was taken, between two values."""
+        """Resume, bit for bit, from a state."""
         whitener = cls(state.learned)
         whitener.past.extend(state.past)
         return whitener
 
     @property
     def state(self) -> PrewhitenerState:
-        """A copy of all that was learned and is remembered."""
+        """A copy of the full state."""
         return PrewhitenerState(self.learned, list(self.past))
 
     def expected(self) -> float:
-        """What z is going to be as far as its past can tell; without a past that is long enough: its mean."""
+        """Prediction of the next z; its mean while there are too few past values."""
         learned = self.learned
         if len(self.past) < self._order:
             return self._mean
@@ -207,12 +207,12 @@ class Prewhitener:
         return value
 
     def update(self, z: float) -> float:
-        """The next value in units of sigma with what was to be expected taken out; NaN for NaN.
+        """Innovation of the next value in units of sigma; NaN for NaN.
 
-        After a gap the past is forgotten, and until it is there again the values are not judged: NaN.
+        A gap clears the past; the innovation is NaN until there are enough values again.
 
         Args:
-            z: NaN if it is missing.
+            z: the next value; NaN if it is missing.
         """
         if not isfinite(z):
             self.past.clear()
@@ -222,8 +222,8 @@ class Prewhitener:
         self.past.appendleft(z)
         return (z - expected) / self.learned.sd if known else nan
 
-    def withhold(self) -> None:
-        """Take the last value for an outlier: what was expected instead is remembered."""
+    def reject_last(self) -> None:
+        """Treat the last value as an outlier: replace it by its prediction."""
         self.past[0] = self._expected
 
     def restart(self) -> None:

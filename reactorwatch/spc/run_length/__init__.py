@@ -1,6 +1,6 @@
-"""How long a chart runs until it signals, by chance or after a shift.
+"""Average run lengths of charts, in control and after a shift.
 
-Average run lengths in samples, for independent normal data and known mean and spread.
+In samples, for independent normal data with known mean and covariance.
 """
 
 from reactorwatch.spc.run_length.cusum import cusum

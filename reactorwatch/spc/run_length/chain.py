@@ -1,4 +1,4 @@
-"""The algebra that all run lengths share.
+"""Run lengths of a Markov chain, shared by all charts.
 
 A chart's statistic is a Markov chain that ends when the chart signals. With K the transitions among the states in
 which it has not signalled, the mean number of samples to the signal from each state solves (1 - K) L = 1 (Brook & Evans
@@ -6,8 +6,8 @@ which it has not signalled, the mean number of samples to the signal from each s
 times the weights: Nystroem's method for the integral equation, which converges exponentially for the smooth kernels of
 normal data. For a discrete chain K is exact.
 
-Zero state: the change is there from the first sample on. Steady state: the chart has long run without a signal when
-the change comes, so the state is distributed as the left eigenvector of the in-control K (the conditional steady
+Zero state: the change is present from the first sample on. Steady state: the chart has long run without a signal when
+the change occurs, so the state is distributed as the left eigenvector of the in-control K (the conditional steady
 state: no false alarm has come yet).
 """
 
@@ -23,9 +23,9 @@ from reactorwatch.spc.run_length.limits import LONGEST
 
 
 def run_lengths(transitions: Array) -> Array:
-    """The mean number of samples to the signal from each state, shape (states,); inf in all if beyond 1e12.
+    """Mean number of samples to the signal from each state, shape (states,); all inf if beyond 1e12.
 
-    Beyond that, what is left of 1 - K is rounding.
+    Beyond that, 1 - K is rounding error.
 
     Args:
         transitions: K, shape (states, states), from row to column.
@@ -40,24 +40,24 @@ def run_lengths(transitions: Array) -> Array:
     return np.asarray(lengths)
 
 
-def settled(transitions: Array) -> Array:
-    """How the states are distributed after long without a signal, shape (states,), sum 1.
+def stationary_distribution(transitions: Array) -> Array:
+    """Conditional stationary distribution of the states, without a signal, shape (states,), sum 1.
 
     The left eigenvector of the largest eigenvalue, by inverse iteration at 1: that eigenvalue is just below.
     """
     factors = linalg.lu_factor(np.eye(len(transitions)) - transitions)
     share = np.full(len(transitions), 1.0 / len(transitions))
     for _ in range(500):
-        following = linalg.lu_solve(factors, share, trans=1)
-        following /= following.sum()
-        if np.max(np.abs(following - share)) < 1e-13:
-            return np.asarray(following)
-        share = following
+        update = linalg.lu_solve(factors, share, trans=1)
+        update /= update.sum()
+        if np.max(np.abs(update - share)) < 1e-13:
+            return np.asarray(update)
+        share = update
     raise InputError("the chart must signal more seldom to have a steady state; raise its limit")
 
 
 def nodes(lower: float, upper: float, count: int) -> tuple[Array, Array]:
-    """Places and weights of Gauss-Legendre quadrature, each of shape (at least count,)."""
+    """Nodes and weights of Gauss-Legendre quadrature, each of shape (at least count,)."""
     at, weight = _unit(16 * ceil(count / 16))
     half = 0.5 * (upper - lower)
     return lower + half * (at + 1.0), half * weight

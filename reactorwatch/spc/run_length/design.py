@@ -1,11 +1,11 @@
-"""The chart that detects a shift fastest at a given rate of false alarms.
+"""Optimal design: the chart that detects a shift fastest at a given rate of false alarms.
 
 For each value of the parameter that sets a chart's memory (k of the CUSUM, lambda of the EWMA and the MEWMA), the limit
 that gives the in-control run length is found as a root; among these charts the one with the shortest zero-state run
 length at the shift is found by a one-dimensional search (Crowder 1989, Design of exponentially weighted moving average
 schemes, J. Quality Technology 21; Gan 1991, An optimal design of CUSUM quality control charts, same journal 23;
-Prabhu & Runger 1997, Designing a multivariate EWMA control chart, same journal 29). The minimum is flat, so its place
-is rounded to three digits and the limit found for that. A chart without memory has only its limit to choose.
+Prabhu & Runger 1997, Designing a multivariate EWMA control chart, same journal 29). The minimum is flat, so its
+argument is rounded to three digits and the limit is computed for that. A chart without memory has only its limit.
 """
 
 from collections.abc import Callable, Iterable
@@ -18,7 +18,7 @@ from scipy import special
 from reactorwatch.errors import InputError
 from reactorwatch.spc.run_length.cusum import LARGEST_LIMIT, cusum
 from reactorwatch.spc.run_length.ewma import ewma
-from reactorwatch.spc.run_length.limits import within
+from reactorwatch.spc.run_length.limits import check_range
 from reactorwatch.spc.run_length.mewma import LARGEST_DIMENSION, SMALLEST_WEIGHT, mewma
 from reactorwatch.spc.run_length.mewma import LARGEST_LIMIT_WITHOUT_SHIFT as LARGEST_MEWMA_LIMIT
 from reactorwatch.spc.run_length.shewhart import checked_rules, shewhart
@@ -33,13 +33,13 @@ Parameters = dict[str, float | int | list[int]]
 
 
 class Design(msgspec.Struct, frozen=True):
-    """A chart, and what it does.
+    """A designed chart and its run lengths.
 
     Attributes:
-        chart: its name in the catalogue.
-        parameters: by the names that the run lengths' commands have for them.
+        chart: name in the catalogue.
+        parameters: values by the parameter names of the run-length commands.
         arl0: run length without a shift, in samples.
-        shift: in sigma.
+        shift: shift to be detected, in sigma.
         arl: run length at the shift, in samples.
     """
 
@@ -51,14 +51,14 @@ class Design(msgspec.Struct, frozen=True):
 
 
 def design(chart: str, arl0: float, shift: float, *, dimension: int = 2, rules: Iterable[int] = (1,)) -> Design:
-    """The fastest chart of a kind for a shift.
+    """Design the fastest chart of a kind for a shift.
 
     >>> design("cusum", 370.4, 1.0).parameters["k"]
     0.5
 
     Args:
         chart: shewhart, cusum, ewma, mewma or t2.
-        arl0: its run length without a shift, in [5, 1e8].
+        arl0: run length without a shift, in [5, 1e8].
         shift: to be detected, in sigma (of several signals: Mahalanobis), in [0.1, 10].
         dimension: number of signals, of mewma and t2.
         rules: run rules, of shewhart.
@@ -66,9 +66,9 @@ def design(chart: str, arl0: float, shift: float, *, dimension: int = 2, rules: 
     Raises:
         InputError: there is no such chart, or an argument out of its range.
     """
-    within("arl0", arl0, SHORTEST, LONGEST_DESIGN)
-    within("shift", shift, SMALLEST_SHIFT, LARGEST_SHIFT)
-    within("dimension", dimension, 1, LARGEST_DIMENSION)
+    check_range("arl0", arl0, SHORTEST, LONGEST_DESIGN)
+    check_range("shift", shift, SMALLEST_SHIFT, LARGEST_SHIFT)
+    check_range("dimension", dimension, 1, LARGEST_DIMENSION)
     if chart == "shewhart":
         wanted = checked_rules(rules)
         limit = shewhart_limit(arl0, wanted)
@@ -79,7 +79,7 @@ def design(chart: str, arl0: float, shift: float, *, dimension: int = 2, rules: 
     if chart == "cusum":
         # Beyond this allowance even a limit of 0 signals too seldom.
         largest = 0.98 * float(-special.ndtri(0.5 / arl0))
-        k = _fastest(
+        k = _fastest_parameter(
             lambda k: cusum(shift, k, cusum_limit(arl0, k)),
             min(0.35 * shift, 0.7 * largest),
             min(0.75 * shift, largest),
@@ -87,11 +87,11 @@ def design(chart: str, arl0: float, shift: float, *, dimension: int = 2, rules: 
         h = cusum_limit(arl0, k)
         return Design(chart, {"k": k, "h": h}, arl0, shift, cusum(shift, k, h))
     if chart == "ewma":
-        weight = _fastest(lambda w: ewma(shift, w, ewma_limit(arl0, w)), _SMALLEST_EWMA_WEIGHT, 1.0)
+        weight = _fastest_parameter(lambda w: ewma(shift, w, ewma_limit(arl0, w)), _SMALLEST_EWMA_WEIGHT, 1.0)
         limit = ewma_limit(arl0, weight)
         return Design(chart, {"lambda": weight, "limit": limit}, arl0, shift, ewma(shift, weight, limit))
     if chart == "mewma":
-        weight = _fastest(
+        weight = _fastest_parameter(
             lambda w: mewma(shift, dimension, w, mewma_limit(arl0, dimension, w)),
             max(SMALLEST_WEIGHT, min(0.03 * shift**1.4, 0.2)),
             min(0.4 * shift**1.4, 1.0),
@@ -104,7 +104,7 @@ def design(chart: str, arl0: float, shift: float, *, dimension: int = 2, rules: 
 
 
 def shewhart_limit(arl0: float, rules: Iterable[int] = (1,)) -> float:
-    """The width L for an in-control run length."""
+    """Width L for an in-control run length."""
     wanted = checked_rules(rules)
     if wanted == (1,):
         return float(-special.ndtri(0.5 / arl0))
@@ -115,33 +115,33 @@ def shewhart_limit(arl0: float, rules: Iterable[int] = (1,)) -> float:
 
 @cache
 def cusum_limit(arl0: float, k: float) -> float:
-    """The limit h of the two-sided CUSUM of allowance k for an in-control run length."""
+    """Limit h of the two-sided CUSUM of allowance k for an in-control run length."""
     # The run length grows about as exp(2 k h).
     return _root(lambda h: cusum(0.0, k, h), arl0, 0.5 / min(max(k, 0.01), 1.0), LARGEST_LIMIT)
 
 
 @cache
 def ewma_limit(arl0: float, weight: float) -> float:
-    """The limit L of the EWMA of weight lambda for an in-control run length."""
+    """Limit L of the EWMA of weight lambda for an in-control run length."""
     return _root(lambda limit: ewma(0.0, weight, limit), arl0, 0.5, 10.0)
 
 
 @cache
 def mewma_limit(arl0: float, dimension: int, weight: float) -> float:
-    """The limit H of the MEWMA of weight lambda for an in-control run length."""
+    """Limit H of the MEWMA of weight lambda for an in-control run length."""
     return _root(
         lambda limit: mewma(0.0, dimension, weight, limit), arl0, max(2.0, 0.5 * dimension), LARGEST_MEWMA_LIMIT
     )
 
 
 def t2_limit(arl0: float, dimension: int) -> float:
-    """The limit of T2 for an in-control run length."""
+    """Limit of T2 for an in-control run length."""
     return float(special.chdtri(dimension, 1.0 / arl0))
 
 
 def _root(run_length: Callable[[float], float], arl0: float, step: float, largest: float) -> float:
-    """The limit at which a run length that rises with the limit is arl0."""
-    from scipy import optimize  # only here: to import it is a tenth of a start
+    """Limit at which a run length that increases with the limit equals arl0."""
+    from scipy import optimize  # imported here, as it takes a tenth of a start
 
     low, high = 1e-3, step
     while run_length(high) < arl0:
@@ -151,12 +151,14 @@ def _root(run_length: Callable[[float], float], arl0: float, step: float, larges
     return float(optimize.brentq(lambda limit: log(run_length(limit) / arl0), low, high, xtol=1e-9))
 
 
-def _fastest(run_length: Callable[[float], float], lowest: float, highest: float, accuracy: float = 2e-3) -> float:
-    """The parameter, to three digits, at which a run length is shortest; searched on a logarithmic scale."""
-    from scipy import optimize  # only here: to import it is a tenth of a start
+def _fastest_parameter(
+    run_length: Callable[[float], float], lowest: float, highest: float, accuracy: float = 2e-3
+) -> float:
+    """Parameter, to three digits, of the shortest run length; searched on a logarithmic scale."""
+    from scipy import optimize  # imported here, as it takes a tenth of a start
 
-    found = optimize.minimize_scalar(
+    result = optimize.minimize_scalar(
         lambda x: run_length(exp(x)), bounds=(log(lowest), log(highest)), method="bounded", options={"xatol": accuracy}
     )
-    best = min(max(float(f"{exp(float(found.x)):.3g}"), lowest), highest)
+    best = min(max(float(f"{exp(float(result.x)):.3g}"), lowest), highest)
     return highest if run_length(highest) <= run_length(best) else best

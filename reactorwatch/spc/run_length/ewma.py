@@ -7,7 +7,7 @@ In units of sigma from the mean, with the limit H = L sqrt(lambda / (2 - lambda)
     L(u) = 1 + 1/lambda integral from -H to H of L(y) phi((y - (1 - lambda) u) / lambda - shift) dy.
 
 With exact limits H depends on the number of samples t; L_t follows from L_(t+1) by the same integral, backwards from
-where the limit has settled.
+the converged limit.
 """
 
 from math import ceil, log, sqrt
@@ -16,8 +16,8 @@ import numpy as np
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Array, positive
-from reactorwatch.spc.run_length.chain import nodes, run_lengths, settled
-from reactorwatch.spc.run_length.limits import checked_shift, told, within
+from reactorwatch.spc.run_length.chain import nodes, run_lengths, stationary_distribution
+from reactorwatch.spc.run_length.limits import check_length, check_range, shift_size
 
 SMALLEST_WEIGHT = 1e-3
 LARGEST_LIMIT = 10.0
@@ -31,35 +31,35 @@ def ewma(
     exact_limits: bool = False,
     steady_state: bool = False,
 ) -> float:
-    """The average run length.
+    """Average run length.
 
     >>> round(ewma(1.0, weight=0.25, limit=3.0), 6)
     11.154267
 
     Args:
-        shift: of the mean, in sigma.
+        shift: shift of the mean, in sigma.
         weight: lambda, in [0.001, 1].
         limit: L, in standard deviations of the average.
         exact_limits: whether the limits grow with the average's standard deviation from the start.
-        steady_state: whether the chart has long run when the shift comes.
+        steady_state: whether the chart has long run when the shift occurs.
 
     Raises:
         InputError: an argument out of its range.
     """
     check_parameters(weight, limit)
-    within("weight (lambda)", weight, SMALLEST_WEIGHT, 1.0)
-    within("limit", limit, 1e-3, LARGEST_LIMIT)
-    size = checked_shift(shift)
+    check_range("weight (lambda)", weight, SMALLEST_WEIGHT, 1.0)
+    check_range("limit", limit, 1e-3, LARGEST_LIMIT)
+    size = shift_size(shift)
     bound = limit * sqrt(weight / (2.0 - weight))
     count = 40 + ceil(6.0 * bound / weight)
-    places, weights = nodes(-bound, bound, count)
-    lengths = run_lengths(_kernel(places, places, size, weight) * weights)
-    told(float(lengths[count // 2]))
+    points, weights = nodes(-bound, bound, count)
+    lengths = run_lengths(_kernel(points, points, size, weight) * weights)
+    check_length(float(lengths[count // 2]))
     if steady_state:
-        return float(settled(_kernel(places, places, 0.0, weight) * weights) @ lengths)
+        return float(stationary_distribution(_kernel(points, points, 0.0, weight) * weights) @ lengths)
     if exact_limits:
-        return _with_exact_limits(size, weight, bound, count, places, lengths)
-    return float(1.0 + _kernel(np.zeros(1), places, size, weight)[0] * weights @ lengths)
+        return _with_exact_limits(size, weight, bound, count, points, lengths)
+    return float(1.0 + _kernel(np.zeros(1), points, size, weight)[0] * weights @ lengths)
 
 
 def check_parameters(weight: float, limit: float) -> None:
@@ -79,8 +79,8 @@ def _kernel(start: Array, end: Array, shift: float, weight: float) -> Array:
     return np.asarray(np.exp(-0.5 * off * off) / (np.sqrt(2.0 * np.pi) * weight))
 
 
-def _with_exact_limits(shift: float, weight: float, bound: float, count: int, places: Array, lengths: Array) -> float:
-    """Backwards from the sample at which the limit is within 1e-9 of its final value."""
+def _with_exact_limits(shift: float, weight: float, bound: float, count: int, points: Array, lengths: Array) -> float:
+    """Run length with exact limits, backwards from the sample at which the limit is within 1e-9 of its final value."""
     if weight == 1.0:
         return float(lengths[0])
     unit, unit_weights = nodes(-1.0, 1.0, count)
@@ -88,6 +88,6 @@ def _with_exact_limits(shift: float, weight: float, bound: float, count: int, pl
     for t in range(ceil(log(1e-9) / (2.0 * log(1.0 - weight))), 0, -1):
         bound_before = bound * sqrt(1.0 - (1.0 - weight) ** (2 * t))
         before = bound_before * unit
-        lengths = 1.0 + (_kernel(before, places, shift, weight) * weights) @ lengths
-        places, weights = before, bound_before * unit_weights
-    return float(1.0 + (_kernel(np.zeros(1), places, shift, weight) * weights)[0] @ lengths)
+        lengths = 1.0 + (_kernel(before, points, shift, weight) * weights) @ lengths
+        points, weights = before, bound_before * unit_weights
+    return float(1.0 + (_kernel(np.zeros(1), points, shift, weight) * weights)[0] @ lengths)

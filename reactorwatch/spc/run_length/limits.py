@@ -1,4 +1,4 @@
-"""What run lengths take and tell."""
+"""Checks of arguments and results of run lengths."""
 
 from math import isfinite
 
@@ -6,11 +6,11 @@ from reactorwatch.errors import InputError
 
 LARGEST_SHIFT = 100.0
 LONGEST = 1e12
-"""Run lengths beyond this cannot be told from double precision."""
+"""Longest run length that double precision resolves."""
 
 
-def checked_shift(shift: float) -> float:
-    """The size of the shift.
+def shift_size(shift: float) -> float:
+    """Size of a shift.
 
     Raises:
         InputError: it is not a finite number of at most 100.
@@ -20,8 +20,8 @@ def checked_shift(shift: float) -> float:
     return abs(float(shift))
 
 
-def within(name: str, value: float, lowest: float, highest: float) -> float:
-    """The value.
+def check_range(name: str, value: float, lowest: float, highest: float) -> float:
+    """Check a range; returns the value.
 
     Raises:
         InputError: it is not in [lowest, highest].
@@ -31,8 +31,8 @@ def within(name: str, value: float, lowest: float, highest: float) -> float:
     return float(value)
 
 
-def told(length: float) -> float:
-    """The run length.
+def check_length(length: float) -> float:
+    """Check a run length; returns it.
 
     Raises:
         InputError: it is beyond 1e12.

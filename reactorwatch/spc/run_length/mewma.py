@@ -1,4 +1,4 @@
-"""Run length of the MEWMA: two numbers stand for p.
+"""Run length of the MEWMA, reduced from p to two dimensions.
 
 Runger & Prabhu (1996), A Markov chain model for the multivariate exponentially weighted moving averages control chart,
 J. Amer. Statist. Assoc. 91; as an integral equation Rigdon (1995), Statist. Probab. Letters 24. In coordinates in which
@@ -12,9 +12,9 @@ and the next r, independent of it, chi with p - 1 degrees of freedom, non-centra
 
 Their product is the kernel of an integral equation over half a disc. Where Runger & Prabhu cut the half disc into
 cells, it is solved here at Gauss nodes: in a with the weight (R^2 - a^2)^((p-1)/2) and for each a in r^2 with the
-weight r^(p-2), which are the volumes that a and r stand for. What is left is smooth in a and r^2, so some hundred nodes
-give five digits. (The Markov chain is kept in the tests, as the independent second method.) Without a shift only |z|
-matters, chi with p degrees of freedom, and the equation has one dimension.
+weight r^(p-2), which are the volumes that a and r stand for. The remainder is smooth in a and r^2, so some hundred
+nodes give five digits. (The Markov chain is kept in the tests, as the independent second method.) Without a shift only
+|z| matters, chi with p degrees of freedom, and the equation has one dimension.
 """
 
 from math import ceil, sqrt
@@ -23,9 +23,9 @@ import numpy as np
 from scipy import special
 
 from reactorwatch.spc.charts.base import Array, positive
-from reactorwatch.spc.run_length.chain import run_lengths, settled
+from reactorwatch.spc.run_length.chain import run_lengths, stationary_distribution
 from reactorwatch.spc.run_length.ewma import ewma
-from reactorwatch.spc.run_length.limits import checked_shift, told, within
+from reactorwatch.spc.run_length.limits import check_length, check_range, shift_size
 from reactorwatch.spc.run_length.t2 import t2
 
 SMALLEST_WEIGHT = 0.01
@@ -36,25 +36,25 @@ LARGEST_LIMIT, LARGEST_LIMIT_WITHOUT_SHIFT = 200.0, 500.0
 
 
 def mewma(shift: float, dimension: int, weight: float, limit: float, *, steady_state: bool = False) -> float:
-    """The average run length.
+    """Average run length.
 
     >>> round(mewma(1.0, dimension=2, weight=0.1, limit=8.64), 1)
     10.1
 
     Args:
-        shift: of the mean: its distance measured by the covariance (Mahalanobis).
+        shift: Mahalanobis distance of the shift of the mean.
         dimension: number of signals, p, at most 50; without a shift at most 100.
         weight: lambda, in [0.01, 1]; without a shift in [0.0001, 1].
         limit: H, of the statistic, at most 200; without a shift at most 500.
-        steady_state: whether the chart has long run when the shift comes.
+        steady_state: whether the chart has long run when the shift occurs.
 
     Raises:
         InputError: an argument out of its range.
     """
-    size = checked_shift(shift)
-    within("dimension", dimension, 1, LARGEST_DIMENSION if size > 0.0 else LARGEST_DIMENSION_WITHOUT_SHIFT)
-    within("weight (lambda)", weight, SMALLEST_WEIGHT if size > 0.0 else SMALLEST_WEIGHT_WITHOUT_SHIFT, 1.0)
-    within("limit", positive("limit", limit), 1e-6, LARGEST_LIMIT if size > 0.0 else LARGEST_LIMIT_WITHOUT_SHIFT)
+    size = shift_size(shift)
+    check_range("dimension", dimension, 1, LARGEST_DIMENSION if size > 0.0 else LARGEST_DIMENSION_WITHOUT_SHIFT)
+    check_range("weight (lambda)", weight, SMALLEST_WEIGHT if size > 0.0 else SMALLEST_WEIGHT_WITHOUT_SHIFT, 1.0)
+    check_range("limit", positive("limit", limit), 1e-6, LARGEST_LIMIT if size > 0.0 else LARGEST_LIMIT_WITHOUT_SHIFT)
     if weight == 1.0:
         return t2(size, dimension, limit)
     # The radius in units of lambda, in which each step has unit variance.
@@ -65,11 +65,11 @@ def mewma(shift: float, dimension: int, weight: float, limit: float, *, steady_s
     if dimension == 1:
         return ewma(size, weight, sqrt(limit), steady_state=steady_state)
     disc = _HalfDisc(radius, dimension - 1)
-    sideways = disc.sideways(rest)
-    lengths = run_lengths(_normal(rest * disc.along + size, disc.along) * sideways)
-    told(float(lengths[0]))
+    transverse = disc.transverse(rest)
+    lengths = run_lengths(_normal(rest * disc.along + size, disc.along) * transverse)
+    check_length(float(lengths[0]))
     if steady_state:
-        return float(settled(_normal(rest * disc.along, disc.along) * sideways) @ lengths)
+        return float(stationary_distribution(_normal(rest * disc.along, disc.along) * transverse) @ lengths)
     centre = np.zeros(1)
     first = _normal(centre + size, disc.along) * _chi(centre, disc.across, dimension - 1) * disc.weights
     return float(1.0 + first[0] @ lengths)
@@ -80,16 +80,17 @@ def _without_shift(dimension: int, rest: float, radius: float, *, steady_state: 
     at, weights = radius * at, radius**dimension * weights
     transitions = _chi(rest * at, at, dimension) * weights
     lengths = run_lengths(transitions)
-    told(float(lengths[0]))
+    check_length(float(lengths[0]))
     if steady_state:
-        return float(settled(transitions) @ lengths)
+        return float(stationary_distribution(transitions) @ lengths)
     return float(1.0 + (_chi(np.zeros(1), at, dimension) * weights)[0] @ lengths)
 
 
 class _HalfDisc:
     """Nodes along and across the shift, and their weights, each of shape (nodes,): lines along r, one for each a.
 
-    Lines at a and -a are alike, so the first half of the lines, and the middle one, say all about what happens across.
+    Lines at a and -a are alike, so the first half of the lines, and the middle one, determine the transverse
+    transitions.
     """
 
     def __init__(self, radius: float, freedom: int) -> None:
@@ -104,7 +105,7 @@ class _HalfDisc:
         self.across: Array = np.outer(height, unit).ravel()
         self.weights: Array = np.outer(radius ** (freedom + 1) * line_weights, unit_weights).ravel()
 
-    def sideways(self, rest: float) -> Array:
+    def transverse(self, rest: float) -> Array:
         """Density times weight of the next r, shape (nodes, nodes)."""
         half = (self.lines + 1) // 2
         kept = self.across[: half * self.on_line]

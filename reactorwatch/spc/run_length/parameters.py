@@ -1,4 +1,4 @@
-"""The limit of the chart on parameters, when their covariance and the reference are learned from a finite training.
+"""Limit of the chart on parameters whose covariance and reference come from a finite training.
 
 If covariance and reference were known, the difference u of the parameters, made white, would be a MEWMA of weight w
 with the rate of false alarms rate(h) = 1 / ARL at the limit h. Neither is known.
@@ -7,12 +7,12 @@ with the rate of false alarms rate(h) = 1 / ARL at the limit h. Neither is known
 |v|^2 / G with G independent of |v|, chi-square with nu - p + 1 degrees of freedom over nu (that is Hotelling's F;
 Mardia, Kent & Bibby, Multivariate Analysis, 1979, section 3.5).
 
-*The reference* is off by a d that does not change any more, of r times the variance of u: what is charted is u - d,
-with 1 + r times the variance. One reference is lucky and another is not; what can be promised is the rate of false
-alarms averaged over the references. A rare alarm of an average whose weight is small comes when u is carried out over
-the boundary of the region within the limit. As u falls back towards 0 at the speed w u, in balance as many cross the
-boundary outwards for the first time as would drift inwards there (the flux that gives Kramers' escape rate), and by
-Gauss's theorem that is, with all that is random in u, d and G averaged over,
+*The reference* has a constant error d, of r times the variance of u: the chart takes u - d, with 1 + r times the
+variance. References differ; the rate of false alarms holds on average over the references. A rare alarm of an average
+whose weight is small comes when u is carried out over the boundary of the region within the limit. As u falls back
+towards 0 at the speed w u, in balance as many cross the boundary outwards for the first time as would drift inwards
+there (the flux that gives Kramers' escape rate), and by Gauss's theorem that is, with all that is random in u, d and G
+averaged over,
 
     w E[(|u|^2 - p) 1(out)].
 
@@ -21,8 +21,8 @@ the limit L of |v|^2 / G is that of the known chart, at the limits L G, over 1 +
 
     E_G[rate(L G)] / (1 + r).
 
-It says how often the statistic leaves where it usually is. A reference so unlucky that the statistic is usually
-out gives one false alarm that stays.
+This is the rate at which the statistic leaves its usual range. With a reference so poor that the statistic is usually
+beyond the limit, there is one lasting false alarm.
 """
 
 from functools import lru_cache
@@ -34,7 +34,7 @@ from scipy import special
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Array
 from reactorwatch.spc.run_length.design import LONGEST_DESIGN, SHORTEST
-from reactorwatch.spc.run_length.limits import within
+from reactorwatch.spc.run_length.limits import check_range
 from reactorwatch.spc.run_length.mewma import LARGEST_LIMIT, mewma
 
 _FIRST_HEIGHT, _HEIGHT_RATIO = 0.5, 1.25
@@ -42,21 +42,21 @@ _LARGEST_LEARNED_LIMIT = 1e6
 
 
 def parameter_limit(arl0: float, dimension: int, weight: float, freedom: float, reference_share: float) -> float:
-    """The limit of the statistic.
+    """Limit of the statistic.
 
     Args:
-        arl0: rows to a false alarm, averaged as above.
-        dimension: number of directions that are charted, p.
-        weight: w, of the newest row in the model that adapts.
-        freedom: nu, of the covariance that was learned; at least p.
-        reference_share: r, the variance of the reference over that of the model that adapts.
+        arl0: rows to a false alarm, averaged over the references.
+        dimension: number of charted directions, p.
+        weight: weight w of the newest row in the adaptive model.
+        freedom: degrees of freedom nu of the learned covariance; at least p.
+        reference_share: r, variance of the reference over that of the adaptive model.
 
     Raises:
         InputError: an argument out of its range, or a training so short that no limit gives that run length.
     """
-    from scipy import optimize  # only here: to import it is a tenth of a start
+    from scipy import optimize  # imported here, as it takes a tenth of a start
 
-    within("arl0", arl0, SHORTEST * (1.0 + reference_share), LONGEST_DESIGN)
+    check_range("arl0", arl0, SHORTEST * (1.0 + reference_share), LONGEST_DESIGN)
     rates = _rates(dimension, weight)
     half = 0.5 * (freedom - dimension + 1.0)
     # All but 1e-20 of the distribution of half of nu G; even steps of the log of it, so that small ones are there too.
@@ -75,17 +75,17 @@ def parameter_limit(arl0: float, dimension: int, weight: float, freedom: float, 
 
 
 class _Rates:
-    """Log of the rate of false alarms of a known chart, by the log of its limit."""
+    """Logarithm of the rate of false alarms of a known chart as a function of the logarithm of its limit."""
 
     def __init__(self, dimension: int, weight: float) -> None:
-        from scipy import interpolate  # only here: to import it is a tenth of a start
+        from scipy import interpolate  # imported here, as it takes a tenth of a start
 
         heights, rates = [], []
         height = _FIRST_HEIGHT
         while height < LARGEST_LIMIT:
             try:
                 rates.append(-log(mewma(0.0, dimension, weight, height)))
-            except InputError:  # beyond the longest run length that can be told
+            except InputError:  # beyond the longest run length that can be computed
                 break
             heights.append(log(height))
             height *= _HEIGHT_RATIO
@@ -94,7 +94,7 @@ class _Rates:
         self._slope = float(self._inside(self._last, 1))
 
     def __call__(self, log_height: Array) -> Array:
-        """Below the first height the chart signals as often as there, which is more often than anyone asks for."""
+        """Evaluate; constant below the first height, where the rate exceeds any that is asked for."""
         inside = self._inside(np.clip(log_height, log(_FIRST_HEIGHT), self._last))
         return np.asarray(inside + self._slope * np.maximum(log_height - self._last, 0.0))
 

@@ -1,6 +1,6 @@
 """Run length of the Shewhart chart with run rules: exact, by the chain of Champ & Woodall (1987), Technometrics 29(4).
 
-A state holds what the rules still need of the points before: on which side each of the last four lies beyond the inner
+A state holds the part of the history that the rules need: on which side each of the last four lies beyond the inner
 line and each of the last two beyond the middle one, and how many in a row are on one side. Points that a rule
 can no longer count are dropped, so the chain is small: 295 states with all four rules.
 """
@@ -13,8 +13,8 @@ from scipy import special
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Array, positive
-from reactorwatch.spc.run_length.chain import run_lengths, settled
-from reactorwatch.spc.run_length.limits import checked_shift, told
+from reactorwatch.spc.run_length.chain import run_lengths, stationary_distribution
+from reactorwatch.spc.run_length.limits import check_length, shift_size
 
 RULES = (1, 2, 3, 4)
 
@@ -27,29 +27,29 @@ _SIDES = (-1, -1, -1, -1, 1, 1, 1, 1)
 
 
 def shewhart(shift: float, width: float = 3.0, rules: Iterable[int] = (1,), *, steady_state: bool = False) -> float:
-    """The average run length.
+    """Average run length.
 
     >>> round(shewhart(0.0), 2)
     370.4
 
     Args:
-        shift: of the mean, in sigma.
+        shift: shift of the mean, in sigma.
         width: L, of the outer lines; the others are at thirds of it.
         rules: some of 1, 2, 3, 4, numbered as in `spc/charts/shewhart.py`.
-        steady_state: whether the chart has long run when the shift comes.
+        steady_state: whether the chart has long run when the shift occurs.
 
     Raises:
         InputError: an argument out of its range.
     """
     positive("limit", width)
     wanted = checked_rules(rules)
-    delta = checked_shift(shift)
-    following = _following(wanted)
-    transitions = _transitions(following, width, delta)
+    delta = shift_size(shift)
+    table = _transition_table(wanted)
+    transitions = _transitions(table, width, delta)
     lengths = run_lengths(transitions)
-    told(float(lengths[0]))
+    check_length(float(lengths[0]))
     if steady_state:
-        return float(settled(_transitions(following, width, 0.0)) @ lengths)
+        return float(stationary_distribution(_transitions(table, width, 0.0)) @ lengths)
     return float(lengths[0])
 
 
@@ -65,7 +65,7 @@ def checked_rules(rules: Iterable[int]) -> tuple[int, ...]:
     return wanted
 
 
-def _transitions(following: list[list[int]], width: float, shift: float) -> Array:
+def _transitions(table: list[list[int]], width: float, shift: float) -> Array:
     lines = np.array([-inf, -3, -2, -1, 0, 1, 2, 3, inf]) * width / 3.0 - shift
     # From the nearer tail, so that a small probability keeps its digits.
     upper_half = lines[:-1] >= 0.0
@@ -74,34 +74,34 @@ def _transitions(following: list[list[int]], width: float, shift: float) -> Arra
         special.ndtr(-lines[:-1]) - special.ndtr(-lines[1:]),
         special.ndtr(lines[1:]) - special.ndtr(lines[:-1]),
     )
-    transitions = np.zeros((len(following), len(following)))
-    for state, targets in enumerate(following):
+    transitions = np.zeros((len(table), len(table)))
+    for state, targets in enumerate(table):
         for target, probability in zip(targets, zones, strict=True):
             if target >= 0:
                 transitions[state, target] += probability
     return transitions
 
 
-def _following(rules: tuple[int, ...]) -> list[list[int]]:
-    """The state after each of the eight zones, for each state that can be reached; -1 for a signal."""
-    number = {START: 0}
+def _transition_table(rules: tuple[int, ...]) -> list[list[int]]:
+    """Next state after each of the eight zones, for each reachable state; -1 for a signal."""
+    index = {START: 0}
     todo = [START]
-    following: list[list[int]] = []
+    table: list[list[int]] = []
     while todo:
         state = todo.pop(0)
         targets = []
         for zone, side in zip(_ZONES, _SIDES, strict=True):
-            target = _after(state, zone, side, rules)
-            if target is not None and target not in number:
-                number[target] = len(number)
+            target = _next_state(state, zone, side, rules)
+            if target is not None and target not in index:
+                index[target] = len(index)
                 todo.append(target)
-            targets.append(-1 if target is None else number[target])
-        following.append(targets)
-    return following
+            targets.append(-1 if target is None else index[target])
+        table.append(targets)
+    return table
 
 
-def _after(state: State, zone: int, side: int, rules: tuple[int, ...]) -> State | None:
-    """The state after a point in a zone; None if it completes a pattern."""
+def _next_state(state: State, zone: int, side: int, rules: tuple[int, ...]) -> State | None:
+    """Next state after a point in a zone; None if it completes a pattern."""
     inner, middle, run = state
     if 1 in rules and abs(zone) == 3:
         return None
@@ -112,7 +112,7 @@ def _after(state: State, zone: int, side: int, rules: tuple[int, ...]) -> State 
     if 3 in rules:
         if abs(zone) >= 1 and inner.count(side) >= 3:
             return None
-        inner = _without_hopeless((side if abs(zone) >= 1 else 0, *inner[:3]))
+        inner = _drop_expired((side if abs(zone) >= 1 else 0, *inner[:3]))
     if 4 in rules:
         run = run + side if run * side > 0 else side
         if abs(run) >= 8:
@@ -120,8 +120,8 @@ def _after(state: State, zone: int, side: int, rules: tuple[int, ...]) -> State 
     return inner, middle, run
 
 
-def _without_hopeless(inner: tuple[int, ...]) -> tuple[int, ...]:
-    """Drop the points that leave the window of five before their side can have four in it."""
+def _drop_expired(inner: tuple[int, ...]) -> tuple[int, ...]:
+    """Drop points that leave the window of five before four of their side can be in it."""
     kept = list(inner)
     for age in range(len(inner)):
         # Until the point of this age leaves, there is room for 4 - age more points.

@@ -1,4 +1,4 @@
-"""Machine code is kept on disk, and what is damaged or cannot be kept is made anew."""
+"""Machine code is cached on disk; damaged or missing entries are compiled again."""
 
 from pathlib import Path
 

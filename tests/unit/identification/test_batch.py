@@ -10,7 +10,7 @@ from reactorwatch.identification.structure import REPORT_ROWS, Structure
 from tests.unit.identification.truth import Array, Daisy, oscillating_plant
 
 
-def simulated(parameters: Array, inputs: Array, structure: Structure, start: Array) -> Array:
+def recursion(parameters: Array, inputs: Array, structure: Structure, start: Array) -> Array:
     """The recursion of one input and output, written out."""
     y = list(start)
     n, m, d = structure.output_lags, structure.input_lags, structure.delay
@@ -56,7 +56,7 @@ def test_a_plant_without_noise_is_found_exactly() -> None:
     model = fit_arx(Structure.of_order(2), plant.inputs, plant.clean)
     np.testing.assert_allclose(model.parameters[0], plant.parameters, atol=1e-11)
     np.testing.assert_allclose(model.poles, np.roots([1.0, -1.5, 0.7]), atol=1e-11)
-    np.testing.assert_allclose(model.one_step(plant.inputs, plant.clean)[2:, 0], plant.clean[2:], atol=1e-9)
+    np.testing.assert_allclose(model.predict(plant.inputs, plant.clean)[2:, 0], plant.clean[2:], atol=1e-9)
 
 
 def test_several_inputs_and_outputs_are_found_together() -> None:
@@ -68,7 +68,7 @@ def test_several_inputs_and_outputs_are_found_together() -> None:
         y[k] = truth @ np.concatenate([y[k - 1], u[k - 2], u[k - 3], [1.0]])
     model = fit_arx(structure, u, y)
     np.testing.assert_allclose(model.parameters, truth, atol=1e-11)
-    np.testing.assert_allclose(model.free_run(u, y)[3:], y[3:], atol=1e-9)
+    np.testing.assert_allclose(model.simulate(u, y)[3:], y[3:], atol=1e-9)
 
 
 def test_a_model_without_offset_has_none() -> None:
@@ -101,9 +101,9 @@ def test_the_free_run_is_the_recursion_on_its_own_output() -> None:
     parameters = np.array([0.9, -0.3, 1.0, 0.5, -0.2, 0.7])
     u, y = rng.standard_normal(60), rng.standard_normal(60)
     model = LinearModel(structure, parameters[None, :], np.zeros((1, 6, 6)), np.zeros(1), 1.0, 60, simulates=True)
-    run = model.free_run(u, y)[:, 0]
+    run = model.simulate(u, y)[:, 0]
     assert np.all(np.isnan(run[:4]))
-    np.testing.assert_allclose(run[4:], simulated(parameters, u, structure, y[:4])[4:], rtol=1e-12)
+    np.testing.assert_allclose(run[4:], recursion(parameters, u, structure, y[:4])[4:], rtol=1e-12)
 
 
 def test_a_free_run_goes_over_missing_outputs_and_starts_anew_after_gaps() -> None:
@@ -117,7 +117,7 @@ def test_a_free_run_goes_over_missing_outputs_and_starts_anew_after_gaps() -> No
     model = LinearModel(
         Structure.of_order(1), parameters[None, :], np.zeros((1, 3, 3)), np.zeros(1), 1.0, 40, simulates=True
     )
-    run = model.free_run(u, y, time)[:, 0]
+    run = model.simulate(u, y, time)[:, 0]
     np.testing.assert_array_equal(np.flatnonzero(np.isnan(run)), [0, 21, 30])
     assert run[13] == pytest.approx(0.5 * run[12] + u[12])
     assert run[22] == pytest.approx(0.5 * y[21] + u[21])
@@ -136,7 +136,7 @@ def test_fit_percent_is_100_for_the_truth_0_for_the_mean_and_minus_infinity_for_
     )
     rng = np.random.default_rng(8)
     u, measured = rng.standard_normal(300), rng.standard_normal(300)
-    assert fit_percent(measured, unstable.free_run(u, measured)[:, 0]) == -np.inf
+    assert fit_percent(measured, unstable.simulate(u, measured)[:, 0]) == -np.inf
 
 
 def test_records_that_determine_nothing_are_refused_with_the_cause() -> None:

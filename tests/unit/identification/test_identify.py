@@ -1,4 +1,4 @@
-"""What `reactorwatch identify --json` tells."""
+"""The result of `reactorwatch identify --json`."""
 
 import math
 
@@ -92,25 +92,27 @@ def test_chosen_rows_are_fitted(daisy: Daisy) -> None:
 def test_a_record_that_determines_nothing_is_refused_with_the_cause(noisy_plant: NoisyPlant) -> None:
     time, u, y = np.arange(200.0), noisy_plant.inputs[:200], noisy_plant.measured[:200]
 
-    def refused(match: str, t: object = time, inputs: object = u, outputs: object = y, **options: object) -> None:
+    def assert_refused(
+        match: str, t: object = time, inputs: object = u, outputs: object = y, **options: object
+    ) -> None:
         with pytest.raises(InputError, match=match) as caught:
             identify(t, inputs, outputs, **options)  # type: ignore[arg-type]
         assert "\n" not in str(caught.value)
 
     holed, infinite = u.copy(), y.copy()
     holed[3], infinite[7] = math.nan, math.inf
-    refused("model must be one of arx, oe, got 'fir'", model="fir")
-    refused("order must be at least 1, got 0", order=0)
-    refused(r"delay \(samples\) must be at least 1, got -1", delay=-1)
-    refused("order 3 with delay 1 needs more than 10 rows in each half, got 12", time[:12], u[:12], y[:12])
-    refused("inputs must have a value in every row, got NaN in row 4", inputs=holed)
-    refused("outputs must be finite, got inf in row 8", outputs=infinite)
-    refused("output 1 is constant, 441 in all rows", outputs=np.full(200, 441.0))
-    refused("a constant input excites none", inputs=np.full(200, 98.0), outputs=np.cumsum(y))
-    refused("equally many rows, got 199, 200 and 200", time[:199])
-    refused("time must increase", np.zeros(200))
-    refused(r"forgetting must be in \(0, 1\], got 2", recursive=True, forgetting=2.0)
-    refused(
+    assert_refused("model must be one of arx, oe, got 'fir'", model="fir")
+    assert_refused("order must be at least 1, got 0", order=0)
+    assert_refused(r"delay \(samples\) must be at least 1, got -1", delay=-1)
+    assert_refused("order 3 with delay 1 needs more than 10 rows in each half, got 12", time[:12], u[:12], y[:12])
+    assert_refused("inputs must have a value in every row, got NaN in row 4", inputs=holed)
+    assert_refused("outputs must be finite, got inf in row 8", outputs=infinite)
+    assert_refused("output 1 is constant, 441 in all rows", outputs=np.full(200, 441.0))
+    assert_refused("a constant input excites none", inputs=np.full(200, 98.0), outputs=np.cumsum(y))
+    assert_refused("equally many rows, got 199, 200 and 200", time[:199])
+    assert_refused("time must increase", np.zeros(200))
+    assert_refused(r"forgetting must be in \(0, 1\], got 2", recursive=True, forgetting=2.0)
+    assert_refused(
         "parameters need as many complete rows", outputs=np.where(np.arange(200) % 3, y, math.nan), missing="leave out"
     )
 

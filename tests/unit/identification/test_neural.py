@@ -39,7 +39,7 @@ def test_a_linear_plant_stays_linear(noisy_plant: NoisyPlant) -> None:
     pytest.importorskip("sklearn", reason="the extra 'neural' is not installed")
     u, y = noisy_plant.inputs, noisy_plant.clean + 0.05 * np.random.default_rng(2).standard_normal(4000)
     model = SMALL.fit(Structure.of_order(2), u[:2000], y[:2000])
-    both = [fit_percent(y[2000:], m.one_step(u[2000:], y[2000:])[:, 0]) for m in (model, model.linear)]
+    both = [fit_percent(y[2000:], m.predict(u[2000:], y[2000:])[:, 0]) for m in (model, model.linear)]
     assert both[0] == pytest.approx(both[1], abs=1.0)
 
 
@@ -51,9 +51,9 @@ def test_the_same_seed_gives_the_same_network_and_its_run_is_its_recursion() -> 
     assert model.parameter_count == 5 + 4 * 6 + 6 + 6 + 1
     own = y.copy()
     for k in range(2, 20):
-        own[k] = model.one_step(u[: k + 1], own[: k + 1])[k, 0]
-    np.testing.assert_allclose(model.free_run(u, y)[2:20, 0], own[2:20], rtol=1e-12)
-    assert np.all(np.isnan(model.free_run(u, y)[:2]))
+        own[k] = model.predict(u[: k + 1], own[: k + 1])[k, 0]
+    np.testing.assert_allclose(model.simulate(u, y)[2:20, 0], own[2:20], rtol=1e-12)
+    assert np.all(np.isnan(model.simulate(u, y)[:2]))
 
 
 def test_without_scikit_learn_the_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,9 +6,9 @@ from scipy.optimize import least_squares as scipy_least_squares
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import fit_arx
-from reactorwatch.identification.instrumental_variable import stabilised
-from reactorwatch.identification.linear_model import free_run, plan_run
-from reactorwatch.identification.output_error import _triangle, fit_oe, run_with_gradient, stable
+from reactorwatch.identification.instrumental_variable import stabilize
+from reactorwatch.identification.linear_model import plan_run, simulate
+from reactorwatch.identification.output_error import _triangle, fit_oe, is_stable, run_with_gradient
 from reactorwatch.identification.structure import RowChoice, Structure
 from tests.unit.identification.truth import Array, Daisy, NoisyPlant, oscillating_plant
 
@@ -53,7 +53,7 @@ def test_the_gradient_is_the_derivative_of_the_run() -> None:
         return values, gradient
 
     values, gradient = run(theta)
-    np.testing.assert_allclose(values, free_run(structure, theta[None, :], u, y, plan)[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(values, simulate(structure, theta[None, :], u, y, plan)[:, 0], rtol=1e-12)
     for i in range(theta.size):
         step = np.zeros(theta.size)
         step[i] = 1e-6
@@ -68,7 +68,7 @@ def test_the_minimum_is_that_of_an_independent_solver(noisy_plant: NoisyPlant) -
     plan = plan_run(structure, u[:, None], y[:, None])
 
     def errors(parameters: Array) -> Array:
-        run = free_run(structure, parameters[None, :], u[:, None], y[:, None], plan)
+        run = simulate(structure, parameters[None, :], u[:, None], y[:, None], plan)
         return (y[:, None] - run)[2:, 0]
 
     independent = scipy_least_squares(errors, noisy_plant.parameters, xtol=1e-12, ftol=1e-14, gtol=1e-14)
@@ -87,7 +87,7 @@ def test_a_higher_order_never_runs_worse_over_the_fitted_rows(daisy: Daisy, outp
     assert squares[0] > squares[1] * (1.0 - 1e-3)
     assert squares[1] > squares[2] * (1.0 - 1e-3)
     arx = [fit_arx(Structure.of_order(order), u, y) for order in (1, 2, 3)]
-    assert all(s < np.sum((y[:, None] - m.free_run(u, y))[3:] ** 2) for s, m in zip(squares, arx, strict=True))
+    assert all(s < np.sum((y[:, None] - m.simulate(u, y))[3:] ** 2) for s, m in zip(squares, arx, strict=True))
     assert all(np.abs(model.poles).max() < 1.0 for model in models)
 
 
@@ -123,16 +123,16 @@ def test_stable_agrees_with_the_roots() -> None:
         a = rng.uniform(-1.0, 1.0, order) * rng.uniform(0.3, 2.0)
         radius = np.abs(np.roots([1.0, *-a])).max()
         if abs(radius - 1.0) > 1e-9:
-            assert stable(a) == (radius < 1.0)
+            assert is_stable(a) == (radius < 1.0)
             stable_ones += radius < 1.0
     assert 3000 < stable_ones < 8000
-    assert not stable(np.array([np.nan]))
+    assert not is_stable(np.array([np.nan]))
 
 
 def test_poles_outside_the_circle_are_mirrored_into_it() -> None:
     structure = Structure.of_order(2)
     outside = np.array([*-np.poly([2.0, 0.5])[1:], 1.0, 1.0, 0.0])
-    inside = stabilised(structure, outside)
+    inside = stabilize(structure, outside)
     np.testing.assert_allclose(np.sort(np.roots([1.0, *-inside[:2]])), [0.49, 0.5], rtol=1e-12)
     np.testing.assert_array_equal(inside[2:], outside[2:])
 

@@ -5,7 +5,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import fit_arx
-from reactorwatch.identification.output_error import fit_oe, stable
+from reactorwatch.identification.output_error import fit_oe, is_stable
 from reactorwatch.identification.recursive_arx import RecursiveArx, RecursiveArxState
 from reactorwatch.identification.recursive_output_error import RecursiveOutputError, RecursiveOutputErrorState
 from reactorwatch.identification.structure import REPORT_ROWS, RowChoice, Scaling, Structure
@@ -101,7 +101,7 @@ def test_its_poles_stay_inside_the_unit_circle_whatever_comes() -> None:
         running.update([u], y)
         y = 1.05 * y + u if k % 100 else 0.0
         model = running.model
-        assert stable(model.parameters[0, :2])
+        assert is_stable(model.parameters[0, :2])
         assert np.all(np.isfinite(model.parameters))
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.regressor import BufferState, RegressorBuffer, rows_of, unbroken
+from reactorwatch.identification.regressor import BufferState, RegressorBuffer, consecutive_rows, rows_of
 from reactorwatch.identification.structure import REPORT_ROWS, RowChoice, Structure
 
 U = np.arange(10.0, 20.0)
@@ -32,7 +32,7 @@ def test_missing_values_and_gaps_cost_the_rows_that_reach_over_them() -> None:
     time = np.arange(10.0)
     time[8:] += 0.5
     np.testing.assert_array_equal(rows_of(Structure.of_order(1), U, outputs, time).position, [1, 2, 3, 6, 7, 9])
-    np.testing.assert_array_equal(unbroken(outputs[:, None], time), [1, 2, 3, 4, 0, 1, 2, 3, 1, 2])
+    np.testing.assert_array_equal(consecutive_rows(outputs[:, None], time), [1, 2, 3, 4, 0, 1, 2, 3, 1, 2])
 
 
 def test_the_report_row_choice_keeps_the_lags_of_the_fast_clock() -> None:

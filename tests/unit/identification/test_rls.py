@@ -11,7 +11,7 @@ from tests.unit.identification.truth import Array, exact_least_squares
 EPSILON = np.finfo(np.float64).eps
 
 
-def learned(regressors: Array, outputs: Array, **settings: float) -> RecursiveLeastSquares:
+def learn(regressors: Array, outputs: Array, **settings: float) -> RecursiveLeastSquares:
     rls = RecursiveLeastSquares(regressors.shape[1], **settings)
     for row, output in zip(regressors, outputs, strict=True):
         rls.update(row, output)
@@ -35,7 +35,7 @@ def test_without_forgetting_it_is_batch_least_squares_at_condition_1e8(seed: int
     rng = np.random.default_rng(seed)
     regressors = collinear(rng, 1000)
     outputs = regressors @ rng.standard_normal(7)
-    assert relative(learned(regressors, outputs).parameters, exact_least_squares(regressors, outputs)) < 1e-9
+    assert relative(learn(regressors, outputs).parameters, exact_least_squares(regressors, outputs)) < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -46,8 +46,7 @@ def test_without_forgetting_it_is_batch_least_squares_for_unlike_units(seed: int
     regressors = rng.standard_normal((1000, 7)) * units
     outputs = regressors @ (rng.standard_normal(7) / units) + 0.1 * rng.standard_normal(1000)
     assert (
-        relative(learned(regressors, outputs).parameters * units, exact_least_squares(regressors, outputs) * units)
-        < 1e-9
+        relative(learn(regressors, outputs).parameters * units, exact_least_squares(regressors, outputs) * units) < 1e-9
     )
 
 
@@ -60,7 +59,7 @@ def test_noise_on_collinear_data_costs_no_more_than_the_problem_itself(seed: int
     truth = exact_least_squares(regressors, outputs)
     rest = np.linalg.norm(outputs - regressors @ truth)
     sensitivity = 1e8 + 1e16 * rest / (np.linalg.norm(regressors, 2) * np.linalg.norm(truth))
-    assert relative(learned(regressors, outputs).parameters, truth) < EPSILON * sensitivity
+    assert relative(learn(regressors, outputs).parameters, truth) < EPSILON * sensitivity
 
 
 def test_an_ill_conditioned_beginning_leaves_no_trace() -> None:
@@ -68,13 +67,13 @@ def test_an_ill_conditioned_beginning_leaves_no_trace() -> None:
     ramp = np.linspace(0.05, 0.95, 1500)
     regressors = np.vander(ramp, 6, increasing=True)
     outputs = regressors @ np.arange(1.0, 7.0) + 0.01 * np.random.default_rng(4).standard_normal(1500)
-    assert relative(learned(regressors, outputs).parameters, exact_least_squares(regressors, outputs)) < 1e-9
+    assert relative(learn(regressors, outputs).parameters, exact_least_squares(regressors, outputs)) < 1e-9
 
 
 def test_as_many_rows_as_parameters_are_met_exactly() -> None:
     rng = np.random.default_rng(5)
     regressors, outputs = rng.standard_normal((4, 4)), rng.standard_normal(4)
-    rls = learned(regressors, outputs)
+    rls = learn(regressors, outputs)
     np.testing.assert_allclose(regressors @ rls.parameters, outputs, atol=1e-12)
     assert np.all(np.isinf(rls.standard_deviations)), "no row is left to tell the noise"
 
@@ -84,7 +83,7 @@ def test_a_column_without_information_gets_the_parameter_zero_and_no_certainty()
     rng = np.random.default_rng(6)
     x = rng.standard_normal(200)
     regressors = np.column_stack([x, x, np.zeros(200), np.ones(200)])
-    rls = learned(regressors, 2.0 * x + 1.0 + 0.1 * rng.standard_normal(200))
+    rls = learn(regressors, 2.0 * x + 1.0 + 0.1 * rng.standard_normal(200))
     np.testing.assert_allclose(rls.parameters, [2.0, 0.0, 0.0, 1.0], atol=0.05)
     np.testing.assert_array_equal(np.isinf(rls.standard_deviations), [True, True, True, False])
     assert np.isinf(rls.condition)
@@ -97,7 +96,7 @@ def test_forgetting_weighs_rows_by_their_age() -> None:
     outputs = regressors @ rng.standard_normal(5) + rng.standard_normal(400)
     root = 0.98 ** (0.5 * np.arange(399, -1, -1))
     batch, rest, _, values = np.linalg.lstsq(regressors * root[:, None], outputs * root)
-    rls = learned(regressors, outputs, forgetting=0.98, covariance_limit=1e20)
+    rls = learn(regressors, outputs, forgetting=0.98, covariance_limit=1e20)
     np.testing.assert_allclose(rls.parameters, batch, rtol=1e-9)
     assert rls.condition == pytest.approx(values[0] / values[-1], rel=1e-9)
     weights = root**2
@@ -184,7 +183,7 @@ def test_standard_deviations_are_the_scatter_of_many_plants(forgetting: float) -
 
 def test_the_prediction_is_made_before_the_row_is_used() -> None:
     rng = np.random.default_rng(12)
-    rls = learned(rng.standard_normal((20, 3)), rng.standard_normal(20))
+    rls = learn(rng.standard_normal((20, 3)), rng.standard_normal(20))
     row = rng.standard_normal(3)
     expected = rls.predict(row)
     said = rls.update(row, 5.0)
@@ -196,7 +195,7 @@ def test_the_prediction_is_made_before_the_row_is_used() -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e30])
 def test_a_value_that_is_no_measurement_is_refused_and_harms_nothing(bad: float) -> None:
     rng = np.random.default_rng(13)
-    rls = learned(rng.standard_normal((20, 3)), rng.standard_normal(20), forgetting=0.9)
+    rls = learn(rng.standard_normal((20, 3)), rng.standard_normal(20), forgetting=0.9)
     before = rls.state
     with pytest.raises(ValueError, match=r"regressor\[1\] must be a finite number"):
         rls.update([1.0, bad, 1.0], 1.0)
@@ -210,14 +209,14 @@ def test_a_value_that_is_no_measurement_is_refused_and_harms_nothing(bad: float)
 @pytest.mark.parametrize("forgetting", [0.95, 1.0])
 def test_moving_the_parameters_keeps_their_covariance(forgetting: float) -> None:
     rng = np.random.default_rng(14)
-    rls = learned(rng.standard_normal((50, 3)), 1e9 * rng.standard_normal(50), forgetting=forgetting)
+    rls = learn(rng.standard_normal((50, 3)), 1e9 * rng.standard_normal(50), forgetting=forgetting)
     covariance = rls.covariance
-    rls.move_to([1.0, 2.0, 3.0])
+    rls.set_parameters([1.0, 2.0, 3.0])
     np.testing.assert_array_equal(rls.covariance, covariance)
     rls.update([0.0, 0.0, 0.0], 0.0)
     np.testing.assert_allclose(rls.parameters, [1.0, 2.0, 3.0], rtol=1e-13)
     with pytest.raises(ValueError, match=r"forgetting can only rise, from .*, got 0.5"):
-        rls.remember_longer(0.5)
+        rls.raise_forgetting(0.5)
 
 
 @pytest.mark.parametrize("forgetting", [1.0, 0.97])

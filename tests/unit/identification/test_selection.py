@@ -35,10 +35,10 @@ def test_the_table_says_what_the_models_do_on_the_held_out_half(daisy: Daisy) ->
     selection = select(daisy.qc, daisy.T, daisy.time, orders=(2,))
     half = 3750
     model = fit_arx(Structure.of_order(2), daisy.qc[:half], daisy.T[:half])
-    run = model.free_run(daisy.qc[half:], daisy.T[half:])[:, 0]
+    run = model.simulate(daisy.qc[half:], daisy.T[half:])[:, 0]
     row = selection.candidates[0]
     assert row.free_run_percent == pytest.approx(fit_percent(daisy.T[half:], run), rel=1e-12)
-    rest = daisy.T[2:half] - model.one_step(daisy.qc[:half], daisy.T[:half])[2:, 0]
+    rest = daisy.T[2:half] - model.predict(daisy.qc[:half], daisy.T[:half])[2:, 0]
     assert row.bic == pytest.approx(rest.size * np.log(np.mean(rest**2)) + 5 * np.log(rest.size), rel=1e-9)
 
 
@@ -60,16 +60,16 @@ class Persistence:
     def fit(self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Model:
         return self
 
-    def one_step(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
         y = np.asarray(outputs, dtype=np.float64)
         return np.concatenate([np.full_like(y[:1], np.nan), y[:-1]])
 
-    def free_run(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
         y = np.asarray(outputs, dtype=np.float64)
         return np.concatenate([np.full_like(y[:1], np.nan), np.repeat(y[:1], len(y) - 1, axis=0)])
 
     def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
-        return np.asarray(outputs, dtype=np.float64) - self.one_step(inputs, outputs, time)
+        return np.asarray(outputs, dtype=np.float64) - self.predict(inputs, outputs, time)
 
 
 def test_another_family_joins_the_table_like_ours(noisy_plant: NoisyPlant) -> None:

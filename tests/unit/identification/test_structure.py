@@ -56,7 +56,7 @@ def test_undoing_the_scaling_gives_the_same_predictions() -> None:
     scaling = Scaling.of(u, y)
     for output in range(2):
         theta = rng.standard_normal(structure.parameters)
-        matrix, shift = scaling.undoing(structure, output)
+        matrix, shift = scaling.unscaling(structure, output)
         own = matrix @ theta + shift
         k = 10
         scaled_u, scaled_y = scaling.inputs(u), scaling.outputs(y)
@@ -65,16 +65,16 @@ def test_undoing_the_scaling_gives_the_same_predictions() -> None:
         assert plain == pytest.approx(
             scaled * scaling.output_spreads[output] + scaling.output_centres[output], rel=1e-12
         )
-        np.testing.assert_allclose(scaling.redoing(structure, own, output), theta, rtol=1e-9)
+        np.testing.assert_allclose(scaling.scale_parameters(structure, own, output), theta, rtol=1e-9)
 
 
 def test_a_model_without_offset_is_scaled_but_not_centred() -> None:
     structure = Structure(1, 1, offset=False)
     scaling = Scaling.of([1.0, 3.0], [10.0, 20.0], centred=False)
     assert scaling.input_centres == scaling.output_centres == (0.0,)
-    np.testing.assert_allclose(scaling.undoing(structure)[0], np.diag([1.0, 5.0]))
+    np.testing.assert_allclose(scaling.unscaling(structure)[0], np.diag([1.0, 5.0]))
     with pytest.raises(InputError, match="use centred=False"):
-        Scaling.of([1.0, 3.0], [10.0, 20.0]).undoing(structure)
+        Scaling.of([1.0, 3.0], [10.0, 20.0]).unscaling(structure)
 
 
 def test_a_constant_signal_keeps_its_size() -> None:

@@ -17,7 +17,7 @@ LEVELS = [NoiseLevels((1e-3 * (1 + n), 0.2), (1e-4, 0.02 * n)) for n in range(6)
 
 
 def record(seed: int, rows: int = ROWS) -> FilterRecord:
-    """Of a plant that is nothing like the model, and drifts."""
+    """Record of a drifting plant that does not match the model."""
     rng = np.random.default_rng(seed)
     measured: Array = np.array([0.1, 438.5]) + rng.normal(size=(rows, 2)) * [1e-3, 0.2]
     measured[rng.random(rows) < 0.05] = np.nan

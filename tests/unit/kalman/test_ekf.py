@@ -55,7 +55,7 @@ def linear_record(rows: int = 120, period_min: float = 0.07, seed: int = 0) -> t
     for row in range(rows):
         if row:
             h = time_min[row] - time_min[row - 1]
-            F, G = sampled(h)
+            F, G = discretize(h)
             x = F @ x + G * inputs[row - 1] + rng.normal(size=2) * NOISE.process_sd * np.sqrt(h)
         measured[row] = C @ x + rng.normal(size=2) * NOISE.measurement_sd
     measured[rng.random((rows, 2)) < 0.1] = np.nan
@@ -63,7 +63,7 @@ def linear_record(rows: int = 120, period_min: float = 0.07, seed: int = 0) -> t
     return time_min, inputs, measured
 
 
-def sampled(h: float) -> tuple[Array, Array]:
+def discretize(h: float) -> tuple[Array, Array]:
     """exp(A h), and what a constant input of 1 adds."""
     block = np.zeros((3, 3))
     block[:2, :2], block[:2, 2] = A, B
@@ -77,7 +77,7 @@ def textbook(state: FilterState, time_min: Array, inputs: Array, measured: Array
     before, u, x, P = state.time_min, state.inputs[0], np.array(state.x), np.array(state.P).reshape(2, 2)
     found: list[tuple[Array, ...]] = []
     for row, t in enumerate(time_min.tolist()):
-        F, G = sampled(t - before)
+        F, G = discretize(t - before)
         x, P = F @ x + G * u, F @ P @ F.T + np.diag(np.square(NOISE.process_sd)) * (t - before)
         known = np.isfinite(measured[row])
         off: Array = measured[row] - C @ x
@@ -90,8 +90,8 @@ def textbook(state: FilterState, time_min: Array, inputs: Array, measured: Array
     return found
 
 
-def begun(model: ProcessModel, noise: NoiseLevels = NOISE) -> FilterState:
-    """As a filter is after a first row at 0 min."""
+def first_state(model: ProcessModel, noise: NoiseLevels = NOISE) -> FilterState:
+    """State of a filter after a first row at 0 min."""
     kalman = Filter(model, noise)
     kalman.update(0.0, (0.0,), (1.0, 2.0))
     return kalman.state
@@ -99,7 +99,7 @@ def begun(model: ProcessModel, noise: NoiseLevels = NOISE) -> FilterState:
 
 def test_on_a_linear_model_it_is_the_kalman_filter_exactly_sampled() -> None:
     time_min, inputs, measured = linear_record()
-    start = begun(linear_model())
+    start = first_state(linear_model())
     found = Filter(linear_model(), NOISE).run(time_min[1:], inputs[1:], measured[1:], start=start)
     for row, (x, P, off, S) in enumerate(textbook(start, time_min[1:], inputs[1:], measured[1:])):
         np.testing.assert_allclose(found.x[row], x, rtol=1e-6, atol=1e-6)
@@ -110,7 +110,7 @@ def test_on_a_linear_model_it_is_the_kalman_filter_exactly_sampled() -> None:
 
 def test_its_likelihood_is_that_of_the_innovations_and_whitening_takes_their_correlation_out() -> None:
     time_min, inputs, measured = linear_record()
-    start = begun(linear_model())
+    start = first_state(linear_model())
     found = Filter(linear_model(), NOISE).run(time_min[1:], inputs[1:], measured[1:], start=start)
     expected = 0.0
     for row, (_, _, off, S) in enumerate(textbook(start, time_min[1:], inputs[1:], measured[1:])):
@@ -285,7 +285,7 @@ def test_an_output_may_depend_on_the_input_of_its_own_row() -> None:
     kalman.state = FilterState(0.0, (1.0,), (3.0, 1.0), (0.1, 0.0, 0.0, 0.1))
     prediction = kalman.update(0.1, (5.0,), (np.nan, np.nan)).prediction
     assert prediction[1] == pytest.approx(prediction[0] + 10.0)
-    assert prediction[0] == pytest.approx((sampled(0.1)[0] @ [3.0, 1.0] + sampled(0.1)[1])[0], abs=1e-9)
+    assert prediction[0] == pytest.approx((discretize(0.1)[0] @ [3.0, 1.0] + discretize(0.1)[1])[0], abs=1e-9)
 
 
 def test_a_sensor_that_is_all_but_exact_leaves_the_covariance_positive() -> None:
@@ -316,7 +316,7 @@ def test_a_gap_is_walked_through_and_one_that_is_too_long_begins_anew() -> None:
     kalman = Filter(linear_model(), quiet)
     kalman.state = FilterState(0.0, (2.0,), (1.0, -2.0), (0.5, 0.1, 0.1, 0.4))
     row = kalman.update(7.77, (0.0,), (np.nan, np.nan))
-    F, G = sampled(7.77)
+    F, G = discretize(7.77)
     np.testing.assert_allclose(row.prediction, C @ (F @ [1.0, -2.0] + G * 2.0), atol=1e-6)
     S = C @ F @ np.array([[0.5, 0.1], [0.1, 0.4]]) @ F.T @ C.T + np.diag(np.square(NOISE.measurement_sd))
     np.testing.assert_allclose(row.sd, np.sqrt(np.diag(S)), rtol=1e-6)

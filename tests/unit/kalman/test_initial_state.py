@@ -1,4 +1,4 @@
-"""Where a filter begins: at what is measured; a state that does not show, at the steady state that goes with it."""
+"""A filter starts at the measurements, and unmeasured states at the steady state that fits them."""
 
 from dataclasses import replace
 

@@ -21,20 +21,20 @@ def record_of(rows: int = ROWS, **settings: object) -> tuple[Array, Array, Array
     return record.time_min, record.columns["qc"], np.column_stack([record.columns["C"], record.columns["T"]])
 
 
-def tuned(time_min: Array, inputs: Array, measured: Array) -> NoiseLevels:
+def estimate(time_min: Array, inputs: Array, measured: Array) -> NoiseLevels:
     return estimate_noise(cstr(), time_min, inputs, measured, SMALLEST)
 
 
 @pytest.mark.parametrize("noise_sd", [NoiseSd(), NoiseSd(C=0.005, T=1.0)])
 def test_of_a_plant_that_the_model_describes_it_finds_the_sensors_noise_and_no_other(noise_sd: NoiseSd) -> None:
-    found = tuned(*record_of(seed=1, noise_sd=noise_sd))
+    found = estimate(*record_of(seed=1, noise_sd=noise_sd))
     np.testing.assert_allclose(found.measurement_sd, (noise_sd.C, noise_sd.T), rtol=SD_ERROR)
     assert found.process_sd == (0.0, 0.0)
 
 
 def test_it_finds_the_noise_of_the_process_too() -> None:
     """Eight runs scattered by 13 % and 7 % about the truth: three times that is allowed."""
-    found = tuned(*record_of(seed=2, process_noise_sd={"C": 0.002, "T": 0.5}))
+    found = estimate(*record_of(seed=2, process_noise_sd={"C": 0.002, "T": 0.5}))
     np.testing.assert_allclose(found.measurement_sd, (0.002, 0.3), rtol=1.3 * SD_ERROR)
     assert found.process_sd[0] == pytest.approx(0.002, rel=0.39)
     assert found.process_sd[1] == pytest.approx(0.5, rel=0.21)
@@ -42,20 +42,20 @@ def test_it_finds_the_noise_of_the_process_too() -> None:
 
 @pytest.mark.parametrize(("state", "sd"), [(0, 0.005), (1, 2.0)])
 def test_it_finds_which_state_is_disturbed(state: int, sd: float) -> None:
-    found = tuned(*record_of(seed=3, process_noise_sd={"CT"[state]: sd}))
+    found = estimate(*record_of(seed=3, process_noise_sd={"CT"[state]: sd}))
     assert found.process_sd[state] == pytest.approx(sd, rel=0.15)
     assert found.process_sd[1 - state] == 0.0
 
 
 def test_rows_that_are_far_apart_do_not_mislead_it() -> None:
     """The plant moves by some 5 K from row to row, which is not noise."""
-    found = tuned(*record_of(seed=4, period_min=1.0))
+    found = estimate(*record_of(seed=4, period_min=1.0))
     np.testing.assert_allclose(found.measurement_sd, (0.002, 0.3), rtol=SD_ERROR)
     assert found.process_sd == (0.0, 0.0)
 
 
 def test_of_a_record_without_noise_it_returns_the_smallest_levels() -> None:
-    found = tuned(*record_of(seed=5, noise_sd=NoiseSd(C=0.0, T=0.0)))
+    found = estimate(*record_of(seed=5, noise_sd=NoiseSd(C=0.0, T=0.0)))
     assert found.measurement_sd == pytest.approx(SMALLEST, rel=1e-9)
     assert found.process_sd == (0.0, 0.0)
 
@@ -67,7 +67,7 @@ def test_spikes_in_two_rows_of_a_hundred_change_it_by_less_than_a_tenth(process_
     spiked = measured.copy()
     for column, size in enumerate((0.05, 8.0)):
         spiked[rng.random(ROWS) < 0.02, column] += size
-    clean, found = tuned(time_min, inputs, measured), tuned(time_min, inputs, spiked)
+    clean, found = estimate(time_min, inputs, measured), estimate(time_min, inputs, spiked)
     np.testing.assert_allclose(found.measurement_sd, clean.measurement_sd, rtol=0.1)
     np.testing.assert_allclose(found.process_sd, clean.process_sd, rtol=0.1)
 
@@ -76,7 +76,7 @@ def test_what_is_missing_is_not_missed() -> None:
     time_min, inputs, measured = record_of(seed=7)
     measured[np.random.default_rng(7).random(measured.shape) < 0.2] = np.nan
     measured[300:330] = np.nan
-    found = tuned(time_min, inputs, measured)
+    found = estimate(time_min, inputs, measured)
     np.testing.assert_allclose(found.measurement_sd, (0.002, 0.3), rtol=1.2 * SD_ERROR)
     assert found.process_sd == (0.0, 0.0)
 
@@ -84,14 +84,14 @@ def test_what_is_missing_is_not_missed() -> None:
 def test_an_output_that_is_never_measured_has_the_smallest_level() -> None:
     time_min, inputs, measured = record_of(seed=8)
     measured[:, 0] = np.nan
-    found = tuned(time_min, inputs, measured)
+    found = estimate(time_min, inputs, measured)
     assert found.measurement_sd[0] == pytest.approx(SMALLEST[0], rel=1e-9)
     assert found.measurement_sd[1] == pytest.approx(0.3, rel=SD_ERROR)
 
 
 def test_it_is_the_same_every_time() -> None:
     record = record_of(seed=9, process_noise_sd={"T": 0.2})
-    assert tuned(*record) == tuned(*record)
+    assert estimate(*record) == estimate(*record)
 
 
 @pytest.mark.parametrize("smallest", [(0.0, 0.0), (0.0, 0.05), (1e-300, 1e-300)])

@@ -13,7 +13,7 @@ Rates = Callable[[float, Array, float], list[float]]
 
 
 def duty(T: float, qc: float) -> float:
-    """What the coolant gives, in K/min."""
+    """Cooling duty in K/min."""
     return 0.01 * qc * (1 - exp(-700 / qc)) * (350 - T)
 
 

@@ -11,7 +11,9 @@ def effect_of(name: str) -> Effect:
     return next(effect for effect in EFFECTS if effect.name == name)
 
 
-def extended(cause: str, size: float, base: ProcessModel | None = None, onset_min: float | None = None) -> ProcessModel:
+def extend_cstr(
+    cause: str, size: float, base: ProcessModel | None = None, onset_min: float | None = None
+) -> ProcessModel:
     """The reactor, or another model, with an effect: always, or from a time on."""
     profile = CONSTANT if onset_min is None else STEP
     onset = {} if onset_min is None else {f"{cause}.onset": onset_min}

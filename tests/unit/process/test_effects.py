@@ -1,4 +1,4 @@
-"""What every effect of the catalogue is held to; a new one inherits it."""
+"""Claims for every effect of the catalogue, new ones included."""
 
 import importlib
 from pathlib import Path
@@ -30,7 +30,7 @@ of_every_effect = pytest.mark.parametrize("effect", EFFECTS, ids=lambda effect: 
 with_every_profile = pytest.mark.parametrize("profile", SHAPES, ids=lambda profile: profile.name)
 
 
-def shaped(effect: Effect, profile: Profile) -> ProcessModel:
+def with_shape(effect: Effect, profile: Profile) -> ProcessModel:
     return effect.extend(cstr(), profile).with_values(
         {f"{effect.name}.{item.name}": SHAPE[item.name] for item in profile.parameters}
     )
@@ -60,7 +60,7 @@ def test_every_file_of_the_folder_is_in_the_catalogue() -> None:
 @with_every_profile
 def test_at_its_neutral_size_it_is_the_base_model(effect: Effect, profile: Profile) -> None:
     """To the last bit, in every state and at any time; in a run but for how steps are cut for new states."""
-    base, extended = cstr(), shaped(effect, profile)
+    base, extended = cstr(), with_shape(effect, profile)
     of_base, of_extended, begun = base.function(), extended.function(), reset_function(extended)
     rng = np.random.default_rng(6)
     for time_min in (-700.0, 0.0, 1.2, 2.0, 3.4, 5000.0):
@@ -80,7 +80,7 @@ def test_at_its_neutral_size_it_is_the_base_model(effect: Effect, profile: Profi
 @of_every_effect
 @with_every_profile
 def test_before_its_onset_nothing_is_different_and_after_it_something_is(effect: Effect, profile: Profile) -> None:
-    model = shaped(effect, profile).with_values({f"{effect.name}.size": effect.typical})
+    model = with_shape(effect, profile).with_values({f"{effect.name}.size": effect.typical})
     expected, found = (Simulator(item).run(TIMES, FLOWS, START).outputs for item in (cstr(), model))
     onset = 0 if profile is CONSTANT else int(np.searchsorted(TIMES, SHAPE["onset"]))
     assert_same(found[:onset], expected[:onset], model)
@@ -96,8 +96,6 @@ def test_its_facts_make_sense(effect: Effect) -> None:
     assert effect.typical != effect.neutral
     assert all(effect.lower <= size <= effect.upper for size in effect.start_values)
     assert set(effect.labels) <= {profile.name for profile in PROFILES}
-    for profile in PROFILES:
-        assert effect.label_with(profile) == effect.labels.get(profile.name, effect.label)
 
 
 @of_every_effect
@@ -184,6 +182,6 @@ def test_profiles_go_in_time_as_they_say() -> None:
     nominal = Simulator(cstr()).run(TIMES, FLOWS, START).outputs
     assert {profile.name for profile in PROFILES} == set(expected)
     for profile in SHAPES:
-        run = Simulator(shaped(bias, profile)).run(TIMES, FLOWS, START, {"temperature_bias.size": 3.0})
+        run = Simulator(with_shape(bias, profile)).run(TIMES, FLOWS, START, {"temperature_bias.size": 3.0})
         np.testing.assert_allclose(run.outputs[:, 1] - nominal[:, 1], expected[profile.name], atol=1e-9)
         np.testing.assert_array_equal(run.outputs[:, 0], nominal[:, 0])

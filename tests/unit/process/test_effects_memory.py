@@ -10,7 +10,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process import by_hand
 from tests.unit.process.by_hand import Rates, balances, duty, nominal
-from tests.unit.process.effect_named import effect_of, extended
+from tests.unit.process.effect_named import effect_of, extend_cstr
 
 TIMES: Array = np.round(np.arange(200.0) * 0.1, 9)
 FLOWS = np.repeat(np.random.default_rng(11).uniform(90, 111, 20), 10)
@@ -24,7 +24,7 @@ def run(rates: Rates, start: Array, flows: Array = FLOWS, time_min: Array = TIME
 
 
 def outputs(model: ProcessModel) -> Array:
-    """Of a run that begins with the memory at rest."""
+    """Outputs of a simulation that starts in equilibrium."""
     return Simulator(model).run(TIMES, FLOWS, START).outputs
 
 
@@ -34,7 +34,7 @@ def test_the_duty_of_a_slow_jacket_follows_its_static_value(m: float) -> None:
         lambda t, x, qc: [*balances(x, x[2]), (duty(x[1], qc) - x[2]) / m],
         np.array([*START, duty(START[1], FLOWS[0])]),
     )
-    assert np.all(np.abs(outputs(extended("jacket_lag", m)) - truth[:, :2]) < ERROR)
+    assert np.all(np.abs(outputs(extend_cstr("jacket_lag", m)) - truth[:, :2]) < ERROR)
 
 
 def test_a_wall_takes_up_heat_at_two_a_minute() -> None:
@@ -43,17 +43,17 @@ def test_a_wall_takes_up_heat_at_two_a_minute() -> None:
         return [dC, dT + 0.3 * 2.0 * (x[2] - x[1]), 2.0 * (x[1] - x[2])]
 
     truth = run(rates, np.array([*START, START[1]]))
-    assert np.all(np.abs(outputs(extended("wall_heat_capacity", 0.3)) - truth[:, :2]) < ERROR)
+    assert np.all(np.abs(outputs(extend_cstr("wall_heat_capacity", 0.3)) - truth[:, :2]) < ERROR)
 
 
 @pytest.mark.parametrize("m", [0.1, 0.7])
 def test_the_flow_through_a_slow_valve_follows_the_command(m: float) -> None:
     truth = run(lambda t, x, qc: [*nominal(t, x, x[2]), (qc - x[2]) / m], np.array([*START, FLOWS[0]]))
-    assert np.all(np.abs(outputs(extended("valve_lag", m)) - truth[:, :2]) < ERROR)
+    assert np.all(np.abs(outputs(extend_cstr("valve_lag", m)) - truth[:, :2]) < ERROR)
 
 
-def stuck(flows: Array, m: float, onset: int = 0) -> Array:
-    """Where a valve stands that moves only when the command is more than m away from it."""
+def valve_positions(flows: Array, m: float, onset: int = 0) -> Array:
+    """Positions of a valve that moves only when the command is more than m away."""
     where = [flows[0]]
     for row, qc in enumerate(flows[1:].tolist(), start=1):
         where.append(qc if abs(qc - where[-1]) > m or row < onset else where[-1])
@@ -62,21 +62,21 @@ def stuck(flows: Array, m: float, onset: int = 0) -> Array:
 
 @pytest.mark.parametrize("m", [3.0, 6.0])
 def test_a_sticking_valve_stays_until_the_command_is_far_from_it_and_then_goes_there(m: float) -> None:
-    flows = stuck(FLOWS, m)
+    flows = valve_positions(FLOWS, m)
     assert 0 < np.sum(flows != FLOWS) < FLOWS.size
-    assert np.all(np.abs(outputs(extended("valve_stiction", m)) - run(nominal, START, flows)) < ERROR)
+    assert np.all(np.abs(outputs(extend_cstr("valve_stiction", m)) - run(nominal, START, flows)) < ERROR)
 
 
 def test_a_valve_that_sticks_from_some_time_on_stands_where_it_was_then() -> None:
-    model = extended("valve_stiction", 6.0, onset_min=4.95)
-    truth = run(nominal, START, stuck(FLOWS, 6.0, onset=50))
+    model = extend_cstr("valve_stiction", 6.0, onset_min=4.95)
+    truth = run(nominal, START, valve_positions(FLOWS, 6.0, onset=50))
     assert np.all(np.abs(outputs(model) - truth) < ERROR)
 
 
 @pytest.mark.parametrize("m", [0.1, 0.7])
 def test_a_thermowell_follows_the_temperature(m: float) -> None:
     truth = run(lambda t, x, qc: [*nominal(t, x, qc), (x[1] - x[2]) / m], np.array([*START, START[1]]))
-    assert np.all(np.abs(outputs(extended("temperature_lag", m)) - truth[:, [0, 2]]) < ERROR)
+    assert np.all(np.abs(outputs(extend_cstr("temperature_lag", m)) - truth[:, [0, 2]]) < ERROR)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_an_analyser_shows_what_was_there(m: float, rms: float, worst: float) ->
     """Against the exact delay, with the coolant stepping every minute over its whole range; noise is 0.002 mol/l."""
     fine: Array = np.round(np.arange(4000.0) * 0.005, 9)
     dense = run(nominal, START, np.repeat(FLOWS, 20), fine)[:, 0]
-    off = outputs(extended("concentration_delay", m))[:, 0] - np.interp(TIMES - m, fine, dense)
+    off = outputs(extend_cstr("concentration_delay", m))[:, 0] - np.interp(TIMES - m, fine, dense)
     assert np.sqrt(np.mean(off**2)) < rms
     assert np.max(np.abs(off)) < worst
 
@@ -104,7 +104,7 @@ def test_lags_below_the_step_of_the_integrator_are_right_to_a_quarter_of_the_sen
     else:
         first, rates = START[1], lambda t, x, qc: [*nominal(t, x, qc), (x[1] - x[2]) / m]
     truth = run(rates, np.array([*START, first]))[:, [0, 2] if cause == "temperature_lag" else [0, 1]]
-    found = outputs(extended(cause, m))
+    found = outputs(extend_cstr(cause, m))
     assert np.all(np.abs(found - truth) < [0.0005, 0.075])
     assert np.all(np.std(found - truth, axis=0) < [0.0001, 0.018])
 
@@ -124,7 +124,7 @@ def test_a_lag_that_sets_in_right_after_the_flow_has_jumped_begins_with_what_is_
 
     times = np.append(5.03, TIMES[row + 1 :])
     after = run(rates, np.array([*x, first]), FLOWS[row:], times)[1:, [0, 2] if cause == "temperature_lag" else [0, 1]]
-    off = outputs(extended(cause, m, onset_min=5.03)) - np.vstack([before, after])
+    off = outputs(extend_cstr(cause, m, onset_min=5.03)) - np.vstack([before, after])
     assert np.max(np.abs(off[: row + 10, 1])) < worst
 
 
@@ -132,7 +132,7 @@ def test_a_lag_that_sets_in_right_after_the_flow_has_jumped_begins_with_what_is_
 def test_a_jacket_lags_behind_the_coolant_that_flows_in_either_order(first: str) -> None:
     sizes = {"jacket_lag": 0.3, "coolant_flow": -0.05}
     second = "coolant_flow" if first == "jacket_lag" else "jacket_lag"
-    found = outputs(extended(second, sizes[second], extended(first, sizes[first])))
+    found = outputs(extend_cstr(second, sizes[second], extend_cstr(first, sizes[first])))
     truth = run(
         lambda t, x, qc: [*balances(x, x[2]), (duty(x[1], 0.95 * qc) - x[2]) / 0.3],
         np.array([*START, duty(START[1], 0.95 * FLOWS[0])]),
@@ -142,20 +142,20 @@ def test_a_jacket_lags_behind_the_coolant_that_flows_in_either_order(first: str)
 
 def test_a_thermowell_lags_behind_what_it_is_in_whatever_else_is_wrong_with_the_heat() -> None:
     """A loss of heat that is put into the model after it reaches it too."""
-    found = outputs(extended("heat_loss", 0.02, extended("temperature_lag", 0.3)))
-    other = outputs(extended("temperature_lag", 0.3, extended("heat_loss", 0.02)))
+    found = outputs(extend_cstr("heat_loss", 0.02, extend_cstr("temperature_lag", 0.3)))
+    other = outputs(extend_cstr("temperature_lag", 0.3, extend_cstr("heat_loss", 0.02)))
     np.testing.assert_allclose(found, other, rtol=0, atol=1e-5)
 
 
 def test_a_sticking_valve_is_stamped_late_in_either_order() -> None:
     """What is measured m after a jump is what the valve has made of it."""
-    one = outputs(extended("sample_timing", 0.04, extended("valve_stiction", 3.0)))
-    other = outputs(extended("valve_stiction", 3.0, extended("sample_timing", 0.04)))
+    one = outputs(extend_cstr("sample_timing", 0.04, extend_cstr("valve_stiction", 3.0)))
+    other = outputs(extend_cstr("valve_stiction", 3.0, extend_cstr("sample_timing", 0.04)))
     np.testing.assert_allclose(one, other, rtol=0, atol=1e-6)
 
 
 def test_two_lags_are_one_behind_the_other() -> None:
-    model = extended("valve_lag", 0.3)
+    model = extend_cstr("valve_lag", 0.3)
     model = effect_of("valve_lag").extend(model).with_values({"valve_lag_2.size": 0.2})
     truth = run(
         lambda t, x, qc: [*nominal(t, x, x[3]), (qc - x[2]) / 0.2, (x[2] - x[3]) / 0.3],

@@ -11,7 +11,7 @@ from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import RAMP
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process.by_hand import duty, run
-from tests.unit.process.effect_named import effect_of, extended
+from tests.unit.process.effect_named import effect_of, extend_cstr
 
 TIMES: Array = np.cumsum(np.append(0.0, np.random.default_rng(8).choice([0.05, 0.1, 0.2], 150)))
 FLOWS = np.repeat(np.random.default_rng(9).uniform(92, 108, 31), 5)[: TIMES.size]
@@ -30,14 +30,14 @@ def reactor(x: Array, qc: float, q: float = 100, V: float = 100, rate: float = 1
     ]
 
 
-def simulated(cause: str, size: float) -> Array:
-    return Simulator(extended(cause, size)).run(TIMES, FLOWS, START).outputs
+def simulate(cause: str, size: float) -> Array:
+    return Simulator(extend_cstr(cause, size)).run(TIMES, FLOWS, START).outputs
 
 
 @pytest.mark.parametrize("size", [-0.3, 0.2])
 def test_reaction_order(size: float) -> None:
     truth = run(lambda t, x, qc: reactor(x, qc, rate=(x[0] / 0.1) ** size), START, TIMES, FLOWS)
-    assert np.all(np.abs(simulated("reaction_order", size) - truth) < ERROR)
+    assert np.all(np.abs(simulate("reaction_order", size) - truth) < ERROR)
 
 
 def test_side_reaction() -> None:
@@ -46,17 +46,17 @@ def test_side_reaction() -> None:
         side = 0.5 * exp(-15e3 * (1 / x[1] - 1 / 438.54)) * x[0]
         return [dC - side, dT + 100 * side]
 
-    assert np.all(np.abs(simulated("side_reaction", 0.5) - run(rates, START, TIMES, FLOWS)) < ERROR)
+    assert np.all(np.abs(simulate("side_reaction", 0.5) - run(rates, START, TIMES, FLOWS)) < ERROR)
 
 
 @pytest.mark.parametrize("size", [-0.1, 0.2])
 def test_volume(size: float) -> None:
     truth = run(lambda t, x, qc: reactor(x, qc, V=100 * (1 + size)), START, TIMES, FLOWS)
-    assert np.all(np.abs(simulated("volume", size) - truth) < ERROR)
+    assert np.all(np.abs(simulate("volume", size) - truth) < ERROR)
 
 
 def test_volume_with_a_level_of_its_own_is_where_the_level_comes_to_rest() -> None:
-    model = extended("volume", 0.1, with_level_control(cstr()))
+    model = extend_cstr("volume", 0.1, with_level_control(cstr()))
     states = Simulator(model).run(TIMES, FLOWS, np.array([*START, 110.0])).states
     truth = run(lambda t, x, qc: reactor(x, qc, V=110), START, TIMES, FLOWS)
     assert np.all(np.abs(states[:, :2] - truth) < ERROR)
@@ -65,14 +65,14 @@ def test_volume_with_a_level_of_its_own_is_where_the_level_comes_to_rest() -> No
 
 def test_bypass() -> None:
     inside = run(lambda t, x, qc: reactor(x, qc, q=95), START, TIMES, FLOWS)
-    assert np.all(np.abs(simulated("bypass", 0.05) - (0.95 * inside + 0.05 * np.array([1.0, 350.0]))) < ERROR)
+    assert np.all(np.abs(simulate("bypass", 0.05) - (0.95 * inside + 0.05 * np.array([1.0, 350.0]))) < ERROR)
 
 
 @pytest.mark.parametrize("first", ["bypass", "feed_temperature"])
 def test_what_passes_by_is_the_feed_as_it_is(first: str) -> None:
     second = "feed_temperature" if first == "bypass" else "bypass"
     sizes = {"bypass": 0.05, "feed_temperature": 8.0}
-    model = extended(second, sizes[second], extended(first, sizes[first]))
+    model = extend_cstr(second, sizes[second], extend_cstr(first, sizes[first]))
     run_ = Simulator(model).run(TIMES, FLOWS, START)
     np.testing.assert_allclose(run_.outputs, 0.95 * run_.states + 0.05 * np.array([1.0, 358.0]), rtol=1e-12)
 
@@ -80,15 +80,15 @@ def test_what_passes_by_is_the_feed_as_it_is(first: str) -> None:
 @pytest.mark.parametrize("late", [0.02, 0.05])
 def test_an_input_that_is_stamped_late_has_acted_before(late: float) -> None:
     """The plant is switched early, and read at the times of the rows; the shortest of them is 0.05 min."""
-    found = simulated("sample_timing", late)
+    found = simulate("sample_timing", late)
     switched = TIMES - late
     between = np.ravel(np.column_stack([switched, TIMES]))
     truth = run(lambda t, x, qc: reactor(x, qc), START, between, np.repeat(FLOWS, 2))
     assert np.all(np.abs(found - truth[1::2]) < ERROR)
 
 
-def felt_earlier(switched_min: Array) -> Array:
-    """What is measured at the rows if the plant feels the input of each from a time of its own on."""
+def advance_inputs(switched_min: Array) -> Array:
+    """Measurements at the rows of a plant in which the input of each row acts from a given time on."""
     between = np.unique(np.concatenate([TIMES, switched_min]))
     flows = FLOWS[np.searchsorted(switched_min, between, side="right") - 1]
     return run(lambda t, x, qc: reactor(x, qc), START, between, flows)[np.searchsorted(between, TIMES)]
@@ -98,8 +98,8 @@ def felt_earlier(switched_min: Array) -> Array:
 def test_stamps_that_become_late_are_felt_earlier_from_then_on_and_no_earlier(before_min: float) -> None:
     """It happens so long before an input changes: twice that change is felt at once, or nearly so."""
     late, onset_min = 0.04, TIMES[75] - before_min
-    truth = felt_earlier(np.where(onset_min < TIMES, np.maximum(TIMES - late, onset_min), TIMES))
-    found = Simulator(extended("sample_timing", late, onset_min=onset_min)).run(TIMES, FLOWS, START).outputs
+    truth = advance_inputs(np.where(onset_min < TIMES, np.maximum(TIMES - late, onset_min), TIMES))
+    found = Simulator(extend_cstr("sample_timing", late, onset_min=onset_min)).run(TIMES, FLOWS, START).outputs
     assert np.all(np.abs(found - truth) < ERROR)
 
 
@@ -111,7 +111,7 @@ def test_stamps_that_become_ever_later_are_felt_ever_earlier() -> None:
     found = Simulator(model).run(TIMES, FLOWS, START).outputs
     growth = size / (end - begin)
     rising = (TIMES + growth * begin) / (1 + growth)  # is felt what is stamped later by as much as it has grown by then
-    truth = felt_earlier(np.where(begin > TIMES, TIMES, np.maximum(rising, TIMES - size)))
+    truth = advance_inputs(np.where(begin > TIMES, TIMES, np.maximum(rising, TIMES - size)))
     assert np.all(np.abs(found - truth) < [1.2e-5, 0.012])
 
 
@@ -125,7 +125,7 @@ def test_an_input_that_is_interpolated_is_held_and_stamped_half_a_period_late_to
 
     truth = run(rates, START, time_min, flows)
     late, in_time = (
-        Simulator(extended("sample_timing", size)).run(time_min, flows, START).outputs[30:] - truth[30:]
+        Simulator(extend_cstr("sample_timing", size)).run(time_min, flows, START).outputs[30:] - truth[30:]
         for size in (0.05, 0.0)
     )
     assert np.all(np.std(late, axis=0) < 0.1 * np.std(in_time, axis=0))

@@ -1,4 +1,4 @@
-"""What the chart on parameters learns from a training, and whether it then keeps its promise."""
+"""The chart on parameters is designed from a training and keeps its false-alarm rate."""
 
 from typing import NamedTuple
 
@@ -34,7 +34,7 @@ def run(rng: np.random.Generator, rows: int, correlation: float, u: Array | None
     return Run(past[100:], y[101:])
 
 
-def adapted(seen: Run, forgetting: float) -> Array:
+def adapt(seen: Run, forgetting: float) -> Array:
     """The parameters after each row by weighted least squares over all rows so far, shape (rows, p)."""
     products = seen.regressors[:, :, None] * seen.regressors[:, None, :]
     forget = ([1.0], [1.0, -forgetting])
@@ -73,7 +73,7 @@ def false_alarms(correlation: float, *, sandwich: bool) -> tuple[float, float]:
     counts = []
     for _ in range(plants):
         seen = run(rng, TRAINING + rows, correlation)
-        parameters = adapted(seen, FORGETTING)
+        parameters = adapt(seen, FORGETTING)
         reference = parameters[TRAINING - 1]
         chart = learned(seen, reference, arl0)
         if not sandwich:
@@ -132,7 +132,7 @@ def test_a_changed_gain_is_seen_and_blamed_on_the_input() -> None:
     for _ in range(10):
         before, after = run(rng, TRAINING, 0.5), run(rng, 150, 0.5, gain=0.6)
         seen = Run(*(np.concatenate(pair) for pair in zip(before, after, strict=True)))
-        parameters = adapted(seen, FORGETTING)
+        parameters = adapt(seen, FORGETTING)
         reference = parameters[TRAINING - 1]
         chart = learned(seen, reference, arl0=1e4)
         assert chart.update(parameters[-1] - reference, seen.regressors[-1]).out
@@ -146,7 +146,7 @@ def test_a_plant_that_comes_to_rest_does_not_drift() -> None:
     clean = signal.lfilter([0.0, 0.5], [1.0, -0.8], u)
     y = clean + 0.1 * rng.standard_normal(u.size)
     seen = Run(np.column_stack([y[:-1], u[:-1], np.ones(u.size - 1)])[100:], y[101:])
-    parameters = adapted(seen, FORGETTING)
+    parameters = adapt(seen, FORGETTING)
     reference = parameters[TRAINING - 1]
     unaware, aware = learned(seen, reference, 1e4), learned(seen, reference, 1e4)
     differences = parameters[TRAINING:] - reference
@@ -157,7 +157,7 @@ def test_a_plant_that_comes_to_rest_does_not_drift() -> None:
 def test_an_input_that_never_moved_is_not_charted() -> None:
     """Two directions of three are; the input's parameter counts for nothing, and the others go on to be watched."""
     seen = run(np.random.default_rng(6), TRAINING, 0.0, u=np.zeros(TRAINING + 101))
-    chart = learned(seen, adapted(seen, FORGETTING)[-1], arl0=1e4)
+    chart = learned(seen, adapt(seen, FORGETTING)[-1], arl0=1e4)
     said = chart.update([0.0, 5.0, 0.0], seen.regressors[0])
     assert said.statistic == 0.0
     assert said.centre == 2.0

@@ -1,4 +1,4 @@
-"""What chance does to a residual is learned from a training, with its uncertainty."""
+"""The autoregression of a residual is learned from a training, with its uncertainty."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ def autoregression(phi: float, rows: int, seed: int) -> np.ndarray:
     return np.asarray(lfilter([1.0], [1.0, -phi], noise))[500:]
 
 
-def whitened(z: np.ndarray, learned: Prewhitening) -> np.ndarray:
+def innovations_of(z: np.ndarray, learned: Prewhitening) -> np.ndarray:
     whitener = Prewhitener(learned)
     return np.array([whitener.update(value) for value in z.tolist()])
 
@@ -22,7 +22,7 @@ def whitened(z: np.ndarray, learned: Prewhitening) -> np.ndarray:
 def test_what_comes_out_of_an_autoregression_is_white_and_of_unit_variance(phi: float) -> None:
     """On 20,000 new rows the first ten autocorrelations are within 4 standard errors, and what the training adds."""
     z = autoregression(phi, 40_000, seed=1)
-    e = whitened(3.0 + 2.0 * z[20_000:], learn(3.0 + 2.0 * z[:20_000], 1e-9))
+    e = innovations_of(3.0 + 2.0 * z[20_000:], learn(3.0 + 2.0 * z[:20_000], 1e-9))
     e = e[np.isfinite(e)]
     assert np.mean(e) == pytest.approx(0.0, abs=4 * np.sqrt(2 / e.size))
     assert np.std(e) == pytest.approx(1.0, abs=4 * np.sqrt(1 / e.size))
@@ -46,12 +46,12 @@ def test_its_uncertainty_is_that_of_many_trainings() -> None:
 def test_a_lasting_shift_is_passed_on_by_the_part_that_it_tells() -> None:
     learned = Prewhitening(0.0, (0.5, 0.2), 2.0, 1000, 0.001, 0.001)
     assert learned.passed == pytest.approx(0.3)
-    assert whitened(np.full(10, 6.0), learned)[-1] == pytest.approx(0.3 * 6.0 / 2.0)
+    assert innovations_of(np.full(10, 6.0), learned)[-1] == pytest.approx(0.3 * 6.0 / 2.0)
 
 
 def test_after_a_gap_nothing_is_judged_until_the_past_is_there_again() -> None:
     learned = Prewhitening(0.0, (0.5, 0.2), 1.0, 1000, 0.001, 0.001)
-    e = whitened(np.array([1.0, 1.0, 1.0, np.nan, 1.0, 1.0, 1.0]), learned)
+    e = innovations_of(np.array([1.0, 1.0, 1.0, np.nan, 1.0, 1.0, 1.0]), learned)
     assert np.isfinite(e).tolist() == [False, False, True, False, False, False, True]
 
 

@@ -2,12 +2,10 @@
 
 from typing import ClassVar
 
-import casadi as ca
-
-from reactorwatch.process.effect import ReadingEffect
+from reactorwatch.process.effect import BiasEffect
 
 
-class LevelBias(ReadingEffect):
+class LevelBias(BiasEffect):
     """The measured level is x2 + m."""
 
     name = "level_bias"
@@ -21,7 +19,3 @@ class LevelBias(ReadingEffect):
     typical = 0.05
     output = "x2"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the level sensor"}
-
-    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """See `ReadingEffect`."""
-        return value + size

@@ -2,12 +2,10 @@
 
 from typing import ClassVar
 
-import casadi as ca
-
-from reactorwatch.process.effect import ReadingEffect
+from reactorwatch.process.effect import BiasEffect
 
 
-class ConcentrationBias(ReadingEffect):
+class ConcentrationBias(BiasEffect):
     """The measured concentration is C + m."""
 
     name = "concentration_bias"
@@ -21,7 +19,3 @@ class ConcentrationBias(ReadingEffect):
     typical = 0.01
     output = "C"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the analyser"}
-
-    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """See `ReadingEffect`."""
-        return value + size

@@ -2,12 +2,10 @@
 
 from typing import ClassVar
 
-import casadi as ca
-
-from reactorwatch.process.effect import ReadingEffect
+from reactorwatch.process.effect import BiasEffect
 
 
-class TemperatureBias(ReadingEffect):
+class TemperatureBias(BiasEffect):
     """The measured temperature is T + m."""
 
     name = "temperature_bias"
@@ -21,7 +19,3 @@ class TemperatureBias(ReadingEffect):
     typical = 2.0
     output = "T"
     labels: ClassVar[dict[str, str]] = {"ramp": "drift of the temperature sensor"}
-
-    def reading(self, value: ca.SX, size: ca.SX) -> ca.SX:
-        """See `ReadingEffect`."""
-        return value + size
