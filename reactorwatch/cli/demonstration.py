@@ -9,6 +9,9 @@ import threading
 import time
 from pathlib import Path
 
+from monitor_node.config import MonitorConfig
+from monitor_node.replay import backtest
+from plant_node.config import PlantConfig
 from reactorwatch.cli.bus_settings import (
     VIEWER,
     load_bus_settings,
@@ -35,10 +38,6 @@ from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
 from reactorwatch.terminal import printable_lines
-
-from monitor_node.config import MonitorConfig
-from monitor_node.replay import backtest
-from plant_node.config import PlantConfig
 from recorder.config import RecorderConfig
 
 PLANT = "demo"
@@ -197,7 +196,6 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     )
     from reactorwatch.diagnosis.report.words import verdict
     from reactorwatch.process import effects_of
-
     from recorder.columns.run_reader import stretches
     from recorder.dashboard.file import write_rrd
 
