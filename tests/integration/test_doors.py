@@ -170,7 +170,7 @@ def test_a_recorder_that_forges_the_monitor_s_source_suppresses_none_of_its_alar
     site: Site, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Zenoh's subscriber drops them; publishers are asked for the last they have published, past it."""
-    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.LAST_AGAIN_S", 0.5)
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.LAST_QUERY_PERIOD_S", 0.5)
     key, changed = "reactor/cstr/alarm/ewma/T", threading.Condition()
     heard: list[bytes] = []
     sources: list[zenoh.SourceInfo] = []

@@ -220,8 +220,8 @@ def change(alarm: Alarm) -> Change:
 def test_what_is_told_again_and_again_waits_on_new_keys_if_there_were_many_lately(
     bus_config: BusConfig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.MOST_NEW_KEYS", 2)
-    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.NEW_KEYS_A_S", 0)
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.MAX_NEW_KEYS", 2)
+    monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.bus.NEW_KEYS_PER_S", 0)
     heard: SimpleQueue[str] = SimpleQueue()
     bus = bus_zenoh.connect(bus_config, "test", StopSignal(), uncached=("health",))
     with client(bus_config) as listener:
