@@ -37,10 +37,11 @@ class RangeCheck(SignalCheck):
         for index, (value, alarm) in enumerate(zip(values, self._alarms, strict=True)):
             if alarm is None or value != value:
                 continue
-            (lower, upper, unit), name = self._ranges[index], self._names[index]
+            lower, upper, unit = self._ranges[index]
             out = not lower <= value <= upper
             if not out and alarm.is_idle:
                 continue
+            name = self._names[index]
             text = (
                 f"{name} reads {value:.6g} {unit}, which the process cannot be: a sensor of it shows {lower:g} to "
                 f"{upper:g} {unit}; such values are not used as measurements"

@@ -59,10 +59,10 @@ class SignalChecks:
         known = ranges or [ANY] * (1 + len(config.outputs))
         self._checks = [check(config, board, known) for check in CHECKS]
         self._silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
-        self._on_row = self._hooks("on_row")
-        self._measured = self._hooks("measured")
-        self._on_values = self._hooks("on_values")
-        self._on_residuals = self._hooks("on_residuals")
+        self._on_row: list[Callable[..., list[Publication]]] = self._hooks("on_row")
+        self._measured: list[Callable[..., tuple[float, ...]]] = self._hooks("measured")
+        self._on_values: list[Callable[..., list[Publication]]] = self._hooks("on_values")
+        self._on_residuals: list[Callable[..., Flags]] = self._hooks("on_residuals")
         self._invalid = [check for check in self._checks if type(check).invalid is not SignalCheck.invalid]
 
     def _hooks(self, name: str) -> list[Callable[..., Any]]:
@@ -127,10 +127,9 @@ class SignalChecks:
 
     def check_row(self, time_ns: int, values: tuple[float, ...]) -> list[Publication]:
         """Check a row, input first; values are NaN where missing."""
-        publications: list[Publication] = []
-        for on_row in self._on_row:
-            publications += on_row(time_ns, values)
-        return publications
+        if len(self._on_row) == 1:  # as mostly: a row passes here
+            return self._on_row[0](time_ns, values)
+        return [item for on_row in self._on_row for item in on_row(time_ns, values)]
 
     def mask_values(
         self, time_ns: int, values: tuple[float, ...], publications: list[Publication]
@@ -142,10 +141,9 @@ class SignalChecks:
 
     def check_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
         """Check the outputs of a row."""
-        publications: list[Publication] = []
-        for on_values in self._on_values:
-            publications += on_values(time_ns, values, units)
-        return publications
+        if len(self._on_values) == 1:
+            return self._on_values[0](time_ns, values, units)
+        return [item for on_values in self._on_values for item in on_values(time_ns, values, units)]
 
     def check_residuals(
         self, time_ns: int, e: list[float], scales: list[float], units: list[str], publications: list[Publication]
@@ -154,8 +152,10 @@ class SignalChecks:
 
         Arguments as for `SignalCheck.on_residuals`.
         """
+        if len(self._on_residuals) == 1:
+            return self._on_residuals[0](time_ns, e, scales, units, publications)
         flags = [on_residuals(time_ns, e, scales, units, publications) for on_residuals in self._on_residuals]
-        return flags[0] if len(flags) == 1 else tuple(any(each) for each in zip(*flags, strict=True))
+        return tuple(any(each) for each in zip(*flags, strict=True))
 
     def restart(self) -> None:
         """Forget what is withheld, as after a gap."""
