@@ -19,7 +19,7 @@ from reactorwatch.records.record import to_time_ns
 from reactorwatch.spc.charts.base import Judgement
 from recorder.tools.player import samples_of
 
-from .board import AT_ONCE, Desk
+from .desk import AT_ONCE, Desk
 
 IN, OUT = 0.0, 5.0
 

@@ -9,7 +9,7 @@ from monitor_node.ingest.pending import PlantHistory
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 
-from .fleets import SECOND_NS, alarms, fleet, noting, of, row_by_row
+from ..fleets import SECOND_NS, alarms, fleet, noting, of, row_by_row
 
 
 def places_of(run: list[Encoded], time_ns: int) -> int:

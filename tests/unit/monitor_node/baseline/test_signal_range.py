@@ -17,7 +17,7 @@ from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.cstr.effects.temperature_bias import TemperatureBias
 from reactorwatch.process.library.cstr.model import cstr
 
-from .samples import leaking_run, samples
+from ..samples import leaking_run, samples
 
 SIGNALS = ("qc", "C", "T")
 CONFIG = MonitorConfig(training_min=20.0, isolation=False)

@@ -22,7 +22,7 @@ from reactorwatch.runtime.metrics import FleetMetrics
 from reactorwatch.runtime.security.command_rate import PER_NAME
 from tests.running import WITHIN_S
 
-from .fleets import PLANTS, QUICK, fleet, row_by_row, run_of
+from ..fleets import PLANTS, QUICK, fleet, row_by_row, run_of
 
 
 class Linked(MemoryBus):

@@ -12,7 +12,7 @@ from monitor_node.quiet import plants
 from reactorwatch.contract import sample_bytes
 from reactorwatch.identification import information
 
-from .fleets import QUICK, SECOND_NS, fleet, row_by_row, run_of
+from ..fleets import QUICK, SECOND_NS, fleet, row_by_row, run_of
 
 LONG_COMPILED: tuple[tuple[ModuleType, str], ...] = (
     (plants, "judge"),

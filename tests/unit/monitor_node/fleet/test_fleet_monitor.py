@@ -8,7 +8,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, Health
 from reactorwatch.errors import InputError
 
-from .fleets import QUICK, SECOND_NS, alarms, fleet, of, row_by_row
+from ..fleets import QUICK, SECOND_NS, alarms, fleet, of, row_by_row
 
 
 def test_each_plant_is_watched_as_if_it_were_alone(

@@ -25,7 +25,7 @@ from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
 from reactorwatch.runtime.security.command_rate import PER_NAME
 
-from .samples import PLANT, leaking_run, samples
+from ..samples import PLANT, leaking_run, samples
 
 END_MIN = 140.0
 

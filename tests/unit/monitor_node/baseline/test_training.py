@@ -6,7 +6,7 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 
-from .watching import sound_run, watched
+from ..watching import sound_run, watched
 
 CONFIG = MonitorConfig(isolation=False)
 

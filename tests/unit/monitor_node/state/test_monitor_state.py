@@ -16,7 +16,7 @@ from reactorwatch.contract.messages_pb2 import AlarmCommand, Health, ShelveAlarm
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 
-from .samples import PLANT, leaking_run, sample, samples
+from ..samples import PLANT, leaking_run, sample, samples
 
 ALL_CHARTS: tuple[ChartName, ...] = (
     "shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe", "parameters",

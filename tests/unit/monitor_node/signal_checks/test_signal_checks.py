@@ -7,8 +7,8 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.messages_pb2 import Alarm
 
-from .samples import leaking_run, samples
-from .watching import minute_ns, sound_run, watched
+from ..samples import leaking_run, samples
+from ..watching import minute_ns, sound_run, watched
 
 AT_MIN, AT = 130.0, 1300
 CONFIG = MonitorConfig(isolation=False)

@@ -21,7 +21,7 @@ from monitor_node.alarms.states import (
 from reactorwatch.contract.messages_pb2 import AlarmState
 from reactorwatch.errors import InputError
 
-DOCUMENT = Path(__file__).parents[3] / "docs" / "alarms.md"
+DOCUMENT = Path(__file__).parents[4] / "docs" / "alarms.md"
 
 LETTERS = dict(zip("ABCDGHI", State, strict=True))
 """The standard's letters; G, H and I are its shelved, suppressed by design and out of service."""

@@ -24,8 +24,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
 
-from .fleets import of_plant
-from .samples import leaking_run, samples
+from ..fleets import of_plant
+from ..samples import leaking_run, samples
 
 FOREIGN = {
     "settings.toml": b'[monitor]\nplant = "cstr"\n',

@@ -7,7 +7,7 @@ from monitor_node.ingest.pending import PlantHistory
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Sample
 
-from .fleets import SECOND_NS, alarms, fleet, noting, of, run_of, shard_token
+from ..fleets import SECOND_NS, alarms, fleet, noting, of, run_of, shard_token
 
 
 def test_plants_of_a_shard_that_is_gone_are_taken_over_and_given_back() -> None:

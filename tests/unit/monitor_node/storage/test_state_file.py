@@ -13,7 +13,7 @@ from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError
 
-from .samples import leaking_run, samples
+from ..samples import leaking_run, samples
 
 SECOND = 1_000_000_000
 END_MIN = 70.0

@@ -6,7 +6,7 @@ from monitor_node.fleet.sharding import Shard, home_shard
 from monitor_node.ingest.pending import PlantHistory
 from reactorwatch.contract.codec import Encoded
 
-from .fleets import SECOND_NS, fleet, noting, run_of, shard_token
+from ..fleets import SECOND_NS, fleet, noting, run_of, shard_token
 
 TEN_MINUTES_NS = 600 * SECOND_NS
 

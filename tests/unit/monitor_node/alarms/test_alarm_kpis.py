@@ -3,7 +3,7 @@
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Priority
 from reactorwatch.records.record import to_time_ns
 
-from .board import Desk
+from .desk import Desk
 
 IN, OUT = 0.0, 5.0
 
