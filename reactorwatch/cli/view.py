@@ -38,7 +38,7 @@ def view(
     import logging
 
     from reactorwatch.cli.observer import begin_beside_recorder
-    from recorder.dashboard.live import Shown, show
+    from recorder.dashboard.live import DisplayTarget, show
 
     bus, recorder = begin_beside_recorder(config, endpoint, name, logging.INFO)
-    show(recorder.plant, bus, Shown(web=web, bind=bind, port=port), say)
+    show(recorder.plant, bus, DisplayTarget(web=web, bind=bind, port=port), say)
