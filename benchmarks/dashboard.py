@@ -84,10 +84,10 @@ def read_bare(path: Path) -> None:
 
 def draw(path: Path) -> None:
     """What `dashboard` does."""
-    from recorder.columns.run_reader import stretches
+    from recorder.columns.run_reader import read_segments
     from recorder.dashboard.file import write_rrd
 
-    write_rrd(stretches(read_messages(path)), path.with_suffix(".rrd"))
+    write_rrd(read_segments(read_messages(path)), path.with_suffix(".rrd"))
 
 
 TASKS = {"bare": read_bare, "draw": draw}

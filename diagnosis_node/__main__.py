@@ -1,4 +1,4 @@
-"""The diagnosing node as a process of its own: `python -m diagnosis_node [settings.toml]`."""
+"""The diagnosis node as a process: `python -m diagnosis_node [settings.toml]`."""
 
 import sys
 

@@ -1,8 +1,8 @@
-"""Diagnoses beside a live monitor: after an alarm the recent samples are written down and diagnosed.
+"""Diagnosis of a live plant: after an alarm the recent samples are recorded and diagnosed.
 
-It hears the same bus as the monitor, is a process of its own, and leaves the work to another one: whatever a diagnosis
-takes or breaks, plant and monitor do not notice. Each gets a folder, named after the plant and the time of the alarm,
-with the samples as a recording and the report of `reactorwatch diagnose` on it, so that it can be done again by hand.
+The node subscribes to the same bus as the monitor and runs each diagnosis in a process of its own, so that neither its
+load nor its failure affects plant and monitor. Each diagnosis gets a folder, named after the plant and the time of the
+alarm, with the samples as a recording and the report of `reactorwatch diagnose`, so that it can be repeated by hand.
 """
 
 import subprocess
@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 import structlog
 
-from diagnosis_node.trigger import AfterAlarm, Asked, DiagnosisConfig
+from diagnosis_node.trigger import DiagnosisConfig, DiagnosisRequest, DiagnosisTrigger
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write
@@ -31,54 +31,59 @@ log = structlog.get_logger()
 
 NODE = "diagnosis"
 RECORDING = "record.mcap"
-"""Name of what is diagnosed, in the folder of its report."""
+"""Name of the diagnosed recording in the folder of its report."""
 
 DRAIN_TIMEOUT_S = 0.5
 
-Run = Callable[[list[str]], tuple[int, str, str]]
-"""Runs arguments of `reactorwatch`; returns its exit code, what it said, and what it complained of."""
+RunCommand = Callable[[list[str]], tuple[int, str, str]]
+"""Runs `reactorwatch` with arguments; returns exit code, standard output and standard error."""
 
 
-class Diagnoses:
-    """Writes samples down and has them diagnosed, one at a time.
+class DiagnosisRunner:
+    """Records samples and diagnoses them, one diagnosis at a time.
 
     Args:
-        config: settings, with a folder to write to.
+        config: settings, with a folder for the reports.
         run: runs the command.
-        in_background: calls something without waiting for its end.
+        in_background: calls a function without waiting for its end.
+
+    Attributes:
+        busy: True while a diagnosis runs.
     """
 
-    def __init__(self, config: DiagnosisConfig, run: Run, in_background: Callable[[Callable[[], None]], None]) -> None:
+    def __init__(
+        self, config: DiagnosisConfig, run: RunCommand, in_background: Callable[[Callable[[], None]], None]
+    ) -> None:
         if config.out is None:
             raise ValueError("out must be a folder")
         self._config, self._out, self._run, self._in_background = config, Path(config.out), run, in_background
         self.busy = False
 
-    def begin(self, asked: Asked) -> None:
-        """Begin one; see `AfterAlarm`."""
+    def start(self, request: DiagnosisRequest) -> None:
+        """Start a diagnosis; see `DiagnosisTrigger`."""
         self.busy = True
-        self._in_background(lambda: self._diagnose(asked))
+        self._in_background(lambda: self._diagnose(request))
 
-    def _diagnose(self, asked: Asked) -> None:
+    def _diagnose(self, request: DiagnosisRequest) -> None:
         try:
-            folder = self._written(asked)
-            code, said, complained = self._run([*self._command(folder), "--json"])
+            folder = self._write_record(request)
+            code, output, errors = self._run([*self._command(folder), "--json"])
             if code != 0:
-                log.warning("not diagnosed", alarm=asked.alarm, why=_last_line(complained), folder=str(folder))
+                log.warning("not diagnosed", alarm=request.alarm, why=_last_line(errors), folder=str(folder))
                 return
-            found = msgspec.json.decode(said)
-            log.info("diagnosed", alarm=asked.alarm, **_summary(found), report=str(folder / "report.html"))
+            result = msgspec.json.decode(output)
+            log.info("diagnosed", alarm=request.alarm, **_summary(result), report=str(folder / "report.html"))
         except (InputError, OSError, msgspec.DecodeError) as error:
-            log.warning("not diagnosed", alarm=asked.alarm, why=str(error))
+            log.warning("not diagnosed", alarm=request.alarm, why=str(error))
         finally:
             self.busy = False
 
-    def _written(self, asked: Asked) -> Path:
-        """The folder with the samples in it."""
-        folder = make_folder(self._free_folder(asked.raised_ns), may_exist=False)
-        about = {"plant": self._config.plant, "alarm": asked.alarm, "raised_ns": str(asked.raised_ns)}
-        with atomic_write(folder / RECORDING) as temporary, RecordingWriter(temporary, about) as writer:
-            for time_ns, item in asked.samples:
+    def _write_record(self, request: DiagnosisRequest) -> Path:
+        """Write the samples to a new folder, which is returned."""
+        folder = make_folder(self._free_folder(request.raised_ns), may_exist=False)
+        metadata = {"plant": self._config.plant, "alarm": request.alarm, "raised_ns": str(request.raised_ns)}
+        with atomic_write(folder / RECORDING) as temporary, RecordingWriter(temporary, metadata) as writer:
+            for time_ns, item in request.samples:
                 writer.write(
                     RecordedMessage(item.key, item.payload, item.encoding, item.received_ns or time_ns, time_ns)
                 )
@@ -100,25 +105,25 @@ class Diagnoses:
 
 
 class Command:
-    """`reactorwatch` as a process of its own, which can be ended."""
+    """Runs `reactorwatch` as a process that can be terminated."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
         self._ended = False
 
     def __call__(self, arguments: list[str]) -> tuple[int, str, str]:
-        """See `Run`."""
+        """Run the command; see `RunCommand`."""
         command = [sys.executable, "-m", "reactorwatch", *arguments]
         self._process = subprocess.Popen(  # noqa: S603 (our own command)
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         if self._ended:
             self._process.terminate()
-        said, complained = self._process.communicate()
-        return self._process.returncode, said, complained or "it was stopped"
+        output, errors = self._process.communicate()
+        return self._process.returncode, output, errors or "it was stopped"
 
     def end(self) -> None:
-        """End the process that runs, if there is one, and every later one."""
+        """Terminate the running process, if any, and every later one."""
         self._ended = True
         if self._process is not None and self._process.poll() is None:
             self._process.terminate()
@@ -128,7 +133,7 @@ def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
     """Diagnose after alarms until SIGINT or SIGTERM.
 
     Raises:
-        InputError: settings that the bus cannot use, or no folder to write to.
+        InputError: the settings of the bus are invalid, or no folder is set.
     """
     if config.out is None:
         raise InputError("settings [diagnosis]: out must be a folder for the reports")
@@ -138,8 +143,8 @@ def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
         threads[:] = [threading.Thread(target=work, name="diagnosis")]
         threads[0].start()
 
-    diagnoses = Diagnoses(config, command, in_background)
-    node = AfterAlarm(config, diagnoses.begin, lambda: diagnoses.busy)
+    diagnoses = DiagnosisRunner(config, command, in_background)
+    node = DiagnosisTrigger(config, diagnoses.start, lambda: diagnoses.busy)
     with stop_on_signals() as stop:
         bus = bus_zenoh.connect(bus_config, NODE, stop)
         if bus is None:
@@ -156,23 +161,23 @@ def run(config: DiagnosisConfig, bus_config: BusConfig) -> None:
             for thread in threads:
                 thread.join()
             if node.waiting is not None:
-                log.warning("not diagnosed", alarm=node.waiting, why="stopped before there was enough to see")
+                log.warning("not diagnosed", alarm=node.waiting, why="stopped before enough data came")
 
 
-def _summary(found: dict[str, Any]) -> dict[str, str]:
-    """Of the object that `diagnose --json` prints, what fits a line."""
-    said = {"verdict": found["verdict"]}
+def _summary(result: dict[str, Any]) -> dict[str, str]:
+    """Log fields for the object that `diagnose --json` prints."""
+    summary = {"verdict": result["verdict"]}
     causes = [
         f"{item['label']} ({item['cause']}, {item['profile']}) {item['parameters']['size']['value']:.3g}"
-        for item in found["causes"]
+        for item in result["causes"]
     ]
     if causes:
-        said["causes"] = " with ".join(causes)
-    if found["alternatives"]:
-        said["alternatives"] = str(len(found["alternatives"]))
-    if found["verdict"] == "unknown" and found["location"]:
-        said["location"] = found["location"]
-    return said
+        summary["causes"] = " with ".join(causes)
+    if result["alternatives"]:
+        summary["alternatives"] = str(len(result["alternatives"]))
+    if result["verdict"] == "unknown" and result["location"]:
+        summary["location"] = result["location"]
+    return summary
 
 
 def _last_line(text: str) -> str:

@@ -1,11 +1,10 @@
-"""Which alarms of a live plant are diagnosed, when, and on which samples.
+"""Trigger of diagnoses of a live plant. Pure: it processes messages and calls a function.
 
-Pure: messages in, and a call of whoever diagnoses. An alarm by itself says that something has happened; to tell what,
-a diagnosis needs to see it go on for a while. So it waits for `after_min` of the plant, and then takes the samples of
-the last `window_min`, those before the alarm among them. Alarms that come meanwhile, or within `apart_min` of it, are
-taken for the same trouble.
+A diagnosis needs data after the onset of a fault. So it starts `after_min` of plant time after the alarm, on the
+samples of the last `window_min`, which include those before the alarm. Alarms raised meanwhile, or within `apart_min`
+of it, are attributed to the same fault.
 
-A plant that ends, or falls silent, while one waits is diagnosed by what there is.
+If the plant stops or no data arrive while a diagnosis is pending, it starts with the available samples.
 """
 
 from collections import deque
@@ -20,36 +19,36 @@ from reactorwatch.contract.keys import check_plant
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Sample
 from reactorwatch.records.record import MINUTE_NS
 
-OUT_OF_SIGHT = (
+HIDDEN_STATES = (
     AlarmState.ALARM_STATE_SHELVED,
     AlarmState.ALARM_STATE_SUPPRESSED_BY_DESIGN,
     AlarmState.ALARM_STATE_OUT_OF_SERVICE,
 )
-"""States of alarms that nobody wants to hear of."""
+"""States of alarms that trigger no diagnosis."""
 
-SILENCE = "silence/"
-"""What the names of alarms begin with that no model explains: nothing comes."""
+NO_DATA = "silence/"
+"""Start of the names of alarms about missing data, which no model explains."""
 
-MOST_SAMPLES = 300_000
-"""That are kept, however often the plant is sampled."""
+MAX_SAMPLES = 300_000
+"""Largest number of stored samples, at any sampling rate."""
 
-SILENT_NS = 60 * 10**9
-"""Of waiting for the next sample, after which the plant is taken to have ended."""
+TIMEOUT_NS = 60 * 10**9
+"""Time without a sample after which the plant is considered stopped."""
 
 NEVER_NS = 2**62
 
 
 class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Diagnoses after alarms.
+    """Settings of diagnoses after alarms.
 
     Attributes:
-        plant: its name.
-        out: folder for the reports, a folder in it for each; None: nothing is diagnosed.
-        window_min: how much of the past is diagnosed, in minutes of the plant ...
-        after_min: ... so long after the alarm was raised.
-        apart_min: alarms of so many minutes after a diagnosis are taken for the same trouble.
-        model: file of an extended model, what is known already; None: the nominal reactor.
-        tolerance: differences that do not matter, by output, in its unit.
+        plant: name of the plant.
+        out: folder for the reports, one subfolder each; None diagnoses nothing.
+        window_min: length of the diagnosed record, in minutes of plant time.
+        after_min: delay from the alarm to the diagnosis, in minutes of plant time.
+        apart_min: minutes after a diagnosis in which alarms are attributed to the same fault.
+        model: file of an extended model, whose causes are known already; None for the nominal process.
+        tolerance: differences without practical significance, by output, in its unit.
     """
 
     plant: str = "cstr"
@@ -73,17 +72,17 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if not self.after_min < self.window_min:
             raise ValueError(
                 f"window_min must be more than after_min, got {self.window_min:g} and {self.after_min:g}; "
-                "a diagnosis needs to see the plant before the alarm"
+                "a diagnosis needs data from before the alarm"
             )
 
 
-class Asked(NamedTuple):
-    """A diagnosis that is due.
+class DiagnosisRequest(NamedTuple):
+    """Request for a diagnosis.
 
     Attributes:
-        alarm: that was raised.
-        raised_ns: when.
-        samples: their times and themselves as they were published, in the order of their receipt.
+        alarm: name of the alarm.
+        raised_ns: time at which it was raised.
+        samples: (sample time, published message) in the order of receipt.
     """
 
     alarm: str
@@ -91,83 +90,85 @@ class Asked(NamedTuple):
     samples: tuple[tuple[int, Encoded], ...]
 
 
-class AfterAlarm:
-    """Asks for a diagnosis after alarms.
+class DiagnosisTrigger:
+    """Starts a diagnosis after an alarm.
 
     Args:
         config: settings.
-        diagnose: begins a diagnosis, without waiting for its end.
-        busy: whether one is under way; then the next waits.
+        diagnose: starts a diagnosis, without waiting for its end.
+        busy: returns True while a diagnosis runs, which delays the next one.
     """
 
     finished = False
 
-    def __init__(self, config: DiagnosisConfig, diagnose: Callable[[Asked], None], busy: Callable[[], bool]) -> None:
+    def __init__(
+        self, config: DiagnosisConfig, diagnose: Callable[[DiagnosisRequest], None], busy: Callable[[], bool]
+    ) -> None:
         self._config, self._diagnose, self._busy = config, diagnose, busy
-        self._samples: deque[tuple[int, Encoded]] = deque(maxlen=MOST_SAMPLES)
+        self._samples: deque[tuple[int, Encoded]] = deque(maxlen=MAX_SAMPLES)
         self._waiting: tuple[str, int] | None = None
-        self._deaf_until_ns = -NEVER_NS
-        self._look_ns = NEVER_NS
+        self._suppressed_until_ns = -NEVER_NS
+        self._timeout_ns = NEVER_NS
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        """Take in a sample or an alarm; what is neither is left alone."""
+        """Process a sample or an alarm; other messages are ignored."""
         try:
-            said = decode(message.payload, message.encoding)
+            content = decode(message.payload, message.encoding)
         except DecodeError:
             return []
-        if isinstance(said, Sample):
-            self._look_ns = now_ns + SILENT_NS
-            self._keep(said.time_ns, message)
-        elif isinstance(said, Alarm):
-            self._on_alarm(said)
+        if isinstance(content, Sample):
+            self._timeout_ns = now_ns + TIMEOUT_NS
+            self._keep(content.time_ns, message)
+        elif isinstance(content, Alarm):
+            self._on_alarm(content)
         return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Nobody asks."""
-        return CommandReply(accepted=False, text="nothing can be asked here"), []
+        """Refuse any command."""
+        return CommandReply(accepted=False, text="this node has no commands"), []
 
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """The plant is silent: diagnose what there is."""
-        if self._waiting is not None and now_ns >= self._look_ns:
-            self._look_ns = now_ns + SILENT_NS
-            self._begin(self._waiting)
+        """Start a pending diagnosis if no data arrive."""
+        if self._waiting is not None and now_ns >= self._timeout_ns:
+            self._timeout_ns = now_ns + TIMEOUT_NS
+            self._start(self._waiting)
         return []
 
     def next_tick_ns(self) -> int:
-        """When a plant that says nothing more is taken to have ended."""
-        return NEVER_NS if self._waiting is None else self._look_ns
+        """Time at which the plant is considered stopped, if a diagnosis is pending."""
+        return NEVER_NS if self._waiting is None else self._timeout_ns
 
     def on_stop(self, now_ns: int) -> list[Publication]:
-        """Nothing is left to say."""
+        """Publish nothing."""
         return []
 
     @property
     def waiting(self) -> str | None:
-        """The alarm that will be diagnosed next."""
+        """Name of the alarm of the pending diagnosis; None if there is none."""
         return None if self._waiting is None else self._waiting[0]
 
     def _on_alarm(self, alarm: Alarm) -> None:
-        comes_up = alarm.event == "raised" and alarm.state not in OUT_OF_SIGHT
-        if not comes_up or alarm.alarm.startswith(SILENCE):
+        is_raised = alarm.event == "raised" and alarm.state not in HIDDEN_STATES
+        if not is_raised or alarm.alarm.startswith(NO_DATA):
             return
-        if self._waiting is None and alarm.raised_ns >= self._deaf_until_ns:
+        if self._waiting is None and alarm.raised_ns >= self._suppressed_until_ns:
             self._waiting = (alarm.alarm, alarm.raised_ns)
 
     def _keep(self, time_ns: int, message: Encoded) -> None:
-        """The samples of the window; a plant whose time goes far back has begun anew, and what was is forgotten."""
+        """Store a sample and drop those before the window; all are dropped if the plant's time steps back before it."""
         window_ns = int(self._config.window_min * MINUTE_NS)
         if self._samples and time_ns < self._samples[0][0]:
             self._samples.clear()
-            self._waiting, self._deaf_until_ns = None, -NEVER_NS
+            self._waiting, self._suppressed_until_ns = None, -NEVER_NS
         self._samples.append((time_ns, message))
         while self._samples[0][0] < time_ns - window_ns:
             self._samples.popleft()
         if self._waiting is not None and time_ns >= self._waiting[1] + self._config.after_min * MINUTE_NS:
-            self._begin(self._waiting)
+            self._start(self._waiting)
 
-    def _begin(self, waiting: tuple[str, int]) -> None:
+    def _start(self, waiting: tuple[str, int]) -> None:
         if self._busy() or not self._samples:
             return
         self._waiting = None
-        self._deaf_until_ns = self._samples[-1][0] + int(self._config.apart_min * MINUTE_NS)
-        self._diagnose(Asked(*waiting, tuple(self._samples)))
+        self._suppressed_until_ns = self._samples[-1][0] + int(self._config.apart_min * MINUTE_NS)
+        self._diagnose(DiagnosisRequest(*waiting, tuple(self._samples)))

@@ -18,7 +18,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.delivery.reorder_buffer import Gap
-from recorder.columns.sequences import SequenceCheck
+from recorder.columns.sequence_counter import SequenceCounter
 from recorder.message import RecordedMessage
 from recorder.policy.channel_budget import Channel
 from recorder.policy.own_alarms import DISK_ALARM, KEYS_ALARM, OwnAlarms
@@ -98,8 +98,8 @@ class Recorder:
         self._refused: Counter[str] = Counter()
         self._stopped = False
         self._alarms = OwnAlarms(plant)
-        self._counters: dict[str, SequenceCheck] = {}  # by key, in the order of their last samples
-        self._evicted = SequenceCheck()  # counts of evicted keys
+        self._counters: dict[str, SequenceCounter] = {}  # by key, in the order of their last samples
+        self._evicted = SequenceCounter()  # counts of evicted keys
         self._no_room_ns = 0  # time of the last rejected message
         self._logged_ns: int | None = None  # time of the last log line about it
 
@@ -137,11 +137,11 @@ class Recorder:
                 self._counter(key).update(decoded.sequence, time_ns)
         return ReceivedMessage(RecordedMessage(key, payload, encoding, received_ns, time_ns), decoded, is_product_key)
 
-    def _counter(self, key: str) -> SequenceCheck:
+    def _counter(self, key: str) -> SequenceCounter:
         """Sequence counter of a key."""
         check = self._counters.pop(key, None)
         if check is None:
-            check = SequenceCheck()
+            check = SequenceCounter()
             if len(self._counters) >= MAX_COUNTERS:
                 evicted = self._counters.pop(next(iter(self._counters)))
                 self._evicted.lost += evicted.lost

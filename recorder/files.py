@@ -32,7 +32,7 @@ from recorder.storage.mcap_scan import RawMessage, Scan, Wanted
 from recorder.storage.mcap_writer import FILE_INDEX, RecordingWriter, check_free, part_of
 from recorder.storage.orphans import find_orphans, list_damaged, repair
 from recorder.storage.part_file import PART, PartFile
-from recorder.tools.cut import cut, received_between
+from recorder.tools.cut import cut, receipt_window
 
 log = structlog.get_logger()
 
@@ -268,7 +268,7 @@ class RecordingFiles:
         path = self._black_boxes.new(interval)
         raised = datetime.fromtimestamp(interval.raised_ns / 1e9, UTC)
         metadata = {**self._metadata, "alarm": interval.alarm, "raised": raised.isoformat(timespec="milliseconds")}
-        window = received_between(interval.from_ns, interval.to_ns)
+        window = receipt_window(interval.from_ns, interval.to_ns)
         while True:
             writing = self.path
             sources = [source for source in self._complete_files() if source.stat().st_mtime_ns >= interval.from_ns]

@@ -196,7 +196,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     )
     from reactorwatch.diagnosis.report.words import verdict
     from reactorwatch.process import effects_of
-    from recorder.columns.run_reader import stretches
+    from recorder.columns.run_reader import read_segments
     from recorder.dashboard.file import write_rrd
 
     drawing = recording.with_suffix(".rrd")
@@ -208,7 +208,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         diagnosis, seconds = run_diagnosis(case)
         write_report(diagnosis, case, seconds)
     with task("drawing"):
-        write_rrd(stretches(messages(recording, PLANT)), drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)
+        write_rrd(read_segments(messages(recording, PLANT)), drawing, diagnosis=folder / DIAGNOSIS_FOLDER / DRAWING)
     same = [alarm.SerializeToString() for alarm in alarms] == [
         alarm.SerializeToString() for alarm in again.alarm_messages
     ]

@@ -13,7 +13,7 @@ from reactorwatch.records.output import check_output_folder
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record
-    from recorder.columns.run import Run
+    from recorder.columns.run import RunColumns
 
 Out = Annotated[Path, typer.Option("--out", "-o", help="The file to write.", show_default=False)]
 
@@ -44,7 +44,7 @@ def dashboard(
     from reactorwatch.cli.diagnosis import DRAWING
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.read_record import open_messages
-    from recorder.columns.run_reader import stretches
+    from recorder.columns.run_reader import read_segments
     from recorder.dashboard.file import write_rrd
     from recorder.dashboard.picture import picture_names, render_tabs
 
@@ -56,8 +56,8 @@ def dashboard(
         check_output_folder(png, picture_names(), (file,), option="--png", force=force)
     with task(f"drawing {file.name}"):
         recording = open_messages(check_recording(file), plant)
-        run = stretches(recording.messages, counted_from_ns=recording.zero_ns)
-        write_rrd(_measured(run, file), out, diagnosis=drawn)
+        run = read_segments(recording.messages, given_zero_ns=recording.zero_ns)
+        write_rrd(_check_samples(run, file), out, diagnosis=drawn)
     print_lines(f"wrote {out}")
     if png is not None:
         with task("rendering"):
@@ -66,17 +66,17 @@ def dashboard(
             print_lines(f"wrote {picture}")
 
 
-def _measured(runs: "Iterable[Run]", file: Path) -> "Iterator[Run]":
-    """Yield the segments of a run.
+def _check_samples(runs: "Iterable[RunColumns]", file: Path) -> "Iterator[RunColumns]":
+    """Pass segments of a run on, and check that one of them has a usable sample.
 
     Raises:
-        InputError: at the end, if no segment holds a measured value.
+        InputError: no segment has one; raised at the end.
     """
     import numpy as np
 
     is_measured = False
     for run in runs:
-        is_measured = is_measured or any(np.isfinite(series.value).any() for series in run.measured.values())
+        is_measured = is_measured or any(np.isfinite(series.value).any() for series in run.samples.values())
         yield run
     if not is_measured:
         raise InputError(f"{file}: holds no sample that can be used")

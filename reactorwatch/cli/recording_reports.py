@@ -8,7 +8,7 @@ from reactorwatch.contract.messages_pb2 import Priority
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.terminal import printable_lines
 from recorder.storage.recover import RecoveryResult
-from recorder.tools.inspect import Look
+from recorder.tools.inspect import FileInfo
 from recorder.tools.mcap_file import has_clock
 
 MAX_LINES = 20
@@ -42,7 +42,7 @@ def saved_text(saved: RecoveryResult, file: Path, out: Path) -> str:
     )
 
 
-def info_object(seen: Look, file: Path) -> dict[str, Any]:
+def info_object(seen: FileInfo, file: Path) -> dict[str, Any]:
     """The object that `info --json` prints; minutes are those of the plant, as `cut` counts them."""
     overview = seen.overview
 
@@ -107,7 +107,7 @@ def info_object(seen: Look, file: Path) -> dict[str, Any]:
     }
 
 
-def info_text(seen: Look, file: Path) -> str:
+def info_text(seen: FileInfo, file: Path) -> str:
     """Format the output of `info` for people."""
     report = info_object(seen, file)
     lines = [f"{file}: {report['messages']} messages of {len(report['topics'])} topics"]

@@ -52,10 +52,10 @@ def info(
 
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.recording_reports import info_object, info_text
-    from recorder.tools.inspect import look_over
+    from recorder.tools.inspect import inspect
 
     with task(f"reading {file.name}"):
-        seen = look_over(check_recording(file))
+        seen = inspect(check_recording(file))
     print_text(msgspec.json.encode(info_object(seen, file)).decode() if as_json else info_text(seen, file))
 
 
@@ -73,7 +73,7 @@ def cut(
     """Copy a span of plant time out of a recording."""
     from reactorwatch.cli.progress import task
     from recorder.tools.cut import cut as copy
-    from recorder.tools.cut import sampled_between
+    from recorder.tools.cut import sample_window
     from recorder.tools.inspect import zero_ns_of
     from recorder.tools.mcap_file import ZERO_NS, read_metadata, recordings_in
 
@@ -85,7 +85,7 @@ def cut(
     with task(f"cutting {file.name}"):
         sources = recordings_in(check_recording(file))
         zero_ns = zero_ns_of(file)
-        window = sampled_between(sources, zero_ns + from_ns, zero_ns + to_ns)
+        window = sample_window(sources, zero_ns + from_ns, zero_ns + to_ns)
         about = {**read_metadata(file), "cut": f"from {begin or 'the start'} to {end or 'the end'} of {file.name}"}
         count = copy(sources, out, window, {**about, ZERO_NS: str(zero_ns)})
     print_lines(f"wrote {out}: {count} messages")

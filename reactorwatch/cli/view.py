@@ -38,7 +38,7 @@ def view(
     import logging
 
     from reactorwatch.cli.observer import load_recorder_settings
-    from recorder.dashboard.live import Shown, show
+    from recorder.dashboard.live import DisplayTarget, show
 
     bus, recorder = load_recorder_settings(config, endpoint, name, logging.INFO)
-    show(recorder.plant, bus, Shown(web=web, bind=bind, port=port), print_lines)
+    show(recorder.plant, bus, DisplayTarget(web=web, bind=bind, port=port), print_lines)

@@ -1,4 +1,4 @@
-"""What a sample says was measured. Pure."""
+"""Validity of a sample's value. Pure."""
 
 import math
 
@@ -8,13 +8,12 @@ from reactorwatch.records.record import LARGEST_VALUE
 _NO_SAMPLE, _BAD = messages.QUALITY_UNSPECIFIED, messages.QUALITY_BAD
 
 
-def measured(sample: messages.Sample) -> float | None:
-    """The value that was measured.
+def measured_value(sample: messages.Sample) -> float | None:
+    """Measured value of a sample.
 
     Returns:
-        The value; NaN if it is of bad quality, not finite or larger than any value can be, which counts as not
-        measured; None if the message is no
-        sample at all: it lacks the quality that every publisher of ours states.
+        The value; NaN, which counts as not measured, if it is of bad quality, not finite or impossibly large; None if
+        the message is no sample, because it lacks the quality that every publisher of this software sets.
     """
     if sample.quality == _NO_SAMPLE:
         return None

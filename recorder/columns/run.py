@@ -1,7 +1,7 @@
-"""A run as columns, for drawing: the whole of it, or a stretch. Pure.
+"""Data of a run as columns, for drawing: the full run or a segment of it. Pure.
 
-It is drawn stretch by stretch, so that a recording larger than memory can be, and a run that has not ended. A stretch
-therefore says of what was before it what panels need to go on where they were.
+Segments allow to draw a recording larger than memory and a run that has not ended. A segment therefore carries the
+context of earlier segments that panels need.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,16 +18,16 @@ Values = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Measured:
-    """The samples of a signal, shape (samples,), in order of time; NaN where the value is unusable."""
+class SampleColumns:
+    """Samples of a signal, each array of shape (samples,), in order of time; NaN where not measured."""
 
     time_ns: Times
     value: Values
 
 
 @dataclass(frozen=True)
-class Estimated:
-    """What the model expected of a signal, shape (estimates,); limits are NaN while they are being learned."""
+class EstimateColumns:
+    """Predictions of a signal, each array of shape (estimates,); limits are NaN during training."""
 
     time_ns: Times
     prediction: Values
@@ -37,18 +37,18 @@ class Estimated:
 
     @property
     def residual_lower_limit(self) -> Values:
-        """The lower limit as one of the residual."""
+        """Lower limit of the residual."""
         return self.lower_limit - self.prediction
 
     @property
     def residual_upper_limit(self) -> Values:
-        """The upper limit as one of the residual."""
+        """Upper limit of the residual."""
         return self.upper_limit - self.prediction
 
 
 @dataclass(frozen=True)
-class Charted:
-    """The points of a control chart, shape (points,); `out` is 1 where the point is out of its limits, else 0."""
+class ChartColumns:
+    """Points of a control chart, each array of shape (points,); `out` is 1 outside the limits, else 0."""
 
     time_ns: Times
     statistic: Values
@@ -59,8 +59,8 @@ class Charted:
 
 
 @dataclass(frozen=True)
-class Reconstructed:
-    """What a signal would read if its sensor were right, shape (points,), while its sensor is suspected."""
+class ReconstructionColumns:
+    """Reconstructed signal while its sensor is suspected, each array of shape (points,)."""
 
     time_ns: Times
     value: Values
@@ -68,7 +68,7 @@ class Reconstructed:
 
 
 class AlarmChange(NamedTuple):
-    """A change of an alarm: its state is a `messages.AlarmState`, `event` says what made it."""
+    """Change of an alarm; `state` is a `messages.AlarmState`, `event` its cause."""
 
     time_ns: int
     alarm: str
@@ -80,7 +80,7 @@ class AlarmChange(NamedTuple):
 
 
 class FaultChange(NamedTuple):
-    """A fault that was injected into the plant, or taken away again."""
+    """Fault that was injected into the simulated plant or removed from it."""
 
     time_ns: int
     cause: str
@@ -89,13 +89,13 @@ class FaultChange(NamedTuple):
     onset_ns: int
 
 
-ADAPTS, HELD, JUDGES, EQUATIONS = "adapts", "held", "judges", "equations"
-"""Purposes of a model: it adapts; it is held since the training and compared with that one; rows are judged by it; or
-rows are judged by equations, whose noise levels are its parameters."""
+ADAPTIVE, FROZEN, REFERENCE, EQUATIONS = "adaptive", "frozen", "reference", "equations"
+"""Purposes of a model: adaptive; frozen since the training and compared with the adaptive one; reference of the charts;
+equations as the reference, with noise levels as parameters."""
 
 
 class Snapshot(NamedTuple):
-    """A model of a signal; parameters by name: (value, standard deviation)."""
+    """Model of a signal; `parameters` maps a name to (value, standard deviation)."""
 
     time_ns: int
     parameters: Mapping[str, tuple[float, float]]
@@ -103,15 +103,15 @@ class Snapshot(NamedTuple):
     condition: float
 
 
-class Report(NamedTuple):
-    """How a node does.
+class HealthReport(NamedTuple):
+    """Health report of a node.
 
     Attributes:
-        time_ns: of the newest sample when the report was received: a node speaks by the clock, a run goes by the time
-            of its samples, and at an accelerated plant the two have nothing in common.
-        phase: a word.
-        lag_ms: between receipt and the end of the work on it.
-        counts: what went wrong, by its name.
+        time_ns: time of the newest sample when the report was received. Reports carry clock time, the axis of a run is
+            sample time, and the two are unrelated for an accelerated plant.
+        phase: phase of the node, in a word.
+        lag_ms: time from receipt to the end of processing, in milliseconds.
+        counts: number of problems, by kind.
     """
 
     time_ns: int
@@ -120,8 +120,8 @@ class Report(NamedTuple):
     counts: Mapping[str, int]
 
 
-class Seen(NamedTuple):
-    """What there has been of a signal so far: how many values, their mean, and between what they were."""
+class SignalStatistics(NamedTuple):
+    """Number, mean and range of a signal's values so far."""
 
     rows: int
     mean: float
@@ -130,70 +130,70 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Earlier:
-    """What was before a stretch.
+class SegmentContext:
+    """Data of earlier segments.
 
     Attributes:
-        first_ns: time of the first sample; None: there was none.
-        last: the newest two samples of each signal: what is measured together may be cut apart.
-        states: of alarms that have spoken.
-        suspected_ns: when suspects were told last.
-        onset_ns: when the first fault sets in, or has.
+        first_ns: time of the first sample; None if there was none.
+        last_samples: newest two samples by signal, as samples of one time may be in two segments.
+        alarm_states: state of each alarm that was published.
+        suspects_ns: time of the last suspects.
+        onset_ns: onset of the first fault; None if there was none.
     """
 
     first_ns: int | None = None
-    last: Mapping[str, Measured] = field(default_factory=dict)
-    states: Mapping[str, int] = field(default_factory=dict)
-    suspected_ns: int | None = None
+    last_samples: Mapping[str, SampleColumns] = field(default_factory=dict)
+    alarm_states: Mapping[str, int] = field(default_factory=dict)
+    suspects_ns: int | None = None
     onset_ns: int | None = None
 
 
 @dataclass(frozen=True)
-class Run:
-    """One plant's run, or a stretch of it.
+class RunColumns:
+    """Run of one plant, or a segment of it.
 
     Attributes:
-        plant: its name; empty if there is nothing of it.
-        units: by signal.
-        measured: by signal.
-        estimated: by signal.
-        charts: by the name of the chart and the signal, `ewma/T`.
-        alarms: in order of time.
-        faults: in order of time.
-        reconstructed: by signal.
-        models: snapshots in order of time, by the signal and the purpose of the model, such as `ADAPTS`.
-        health: reports in order of time, by node.
-        seen: of each signal, up to the end of the stretch.
-        earlier: what was before it.
-        counted_from_ns: the time that its minutes count from; None: its first sample.
+        plant: name of the plant; empty without messages.
+        units: units by signal.
+        samples: samples by signal.
+        estimates: predictions by signal.
+        charts: chart points by chart and signal, such as `ewma/T`.
+        alarms: changes of alarms in order of time.
+        faults: changes of faults in order of time.
+        reconstructions: reconstructed signals.
+        models: snapshots in order of time, by signal and purpose of the model, such as `ADAPTIVE`.
+        health: health reports in order of time, by node.
+        statistics: statistics of each signal up to the end of the segment.
+        context: data of earlier segments.
+        given_zero_ns: time that minutes count from; None for the first sample.
     """
 
     plant: str
     units: dict[str, str]
-    measured: dict[str, Measured]
-    estimated: dict[str, Estimated]
-    charts: dict[str, Charted]
+    samples: dict[str, SampleColumns]
+    estimates: dict[str, EstimateColumns]
+    charts: dict[str, ChartColumns]
     alarms: tuple[AlarmChange, ...]
     faults: tuple[FaultChange, ...]
-    reconstructed: dict[str, Reconstructed] = field(default_factory=dict)
+    reconstructions: dict[str, ReconstructionColumns] = field(default_factory=dict)
     models: dict[tuple[str, str], tuple[Snapshot, ...]] = field(default_factory=dict)
-    health: dict[str, tuple[Report, ...]] = field(default_factory=dict)
-    seen: dict[str, Seen] = field(default_factory=dict)
-    earlier: Earlier = Earlier()
-    counted_from_ns: int | None = None
+    health: dict[str, tuple[HealthReport, ...]] = field(default_factory=dict)
+    statistics: dict[str, SignalStatistics] = field(default_factory=dict)
+    context: SegmentContext = SegmentContext()
+    given_zero_ns: int | None = None
 
     @property
     def span_ns(self) -> tuple[int, int]:
-        """The times of the first and of the last sample; both 0 if there is none."""
-        series = [item.time_ns for item in self.measured.values()]
+        """Times of the first and the last sample of the segment; (0, 0) if there is none."""
+        series = [item.time_ns for item in self.samples.values()]
         return (min(int(t[0]) for t in series), max(int(t[-1]) for t in series)) if series else (0, 0)
 
     @property
     def first_ns(self) -> int:
-        """The time of the run's first sample, which may have been in an earlier stretch; 0 if there is none."""
-        return self.span_ns[0] if self.earlier.first_ns is None else self.earlier.first_ns
+        """Time of the first sample of the run, earlier segments included; 0 if there is none."""
+        return self.span_ns[0] if self.context.first_ns is None else self.context.first_ns
 
     @property
     def zero_ns(self) -> int:
-        """The time that its minutes count from."""
-        return self.first_ns if self.counted_from_ns is None else self.counted_from_ns
+        """Time that minutes count from."""
+        return self.first_ns if self.given_zero_ns is None else self.given_zero_ns

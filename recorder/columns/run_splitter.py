@@ -1,25 +1,25 @@
-"""The runs of a recording: samples of one plant, in order of receipt, cut where a new run starts. Pure.
+"""Split the samples of one plant, in order of receipt, into runs. Pure.
 
-A new run starts where the publisher was restarted or its clock was set back, as the numbers and times of the samples
-tell (`sequences`). The first signal that shows it starts the run, and each other signal joins it with its own next
-sample that belongs there.
+A new run starts where the publisher was restarted or its clock was set back, according to sequence numbers and times
+(`sequence_counter`). The first signal that shows it starts the run. Each other signal joins with its first sample that
+belongs to the new run.
 """
 
 from typing import Any, NamedTuple
 
 from reactorwatch.contract.messages_pb2 import Sample
-from recorder.columns.sequences import Place, SequenceCheck
+from recorder.columns.sequence_counter import RunTransition, SequenceCounter
 
 
 class RunSpan(NamedTuple):
-    """The times of the first and the last sample of a run."""
+    """Times of the first and the last sample of a run."""
 
     first_ns: int
     last_ns: int
 
 
 class _Run:
-    """A run, and the signals that have samples in it."""
+    """Time span, sampling period and number of samples of a run."""
 
     def __init__(self, time_ns: int) -> None:
         self.first_ns, self.last_ns, self.period_ns = time_ns, time_ns, 0
@@ -32,51 +32,51 @@ class _Run:
             self.period_ns = time_ns - self.last_ns
             self.last_ns = time_ns
 
-    def reaches(self, time_ns: int) -> bool:
-        """Whether the run has come to a time, to a row."""
+    def covers(self, time_ns: int) -> bool:
+        """True if a time is within the run or one sampling period after it."""
         return self.first_ns <= time_ns <= self.last_ns + self.period_ns
 
 
 class RunSplitter:
-    """Numbers the runs of one plant's samples.
+    """Assigns the samples of one plant to runs.
 
     Attributes:
-        checks: of the sequence numbers, by signal.
-        current: number of the run that new samples are of, counted from 1; 0 before the first.
+        counters: sequence counters by signal.
+        current: index of the current run, from 1; 0 before the first sample.
     """
 
     def __init__(self) -> None:
-        self.checks: dict[str, SequenceCheck] = {}
+        self.counters: dict[str, SequenceCounter] = {}
         self.current = 0
         self._runs: list[_Run] = []
-        self._last: dict[str, list[tuple[int, int]]] = {}  # by signal, run and time of its newest two samples
+        self._last: dict[str, list[tuple[int, int]]] = {}  # run and time of the newest two samples, by signal
 
     @property
     def runs(self) -> list[RunSpan]:
-        """The runs that have samples, in the order in which they started."""
+        """Runs with samples, in the order of their starts."""
         return [RunSpan(run.first_ns, run.last_ns) for run in self._runs if run.samples]
 
     @property
     def strays(self) -> int:
-        """Samples that were out of place, and are of no run."""
-        return sum(check.out_of_place for check in self.checks.values())
+        """Number of stray samples, which belong to no run."""
+        return sum(counter.out_of_place for counter in self.counters.values())
 
     def update(self, signal: str, sequence: int, time_ns: int) -> int:
-        """The run that a sample is of, counted from 1; a run of strays alone has a number, too."""
-        check = self.checks.get(signal)
-        if check is None:
-            check, number = self.checks.setdefault(signal, SequenceCheck()), max(self.current, 1)
+        """Index of the run of a sample, from 1; a run of strays alone has an index too."""
+        counter = self.counters.get(signal)
+        if counter is None:
+            counter, number = self.counters.setdefault(signal, SequenceCounter()), max(self.current, 1)
             last = self._last.setdefault(signal, [])
         else:
             last = self._last[signal]
             number = last[-1][0]
-        place = check.update(sequence, time_ns)
-        if place is Place.AFTER_STRAY:
+        transition = counter.update(sequence, time_ns)
+        if transition is RunTransition.AFTER_STRAY:
             number = self._drop_stray(last)
-        elif place is Place.STARTS_RUN:
+        elif transition is RunTransition.NEW_RUN:
             number = self.current if number < self.current else len(self._runs) + 1
-        elif number < self.current and not self._runs[number - 1].reaches(time_ns):
-            number = self.current if self._runs[self.current - 1].reaches(time_ns) else number
+        elif number < self.current and not self._runs[number - 1].covers(time_ns):
+            number = self.current if self._runs[self.current - 1].covers(time_ns) else number
         if number > len(self._runs):
             self._runs.append(_Run(time_ns))
         self.current = max(self.current, number)
@@ -86,12 +86,12 @@ class RunSplitter:
         return number
 
     def span(self, number: int) -> RunSpan:
-        """The times of a run."""
+        """Time span of a run."""
         run = self._runs[number - 1]
         return RunSpan(run.first_ns, run.last_ns)
 
     def _drop_stray(self, last: list[tuple[int, int]]) -> int:
-        """Take the newest sample of a signal out of its run; returns the run of the one before."""
+        """Remove the newest sample of a signal from its run; returns the run of the sample before."""
         stray, time_ns = last.pop()
         run = self._runs[stray - 1]
         run.samples -= 1
@@ -99,15 +99,15 @@ class RunSplitter:
         if not run.samples and self.current == stray:
             self.current = number
         if time_ns == run.last_ns and number == stray:
-            newest = [check.newest_ns for name, check in self.checks.items() if self._last[name]]
+            newest = [counter.newest_ns for name, counter in self.counters.items() if self._last[name]]
             run.last_ns = max(time for time in newest if time != time_ns)
         return number
 
 
 class ContinuousTime:
-    """Times of one plant's messages that increase over all of its runs, for what has one axis of time or one pace.
+    """Times of one plant's messages that increase over all runs, for one time axis.
 
-    A run that starts before the one before it has ended is moved to follow it, one sampling period later.
+    A run that starts before the end of the run before is shifted to start one sampling period after it.
     """
 
     def __init__(self) -> None:
@@ -116,14 +116,14 @@ class ContinuousTime:
         self._newest_ns: int | None = None
         self._period_ns = 0
 
-    def of(self, key: str, message: Any) -> int:
-        """The time of a message; messages are handed in in the order of receipt."""
+    def continuous_ns(self, key: str, message: Any) -> int:
+        """Continuous time of a message; messages must be passed in the order of receipt."""
         if isinstance(message, Sample):
-            return self._of_sample(key, message.sequence, message.time_ns)
+            return self._sample_ns(key, message.sequence, message.time_ns)
         time_ns: int = message.time_ns
         return time_ns + self.shift_ns(time_ns)
 
-    def _of_sample(self, signal: str, sequence: int, time_ns: int) -> int:
+    def _sample_ns(self, signal: str, sequence: int, time_ns: int) -> int:
         number, newest_ns = self._splitter.update(signal, sequence, time_ns), self._newest_ns
         starts = number > len(self._shifts_ns)
         if starts:
@@ -131,18 +131,18 @@ class ContinuousTime:
             if newest_ns is not None and time_ns + shift_ns <= newest_ns:
                 shift_ns = newest_ns + self._period_ns - time_ns
             self._shifts_ns.append(shift_ns)
-        moved_ns = time_ns + self._shifts_ns[number - 1]
-        if newest_ns is None or moved_ns > newest_ns:
+        shifted_ns = time_ns + self._shifts_ns[number - 1]
+        if newest_ns is None or shifted_ns > newest_ns:
             if newest_ns is not None and not starts:
-                self._period_ns = moved_ns - newest_ns
-            self._newest_ns = moved_ns
-        return moved_ns
+                self._period_ns = shifted_ns - newest_ns
+            self._newest_ns = shifted_ns
+        return shifted_ns
 
     def shift_ns(self, time_ns: int) -> int:
-        """What is added to the time of a message that speaks of samples that came before it."""
+        """Shift of a message about an earlier sample."""
         number = self._splitter.current
         if not number:
             return 0
         if number > 1 and self._splitter.span(number).last_ns < time_ns <= self._splitter.span(number - 1).last_ns:
-            return self._shifts_ns[number - 2]  # it is said of the run before
+            return self._shifts_ns[number - 2]  # it concerns the run before
         return self._shifts_ns[number - 1]

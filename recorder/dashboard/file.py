@@ -11,9 +11,9 @@ from pathlib import Path
 import rerun as rr
 
 from reactorwatch.records.atomic import atomic_write
-from recorder.columns.run import Run
-from recorder.dashboard.drawing import Drawing
-from recorder.dashboard.reading import read_time_plots
+from recorder.columns.run import RunColumns
+from recorder.dashboard.read_plots import read_time_plots
+from recorder.dashboard.renderer import Renderer
 from recorder.dashboard.stream import APPLICATION
 from recorder.panels import PANELS
 from recorder.panels.base import Panel, View
@@ -25,56 +25,59 @@ DIAGNOSIS = "Diagnosis"
 
 
 def write_rrd(
-    run: Run | Iterable[Run], path: Path, panels: tuple[Panel, ...] = PANELS, diagnosis: Path | None = None
+    run: RunColumns | Iterable[RunColumns],
+    path: Path,
+    panels: tuple[Panel, ...] = PANELS,
+    diagnosis: Path | None = None,
 ) -> None:
-    """Draw a run.
+    """Write the dashboard of a run.
 
     Args:
-        run: the run; or its stretches, of which one is in memory at a time.
-        path: the file; an older one of that name is replaced.
-        panels: what is drawn of it.
-        diagnosis: drawing of a diagnosis of the run (`write_views`), which becomes a tab; None: there is none.
+        run: the run; or its segments, of which one is in memory at a time.
+        path: the file; an existing one is replaced.
+        panels: panels to draw.
+        diagnosis: dashboard file of a diagnosis of the run (`write_views`), which becomes a tab; None for no tab.
 
     Raises:
-        InputError: the folder does not exist or cannot be written to, or the drawing cannot be read.
+        InputError: the folder does not exist or cannot be written to, or the diagnosis cannot be read.
     """
     plots = read_time_plots(diagnosis) if diagnosis is not None else []
 
-    def onto(drawing: Drawing) -> None:
+    def onto(drawing: Renderer) -> None:
         zero_ns = 0
-        for stretch in (run,) if isinstance(run, Run) else run:
-            drawing.draw(stretch, panels)
-            zero_ns = stretch.zero_ns
+        for segment in (run,) if isinstance(run, RunColumns) else run:
+            drawing.draw(segment, panels)
+            zero_ns = segment.zero_ns
         drawing.add(DIAGNOSIS, "grid", plots, zero_ns)
 
     _write(path, onto)
 
 
-def write_views(drawn: Mapping[str, Sequence[View]], path: Path, zero_ns: int) -> None:
-    """Draw views of anything.
+def write_views(views_by_tab: Mapping[str, Sequence[View]], path: Path, zero_ns: int) -> None:
+    """Write a dashboard of given views.
 
     Args:
-        drawn: views, by the title of the tab that they are in.
-        path: the file; an older one of that name is replaced.
-        zero_ns: the time that the run counts from.
+        views_by_tab: views by the title of their tab.
+        path: the file; an existing one is replaced.
+        zero_ns: time that minutes count from.
 
     Raises:
         InputError: the folder does not exist or cannot be written to.
     """
 
-    def onto(drawing: Drawing) -> None:
-        for title, views in drawn.items():
+    def onto(drawing: Renderer) -> None:
+        for title, views in views_by_tab.items():
             drawing.add(title, "grid", views, zero_ns)
 
     _write(path, onto)
 
 
-def _write(path: Path, onto: Callable[[Drawing], None]) -> None:
+def _write(path: Path, onto: Callable[[Renderer], None]) -> None:
     recording = rr.RecordingStream(APPLICATION)
-    with atomic_write(path) as temporary, _copied_to(temporary) as pipe:
+    with atomic_write(path) as temporary, _pipe_to(temporary) as pipe:
         recording.save(pipe)
         try:
-            drawing = Drawing(recording)
+            drawing = Renderer(recording)
             onto(drawing)
             recording.send_blueprint(drawing.layout.blueprint())
         finally:
@@ -83,11 +86,11 @@ def _write(path: Path, onto: Callable[[Drawing], None]) -> None:
 
 
 @contextmanager
-def _copied_to(path: Path) -> Iterator[Path]:
-    """A pipe whose content goes into a file.
+def _pipe_to(path: Path) -> Iterator[Path]:
+    """Pipe whose content is copied to a file.
 
-    Rerun writes a file in a thread of its own; where the disk is full it logs that and goes on, or waits for ever. A
-    pipe takes all, and the error is ours.
+    Rerun writes a file in a thread of its own. On a full disk it logs the error and continues, or blocks forever. With
+    a pipe, the error is raised here.
 
     Raises:
         OSError: the file cannot be written.
@@ -101,7 +104,7 @@ def _copied_to(path: Path) -> Iterator[Path]:
                     shutil.copyfileobj(source, file, _PIPE_BYTES)
             except OSError as error:
                 failed.append(error)
-                while source.read(_PIPE_BYTES):  # so that the other end never waits
+                while source.read(_PIPE_BYTES):  # so that the writer never blocks
                     pass
 
     with tempfile.TemporaryDirectory() as folder:
@@ -112,7 +115,7 @@ def _copied_to(path: Path) -> Iterator[Path]:
         try:
             yield pipe
         finally:
-            with suppress(OSError):  # nobody reads any more
+            with suppress(OSError):  # the reader has ended
                 os.close(os.open(pipe, os.O_WRONLY | os.O_NONBLOCK))
             thread.join()
     if failed:

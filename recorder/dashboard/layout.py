@@ -1,7 +1,6 @@
-"""How a dashboard is laid out: a tab for each panel, and in it its views, open on the whole run.
+"""Layout of a dashboard: a tab for each panel with its views, initially on the full run.
 
-Rerun's own default is to show the last minute around the cursor. What is remembered of a view does not grow with the
-run.
+Rerun's default is the last minute around the cursor. The stored data of a view do not grow with the run.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,15 +13,15 @@ import rerun.blueprint as rrb
 
 from recorder.dashboard.plane import Frame
 from recorder.dashboard.stream import APPLICATION, RUN_TIME, SAMPLE_TIME, path_of
-from recorder.panels.base import Again, Arrangement, EventLog, PlanePlot, StateLines, TimePlot, View
+from recorder.panels.base import Arrangement, EventLog, PlanePlot, StateLines, TimePlot, View, ViewReference
 
 _ENDLESS = rr.TimeRangeBoundary.infinite()
 _WHOLE_RUN = rr.TimeRange(start=_ENDLESS, end=_ENDLESS)
 _LANES_SHARE = 1.3
-"""Of the height, that lanes take beside time plots."""
+"""Height of lanes, in heights of a time plot."""
 
 
-class _Placed(NamedTuple):
+class _PlacedView(NamedTuple):
     path: str
     view: View
 
@@ -34,48 +33,48 @@ class _Tab:
 
 
 class Layout:
-    """The tabs and the views in them, as they become known."""
+    """Tabs and their views, extended segment by segment."""
 
     def __init__(self) -> None:
         self._tabs: dict[str, _Tab] = {}
         self._frames: dict[str, Frame] = {}
         self.changed = False
-        """Whether there is something that the last blueprint does not show."""
+        """True if the last blueprint lacks something."""
 
-    def note(self, tab: str, arranged: Arrangement, views: Sequence[View]) -> None:
-        """Take note of the views that a tab has.
+    def update(self, tab: str, arranged: Arrangement, views: Sequence[View]) -> None:
+        """Add the views of a segment to a tab.
 
         Args:
-            tab: its title.
-            arranged: how they are.
-            views: those of a stretch.
+            tab: title of the tab.
+            arranged: arrangement of the tab.
+            views: the views.
         """
         known = self._tabs.setdefault(tab, _Tab(arranged))
         for view in views:
             before = known.views.get(view.title)
-            after = known.views[view.title] = _merged(before, view)
-            self.changed |= before is None or _is_bare(before) != _is_bare(after)
+            after = known.views[view.title] = _merge(before, view)
+            self.changed |= before is None or _is_empty(before) != _is_empty(after)
             if isinstance(view, PlanePlot):
                 self._note_plane(origin(tab, view), view)
         titles = [view.title for view in views]
         if known.views.keys() == set(titles) and list(known.views) != titles:
-            known.views = {title: known.views[title] for title in titles}  # all are there: their order is known now
+            known.views = {title: known.views[title] for title in titles}  # complete: now their order is known
             self.changed = True
 
     def frame(self, path: str) -> Frame:
-        """That of a plane."""
+        """Frame of a plane."""
         return self._frames[path]
 
     def blueprint(self, *, live: bool = False) -> rrb.Blueprint:
-        """The layout of what is known by now.
+        """Rerun blueprint of the present tabs.
 
         Args:
-            live: whether the run goes on: the cursor then follows it.
+            live: True if the run continues: the cursor then follows it.
         """
         self.changed = False
         tabs = [self._container(title, tab) for title, tab in self._tabs.items() if any(self._placed(title, tab))]
         return rrb.Blueprint(
-            _lasting(rrb.Tabs(*tabs, active_tab=0 if tabs else None), "tabs"),
+            _with_stable_id(rrb.Tabs(*tabs, active_tab=0 if tabs else None), "tabs"),
             rrb.TimePanel(state="collapsed", timeline=RUN_TIME, play_state="following" if live else "paused"),
             rrb.BlueprintPanel(state="collapsed"),
             rrb.SelectionPanel(state="collapsed"),
@@ -88,17 +87,17 @@ class Layout:
             self._frames[path] = Frame.around(plane.box if known is None else known.box, plane.shown)
             self.changed = True
 
-    def _placed(self, title: str, tab: _Tab) -> Iterator[_Placed]:
-        """The views of a tab that have something in them, and where they are drawn."""
+    def _placed(self, title: str, tab: _Tab) -> Iterator[_PlacedView]:
+        """Non-empty views of a tab, and their paths."""
         for view in tab.views.values():
             where, shown = title, view
-            if isinstance(view, Again):
+            if isinstance(view, ViewReference):
                 other = self._tabs.get(view.panel)
                 if other is None or view.title not in other.views:
                     continue
                 where, shown = view.panel, other.views[view.title]
-            if not _is_bare(shown):
-                yield _Placed(origin(where, shown), shown)
+            if not _is_empty(shown):
+                yield _PlacedView(origin(where, shown), shown)
 
     def _container(self, title: str, tab: _Tab) -> rrb.Container:
         placed = list(self._placed(title, tab))
@@ -106,18 +105,18 @@ class Layout:
             over_time = [item for item in placed if isinstance(item.view, TimePlot | StateLines)]
             rest = [item for item in placed if item not in over_time]
             columns = [self._column(title, number, items) for number, items in enumerate((over_time, rest)) if items]
-            return _lasting(rrb.Horizontal(*columns, column_shares=[3, 2][: len(columns)], name=title), title)
-        views = [_lasting(self._view(item), title, item.path) for item in placed]
+            return _with_stable_id(rrb.Horizontal(*columns, column_shares=[3, 2][: len(columns)], name=title), title)
+        views = [_with_stable_id(self._view(item), title, item.path) for item in placed]
         if tab.arranged == "grid" and len(placed) > 1:
-            return _lasting(rrb.Grid(*views, grid_columns=2, name=title), title)
-        return _lasting(rrb.Vertical(*views, row_shares=_shares(placed), name=title), title)
+            return _with_stable_id(rrb.Grid(*views, grid_columns=2, name=title), title)
+        return _with_stable_id(rrb.Vertical(*views, row_shares=_shares(placed), name=title), title)
 
-    def _column(self, title: str, number: int, placed: Sequence[_Placed]) -> rrb.Container:
-        """One under the other, so that one moment is one vertical line."""
-        views = [_lasting(self._view(item), title, item.path) for item in placed]
-        return _lasting(rrb.Vertical(*views, row_shares=_shares(placed)), title, str(number))
+    def _column(self, title: str, number: int, placed: Sequence[_PlacedView]) -> rrb.Container:
+        """Views one below the other, so that one time is one vertical line."""
+        views = [_with_stable_id(self._view(item), title, item.path) for item in placed]
+        return _with_stable_id(rrb.Vertical(*views, row_shares=_shares(placed)), title, str(number))
 
-    def _view(self, placed: _Placed) -> rrb.View:
+    def _view(self, placed: _PlacedView) -> rrb.View:
         path, view = placed
         match view:
             case TimePlot():
@@ -144,37 +143,37 @@ class Layout:
                 ]
                 bounds = rrb.VisualBounds2D(x_range=across, y_range=down)
                 return rrb.Spatial2DView(origin=path, name=view.title, visual_bounds=bounds, time_ranges=at_any_time)
-            case Again():
-                raise AssertionError("what is drawn again was looked up before")
+            case ViewReference():
+                raise AssertionError("references were resolved before")
             case _:
                 assert_never(view)
 
 
 def origin(tab: str, view: View) -> str:
-    """Where a view is drawn; Rerun labels lanes with their whole paths, so these are short and without spaces."""
+    """Path of a view; Rerun labels lanes with their full paths, so these are short and without spaces."""
     return path_of(view.title.lower().replace(" ", "-")) if isinstance(view, StateLines) else path_of(tab, view.title)
 
 
 _Part = TypeVar("_Part", rrb.Container, rrb.View)
 
 
-def _lasting(part: _Part, *names: str) -> _Part:
-    """A part of the layout, known by its names also in the next one: a viewer keeps what people did to it."""
+def _with_stable_id(part: _Part, *names: str) -> _Part:
+    """Set an id derived from names, so that a viewer keeps the changes of users in the next blueprint."""
     part.id = uuid5(NAMESPACE_URL, "/".join((APPLICATION, *names)))
     return part
 
 
-def _shares(placed: Sequence[_Placed]) -> list[float]:
+def _shares(placed: Sequence[_PlacedView]) -> list[float]:
     return [_LANES_SHARE if isinstance(item.view, StateLines) else 1.0 for item in placed]
 
 
-def _is_bare(view: View) -> bool:
-    """Whether there is nothing to be seen in a view."""
+def _is_empty(view: View) -> bool:
+    """True if a view shows nothing."""
     return (isinstance(view, StateLines) and not view.lines) or (isinstance(view, EventLog) and not view.events)
 
 
-def _merged(known: View | None, view: View) -> View:
-    """What is remembered of a view: no numbers, and of lines and events one, to tell that there are any."""
+def _merge(known: View | None, view: View) -> View:
+    """Stored form of a view: without numbers, and with one line or event as a sign that there are any."""
     match view:
         case TimePlot():
             shown = view.shown

@@ -1,8 +1,7 @@
-"""Pictures of dashboards, without a screen: Rerun's own viewer draws them, in a process that lives for one dashboard.
+"""Pictures of dashboards without a screen, drawn by the headless Rerun viewer in a process for each dashboard.
 
-There is no moment at which the viewer says that it is done. What can be seen is that nothing is being loaded any more,
-that the picture holds coloured lines and not only frames, that it is not that of another tab any more, and that the
-next picture is the same.
+The viewer does not report that it has finished. A picture is complete if nothing is being loaded, it has coloured lines
+and not only frames, it is not that of the tab before, and the next picture is equal.
 """
 
 import io
@@ -23,35 +22,35 @@ from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.folder import make_folder
 from reactorwatch.runtime.loopback import free_port
 from recorder.dashboard.file import DIAGNOSIS
-from recorder.dashboard.viewer import viewer
+from recorder.dashboard.viewer_process import viewer
 from recorder.panels import PANELS
 
 if TYPE_CHECKING:
-    from recorder.dashboard.screen import Viewer
+    from recorder.dashboard.viewer_client import Viewer
 
 DEADLINE_S = 60.0
-LOOK_EVERY_S = 0.3
+POLL_S = 0.3
 LEAST_COLOUR = 60
-"""By how much the channels of a pixel differ at least, when it is of a line: frames and texts are grey."""
+"""Least difference between the channels of a pixel of a line; frames and texts are grey."""
 LEAST_PIXELS = 500
-"""Of that sort, in a picture with plots in it; its buttons have fewer."""
+"""Least number of coloured pixels of a picture with plots; buttons alone have fewer."""
 
 
 def render_png(rrd: Path, png: Path, width: int = 1600, height: int = 1000, deadline_s: float = DEADLINE_S) -> None:
-    """Draw a dashboard as it looks when it is opened.
+    """Draw the initial view of a dashboard.
 
     Args:
         rrd: the dashboard.
-        png: the picture; an older one of that name is replaced.
-        width: in pixels.
-        height: in pixels.
-        deadline_s: how long it may take.
+        png: the picture; an existing file is replaced.
+        width: width in pixels.
+        height: height in pixels.
+        deadline_s: largest duration, in seconds.
 
     Raises:
-        InputError: there is no such dashboard, the viewer does not run on this machine, or it shows no plots in time.
+        InputError: the dashboard does not exist, the viewer does not run on this machine, or it shows no plots in time.
     """
     deadline = time.monotonic() + deadline_s
-    with atomic_write(png) as temporary, _Studio.opened(rrd, width, height, deadline) as studio:
+    with atomic_write(png) as temporary, _HeadlessViewer.open(rrd, width, height, deadline) as studio:
         temporary.write_bytes(studio.picture(deadline))
 
 
@@ -62,75 +61,75 @@ def render_tabs(
 
     Args:
         rrd: the dashboard.
-        folder: for the pictures, which are named after the tabs; it is made if it is not there.
-        width: in pixels.
-        height: in pixels.
-        deadline_s: how long each may take.
+        folder: folder for the pictures, which are named after the tabs; it is created if needed.
+        width: width in pixels.
+        height: height in pixels.
+        deadline_s: largest duration of each picture, in seconds.
 
     Returns:
         The pictures, in the order of the tabs.
 
     Raises:
-        InputError: as `render_png`; or the folder cannot be made.
+        InputError: as `render_png`; or the folder cannot be created.
     """
     make_folder(folder)
-    found: list[Path] = []
+    pictures: list[Path] = []
     deadline = time.monotonic() + deadline_s
-    with _Studio.opened(rrd, width, height, deadline) as studio:
+    with _HeadlessViewer.open(rrd, width, height, deadline) as studio:
         picture = studio.picture(deadline)
-        for number, (title, tab) in enumerate(studio.tabs().items()):
-            if number:
+        for index, (title, tab) in enumerate(studio.tabs().items()):
+            if index:
                 studio.open_tab(tab)
                 picture = studio.picture(time.monotonic() + deadline_s, other_than=picture)
-            path = folder / f"{named_after(title)}.png"
+            path = folder / f"{slug(title)}.png"
             with atomic_write(path) as temporary:
                 temporary.write_bytes(picture)
-            found.append(path)
-    return found
+            pictures.append(path)
+    return pictures
 
 
 def picture_names() -> list[str]:
-    """The names of the pictures that `render_tabs` may write."""
-    return [f"{named_after(title)}.png" for title in (*(panel.title for panel in PANELS), DIAGNOSIS)]
+    """Names of the pictures that `render_tabs` may write."""
+    return [f"{slug(title)}.png" for title in (*(panel.title for panel in PANELS), DIAGNOSIS)]
 
 
-def named_after(title: str) -> str:
-    """The name of a file for a tab: `residuals-and-charts`."""
+def slug(title: str) -> str:
+    """Title as a file name: `residuals-and-charts`."""
     return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")
 
 
 def count_coloured(png: bytes) -> int:
-    """How many pixels of a picture are those of coloured lines."""
+    """Number of pixels of coloured lines."""
     channels = _channels(png)
     return int((channels.max(axis=2) - channels.min(axis=2) >= LEAST_COLOUR).sum())
 
 
 def _channels(png: bytes) -> NDArray[np.int16]:
-    """Shape (height, width, 3)."""
+    """Pixels of a picture, shape (height, width, 3)."""
     from PIL import Image
 
     with Image.open(io.BytesIO(png)) as image:
         return np.asarray(image.convert("RGB"), np.int16)
 
 
-class _Studio:
-    """A viewer without a screen that shows a dashboard.
+class _HeadlessViewer:
+    """Headless viewer that shows a dashboard.
 
     Args:
-        process: the viewer's.
-        port: that it listens at.
-        log: what it says.
-        deadline: when it is to answer at the latest, by the monotonic clock.
+        process: process of the viewer.
+        port: port of the viewer.
+        log: file with its output.
+        deadline: latest time of its first reply, by the monotonic clock.
     """
 
     def __init__(self, process: subprocess.Popen[bytes], port: int, log: Path, deadline: float) -> None:
         self._process, self._log = process, log
-        self._client = self._connected(port, deadline)
+        self._client = self._connect(port, deadline)
 
     @classmethod
     @contextmanager
-    def opened(cls, rrd: Path, width: int, height: int, deadline: float) -> "Iterator[_Studio]":
-        """One with settings of nobody's; it ends with the context."""
+    def open(cls, rrd: Path, width: int, height: int, deadline: float) -> "Iterator[_HeadlessViewer]":
+        """Run a viewer with default settings within the context."""
         if not rrd.is_file():
             raise InputError(f"{rrd}: there is no such file")
         port = free_port()
@@ -142,22 +141,24 @@ class _Studio:
                 yield cls(process, port, log, deadline)
 
     def picture(self, deadline: float, other_than: bytes = b"") -> bytes:
-        """What it shows once all is there.
+        """Picture of the tab once it is complete.
 
         Args:
-            deadline: until when, by the monotonic clock.
-            other_than: a picture of something else, shown before.
+            deadline: latest time, by the monotonic clock.
+            other_than: picture of the tab shown before.
         """
         before, shows = b"", "nothing was drawn"
-        while self._goes_on(deadline, shows):
+        while self._wait_for_poll(deadline, shows):
             png = self._client.screenshot()
             coloured = count_coloured(png)
             shows = f"{coloured} coloured pixels"
-            whole = coloured >= LEAST_PIXELS and self._client.is_ready and (not other_than or _differ(png, other_than))
-            if whole and png == before:
+            is_complete = (
+                coloured >= LEAST_PIXELS and self._client.is_ready and (not other_than or _differ(png, other_than))
+            )
+            if is_complete and png == before:
                 return png
             before = png
-        raise AssertionError("it goes on or raises")
+        raise AssertionError("polling continues or raises")
 
     def tabs(self) -> dict[str, str]:
         """See `Viewer.tabs`."""
@@ -167,11 +168,11 @@ class _Studio:
         """See `Viewer.open_tab`."""
         self._client.open_tab(tab)
 
-    def _connected(self, port: int, deadline: float) -> "Viewer":
-        from recorder.dashboard.screen import Viewer
+    def _connect(self, port: int, deadline: float) -> "Viewer":
+        from recorder.dashboard.viewer_client import Viewer
 
         shows = "it did not answer"
-        while self._goes_on(deadline, shows):
+        while self._wait_for_poll(deadline, shows):
             try:
                 client = Viewer(port)
                 if client.is_ready:
@@ -179,27 +180,27 @@ class _Studio:
                     return client
             except (ConnectionError, RuntimeError) as error:
                 shows = str(error)  # not listening yet
-        raise AssertionError("it goes on or raises")
+        raise AssertionError("polling continues or raises")
 
-    def _goes_on(self, deadline: float, shows: str) -> bool:
-        """Wait until it is time for another look.
+    def _wait_for_poll(self, deadline: float, shows: str) -> bool:
+        """Wait until the next poll is due.
 
         Raises:
-            InputError: the viewer has ended, or the time is over.
+            InputError: the viewer has exited, or the deadline has passed.
         """
         if time.monotonic() >= deadline:
             raise InputError(f"no picture: the viewer did not show the plots in time ({shows})")
         try:
-            code = self._process.wait(LOOK_EVERY_S)
+            code = self._process.wait(POLL_S)
         except subprocess.TimeoutExpired:
             return True
-        said = self._log.read_text(errors="replace").strip().splitlines()
+        lines = self._log.read_text(errors="replace").strip().splitlines()
         raise InputError(
-            f"no picture: the viewer ended with code {code}: {said[-1] if said else 'it did not say why'}; it needs a "
+            f"no picture: the viewer ended with code {code}: {lines[-1] if lines else 'without a message'}; it needs a "
             f"graphics driver, on Debian mesa-vulkan-drivers libegl1 libgl1 libxkbcommon-x11-0"
         )
 
 
 def _differ(one: bytes, other: bytes) -> bool:
-    """Whether two pictures differ by more than the name of the tab in front."""
+    """True if two pictures differ by more than the title of the active tab."""
     return bool((np.abs(_channels(one) - _channels(other)).max(axis=2) >= LEAST_COLOUR).sum() >= LEAST_PIXELS)

@@ -1,7 +1,7 @@
-"""A plane of one value over another, of which Rerun has no plot: its axes are lines and labels like what is in it.
+"""Draw a plane plot, which Rerun lacks: its axes are drawn as lines and labels.
 
-The path goes out in strips, one a stretch, which the view shows all at once, whatever their time. What sets the scale
-of the page is settled by the first stretch; a frame that has become too small is drawn anew, larger.
+Each segment adds a strip to the path, and the view shows all strips regardless of their time. The first segment sets
+the scale of the page. A frame that has become too small is redrawn larger.
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from reactorwatch.axis import Axis, axis
 from recorder.dashboard.stream import Stream, path_of
 from recorder.panels.base import Box, PlaneMark, PlanePath, PlanePlot
 
-_WIDTH, _HEIGHT = 400.0, 300.0  # of the box that sets the scales, in units of the page
+_WIDTH, _HEIGHT = 400.0, 300.0  # page size of the box that sets the scales
 _AXIS_COLOUR = (90, 90, 90)
 _LABEL_COLOUR = (150, 150, 150)
-_BELOW, _PATHS, _CURVES, _MARKS = 0.0, 10.0, 30.0, 100.0  # what is drawn over what
+_BELOW, _PATHS, _CURVES, _MARKS = 0.0, 10.0, 30.0, 100.0  # drawing order
 
 
 class Frame(NamedTuple):
-    """The axes of a plane, and what sets its scales."""
+    """Axes of a plane, and the box that sets its scales."""
 
     box: Box
     x_axis: Axis
@@ -30,16 +30,16 @@ class Frame(NamedTuple):
 
     @classmethod
     def around(cls, box: Box, shown: Box) -> "Frame":
-        """The frame that shows so much."""
+        """Frame that contains `shown`."""
         return cls(box, axis(shown.x_lower, shown.x_upper), axis(shown.y_lower, shown.y_upper))
 
     def holds(self, shown: Box) -> bool:
-        """Whether it shows so much."""
+        """True if the frame contains `shown`."""
         across = self.x_axis.lower <= shown.x_lower and shown.x_upper <= self.x_axis.upper
         return across and self.y_axis.lower <= shown.y_lower and shown.y_upper <= self.y_axis.upper
 
     def page(self, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Places on the page, shape (points, 2); the second coordinate counts downwards, as on a screen."""
+        """Page coordinates, shape (points, 2); the second one points downwards, as on a screen."""
         box = self.box
         across = (x - box.x_lower) / ((box.x_upper - box.x_lower) or 1.0)
         up = (y - box.y_lower) / ((box.y_upper - box.y_lower) or 1.0)
@@ -47,7 +47,7 @@ class Frame(NamedTuple):
 
     @property
     def edges(self) -> tuple[float, float, float, float]:
-        """Left, right, top and bottom on the page."""
+        """Left, right, top and bottom in page coordinates."""
         corners = self.page(
             np.array([self.x_axis.lower, self.x_axis.upper]), np.array([self.y_axis.lower, self.y_axis.upper])
         )
@@ -56,14 +56,14 @@ class Frame(NamedTuple):
 
     @property
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """What of the page is to be seen, labels included: from left to right, and from top to bottom."""
+        """Visible range of the page, labels included: (left, right), (top, bottom)."""
         left, right, top, bottom = self.edges
         width, height = right - left, bottom - top
         return (left - 0.12 * width, right + 0.1 * width), (top - 0.18 * height, bottom + 0.22 * height)
 
 
 def draw_plane(stream: Stream, path: str, plane: PlanePlot, frame: Frame, zero_ns: int) -> None:
-    """Draw a plane, or add to it what a stretch has."""
+    """Draw a plane, or add a segment to it."""
     _draw_frame(stream, path, plane, frame)
     time_ns = np.array([plane.time_ns], np.int64)
     for order, line in enumerate(plane.paths):
@@ -73,18 +73,18 @@ def draw_plane(stream: Stream, path: str, plane: PlanePlot, frame: Frame, zero_n
             look = rr.LineStrips2D.from_fields(
                 colors=[line.colour], radii=rr.Radius.ui_points(line.width / 2), draw_order=_PATHS + order
             )
-            stream.say(where, (line.colour, line.width), look)
+            stream.log_static(where, (line.colour, line.width), look)
             columns = rr.LineStrips2D.columns(strips=strips).partition([len(strips)])
             stream.send(where, time_ns, zero_ns, columns)
     for line in plane.curves:
         curve = rr.LineStrips2D(
             _strips(line, frame), colors=[line.colour], radii=rr.Radius.ui_points(line.width / 2), draw_order=_CURVES
         )
-        stream.say(path + path_of(line.name), np.concatenate([line.x, line.y]).tobytes(), curve)
+        stream.log_static(path + path_of(line.name), np.concatenate([line.x, line.y]).tobytes(), curve)
     if plane.marks:
-        stream.say(path + path_of("marks"), plane.marks, _points(plane.marks, frame))
+        stream.log_static(path + path_of("marks"), plane.marks, _points(plane.marks, frame))
     for mark in plane.events:
-        stream.say(path + path_of(mark.name), mark, _points((mark,), frame))
+        stream.log_static(path + path_of(mark.name), mark, _points((mark,), frame))
 
 
 def _draw_frame(stream: Stream, path: str, plane: PlanePlot, frame: Frame) -> None:
@@ -97,7 +97,7 @@ def _draw_frame(stream: Stream, path: str, plane: PlanePlot, frame: Frame) -> No
     grid = [[[at, top], [at, bottom]] for at, _ in x_ticks] + [[[left, at], [right, at]] for _, at in y_ticks]
     around = [[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]
     lines = rr.LineStrips2D([*grid, around], colors=[_AXIS_COLOUR], radii=rr.Radius.ui_points(0.4), draw_order=_BELOW)
-    stream.say(path + path_of("axes"), key, lines)
+    stream.log_static(path + path_of("axes"), key, lines)
     texts = {
         **{(at, bottom + 0.05 * height): text for (at, _), text in zip(x_ticks, x_axis.labels, strict=True)},
         **{(left - 0.045 * width, at): text for (_, at), text in zip(y_ticks, y_axis.labels, strict=True)},
@@ -113,7 +113,7 @@ def _draw_frame(stream: Stream, path: str, plane: PlanePlot, frame: Frame) -> No
         colors=[_LABEL_COLOUR],
         radii=rr.Radius.ui_points(0.0),
     )
-    stream.say(path + path_of("axis labels"), (key, plane.note), labels)
+    stream.log_static(path + path_of("axis labels"), (key, plane.note), labels)
 
 
 def _points(marks: Sequence[PlaneMark], frame: Frame) -> rr.Points2D:
@@ -128,7 +128,7 @@ def _points(marks: Sequence[PlaneMark], frame: Frame) -> rr.Points2D:
 
 
 def _strips(line: PlanePath, frame: Frame) -> list[NDArray[np.float64]]:
-    """The stretches of a path without gaps."""
+    """Parts of a path between its gaps."""
     there = np.isfinite(line.x) & np.isfinite(line.y)
     edges = np.flatnonzero(np.diff(there, prepend=False, append=False))
     return [frame.page(line.x[start:end], line.y[start:end]) for start, end in edges.reshape(-1, 2)]

@@ -1,7 +1,7 @@
-"""A stream of Rerun's, and what everything drawn onto it has: a path, two timelines, and a look that is said once.
+"""Wrapper of a Rerun stream with two timelines, which logs static data once.
 
-Two timelines carry every point: the time of the run, as a rule since its first sample, for people, and the time of the
-sample, for those who compare with something else.
+Every point is on both timelines: the time of the run, usually since its first sample, for people, and the sample time,
+for comparison with other data.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ BATCH_ROWS = 8192
 
 
 class Stream:
-    """What has been said on a recording stream once and for all.
+    """Rerun stream that logs static data once.
 
     Args:
         recording: the stream.
@@ -23,27 +23,27 @@ class Stream:
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._recording = recording
-        self._said: dict[str, object] = {}
+        self._static_keys: dict[str, object] = {}
 
-    def say(self, path: str, key: object, what: rr.AsComponents) -> None:
-        """Say something without a time, unless what was said there last is the same.
+    def log_static(self, path: str, key: object, data: rr.AsComponents) -> None:
+        """Log static data, unless equal data were logged last.
 
         Args:
-            path: of the entity.
-            key: equal if what is said is.
-            what: it.
+            path: path of the entity.
+            key: key that is equal for equal data.
+            data: the data.
         """
-        if self._said.get(path) != key:
-            self._said[path] = key
-            self._recording.log(path, what, static=True)
+        if self._static_keys.get(path) != key:
+            self._static_keys[path] = key
+            self._recording.log(path, data, static=True)
 
     def send(self, path: str, time_ns: NDArray[np.int64], zero_ns: int, columns: rr.ComponentColumnList) -> None:
         """Send columns, a row for each time.
 
         Args:
-            path: of the entity.
-            time_ns: of the samples that they speak of.
-            zero_ns: the time that the run counts from.
+            path: path of the entity.
+            time_ns: sample times.
+            zero_ns: time that minutes count from.
             columns: the values.
         """
         self._recording.send_columns(path, _clocks(time_ns, zero_ns), columns, strict=True)
@@ -56,7 +56,7 @@ class Stream:
 
 
 def path_of(*parts: str) -> str:
-    """The path of an entity, from names of any kind."""
+    """Path of an entity, from names with any characters."""
     return rr.new_entity_path(list(parts))
 
 

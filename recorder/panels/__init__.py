@@ -1,4 +1,4 @@
-"""The catalogue of panels, in the order of their tabs.
+"""Catalogue of panels, in the order of their tabs.
 
 A new panel is a file here that ends in `PANEL = Panel(title, draw)`, and a line in the tuple below.
 """

@@ -1,9 +1,9 @@
-"""The life of each alarm as a line of its states, and a log of what was raised and cleared and of the true faults."""
+"""Alarm states over time, and a log of alarms, suspects and injected faults."""
 
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.suspects import suspects_text
 from reactorwatch.records.record import to_minutes
-from recorder.columns.run import AlarmChange, FaultChange, Run
+from recorder.columns.run import AlarmChange, FaultChange, RunColumns
 from recorder.columns.run_reader import LISTED, SUSPECTED
 from recorder.panels.base import (
     ALARM,
@@ -42,29 +42,31 @@ _COLOURS: dict[str, Colour] = {
 }
 
 
-def draw(run: Run) -> tuple[View, ...]:
-    """The lanes, and one log of alarms, suspects and faults."""
-    known_ns = run.earlier.suspected_ns
-    looks = {  # alarms of one look agree
-        change.time_ns: change for change in run.alarms if change.event == SUSPECTED and change.time_ns != known_ns
+def draw(run: RunColumns) -> tuple[View, ...]:
+    """State lanes of the alarms, and one log of alarms, suspects and faults."""
+    last_ns = run.context.suspects_ns
+    suspects = {  # alarms of one time have the same suspects
+        change.time_ns: change for change in run.alarms if change.event == SUSPECTED and change.time_ns != last_ns
     }
     logged = (change for change in run.alarms if change.event not in (SUSPECTED, LISTED))
-    events = [_of_alarm(change, run.zero_ns) for change in logged]
-    events += [_of_suspects(change, run.zero_ns) for change in looks.values()]
-    events += [_of_fault(change, run.zero_ns) for change in run.faults]
+    events = [_alarm_event(change, run.zero_ns) for change in logged]
+    events += [_suspects_event(change, run.zero_ns) for change in suspects.values()]
+    events += [_fault_event(change, run.zero_ns) for change in run.faults]
     log = EventLog("Alarms and faults", tuple(sorted(events, key=lambda event: event.time_ns)))
     lines = tuple(_line(run, alarm) for alarm in dict.fromkeys(change.alarm for change in run.alarms))
     return (StateLines("Alarm states", lines, _COLOURS), log)
 
 
-def _line(run: Run, alarm: str) -> StateLine:
-    """The states of an alarm; one that is raised as the first thing that is heard of it was normal until then."""
-    changes = {change.time_ns: change for change in run.alarms if change.alarm == alarm}  # the last of a moment counts
+def _line(run: RunColumns, alarm: str) -> StateLine:
+    """States of an alarm; normal before the first change, if that raises it."""
+    changes = {
+        change.time_ns: change for change in run.alarms if change.alarm == alarm
+    }  # the last one of equal times counts
     first = next(iter(changes.values()))
     times, states = list(changes), [_word(change.state) for change in changes.values()]
-    begun_ns = max(run.first_ns, run.zero_ns)  # of a run that is joined late, the first sample heard is not its first
-    if alarm not in run.earlier.states and first.event == "raised" and begun_ns < first.time_ns:
-        times, states = [begun_ns, *times], ["normal", *states]
+    start_ns = max(run.first_ns, run.zero_ns)  # later than the run's start if it was joined late
+    if alarm not in run.context.alarm_states and first.event == "raised" and start_ns < first.time_ns:
+        times, states = [start_ns, *times], ["normal", *states]
     return StateLine(alarm, tuple(times), tuple(states))
 
 
@@ -72,23 +74,23 @@ def _word(state: int) -> str:
     return _WORDS.get(state, str(state))
 
 
-def _of_alarm(change: AlarmChange, zero_ns: int) -> Event:
+def _alarm_event(change: AlarmChange, zero_ns: int) -> Event:
     word = _word(change.state)
     colour = ALARM if change.state == messages.ALARM_STATE_UNACKNOWLEDGED else QUIET
     return Event(change.time_ns, word, f"{_at(change.time_ns, zero_ns)}  {change.alarm}: {change.text}", colour)
 
 
-def _of_suspects(change: AlarmChange, zero_ns: int) -> Event:
-    told = suspects_text(change.suspects, zero_ns)
-    return Event(change.time_ns, "suspect", f"{_at(change.time_ns, zero_ns)}  {told}", ALARM)
+def _suspects_event(change: AlarmChange, zero_ns: int) -> Event:
+    text = suspects_text(change.suspects, zero_ns)
+    return Event(change.time_ns, "suspect", f"{_at(change.time_ns, zero_ns)}  {text}", ALARM)
 
 
-def _of_fault(change: FaultChange, zero_ns: int) -> Event:
-    done = "injected" if change.active else "taken away"
+def _fault_event(change: FaultChange, zero_ns: int) -> Event:
+    action = "injected" if change.active else "removed"
     return Event(
         change.time_ns,
         "fault",
-        f"{_at(change.time_ns, zero_ns)}  {done}: {change.specification or change.cause}",
+        f"{_at(change.time_ns, zero_ns)}  {action}: {change.specification or change.cause}",
         FAULT,
     )
 

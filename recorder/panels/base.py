@@ -1,7 +1,7 @@
-"""What a panel says of a run: plain descriptions, which know nothing of the program that draws them.
+"""Descriptions of plots, independent of the program that draws them.
 
-A run is described stretch by stretch. What has a time is added to what there is; a view of the same title is the same
-view.
+A run is described segment by segment. A view with the title of an earlier one is the same view, and data with a time
+are added to it.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,11 +11,11 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from recorder.columns.run import Run
+from recorder.columns.run import RunColumns
 
 
 class Colour(NamedTuple):
-    """Red, green and blue, 0 to 255; chosen to be told apart on dark and on light ground, and by the colour-blind.
+    """Red, green and blue, 0 to 255, distinguishable on dark and light ground and by the colour-blind.
 
     The hues are those of Okabe and Ito, "Color Universal Design" (2008).
     """
@@ -36,20 +36,20 @@ QUIET = Colour(150, 150, 150)
 STABLE = Colour(60, 200, 140)
 UNSTABLE = Colour(225, 130, 190)
 SEVERAL = (MEASURED, PREDICTED, INPUT, RESIDUAL, FAULT, ALARM)
-"""For lines that are alike, one after the other."""
+"""Colours of lines of one kind, in order."""
 
 
 class Series(NamedTuple):
     """A line in a time plot.
 
     Attributes:
-        name: of the line, of which there is one in a plot.
-        time_ns: shape (points,), ascending.
-        value: shape (points,); NaN leaves a gap.
-        colour: of the line.
-        width: of the line, in points of the screen.
-        held: drawn as steps, because the value holds until the next.
-        legend: the name for people, where it is not `name`; lines may share one.
+        name: name of the line, unique in its plot.
+        time_ns: times, shape (points,), ascending.
+        value: values, shape (points,); NaN leaves a gap.
+        colour: colour of the line.
+        width: width of the line, in points of the screen.
+        held: True to draw steps, because a value holds until the next.
+        legend: displayed name, where it is not `name`; lines may share one.
     """
 
     name: str
@@ -65,10 +65,10 @@ class TimePlot(NamedTuple):
     """Lines over the time of the run.
 
     Attributes:
-        title: as on the screen.
-        unit: of all its lines.
-        series: the lines, the last on top.
-        shown: the values between which it opens; None for all.
+        title: displayed title.
+        unit: unit of all lines.
+        series: lines, the last on top.
+        shown: initial range of values; None for all.
     """
 
     title: str
@@ -94,7 +94,7 @@ class EventLog(NamedTuple):
 
 
 class StateLine(NamedTuple):
-    """What state a thing is in: from each time on, a word."""
+    """States over time: each word holds from its time on."""
 
     name: str
     time_ns: tuple[int, ...]
@@ -102,7 +102,7 @@ class StateLine(NamedTuple):
 
 
 class StateLines(NamedTuple):
-    """Lanes over the time of the run, coloured by the state of each; `colours` are by its word."""
+    """Lanes of states over the time of the run; `colours` maps the word of a state to its colour."""
 
     title: str
     lines: tuple[StateLine, ...]
@@ -110,7 +110,7 @@ class StateLines(NamedTuple):
 
 
 class PlanePath(NamedTuple):
-    """A line in a plane, shape (points,); NaN leaves a gap."""
+    """Line in a plane; `x` and `y` have shape (points,), and NaN leaves a gap."""
 
     name: str
     x: NDArray[np.float64]
@@ -120,7 +120,7 @@ class PlanePath(NamedTuple):
 
 
 class PlaneMark(NamedTuple):
-    """A point in a plane with its name beside it."""
+    """Labelled point in a plane."""
 
     name: str
     x: float
@@ -129,7 +129,7 @@ class PlaneMark(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A rectangle in a plane, in its units."""
+    """Rectangle in the units of a plane."""
 
     x_lower: float
     x_upper: float
@@ -138,20 +138,20 @@ class Box(NamedTuple):
 
 
 class PlanePlot(NamedTuple):
-    """One thing over another.
+    """Plot of one quantity over another.
 
     Attributes:
-        title: as on the screen.
-        x_label: with the unit.
-        y_label: with the unit.
-        box: what sets the scales; that of the first stretch counts.
-        shown: what it opens on.
-        time_ns: that the paths are of.
-        paths: in order of time; those of a stretch are added to those before.
-        curves: as they are now; those of a stretch take the place of those before.
-        marks: likewise.
-        events: marks that stay.
-        note: a line of text above it.
+        title: displayed title.
+        x_label: label of the x axis, with the unit.
+        y_label: label of the y axis, with the unit.
+        box: rectangle that sets the scales; that of the first segment counts.
+        shown: rectangle that is initially visible.
+        time_ns: time of the paths.
+        paths: paths in order of time; those of a segment are added.
+        curves: present curves; those of a segment replace earlier ones.
+        marks: present marks; those of a segment replace earlier ones.
+        events: permanent marks.
+        note: line of text above the plot.
     """
 
     title: str
@@ -167,14 +167,14 @@ class PlanePlot(NamedTuple):
     note: str = ""
 
 
-class Again(NamedTuple):
-    """A view of another panel, here too, if there is one."""
+class ViewReference(NamedTuple):
+    """Copy of a view of another panel, omitted if that panel has none."""
 
     panel: str
     title: str
 
 
-View: TypeAlias = TimePlot | EventLog | StateLines | PlanePlot | Again
+View: TypeAlias = TimePlot | EventLog | StateLines | PlanePlot | ViewReference
 Arrangement: TypeAlias = Literal["rows", "grid", "beside"]
 
 
@@ -183,12 +183,12 @@ class Panel:
     """A tab of the dashboard.
 
     Attributes:
-        title: as on the screen.
-        draw: the views of a run, or of a stretch of it; none if there is nothing for it.
-        arranged: one view under the other (`rows`), two in a row (`grid`), or what goes over time at the left and the
-            rest at the right (`beside`).
+        title: displayed title.
+        draw: returns the views of a run or of a segment; empty without data.
+        arranged: one view below the other (`rows`), two in a row (`grid`), or views over time on the left and others
+            on the right (`beside`).
     """
 
     title: str
-    draw: Callable[[Run], tuple[View, ...]]
+    draw: Callable[[RunColumns], tuple[View, ...]]
     arranged: Arrangement = "rows"

@@ -1,10 +1,10 @@
-"""How the nodes do: their phase, how far behind they are, and what they lost, had too late or refused."""
+"""Health of the nodes: phase, lag, and messages lost, late or refused."""
 
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from recorder.columns.run import Report, Run
+from recorder.columns.run import HealthReport, RunColumns
 from recorder.panels.base import (
     ALARM,
     FAULT,
@@ -31,8 +31,8 @@ _PHASES = {
 }
 
 
-def draw(run: Run) -> tuple[View, ...]:
-    """A lane for each node, the lag of all in one plot, and in another how many messages they had trouble with."""
+def draw(run: RunColumns) -> tuple[View, ...]:
+    """Lanes of the nodes' phases, and plots of their lags and of problem counts."""
     if not run.health:
         return ()
     lanes = tuple(
@@ -41,19 +41,19 @@ def draw(run: Run) -> tuple[View, ...]:
     )
     return (
         StateLines("Node phases", lanes, _PHASES),
-        TimePlot("Lag between receipt and the end of the work", "ms", tuple(_lines(run, lambda item: item.lag_ms))),
+        TimePlot("Lag between receipt and the end of processing", "ms", tuple(_lines(run, lambda item: item.lag_ms))),
         TimePlot(
-            "Lost, late, refused, twice there or out of order",
+            "Lost, late, refused, duplicate or out of order",
             "messages since the start",
             tuple(_lines(run, lambda item: float(sum(item.counts.values())), held=True)),
         ),
     )
 
 
-def _lines(run: Run, of: Callable[[Report], float], *, held: bool = False) -> Iterator[Series]:
-    for place, (node, reports) in enumerate(sorted(run.health.items())):
+def _lines(run: RunColumns, of: Callable[[HealthReport], float], *, held: bool = False) -> Iterator[Series]:
+    for index, (node, reports) in enumerate(sorted(run.health.items())):
         time_ns = np.array([report.time_ns for report in reports], np.int64)
-        yield Series(node, time_ns, np.array([of(item) for item in reports]), SEVERAL[place % len(SEVERAL)], held=held)
+        yield Series(node, time_ns, np.array([of(item) for item in reports]), SEVERAL[index % len(SEVERAL)], held=held)
 
 
 PANEL = Panel("Health", draw)

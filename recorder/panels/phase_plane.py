@@ -1,7 +1,7 @@
-"""The process in the plane of its first two outputs, among the steady states of its equations.
+"""Phase plane of the first two outputs, with the steady states of the equations.
 
-In the plane a disturbance is a loop that comes back, and a reactor that leaves its operating branch goes away for
-good, which over time both look like a swing at first.
+In the plane a disturbance is a closed loop, and a reactor that leaves its operating branch does not return. Over time
+both look alike at first.
 """
 
 from collections.abc import Sequence
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.process.steady_state import SteadyState
-from recorder.columns.process_annotations import operating_branch, process_of, rests
-from recorder.columns.run import Run, Times, Values
+from recorder.columns.process_annotations import find_process, operating_branch, steady_states_at
+from recorder.columns.run import RunColumns, Times, Values
 from recorder.panels.base import (
     ALARM,
     FAULT,
@@ -26,34 +26,34 @@ from recorder.panels.base import (
     PlanePlot,
 )
 
-MOST_POINTS = 4000
-"""Of the path in a stretch; of more rows those are drawn that are farthest out."""
+MAX_POINTS = 4000
+"""Largest number of points of a path in a segment; beyond it only extreme rows are drawn."""
 MARGIN = 0.05
-"""The branch is drawn over the levels of the input that there were, and this share of it to either side at least."""
+"""Share of the mean level of the input by which the drawn branch extends to either side at least."""
 
-_STANDING = (messages.ALARM_STATE_UNACKNOWLEDGED, messages.ALARM_STATE_ACKNOWLEDGED)
+_ACTIVE = (messages.ALARM_STATE_UNACKNOWLEDGED, messages.ALARM_STATE_ACKNOWLEDGED)
 
 
-def draw(run: Run) -> tuple[PlanePlot, ...]:
-    """The path close by, and among all steady states; nothing if no process is known that has these signals."""
-    model = process_of({name: run.units.get(name, "") for name in run.seen})
+def draw(run: RunColumns) -> tuple[PlanePlot, ...]:
+    """Path around the operating branch and among all steady states; empty for signals of no known process."""
+    model = find_process({name: run.units.get(name, "") for name in run.statistics})
     if model is None or len(model.outputs) < 2 or len(model.inputs) != 1:
         return ()
     (input_,), (x_output, y_output) = model.inputs, model.outputs[:2]
-    level, x_seen, y_seen = (run.seen[name] for name in (input_.name, x_output.name, y_output.name))
-    time_ns, x, y = _together(run, x_output.name, y_output.name)
+    level, x_seen, y_seen = (run.statistics[name] for name in (input_.name, x_output.name, y_output.name))
+    time_ns, x, y = _paired_samples(run, x_output.name, y_output.name)
     if not (level.rows and np.isfinite(x).any()):
         return ()
     around = MARGIN * abs(level.mean)
     ends = (min(level.lowest, level.mean - around), max(level.highest, level.mean + around))
     branch = operating_branch(model.name, *ends, level.mean)
-    said = float(f"{level.mean:.4g}")
-    states = rests(model.name, said) if branch else ()
+    rounded = float(f"{level.mean:.4g}")
+    states = steady_states_at(model.name, rounded) if branch else ()
     data = Box(x_seen.lowest, x_seen.highest, y_seen.lowest, y_seen.highest)
     near, far = (_around(points, data) for points in (branch, (*branch, *states)))
     marks = tuple(_mark(state) for state in states)
     labels = (f"{x_output.name}, {x_output.unit}", f"{y_output.name}, {y_output.unit}")
-    note = f"steady states at {input_.name} = {said:g} {input_.unit}"
+    note = f"steady states at {input_.name} = {rounded:g} {input_.unit}"
     path = PlanePlot("", *labels, near, data, int(time_ns[-1]), _paths(run, time_ns, x, y), _curves(branch), note=note)
     at_hand = tuple(mark for mark, state in zip(marks, states, strict=True) if state is states[-1])
     return (
@@ -67,10 +67,10 @@ def draw(run: Run) -> tuple[PlanePlot, ...]:
     )
 
 
-def _together(run: Run, x_name: str, y_name: str) -> tuple[Times, Values, Values]:
-    """Both where both were measured at one time, also just before the stretch; NaN where one is unusable."""
+def _paired_samples(run: RunColumns, x_name: str, y_name: str) -> tuple[Times, Values, Values]:
+    """Samples of both signals at equal times, also just before the segment; NaN where one is not measured."""
     both = [
-        [item for item in (run.earlier.last.get(name), run.measured.get(name)) if item is not None]
+        [item for item in (run.context.last_samples.get(name), run.samples.get(name)) if item is not None]
         for name in (x_name, y_name)
     ]
     if not all(both):
@@ -82,56 +82,56 @@ def _together(run: Run, x_name: str, y_name: str) -> tuple[Times, Values, Values
     return time_ns, np.where(there, x[at_x], np.nan), np.where(there, y[at_y], np.nan)
 
 
-def _paths(run: Run, time_ns: Times, x: Values, y: Values) -> tuple[PlanePath, ...]:
-    """The path, in another colour while an alarm stands."""
-    alarmed = _alarm_stands(run, time_ns)
-    rows = _farthest(x, y)
+def _paths(run: RunColumns, time_ns: Times, x: Values, y: Values) -> tuple[PlanePath, ...]:
+    """Path, in another colour while an alarm is active."""
+    alarmed = _alarm_is_active(run, time_ns)
+    rows = _envelope_rows(x, y)
     x, y, alarmed = x[rows], y[rows], alarmed[rows]
-    # a step belongs to the state that it ends in; its first point too, so that the line is not broken there
+    # a step has the state of its end; its first point is included, so that the line is continuous
     towards = np.append(alarmed[1:], alarmed[-1])
     return tuple(
         PlanePath(name, np.where(mask, x, np.nan), np.where(mask, y, np.nan), colour)
         for name, mask, colour in (
             ("no alarm", ~alarmed | ~towards, MEASURED),
-            ("alarm stands", alarmed | towards, ALARM),
+            ("alarm active", alarmed | towards, ALARM),
         )
         if mask.any()
     )
 
 
-def _farthest(x: Values, y: Values) -> NDArray[np.int64]:
-    """The rows to draw: of each group of rows the lowest and the highest of either output, in order of time."""
-    if x.size <= MOST_POINTS:
+def _envelope_rows(x: Values, y: Values) -> NDArray[np.int64]:
+    """Rows to draw, in order of time: in each group, those with the lowest and highest value of either output."""
+    if x.size <= MAX_POINTS:
         return np.arange(x.size)
-    each = -(-x.size // (MOST_POINTS // 4))
-    whole = x.size - x.size % each
-    first = np.arange(0, whole, each)
-    rows = [np.arange(whole, x.size)]
+    each = -(-x.size // (MAX_POINTS // 4))
+    grouped = x.size - x.size % each
+    first = np.arange(0, grouped, each)
+    rows = [np.arange(grouped, x.size)]
     for values in (x, y):
-        groups = values[:whole].reshape(-1, each)
+        groups = values[:grouped].reshape(-1, each)
         rows.append(first + np.argmin(np.where(np.isfinite(groups), groups, np.inf), axis=1))
         rows.append(first + np.argmax(np.where(np.isfinite(groups), groups, -np.inf), axis=1))
     return np.unique(np.concatenate(rows))
 
 
-def _alarm_stands(run: Run, time_ns: Times) -> NDArray[np.bool_]:
-    """Shape (times,): whether any alarm stands."""
-    standing = {alarm for alarm, state in run.earlier.states.items() if state in _STANDING}
-    stands = np.full(time_ns.size, bool(standing))
+def _alarm_is_active(run: RunColumns, time_ns: Times) -> NDArray[np.bool_]:
+    """True where any alarm is active, shape (times,)."""
+    active = {alarm for alarm, state in run.context.alarm_states.items() if state in _ACTIVE}
+    is_active = np.full(time_ns.size, bool(active))
     for change in run.alarms:
-        (standing.add if change.state in _STANDING else standing.discard)(change.alarm)
-        stands[np.searchsorted(time_ns, change.time_ns) :] = bool(standing)
-    return stands
+        (active.add if change.state in _ACTIVE else active.discard)(change.alarm)
+        is_active[np.searchsorted(time_ns, change.time_ns) :] = bool(active)
+    return is_active
 
 
-def _events(run: Run, time_ns: Times, x: Values, y: Values) -> tuple[PlaneMark, ...]:
-    """Where the first fault set in and the first alarm was raised, if that was in this stretch."""
-    onset = run.earlier.onset_ns
+def _events(run: RunColumns, time_ns: Times, x: Values, y: Values) -> tuple[PlaneMark, ...]:
+    """Marks of the onset of the first fault and of the first alarm, if in this segment."""
+    onset = run.context.onset_ns
     if onset is None:
         onset = next((change.onset_ns for change in run.faults if change.active), None)
     raised = None
-    if not run.earlier.states:
-        raised = next((change.time_ns for change in run.alarms if change.state in _STANDING), None)
+    if not run.context.alarm_states:
+        raised = next((change.time_ns for change in run.alarms if change.state in _ACTIVE), None)
     marks = []
     for name, event_ns, colour in (("fault sets in", onset, FAULT), ("first alarm", raised, ALARM)):
         if event_ns is not None and time_ns[0] <= event_ns <= time_ns[-1]:
@@ -147,11 +147,11 @@ def _mark(state: SteadyState) -> PlaneMark:
 
 
 def _curves(branch: Sequence[SteadyState]) -> tuple[PlanePath, ...]:
-    """The operating branch, stable and not; a step belongs to the state that it ends in."""
+    """Stable and unstable part of the operating branch; a step has the stability of its end."""
     if not branch:
         return ()
-    points = np.array([rest.outputs[:2] for rest in branch])
-    stable = np.array([rest.stable for rest in branch])
+    points = np.array([state.outputs[:2] for state in branch])
+    stable = np.array([state.stable for state in branch])
     unstable = ~stable | np.append(~stable[1:], False) if not stable.all() else np.zeros(stable.size, bool)
     return tuple(
         PlanePath(name, np.where(mask, points[:, 0], np.nan), np.where(mask, points[:, 1], np.nan), colour, width=3.0)
@@ -160,11 +160,11 @@ def _curves(branch: Sequence[SteadyState]) -> tuple[PlanePath, ...]:
     )
 
 
-def _around(rests_there: Sequence[SteadyState], data: Box) -> Box:
-    """What holds these steady states; what holds the data, if there are none."""
-    if not rests_there:
+def _around(states: Sequence[SteadyState], data: Box) -> Box:
+    """Bounding box of steady states; that of the data if there are none."""
+    if not states:
         return data
-    points = np.array([rest.outputs[:2] for rest in rests_there])
+    points = np.array([state.outputs[:2] for state in states])
     (x_lower, y_lower), (x_upper, y_upper) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
     return Box(x_lower, x_upper, y_lower, y_upper)
 

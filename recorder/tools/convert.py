@@ -1,4 +1,4 @@
-"""Between recordings and records in CSV."""
+"""Convert between recordings (MCAP) and records (CSV)."""
 
 import itertools
 from collections.abc import Mapping
@@ -18,24 +18,23 @@ from recorder.tools.player import samples_of
 
 
 def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | None = None, zero_ns: int = 0) -> Record:
-    """Turn a record into a recording, as if it had been received when it was measured.
+    """Convert a record to a recording; the time of receipt is the sample time.
 
     A recording holds no times before 1970. Where a record without clock time has some, all its times are shifted, and
-    the recording's `zero_ns` says by how much. A run that starts before the one before it has ended is received after
-    it.
+    the recording's `zero_ns` holds the shift. A run that starts before the end of the run before is received after it.
 
     Args:
         csv: the record.
-        mcap: the recording; an older file of that name is replaced.
-        plant: the name of the plant.
-        columns: the file's own names for its columns, as in `read_csv`.
-        zero_ns: the time that the record's minutes count from; 0: not known.
+        mcap: the recording; an existing file is replaced.
+        plant: name of the plant.
+        columns: column names of the file by signal, as in `read_csv`.
+        zero_ns: time that the record's minutes count from; 0 if unknown.
 
     Returns:
         The record.
 
     Raises:
-        InputError: the record is malformed, or has times that a recording cannot hold; or the name cannot be a plant's.
+        InputError: the record is malformed, or has times that a recording cannot hold; or the plant's name is invalid.
     """
     try:
         keys.check_plant(plant)
@@ -55,25 +54,25 @@ def import_csv(csv: Path, mcap: Path, plant: str, columns: Mapping[str, str] | N
     ):
         for publication in samples_of(record, plant, zero_ns):
             encoded = encode(publication)
-            received_ns = received.of(*publication)
+            received_ns = received.continuous_ns(*publication)
             time_ns = publication.message.time_ns
             writer.write(RecordedMessage(encoded.key, encoded.payload, encoded.encoding, received_ns, time_ns))
     return record
 
 
 def export_csv(mcap: Path, csv: Path, plant: str | None = None) -> Record:
-    """Turn the samples of a recording into a record.
+    """Convert the samples of a recording to a record.
 
     Args:
         mcap: the recording.
-        csv: the record; an older file of that name is replaced.
-        plant: whose samples; may be left out if there is but one plant in it.
+        csv: the record; an existing file is replaced.
+        plant: name of the plant; None if the recording has only one.
 
     Returns:
         The record.
 
     Raises:
-        InputError: the recording cannot be read, or it is not said of which plant.
+        InputError: the recording cannot be read, or has several plants and `plant` is None.
     """
     refuse_source(csv, (mcap,))
     record = read_record(mcap, plant)

@@ -1,7 +1,7 @@
-"""Recordings out of recordings: a stretch of time (`cut`), or several as one (`merge`).
+"""Copy a time window of recordings (`cut`), or merge several recordings (`merge`).
 
-Messages are copied as they are, of whatever program. What a stretch says first is how things stood at its beginning, as
-at the beginning of any file of ours; see `head`.
+Messages of any program are copied unchanged. A cut starts with latched messages, as any file of a recorder does; see
+`recorder.policy.latched`.
 """
 
 import heapq
@@ -24,49 +24,49 @@ from recorder.storage.gaps import GAP, from_metadata
 from recorder.storage.mcap_chunks import damage_error, read_summary, span_ns
 from recorder.storage.mcap_scan import LATEST_NS, RawMessage, Scan, Wanted, profile_of
 from recorder.storage.mcap_writer import METADATA, RecordingWriter
-from recorder.tools.overlap import in_turn
+from recorder.tools.overlap import group_overlapping
 
-STANDING = frozenset({keys.MODEL, keys.ALARM, keys.FAULT})
-"""Kinds of messages whose last one tells how things stand."""
+LATCHED_KINDS = frozenset({keys.MODEL, keys.ALARM, keys.FAULT})
+"""Kinds of messages that are latched."""
 
 
 class Window(NamedTuple):
-    """A stretch of time, both ends included.
+    """Time window, both ends included.
 
     Attributes:
-        received_ns: of the times of receipt.
-        sampled_ns: of the times of samples, by which all is judged that speaks of one; None: all is by its receipt.
+        received_ns: range of times of receipt.
+        sampled_ns: range of sample times, which applies instead to messages that have one; None if it never applies.
     """
 
     received_ns: tuple[int, int]
     sampled_ns: tuple[int, int] | None = None
 
-    def holds(self, stored: RawMessage) -> bool:
-        """Whether a message is in it."""
-        if self.sampled_ns is not None and speaks_of_a_sample(stored.channel.topic):
+    def contains(self, stored: RawMessage) -> bool:
+        """True if a message is in the window."""
+        if self.sampled_ns is not None and has_sample_time(stored.channel.topic):
             return self.sampled_ns[0] <= stored.publish_time_ns <= self.sampled_ns[1]
         return self.received_ns[0] <= stored.log_time_ns <= self.received_ns[1]
 
-    def is_after(self, stored: RawMessage) -> bool:
-        """Whether a message was there before it began."""
-        if self.sampled_ns is not None and speaks_of_a_sample(stored.channel.topic):
+    def starts_after(self, stored: RawMessage) -> bool:
+        """True if the window starts after a message."""
+        if self.sampled_ns is not None and has_sample_time(stored.channel.topic):
             return stored.publish_time_ns < self.sampled_ns[0]
         return stored.log_time_ns < self.received_ns[0]
 
 
-def received_between(from_ns: int, to_ns: int) -> Window:
-    """The window of what was received within a time."""
+def receipt_window(from_ns: int, to_ns: int) -> Window:
+    """Window of messages received within a time."""
     return Window((from_ns, to_ns))
 
 
-def sampled_between(sources: Sequence[Path], from_ns: int, to_ns: int) -> Window:
-    """The window of what speaks of samples of a time, and of what else was received meanwhile.
+def sample_window(sources: Sequence[Path], from_ns: int, to_ns: int) -> Window:
+    """Window of messages about samples of a time, and of other messages received meanwhile.
 
     Raises:
         InputError: there is no such sample; or as `cut`.
     """
     first_ns, last_ns = LATEST_NS, 0
-    for stored in _in_order(_sources(sources), wanted=speaks_of_a_sample):
+    for stored in _merged_messages(_sources(sources), wanted=has_sample_time):
         if not stored.latched and from_ns <= stored.publish_time_ns <= to_ns:
             first_ns, last_ns = min(first_ns, stored.log_time_ns), max(last_ns, stored.log_time_ns)
     if first_ns > last_ns:
@@ -77,68 +77,68 @@ def sampled_between(sources: Sequence[Path], from_ns: int, to_ns: int) -> Window
 def cut(
     sources: Sequence[Path], out: Path, window: Window, metadata: Mapping[str, str], *, tolerant: bool = False
 ) -> int:
-    """Copy a stretch of time into a recording of its own.
+    """Copy a time window into a new recording.
 
     Args:
         sources: recordings that follow each other.
-        out: the new one; an older file of that name is replaced.
-        window: the stretch.
-        metadata: what the new one says about its origin.
-        tolerant: pass over what is damage_error, and take a file as it is that is still being written.
+        out: the new recording; an existing file is replaced.
+        window: the time window.
+        metadata: metadata of the new recording.
+        tolerant: True to skip damage and accept a file that is still being written.
 
     Returns:
-        The number of messages in the stretch, without what is said again at its beginning.
+        Number of copied messages, latched ones excluded.
 
     Raises:
-        InputError: nothing was received then, a source is damage_error, or the new file cannot be written.
+        InputError: the window is empty, a source is damaged, or the new file cannot be written.
     """
     if not sources:
         raise InputError(f"{out.name}: there is no recording of that time; were its files deleted?")
-    found = _sources(sources, tolerant=tolerant)
+    files = _sources(sources, tolerant=tolerant)
     refuse_source(out, sources)
     count = 0
-    with atomic_write(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(found)) as writer:
-        for stored in _in_order(found, window.received_ns, tolerant=tolerant):
-            if stored.latched or not window.holds(stored):
+    with atomic_write(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(files)) as writer:
+        for stored in _merged_messages(files, window.received_ns, tolerant=tolerant):
+            if stored.latched or not window.contains(stored):
                 continue
             if not count:
-                for entry in _standing(found, window, stored.log_time_ns):
+                for entry in _latched_messages(files, window, stored.log_time_ns):
                     writer.write(entry)
             writer.copy(stored)
             count += 1
         if not count:
             raise InputError(f"{sources[0]}: holds no message of that time")
-        _copy_the_rest(found, writer, window.received_ns)
+        _copy_metadata(files, writer, window.received_ns)
     return count
 
 
 def merge(sources: Sequence[Path], out: Path, metadata: Mapping[str, str]) -> int:
-    """Put several recordings into one, in the order of receipt.
+    """Merge several recordings in the order of receipt.
 
     Args:
-        sources: the recordings; what one says again of those before it is left out.
-        out: the new one; an older file of that name is replaced.
-        metadata: what the new one says about its origin.
+        sources: the recordings; latched messages of all but the first are left out.
+        out: the new recording; an existing file is replaced.
+        metadata: metadata of the new recording.
 
     Returns:
-        The number of messages.
+        Number of messages.
 
     Raises:
-        InputError: a source is damage_error, or the new file cannot be written.
+        InputError: a source is damaged, or the new file cannot be written.
     """
-    found = _sources(sources)
+    files = _sources(sources)
     refuse_source(out, sources)
     count = 0
-    with atomic_write(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(found)) as writer:
-        for stored in _in_order(found):
+    with atomic_write(out) as temporary, RecordingWriter(temporary, metadata, profile=_profile(files)) as writer:
+        for stored in _merged_messages(files):
             writer.copy(stored)
             count += 1
-        _copy_the_rest(found, writer)
+        _copy_metadata(files, writer)
     return count
 
 
-def speaks_of_a_sample(topic: str) -> bool:
-    """Whether the messages of a topic have the time of a sample, and not that of a clock."""
+def has_sample_time(topic: str) -> bool:
+    """True if messages of a topic carry sample time, not clock time."""
     parsed = keys.parse(topic)
     return parsed is not None and parsed.kind != keys.HEALTH
 
@@ -151,7 +151,7 @@ class _Source:
 
 
 def _sources(paths: Sequence[Path], *, tolerant: bool = False) -> list[_Source]:
-    """The files in the order of their beginnings."""
+    """Files in the order of their first messages."""
     spans = []
     for path in paths:
         try:
@@ -159,24 +159,24 @@ def _sources(paths: Sequence[Path], *, tolerant: bool = False) -> list[_Source]:
         except InputError:
             if not tolerant:
                 raise
-            begin = next(iter(Scan(path)), None)
-            span = (begin.log_time_ns if begin is not None else 0, LATEST_NS)
+            first = next(iter(Scan(path)), None)
+            span = (first.log_time_ns if first is not None else 0, LATEST_NS)
         spans.append((span, path))
     spans.sort()
-    return [_Source(path, span, first=not number) for number, (span, path) in enumerate(spans)]
+    return [_Source(path, span, first=not index) for index, (span, path) in enumerate(spans)]
 
 
-def _in_order(
+def _merged_messages(
     sources: Sequence[_Source],
     received_ns: tuple[int, int] = (0, LATEST_NS),
     *,
     wanted: Wanted | None = None,
     tolerant: bool = False,
 ) -> Iterator[RawMessage]:
-    """The messages of all files in the order of receipt; each file for itself is taken to be in order."""
+    """Messages of all files in the order of receipt, assuming that each file is in order."""
     from_ns, to_ns = received_ns
 
-    def of(source: _Source) -> Iterator[RawMessage]:
+    def read(source: _Source) -> Iterator[RawMessage]:
         scan = Scan(source.path, from_ns, to_ns, wanted)
         for stored in scan:
             if source.first or not stored.latched:
@@ -185,38 +185,38 @@ def _in_order(
             raise damage_error(source.path, "; ".join(map(str, scan.damages)) or "some channels are described nowhere")
 
     within = [source for source in sources if source.span[1] >= from_ns and source.span[0] <= to_ns]
-    for group in in_turn(within, lambda source: source.span):
-        yield from heapq.merge(*map(of, group), key=lambda stored: stored.log_time_ns)
+    for group in group_overlapping(within, lambda source: source.span):
+        yield from heapq.merge(*map(read, group), key=lambda stored: stored.log_time_ns)
 
 
-def _standing(sources: Sequence[_Source], window: Window, begun_ns: int) -> list[RecordedMessage]:
-    """How things stood when the window began."""
-    head = LatchedMessages()
+def _latched_messages(sources: Sequence[_Source], window: Window, start_ns: int) -> list[RecordedMessage]:
+    """Latched messages at the start of the window."""
+    latched = LatchedMessages()
 
     def wanted(topic: str) -> bool:
         parsed = keys.parse(topic)
-        return parsed is not None and parsed.kind in STANDING
+        return parsed is not None and parsed.kind in LATCHED_KINDS
 
     for source in sources:
-        if source.span[0] > begun_ns:
+        if source.span[0] > start_ns:
             continue
-        for stored in Scan(source.path, to_ns=begun_ns, wanted=wanted):
-            if not (stored.latched or window.is_after(stored)):
+        for stored in Scan(source.path, to_ns=start_ns, wanted=wanted):
+            if not (stored.latched or window.starts_after(stored)):
                 continue
-            entry = stored.recorded
+            recorded = stored.recorded
             try:
-                head.update(entry, decode(entry.payload, entry.encoding))
+                latched.update(recorded, decode(recorded.payload, recorded.encoding))
             except DecodeError:
                 continue
-    return head.messages(begun_ns)
+    return latched.messages(start_ns)
 
 
-def _copy_the_rest(
+def _copy_metadata(
     sources: Sequence[_Source], writer: RecordingWriter, received_ns: tuple[int, int] = (0, LATEST_NS)
 ) -> None:
-    """Write what programs say about the sources and what they attached to them; what several say alike, once.
+    """Copy metadata and attachments, equal ones once.
 
-    What was lost on the way is said of the time that is copied, and our own metadata are new.
+    Gaps are copied if they are within the time, and the metadata of this software are not copied.
     """
     written: list[Metadata | Attachment] = []
     for source in sources:
@@ -236,6 +236,6 @@ def _copy_the_rest(
 
 
 def _profile(sources: Sequence[_Source]) -> str:
-    """The profile that all sources name; empty if they name several."""
+    """Profile that all sources share; empty if they differ."""
     profiles = {profile_of(source.path) for source in sources}
     return profiles.pop() if len(profiles) == 1 else ""

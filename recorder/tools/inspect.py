@@ -1,4 +1,4 @@
-"""A recording looked over: a file in whatever state, or the files in a folder."""
+"""Inspect a recording: a file in any state, or the files in a folder."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -22,15 +22,15 @@ from recorder.tools.overview import Overview, overview
 
 
 @dataclass(frozen=True)
-class Look:
-    """What was seen.
+class FileInfo:
+    """Content and condition of a recording.
 
     Attributes:
-        overview: what is in it.
-        metadata: what it says about its origin, or the first file of a folder does.
-        zero_ns: the time that its minutes count from.
-        damages: what of it cannot be read; empty if it is whole.
-        gaps: what was lost on the way to the recorder, as it says itself.
+        overview: summary of the messages.
+        metadata: metadata of the file, or of the first file of a folder.
+        zero_ns: time that minutes count from.
+        damages: unreadable parts; empty if the file is intact.
+        gaps: messages lost on the bus before the recorder.
     """
 
     overview: Overview
@@ -40,15 +40,15 @@ class Look:
     gaps: tuple[Gap, ...] = ()
 
 
-def look_over(path: Path) -> Look:
-    """Look over a recording; a single file may be damaged, or still be written.
+def inspect(path: Path) -> FileInfo:
+    """Inspect a recording; a single file may be damaged or still being written.
 
     Raises:
         InputError: it is no recording, or a file of the folder is damaged.
     """
     if path.is_dir():
         found, metadata = overview(read_messages(path)), read_metadata(path)
-        return Look(found, metadata, zero_from(metadata, found.starts_ns or 0), (), gaps_in(path))
+        return FileInfo(found, metadata, zero_from(metadata, found.starts_ns or 0), (), gaps_in(path))
     scan = Scan(path)
     found = overview(stored.recorded for stored in scan)
     metadata = own_metadata(scan.metadata)
@@ -56,11 +56,11 @@ def look_over(path: Path) -> Look:
     if scan.orphans:
         damages.append(f"{scan.orphans} messages of channels that are described nowhere")
     zero_ns = zero_from(metadata, found.starts_ns or 0)
-    return Look(found, metadata, zero_ns, tuple(damages), _gaps(scan.metadata))
+    return FileInfo(found, metadata, zero_ns, tuple(damages), _gaps(scan.metadata))
 
 
 def gaps_in(path: Path) -> tuple[Gap, ...]:
-    """What was lost on the way to a recording, or to those of a folder, as they say themselves.
+    """Messages lost on the bus before the recorder, from the metadata of a file or a folder.
 
     Raises:
         InputError: a file is damaged.
@@ -69,7 +69,7 @@ def gaps_in(path: Path) -> tuple[Gap, ...]:
 
 
 def zero_ns_of(path: Path) -> int:
-    """The time that the minutes of a recording count from: what it says itself, else the first sample of its first run.
+    """Time that minutes of a recording count from: its metadata, else the first sample of its first run.
 
     Raises:
         InputError: it holds no sample, or it is damaged.

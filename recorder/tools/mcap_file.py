@@ -1,15 +1,15 @@
-"""Recordings as MCAP files, read: https://mcap.dev/spec. They are written by `mcap_writer`.
+"""Read recordings from MCAP files: https://mcap.dev/spec. They are written by `mcap_writer`.
 
-The topic of a message is its key, its log time the time of receipt, its publish time that of its sample. Messages of
-ours carry their protobuf schema, so that any program reads them; a stranger's bytes are kept with the encoding that
-they claimed and no schema.
+The topic of a message is its key, its log time the time of receipt, its publish time the sample time. Messages of this
+software carry their protobuf schema, so that any program reads them. Other messages are recorded with the encoding
+that they claimed and no schema.
 
-Our metadata record, "reactorwatch", says which version wrote the file and what else its writer thought worth knowing;
-`zero_ns` in it is the time that minutes are counted from, where that is not the first sample. Where `clock` in it is
-`none`, the times are those of a record without clock time, shifted so that none is before 1970.
+The metadata record "reactorwatch" holds the version that wrote the file and details of its origin. Its `zero_ns` is the
+time that minutes count from, where that is not the first sample. If its `clock` is `none`, the record had no clock
+time, and its times were shifted so that none is before 1970.
 
-A folder is read as one recording: the files in it in the order of their times, and each in turn, or together where
-their times overlap. What a file says again of the one before it is passed over, but in the first.
+A folder is read as one recording, file by file in the order of time, or interleaved where times overlap. Latched
+messages are skipped in all files but the first.
 """
 
 import heapq
@@ -28,7 +28,7 @@ from reactorwatch.contract.codec import DecodeError, decode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import MINUTE_NS, UNITS, Record, join_runs
-from recorder.columns.measurement import measured
+from recorder.columns.measurement import measured_value
 from recorder.columns.run_splitter import RunSplitter
 from recorder.message import RecordedMessage
 from recorder.storage.mcap_chunks import (
@@ -40,7 +40,7 @@ from recorder.storage.mcap_chunks import (
     span_ns,
 )
 from recorder.storage.mcap_writer import RecordingWriter, own_metadata
-from recorder.tools.overlap import in_turn
+from recorder.tools.overlap import group_overlapping
 
 __all__ = ["RecordingWriter", "plants_in", "read_messages", "read_metadata", "read_record", "recordings_in"]
 
@@ -53,20 +53,20 @@ _SAMPLE = encoding_of(messages.Sample)
 def read_messages(
     path: Path, kinds: Collection[str] | None = None, plant: str | None = None
 ) -> Iterator[RecordedMessage]:
-    """The messages of a recording in the order in which they were received; those of equal time as in the file.
+    """Messages of a recording in the order of receipt; those of equal time in the order of the file.
 
     Args:
-        path: the file or the folder; of any size, a chunk of each file is in memory at a time.
-        kinds: only these, such as `keys.SAMPLE`; None for all, also what has no key of ours.
-        plant: only those of this plant.
+        path: file or folder of any size; one chunk of each file is in memory at a time.
+        kinds: kinds to read, such as `keys.SAMPLE`; None for all, other programs' keys included.
+        plant: plant to read; None for all.
 
     Raises:
-        InputError: the file is not there, is no MCAP file, or is damaged. Damage within a chunk is raised when
-            the reading comes there.
+        InputError: the file does not exist, is no MCAP file, or is damaged. Damage within a chunk is raised when the
+            iteration reaches it.
     """
-    groups = in_turn(
+    groups = group_overlapping(
         _files(path), lambda file: file.span
-    )  # not within a generator: what is wrong is raised at the call
+    )  # not within a generator: errors are raised at the call
 
     def wanted(key: str) -> bool:
         topic = keys.parse(key)
@@ -74,7 +74,7 @@ def read_messages(
             return kinds is None and plant is None
         return (kinds is None or topic.kind in kinds) and (plant is None or topic.plant == plant)
 
-    def of(file: _File) -> Iterator[RecordedMessage]:
+    def read(file: _File) -> Iterator[RecordedMessage]:
         if is_in_order(file.summary):
             numbers = {number for number, channel in file.summary.channels.items() if wanted(channel.topic)}
             found = ordered_messages(file.path, file.summary, numbers)
@@ -83,12 +83,12 @@ def read_messages(
         return found if file.first else (entry for entry in found if not entry.latched)
 
     if len(groups) == len(groups[0]) == 1:
-        return of(groups[0][0])
-    return (entry for group in groups for entry in heapq.merge(*map(of, group), key=lambda entry: entry.log_time_ns))
+        return read(groups[0][0])
+    return (entry for group in groups for entry in heapq.merge(*map(read, group), key=lambda entry: entry.log_time_ns))
 
 
 def recordings_in(path: Path) -> list[Path]:
-    """The files of a recording in the order of their times: the path itself, or those in the folder that it is.
+    """Files of a recording in the order of their times: the path itself, or the files in the folder.
 
     Raises:
         InputError: a file is damaged, or the folder holds none.
@@ -97,7 +97,7 @@ def recordings_in(path: Path) -> list[Path]:
 
 
 def plants_in(path: Path) -> tuple[str, ...]:
-    """The plants that the recording has samples of, in alphabetical order.
+    """Plants with samples in the recording, in alphabetical order.
 
     Raises:
         InputError: as `read_messages`.
@@ -113,10 +113,10 @@ def plants_in(path: Path) -> tuple[str, ...]:
 
 
 def one_plant_in(path: Path, plant: str | None = None) -> str:
-    """The plant that is asked for, or the only one there is.
+    """The given plant, or the only one of the recording.
 
     Raises:
-        InputError: there are no samples, or none of this plant, or of several plants and none was named.
+        InputError: there are no samples, or none of the given plant, or several plants and none was given.
     """
     plants = plants_in(path)
     if not plants:
@@ -129,7 +129,7 @@ def one_plant_in(path: Path, plant: str | None = None) -> str:
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """What the recording, or the first of a folder, says about its origin; empty if it is not one of ours.
+    """Metadata of the recording, or of the first file of a folder; empty if another program wrote it.
 
     Raises:
         InputError: as `read_messages`.
@@ -138,17 +138,16 @@ def read_metadata(path: Path) -> dict[str, str]:
 
 
 def read_record(path: Path, plant: str | None = None) -> Record:
-    """The samples of one plant as rows of equal sample time; see `RunSplitter` for where a new run starts.
+    """Samples of one plant as rows of equal sample time; runs are split by `RunSplitter`.
 
     Args:
         path: the recording.
-        plant: whose samples; may be left out if there is but one plant in it.
+        plant: name of the plant; None if the recording has only one.
 
     Returns:
-        The three signals; NaN where one has no sample at a time that another has, or none that is finite and not of
-        bad quality. Where a sample came twice in a run the first counts, and samples that are out of place are counted
-        as `strays`. The time is counted from `zero_ns` of the
-        file's metadata, else from the first sample of the first run.
+        The three signals; NaN where a signal has no sample at the time of another one, or no valid one. The first of
+        duplicate samples in a run counts, and stray samples are counted as `strays`. Time counts from `zero_ns` of the
+        metadata, else from the first sample of the first run.
 
     Raises:
         InputError: as `read_messages` and `one_plant_in`; or a sample cannot be decoded.
@@ -156,7 +155,7 @@ def read_record(path: Path, plant: str | None = None) -> Record:
     plant = one_plant_in(path, plant)
     signals = {keys.key(plant, keys.SAMPLE, signal): signal for signal in UNITS}
     runs: list[dict[str, tuple[array[int], array[float]]]] = []
-    newest: dict[str, tuple[array[int], array[float]]] = {}  # by signal, where its newest sample is
+    newest: dict[str, tuple[array[int], array[float]]] = {}  # columns of the newest sample, by signal
     units: dict[str, str] = {}
     splitter = RunSplitter()
     for entry in read_messages(path, {keys.SAMPLE}, plant):
@@ -166,7 +165,7 @@ def read_record(path: Path, plant: str | None = None) -> Record:
             sample: Any = decode(entry.payload, entry.encoding)
         except DecodeError:
             continue  # the recorder has counted it as refused
-        value = measured(sample)
+        value = measured_value(sample)
         if value is not None:
             signal, strays = signals[entry.key], splitter.strays
             number = splitter.update(signal, sample.sequence, sample.time_ns)
@@ -190,7 +189,7 @@ def read_record(path: Path, plant: str | None = None) -> Record:
 
 
 def zero_from(metadata: dict[str, str], first_ns: int) -> int:
-    """The time that the minutes of a recording count from: what its metadata says, else its first sample."""
+    """Time that minutes of a recording count from: its metadata, else its first sample."""
     try:
         return int(metadata.get(ZERO_NS, first_ns))
     except ValueError:
@@ -198,12 +197,12 @@ def zero_from(metadata: dict[str, str], first_ns: int) -> int:
 
 
 def has_clock(metadata: dict[str, str]) -> bool:
-    """Whether the times of a recording are clock times."""
+    """True if the times of a recording are clock times."""
     return metadata.get(CLOCK) != NO_CLOCK and metadata.get(ZERO_NS) != "0"
 
 
 def _rows(series: dict[str, tuple["array[int]", "array[float]"]], zero_ns: int, name: str) -> Record:
-    """The samples of one run, by signal their times and values, as rows."""
+    """Rows of one run, from times and values by signal."""
     all_times = np.unique(np.concatenate([np.asarray(times, np.int64) for times, _ in series.values()]))
     columns = {signal: np.full(all_times.size, np.nan) for signal in series}
     for signal, (times, values) in series.items():
@@ -213,7 +212,7 @@ def _rows(series: dict[str, tuple["array[int]", "array[float]"]], zero_ns: int, 
 
 
 class _File(NamedTuple):
-    """A recording and its index; `first` of its folder, or the only one."""
+    """Recording and its index; `first` is True for the first or only file."""
 
     path: Path
     summary: Summary
@@ -230,4 +229,4 @@ def _files(path: Path) -> list[_File]:
         raise InputError(f"{path}: holds no recording (.mcap)")
     spans = [(span_ns(summary), file, summary) for file, summary in read]
     found = sorted((item for item in spans if item[0] != (0, 0)), key=lambda item: item[:2]) or spans[:1]
-    return [_File(file, summary, span, first=not number) for number, (span, file, summary) in enumerate(found)]
+    return [_File(file, summary, span, first=not index) for index, (span, file, summary) in enumerate(found)]

@@ -1,4 +1,4 @@
-"""Which of several recordings are read one after the other, and which together. Pure."""
+"""Group recordings whose time spans overlap. Pure."""
 
 from collections.abc import Callable, Iterable
 from typing import TypeVar
@@ -6,14 +6,14 @@ from typing import TypeVar
 Item = TypeVar("Item")
 
 
-def in_turn(items: Iterable[Item], span: Callable[[Item], tuple[int, int]]) -> list[list[Item]]:
-    """Put things in groups that follow each other in time; within a group their times overlap.
+def group_overlapping(items: Iterable[Item], span: Callable[[Item], tuple[int, int]]) -> list[list[Item]]:
+    """Group items so that groups follow each other in time, and times overlap within a group.
 
     Args:
-        items: in the order of their beginnings.
-        span: beginning and end of one.
+        items: items in the order of their starts.
+        span: returns start and end of an item.
 
-    >>> in_turn(["ad", "bc", "de", "fg"], lambda item: (ord(item[0]), ord(item[1])))
+    >>> group_overlapping(["ad", "bc", "de", "fg"], lambda item: (ord(item[0]), ord(item[1])))
     [['ad', 'bc'], ['de'], ['fg']]
     """
     groups: list[list[Item]] = []

@@ -1,4 +1,4 @@
-"""What is in a recording: how much, from when to when, what is missing, which alarms. Pure."""
+"""Summary of a recording: counts, time spans, gaps and alarms. Pure."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -10,20 +10,20 @@ from reactorwatch.contract.codec import DecodeError, decode
 from recorder.columns.run_splitter import RunSpan, RunSplitter
 from recorder.message import RecordedMessage
 
-MOST_GAPS = 1000
-"""Gaps that are named; more are counted only."""
+MAX_GAPS = 1000
+"""Gaps that are listed; more are counted only."""
 
 
 @dataclass
 class Topic:
-    """What came on one key.
+    """Messages of one key.
 
     Attributes:
         key: the key.
-        encoding: of the first message.
-        count: messages.
-        first_ns: when the first was received.
-        last_ns: when the last was received.
+        encoding: encoding of the first message.
+        count: number of messages.
+        first_ns: time of receipt of the first.
+        last_ns: time of receipt of the last.
     """
 
     key: str
@@ -35,7 +35,7 @@ class Topic:
 
 @dataclass
 class Gap:
-    """Samples of one key that are missing, by their sequence numbers."""
+    """Missing samples of one key, by sequence number."""
 
     key: str
     first: int
@@ -45,7 +45,7 @@ class Gap:
 
 
 class Raised(NamedTuple):
-    """An alarm that came up; times are those of samples; `cleared_ns` is None if it still stands at the end."""
+    """Raised alarm; times are sample times, and `cleared_ns` is None if it is active at the end."""
 
     alarm: str
     priority: int
@@ -56,19 +56,19 @@ class Raised(NamedTuple):
 
 @dataclass
 class Overview:
-    """What is in a recording.
+    """Summary of a recording.
 
     Attributes:
-        topics: by key.
-        first_ns: when the first message was received; 0 if there is none.
-        last_ns: likewise, the last.
-        runs: of each plant, the times of its first and its last sample in each run.
-        lost: samples that are missing.
-        duplicated: samples that are there again.
-        out_of_order: samples after a later one.
-        out_of_place: samples with a number or time that fits neither those before nor those after.
-        gaps: which are missing.
-        alarms: in the order in which they came up.
+        topics: topics by key.
+        first_ns: time of receipt of the first message; 0 if there is none.
+        last_ns: time of receipt of the last message; 0 if there is none.
+        runs: time spans of the runs of each plant.
+        lost: number of missing samples.
+        duplicated: number of duplicate samples.
+        out_of_order: number of samples received after a later one.
+        out_of_place: number of stray samples.
+        gaps: missing samples.
+        alarms: alarms in the order in which they were raised.
     """
 
     topics: dict[str, Topic] = field(default_factory=dict)
@@ -84,62 +84,62 @@ class Overview:
 
     @property
     def messages(self) -> int:
-        """All of them, without what is said again at the beginning."""
+        """Number of messages, latched ones excluded."""
         return sum(topic.count for topic in self.topics.values())
 
     @property
     def sample_span_ns(self) -> RunSpan | None:
-        """The times of the first and the last sample; None if there is none."""
+        """Times of the first and the last sample; None if there is none."""
         spans = [span for runs in self.runs.values() for span in runs]
         return RunSpan(min(span.first_ns for span in spans), max(span.last_ns for span in spans)) if spans else None
 
     @property
     def starts_ns(self) -> int | None:
-        """The time of the first sample of the first run; None if there is none."""
+        """Time of the first sample of the first run; None if there is none."""
         return min((runs[0].first_ns for runs in self.runs.values()), default=None)
 
     @property
     def span_s(self) -> float:
-        """From the first to the last receipt."""
+        """Time from the first to the last receipt, in seconds."""
         return (self.last_ns - self.first_ns) / 1e9
 
 
-def overview(entries: Iterable[RecordedMessage]) -> Overview:
-    """Look over a recording.
+def overview(recording: Iterable[RecordedMessage]) -> Overview:
+    """Summarise a recording.
 
     Args:
-        entries: in the order of receipt; what is said again counts for the alarms alone.
+        recording: messages in the order of receipt; latched ones count for alarms only.
     """
     seen = Overview()
-    checks: dict[str, _Check | None] = {}
+    trackers: dict[str, _GapTracker | None] = {}
     splitters: dict[str, RunSplitter] = {}
-    standing: dict[str, int] = {}
-    for entry in entries:
+    active: dict[str, int] = {}
+    for entry in recording:
         if not entry.latched:
             _count(seen, entry)
-        if entry.key not in checks:
-            checks[entry.key] = _Check.of(entry.key, splitters)
-        check = checks[entry.key]
-        if check is None:
+        if entry.key not in trackers:
+            trackers[entry.key] = _GapTracker.of(entry.key, splitters)
+        tracker = trackers[entry.key]
+        if tracker is None:
             continue
         try:
             message: Any = decode(entry.payload, entry.encoding)
         except DecodeError:
             continue
         if isinstance(message, messages.Alarm):
-            _follow(seen, standing, message)
+            _follow(seen, active, message)
         elif isinstance(message, messages.Sample) and message.quality != messages.QUALITY_UNSPECIFIED:
-            check.update(message)
+            tracker.update(message)
     seen.runs = {plant: splitter.runs for plant, splitter in splitters.items() if splitter.runs}
-    for sequence in (item for splitter in splitters.values() for item in splitter.checks.values()):
+    for sequence in (item for splitter in splitters.values() for item in splitter.counters.values()):
         seen.lost += sequence.lost
         seen.duplicated += sequence.duplicated
         seen.out_of_order += sequence.out_of_order
         seen.out_of_place += sequence.out_of_place
-    for check in filter(None, checks.values()):
-        seen.gaps += check.gaps
+    for tracker in filter(None, trackers.values()):
+        seen.gaps += tracker.gaps
     seen.gaps.sort(key=lambda gap: (gap.after_ns, gap.key))
-    del seen.gaps[MOST_GAPS:]
+    del seen.gaps[MAX_GAPS:]
     return seen
 
 
@@ -154,19 +154,19 @@ def _count(seen: Overview, entry: RecordedMessage) -> None:
     seen.last_ns = max(seen.last_ns, at_ns)
 
 
-def _follow(seen: Overview, standing: dict[str, int], alarm: messages.Alarm) -> None:
-    """An alarm that comes up is noted, and so is its end; one that stood before the recording began is noted too."""
-    number = standing.get(alarm.alarm)
+def _follow(seen: Overview, active: dict[str, int], alarm: messages.Alarm) -> None:
+    """Add a raised or latched alarm, or the time at which it cleared."""
+    number = active.get(alarm.alarm)
     known = number is not None and seen.alarms[number].raised_ns == alarm.raised_ns
     if alarm.raised_ns and not known and (alarm.event == "raised" or not alarm.cleared_ns):
-        standing[alarm.alarm] = len(seen.alarms)
+        active[alarm.alarm] = len(seen.alarms)
         seen.alarms.append(Raised(alarm.alarm, alarm.priority, alarm.raised_ns, None, alarm.text))
     elif number is not None and known and alarm.cleared_ns and seen.alarms[number].cleared_ns is None:
         seen.alarms[number] = seen.alarms[number]._replace(cleared_ns=alarm.cleared_ns)
 
 
-class _Check:
-    """The sequence numbers of one key, and which of them are missing."""
+class _GapTracker:
+    """Missing sequence numbers of one key."""
 
     def __init__(self, key: str, signal: str, splitter: RunSplitter) -> None:
         self._key, self._signal, self._splitter = key, signal, splitter
@@ -174,38 +174,39 @@ class _Check:
         self.gaps: list[Gap] = []
 
     @classmethod
-    def of(cls, key: str, splitters: dict[str, RunSplitter]) -> "_Check | None":
-        """The check of a key, with the runs of its plant; None if nothing on it has to be looked into."""
+    def of(cls, key: str, splitters: dict[str, RunSplitter]) -> "_GapTracker | None":
+        """Tracker of a key, with the runs of its plant; None if the key is neither sample nor alarm."""
         topic = keys.parse(key)
         if topic is None or topic.kind not in (keys.SAMPLE, keys.ALARM):
             return None
         return cls(key, topic.name, splitters.setdefault(topic.plant, RunSplitter()))
 
     def update(self, sample: messages.Sample) -> None:
-        """Look at one sample."""
-        check, number = self._splitter.checks.get(self._signal), sample.sequence
+        """Process one sample."""
+        check, number = self._splitter.counters.get(self._signal), sample.sequence
         before, after_ns = (check.lost, check.newest_ns) if check is not None else (0, 0)
         strays = check.out_of_place if check is not None else 0
         self._splitter.update(self._signal, number, sample.time_ns)
-        check = self._splitter.checks[self._signal]
-        if check.out_of_place > strays:  # the gap before it is none
+        check = self._splitter.counters[self._signal]
+        if check.out_of_place > strays:  # the gap before a stray is none
             if self._skipped:
                 gap = self.gaps.pop()
                 before -= gap.last - gap.first + 1
             after_ns = 0
         missing = check.lost - before
-        self._skipped = missing > 0 and len(self.gaps) < MOST_GAPS
+        self._skipped = missing > 0 and len(self.gaps) < MAX_GAPS
         if self._skipped:
             self.gaps.append(Gap(self._key, number - missing, number - 1, after_ns))
         elif missing < 0:
             self._fill(number)
 
     def _fill(self, number: int) -> None:
-        """A sample that was missing has come after all."""
-        for place in range(len(self.gaps) - 1, -1, -1):
-            gap = self.gaps[place]
+        """Remove a late sample from its gap."""
+        for index in range(len(self.gaps) - 1, -1, -1):
+            gap = self.gaps[index]
             if gap.first <= number <= gap.last:
-                rest = [(gap.first, number - 1), (number + 1, gap.last)]
-                left = [Gap(gap.key, first, last, gap.after_ns) for first, last in rest if first <= last]
-                self.gaps[place : place + 1] = left
+                parts = [(gap.first, number - 1), (number + 1, gap.last)]
+                self.gaps[index : index + 1] = [
+                    Gap(gap.key, first, last, gap.after_ns) for first, last in parts if first <= last
+                ]
                 return

@@ -1,9 +1,9 @@
-"""Plays stored messages back at a pace. Pure: no file, no bus, no clock of its own.
+"""Replay of recorded messages at a given rate. Pure: no file, no bus, no clock.
 
-The pace is that of the sample times, not of the times of receipt: a record from elsewhere has only those, and a
-recording of a plant that ran sixty times faster than the clock is the same plant. Messages go out in the order in
-which they were received; one whose sample is older than what went before goes out at once. Where the plant's clock
-stepped back, the run that follows is played at its pace, one row after the run before it (`ContinuousTime`).
+The rate refers to sample times, not to times of receipt: CSV records have only those, and a recording of an accelerated
+plant is that of the same plant. Messages are published in the order of receipt; one with an older sample than the one
+before is published at once. After the plant's clock stepped back, the next run follows one row after the run before
+(`ContinuousTime`).
 """
 
 import math
@@ -21,12 +21,12 @@ from recorder.columns.run_splitter import ContinuousTime
 from recorder.message import RecordedMessage
 
 BATCH = 256
-"""Messages that go out before the loop looks for a stop again."""
+"""Largest number of messages published in one tick, so that the loop notices a stop."""
 
 NEVER_NS = 2**62
 
 COMMANDS = dict.fromkeys(("pause", "resume", "step", "set_rate"), messages.ReplayCommand)
-"""The commands and what they carry."""
+"""Message type by command."""
 
 SAMPLES = frozenset({keys.SAMPLE})
 EVERYTHING = frozenset(
@@ -41,22 +41,21 @@ EVERYTHING = frozenset(
         keys.FAULT,
     }
 )
-"""What a plant and a monitor publish. Health speaks of nodes that are not there, commands were heard once."""
+"""Kinds that a plant and a monitor publish, without health, which concerns nodes of the recorded time."""
 
 
 def samples_of(record: Record, plant: str, zero_ns: int = 0) -> Iterator[Publication]:
-    """A record as the plant would have published it: row by row, the input first.
+    """Samples of a record as a plant would publish them: row by row, the input first.
 
     Args:
         record: the record.
-        plant: its name on the bus.
-        zero_ns: the time that the record's minutes count from.
+        plant: name of the plant on the bus.
+        zero_ns: time that the record's minutes count from.
 
     Yields:
-        The samples; none for what was not measured, but one of bad quality where nothing at all was, so that the row
-        is not lost. Each signal is counted from 0, and again from 0 where a run starts after the one before it, as a
-        plant counts that was restarted. Where the clock steps back the count goes on, as of a plant whose clock was
-        set.
+        The measured samples; for a row without any, one sample of bad quality, so that the row is not lost. Sequence
+        numbers count from 0 for each signal. They restart where a run starts at a later time, as after a restart of
+        the plant, and continue where the clock steps back, as after a change of the clock.
     """
     sequences = dict.fromkeys(record.columns, 0)
     columns = {signal: values.tolist() for signal, values in record.columns.items()}
@@ -80,81 +79,79 @@ def samples_of(record: Record, plant: str, zero_ns: int = 0) -> Iterator[Publica
             yield Publication(names[signal], sample)
 
 
-def playable(
-    entries: Iterable[RecordedMessage], plant: str = "", kinds: frozenset[str] = SAMPLES
+def filter_playable(
+    recording: Iterable[RecordedMessage], plant: str = "", kinds: frozenset[str] = SAMPLES
 ) -> Iterator[Publication]:
-    """The messages of a recording that can be played back.
+    """Messages of a recording that can be replayed.
 
     Args:
-        entries: the recording, in order of receipt.
-        plant: the name to publish them under; empty for that of the recording.
-        kinds: what is played.
+        recording: messages in the order of receipt.
+        plant: name of the plant to publish under; empty keeps the recorded name.
+        kinds: kinds of messages to replay.
 
     Yields:
-        The publications; what no node of ours has published, or what cannot be decoded, is left out.
+        The publications, without undecodable messages and keys of other programs.
     """
-    for entry in entries:
+    for entry in recording:
         topic = keys.parse(entry.key)
         if topic is None or topic.kind not in kinds:
             continue
         try:
             message = decode(entry.payload, entry.encoding)
         except DecodeError:
-            continue  # it was refused when it was recorded, and counted
+            continue  # the recorder counted it as refused
         if hasattr(message, "time_ns"):
             yield Publication(keys.key(plant or topic.plant, topic.kind, topic.name), cast(Body, message))
 
 
-def between(publications: Iterable[Publication], from_ns: int, to_ns: int) -> Iterator[Publication]:
-    """Those that speak of samples from one time to another, both included."""
+def filter_time(publications: Iterable[Publication], from_ns: int, to_ns: int) -> Iterator[Publication]:
+    """Publications about samples within a time, both ends included."""
     return (publication for publication in publications if from_ns <= publication.message.time_ns <= to_ns)
 
 
-class _Due(NamedTuple):
-    """A publication, and the time by which it is paced."""
+class _Scheduled(NamedTuple):
+    """Publication with its continuous time."""
 
     publication: Publication
     time_ns: int
 
 
-def _paced(tape: Iterable[Publication]) -> Iterator[_Due]:
-    """The publications with times that increase from run to run of each plant."""
+def _schedule(tape: Iterable[Publication]) -> Iterator[_Scheduled]:
+    """Add to each publication its time, continuous over the runs of its plant."""
     clocks: dict[str, ContinuousTime] = {}
     for publication in tape:
         plant = publication.key.split("/", 2)[1]
         clock = clocks.get(plant)
         if clock is None:
             clock = clocks[plant] = ContinuousTime()
-        yield _Due(publication, clock.of(*publication))
+        yield _Scheduled(publication, clock.continuous_ns(*publication))
 
 
 class Player:
-    """Hands out publications when they are due; see `reactorwatch.runtime.event_loop.Node`.
+    """Publishes messages when they are due; see `reactorwatch.runtime.event_loop.Node`.
 
     Args:
-        open_tape: gives what is to be played, from its beginning each time it is called.
-        rate: plant time over clock time; infinite: without waiting.
-        loop: whether it begins anew at the end, one row's time after the last row.
+        open_tape: returns the publications from the start, each time it is called.
+        rate: plant time over clock time; inf does not wait.
+        loop: True to restart at the end, one row after the last row.
 
     Attributes:
-        published: messages so far.
+        published: number of published messages.
     """
 
     def __init__(self, open_tape: Callable[[], Iterator[Publication]], rate: float, *, loop: bool = False) -> None:
         self._open_tape = open_tape
-        self._tape = _paced(open_tape())
+        self._tape = _schedule(open_tape())
         self._rate = rate
         self._loop = loop
         self._paused = False
         self._next = next(self._tape, None)
-        self._spacing_ns = 0  # of the last two rows
-        self._anchor: tuple[int, int] | None = None  # a moment of the clock, and the plant's time then
+        self._spacing_ns = 0  # between the last two rows
+        self._anchor: tuple[int, int] | None = None  # (clock time, plant time) of one moment
         self.published = 0
 
-    # --- what the loop calls ---------------------------------------------------------------------------------
-
     def on_tick(self, now_ns: int) -> list[Publication]:
-        """What is due; the first call starts the play."""
+        """Publish due messages; the first call starts the replay."""
         if self._next is not None and self._anchor is None:
             self._anchor = now_ns, self._next.time_ns
         due: list[Publication] = []
@@ -164,7 +161,7 @@ class Player:
         return due
 
     def next_tick_ns(self) -> int:
-        """When the next message is due."""
+        """Time at which the next message is due."""
         if self._paused:
             return NEVER_NS
         if self._anchor is None or self._next is None:
@@ -174,29 +171,27 @@ class Player:
 
     @property
     def finished(self) -> bool:
-        """Whether all was played."""
+        """True if every message was published."""
         return self._next is None
 
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
-        """It listens to nothing."""
+        """Ignore messages; it subscribes to none."""
         return []
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
-        """Pause, go on, go a step, or change the rate; or say why not."""
+        """Execute a command: pause, resume, step or set the rate. A refusal is a reply with the reason."""
         try:
-            text, publications = self._obey(question, now_ns)
+            text, publications = self._execute(question, now_ns)
         except (InputError, DecodeError) as error:
             return CommandReply(accepted=False, text=str(error)), []
         self.published += len(publications)
         return CommandReply(accepted=True, text=text), publications
 
     def on_stop(self, now_ns: int) -> list[Publication]:
-        """It has no last words."""
+        """Publish nothing."""
         return []
 
-    # --- within ----------------------------------------------------------------------------------------------
-
-    def _obey(self, question: Encoded, now_ns: int) -> tuple[str, list[Publication]]:
+    def _execute(self, question: Encoded, now_ns: int) -> tuple[str, list[Publication]]:
         name, command = decode_command(question, COMMANDS)
         assert isinstance(command, messages.ReplayCommand), "the catalogue holds no others"
         if name == "set_rate" and not command.rate > 0.0:
@@ -209,7 +204,7 @@ class Player:
         stepped: list[Publication] = []
         if name == "step":
             for _ in range(command.rows or 1):
-                stepped += self._row(now_ns)
+                stepped += self._play_row(now_ns)
         elif name == "set_rate":
             self._rate = command.rate
         else:
@@ -223,7 +218,7 @@ class Player:
         return "paused" if self._paused else "playing"
 
     def _plant_time_ns(self, now_ns: int) -> int | None:
-        """How far the play has come; None before its start. It is never beyond what is due next."""
+        """Current plant time, at most that of the next message; None before the start."""
         if self._anchor is None or self._next is None:
             return None
         clock_ns, plant_ns = self._anchor
@@ -232,8 +227,8 @@ class Player:
             return plant_ns if self._paused else next_ns
         return min(next_ns, plant_ns + round((now_ns - clock_ns) * self._rate))
 
-    def _row(self, now_ns: int) -> list[Publication]:
-        """All messages of the next time, which the play has then come to."""
+    def _play_row(self, now_ns: int) -> list[Publication]:
+        """Publish all messages of the next time."""
         row: list[Publication] = []
         first_ns = self._next.time_ns if self._next is not None else 0
         while self._next is not None and self._next.time_ns == first_ns:
@@ -241,13 +236,13 @@ class Player:
             row.append(self._take(self._next))
         return row
 
-    def _take(self, due: _Due) -> Publication:
-        """Move on behind a message, at the end to the beginning."""
+    def _take(self, due: _Scheduled) -> Publication:
+        """Advance to the next message, at the end of a loop to the first."""
         self._next = next(self._tape, None)
         if self._next is not None:
             self._spacing_ns = self._next.time_ns - due.time_ns or self._spacing_ns
         elif self._loop:
-            self._tape = _paced(self._open_tape())
+            self._tape = _schedule(self._open_tape())
             self._next = next(self._tape, None)
             if self._next is not None and self._anchor is not None:
                 clock_ns, plant_ns = self._anchor

@@ -1,4 +1,4 @@
-"""Replay: a recording or a record onto the bus, as the plant published it."""
+"""Replay a recording or a record on the bus."""
 
 from collections.abc import Callable, Iterator
 from math import inf, isinf
@@ -18,7 +18,16 @@ from reactorwatch.runtime.liveliness import wait_alive
 from recorder.config import ReplayConfig
 from recorder.tools.inspect import zero_ns_of
 from recorder.tools.mcap_file import plants_in, read_messages
-from recorder.tools.player import COMMANDS, EVERYTHING, NEVER_NS, SAMPLES, Player, between, playable, samples_of
+from recorder.tools.player import (
+    COMMANDS,
+    EVERYTHING,
+    NEVER_NS,
+    SAMPLES,
+    Player,
+    filter_playable,
+    filter_time,
+    samples_of,
+)
 
 __all__ = ["Player", "ReplayConfig", "replay", "run_replay", "samples_of"]
 
@@ -26,7 +35,7 @@ log = structlog.get_logger()
 
 NODE = "replay"
 PLANT = "cstr"
-"""The name of a plant whose record has none."""
+"""Name of the plant for a CSV record."""
 
 
 def run_replay(config: ReplayConfig, bus_config: BusConfig) -> None:
@@ -43,12 +52,12 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
     """Play a file until its end or until `stop` is set.
 
     Returns:
-        How many messages went out.
+        Number of published messages.
 
     Raises:
         InputError: as `run_replay`.
     """
-    plants, tape = _opened(config)
+    plants, tape = _open_tape(config)
     player = Player(tape, config.rate, loop=config.loop)
     if player.finished:
         begin = "the start" if isinf(config.from_min) else f"{config.from_min:g} min"
@@ -72,15 +81,15 @@ def replay(config: ReplayConfig, bus_config: BusConfig, stop: StopSignal) -> int
     return player.published
 
 
-def _opened(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterator[Publication]]]:
-    """The names of the plants as they will be on the bus, and what gives that which will be published."""
+def _open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterator[Publication]]]:
+    """Names of the plants on the bus, and the function that returns the publications."""
     path = Path(config.file)
     if path.suffix.lower() == ".csv":
         plant, record = config.plant or PLANT, read_csv(path, config.columns)
         if record.runs is not None:
             log.warning("plays several runs one after the other", file=config.file, runs=record.describe_runs())
         zero_ns = record.stored_zero_ns
-        return (plant,), lambda: between(samples_of(record, plant, zero_ns), *_span_ns(config, zero_ns))
+        return (plant,), lambda: filter_time(samples_of(record, plant, zero_ns), *_span_ns(config, zero_ns))
     plants = plants_in(path)
     if not plants:
         raise InputError(f"{path}: holds no samples")
@@ -97,13 +106,13 @@ def _opened(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Iterato
     from_ns, to_ns = _span_ns(config, 0 if whole else zero_ns_of(path))
 
     def tape() -> Iterator[Publication]:
-        return between(playable(read_messages(path, kinds), config.plant, kinds), from_ns, to_ns)
+        return filter_time(filter_playable(read_messages(path, kinds), config.plant, kinds), from_ns, to_ns)
 
     return (config.plant,) if config.plant else plants, tape
 
 
 def _span_ns(config: ReplayConfig, zero_ns: int) -> tuple[int, int]:
-    """Where the play begins and ends, in the time of the samples."""
+    """Start and end of the replay in sample time."""
     begin, end = config.from_min, config.to_min
     return (
         -NEVER_NS if isinf(begin) else to_time_ns(begin, zero_ns),

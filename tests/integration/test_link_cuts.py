@@ -30,7 +30,7 @@ from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.loopback import free_endpoint
-from recorder.tools.inspect import look_over
+from recorder.tools.inspect import inspect
 from recorder.tools.mcap_file import recordings_in
 
 KEPT = 60_000
@@ -92,7 +92,7 @@ def test_the_first_messages_on_keys_are_heard_though_the_router_was_gone_when_th
 def test_what_could_not_be_recovered_is_counted_and_named_in_the_file_and_by_info(tmp_path: Path, whose: Whose) -> None:
     """The publisher remembers a tenth of what was published while the link was down."""
     found = cut(tmp_path, whose, "closed", 1.0, cache_messages=RATE_PER_S // SIGNALS // 10)
-    seen = look_over(tmp_path / "run.mcap")
+    seen = inspect(tmp_path / "run.mcap")
     assert found.missing > 0
     assert {gap.stream for gap in seen.gaps} == {"reactor/cstr/sample"}
     assert sum(gap.messages for gap in seen.gaps) == seen.overview.lost == found.missing

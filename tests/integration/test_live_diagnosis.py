@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import structlog
 
-from diagnosis_node.node import Command, Diagnoses
-from diagnosis_node.trigger import AfterAlarm, DiagnosisConfig
+from diagnosis_node.node import Command, DiagnosisRunner
+from diagnosis_node.trigger import DiagnosisConfig, DiagnosisTrigger
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from plant_node.config import PlantConfig
@@ -22,14 +22,14 @@ from recorder.tools.replay import samples_of
 ZERO_NS = 1_780_000_000 * 10**9
 
 
-def watched(record: Record, out: Path, run: Command) -> Diagnoses:
+def watched(record: Record, out: Path, run: Command) -> DiagnosisRunner:
     """Plays a record onto a bus that a monitor and a diagnosis hear; the diagnosis is done at once."""
     exchange = Exchange()
     bus = MemoryBus(exchange)
     monitor = Monitor(MonitorConfig(training_min=60.0), 0)
     config = DiagnosisConfig(out=str(out), window_min=100.0, after_min=25.0, tolerance={"T": 0.2, "C": 0.001})
-    diagnoses = Diagnoses(config, run, lambda work: work())
-    node = AfterAlarm(config, diagnoses.begin, lambda: diagnoses.busy)
+    diagnoses = DiagnosisRunner(config, run, lambda work: work())
+    node = DiagnosisTrigger(config, diagnoses.start, lambda: diagnoses.busy)
     samples, alarms = (keys.all_keys("cstr", kind) for kind in (keys.SAMPLE, keys.ALARM))
 
     def watch(item: Encoded) -> None:

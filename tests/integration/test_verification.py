@@ -17,7 +17,7 @@ from reactorwatch.runtime.delivery.reorder_buffer import Gap
 from recorder.message import RecordedMessage
 from recorder.storage.gaps import GAP, to_metadata
 from recorder.storage.recover import recover
-from recorder.tools.cut import cut, sampled_between
+from recorder.tools.cut import cut, sample_window
 from recorder.tools.mcap_file import RecordingWriter, read_messages, read_metadata, recordings_in
 
 from .watched_hour import ROWS, START_NS, record_hour
@@ -249,7 +249,7 @@ def test_a_monitor_that_was_started_anew_is_verified_as_two(tmp_path: Path, caps
 
 
 def test_a_cut_from_the_middle_says_that_it_cannot_be_verified(hour: Path, tmp_path: Path) -> None:
-    window = sampled_between([hour], START_NS + 20 * 60 * 10**9, START_NS + 40 * 60 * 10**9)
+    window = sample_window([hour], START_NS + 20 * 60 * 10**9, START_NS + 40 * 60 * 10**9)
     cut([hour], tmp_path / "cut.mcap", window, read_metadata(hour))
     with pytest.raises(InputError, match="was running before this recording begins"):
         run(tmp_path / "cut.mcap", None, None, as_json=False)

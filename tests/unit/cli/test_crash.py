@@ -111,7 +111,7 @@ def test_where_no_report_can_be_written_the_line_names_the_place(
 
 
 def refused(typed: str, folder: Path, monkeypatch: Patch, capsys: Shown) -> str:
-    """Run what must be refused in one line, leaving nothing; returns the line."""
+    """RunColumns what must be refused in one line, leaving nothing; returns the line."""
     before = sorted(folder.rglob("*"))
     assert run(shlex.split(typed), monkeypatch) == 2
     shown = capsys.readouterr()

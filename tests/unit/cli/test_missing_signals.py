@@ -35,7 +35,7 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def main(monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Run a command; returns its exit code."""
+    """RunColumns a command; returns its exit code."""
 
     def run(words: list[str]) -> object:
         monkeypatch.setattr(sys, "argv", ["reactorwatch", *words])

@@ -167,7 +167,7 @@ def state(folder: Path) -> dict[str, tuple[int, int, bytes]]:
 
 
 def refuse(typed: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
-    """Run a command line that must be refused with one line and change nothing; returns the line."""
+    """RunColumns a command line that must be refused with one line and change nothing; returns the line."""
     before = state(Path())
     monkeypatch.setattr(sys, "argv", ["reactorwatch", *shlex.split(typed)])
     with pytest.raises(SystemExit) as ended:

@@ -24,7 +24,7 @@ from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
 from recorder.columns.run_reader import read_run
 from recorder.tools.convert import import_csv
-from recorder.tools.inspect import look_over
+from recorder.tools.inspect import inspect
 from recorder.tools.mcap_file import read_record
 
 ROWS, ONSET_MIN = 600, 40.0
@@ -102,7 +102,7 @@ def test_a_drawing_and_a_look_count_the_minutes_of_the_file(leaking: Record, tmp
         shown = read_run(recording.messages)
         assert recording.zero_ns is not None
         assert (shown.span_ns[0] - recording.zero_ns) / 60e9 == -ONSET_MIN
-    seen = look_over(path)
+    seen = inspect(path)
     (span,) = seen.overview.runs["cstr"]
     assert (span.first_ns - seen.zero_ns) / 60e9 == -ONSET_MIN
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from diagnosis_node.trigger import SILENT_NS, AfterAlarm, Asked, DiagnosisConfig
+from diagnosis_node.trigger import TIMEOUT_NS, DiagnosisConfig, DiagnosisRequest, DiagnosisTrigger
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Sample
@@ -12,12 +12,12 @@ CONFIG = DiagnosisConfig(window_min=50.0, after_min=10.0, apart_min=30.0, out="r
 
 
 class Live:
-    """A plant that is sampled once a minute, and what is asked for."""
+    """A plant that is sampled once a minute, and what is request for."""
 
     def __init__(self, config: DiagnosisConfig = CONFIG) -> None:
-        self.asked: list[Asked] = []
+        self.request: list[DiagnosisRequest] = []
         self.busy = False
-        self.node = AfterAlarm(config, self.asked.append, lambda: self.busy)
+        self.node = DiagnosisTrigger(config, self.request.append, lambda: self.busy)
 
     def samples(self, first_min: int, last_min: int) -> None:
         for minute in range(first_min, last_min + 1):
@@ -31,7 +31,7 @@ class Live:
         self.node.on_message(_encoded("alarm", name, alarm), minute)
 
     def spans(self) -> list[tuple[float, float]]:
-        return [(item.samples[0][0] / MINUTE_NS, item.samples[-1][0] / MINUTE_NS) for item in self.asked]
+        return [(item.samples[0][0] / MINUTE_NS, item.samples[-1][0] / MINUTE_NS) for item in self.request]
 
 
 def _encoded(kind: str, name: str, message: Sample | Alarm) -> Encoded:
@@ -43,10 +43,10 @@ def test_it_waits_until_there_is_something_to_see_and_takes_the_window() -> None
     live.samples(0, 100)
     live.alarm(100)
     live.samples(101, 109)
-    assert live.asked == []
+    assert live.request == []
     live.samples(110, 111)
     assert live.spans() == [(60.0, 110.0)]
-    assert (live.asked[0].alarm, live.asked[0].raised_ns) == ("shewhart/T", 100 * MINUTE_NS)
+    assert (live.request[0].alarm, live.request[0].raised_ns) == ("shewhart/T", 100 * MINUTE_NS)
 
 
 def test_what_comes_soon_after_is_the_same_trouble() -> None:
@@ -59,7 +59,7 @@ def test_what_comes_soon_after_is_the_same_trouble() -> None:
     live.samples(121, 150)
     live.alarm(150, "mewma/all")
     live.samples(151, 170)
-    assert [item.alarm for item in live.asked] == ["shewhart/T", "mewma/all"]
+    assert [item.alarm for item in live.request] == ["shewhart/T", "mewma/all"]
 
 
 def test_while_one_is_under_way_the_next_waits() -> None:
@@ -68,7 +68,7 @@ def test_while_one_is_under_way_the_next_waits() -> None:
     live.alarm(50)
     live.busy = True
     live.samples(51, 70)
-    assert live.asked == []
+    assert live.request == []
     live.busy = False
     live.samples(71, 71)
     assert live.spans() == [(21.0, 71.0)]
@@ -87,7 +87,7 @@ def test_what_is_no_trouble_of_the_process_is_not_diagnosed(name: str, event: st
     live.samples(0, 50)
     live.alarm(50, name, event, state=state)
     live.samples(51, 100)
-    assert live.asked == []
+    assert live.request == []
 
 
 def test_a_plant_that_ends_is_diagnosed_by_what_there_is() -> None:
@@ -96,9 +96,9 @@ def test_a_plant_that_ends_is_diagnosed_by_what_there_is() -> None:
     live.alarm(50)
     live.samples(51, 54)
     due_ns = live.node.next_tick_ns()
-    assert due_ns == 54 + SILENT_NS
+    assert due_ns == 54 + TIMEOUT_NS
     live.node.on_tick(due_ns - 1)
-    assert live.asked == []
+    assert live.request == []
     live.node.on_tick(due_ns)
     assert live.spans() == [(4.0, 54.0)]
 
@@ -108,7 +108,7 @@ def test_a_plant_that_begins_anew_has_no_past() -> None:
     live.samples(1000, 1050)
     live.alarm(1050)
     live.samples(0, 60)
-    assert live.asked == []
+    assert live.request == []
     live.alarm(60)
     live.samples(61, 70)
     assert live.spans() == [(20.0, 70.0)]

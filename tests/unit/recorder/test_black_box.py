@@ -1,4 +1,4 @@
-"""Which stretches of time are kept for good."""
+"""Which read_segments of time are kept for good."""
 
 import itertools
 

@@ -16,8 +16,8 @@ from reactorwatch.errors import InputError
 from recorder.storage.chunk_data import LARGEST_MB
 from recorder.storage.mcap_scan import LATEST_NS
 from recorder.storage.recover import recover
-from recorder.tools.cut import cut, merge, received_between
-from recorder.tools.inspect import look_over
+from recorder.tools.cut import cut, merge, receipt_window
+from recorder.tools.inspect import inspect
 from recorder.tools.mcap_file import read_messages
 
 BOMB_BYTES = 40_000_000
@@ -97,7 +97,7 @@ BOMBS: dict[str, Callable[[str], tuple[Chunk, int | None]]] = {
 }
 READERS: dict[str, Callable[[Path, Path], object]] = {
     "read": lambda path, _: list(read_messages(path)),
-    "cut": lambda path, out: cut([path], out, received_between(0, LATEST_NS), {}),
+    "cut": lambda path, out: cut([path], out, receipt_window(0, LATEST_NS), {}),
     "merge": lambda path, out: merge([path], out, {}),
 }
 
@@ -130,7 +130,7 @@ def test_every_reader_refuses_it_in_one_line_and_takes_no_more_memory_than_is_al
             with pytest.raises(InputError, match=r"^[^\n]*run\.mcap[^\n]*$"):
                 read(path, out)
         assert not out.exists()
-        seen = look_over(path)
+        seen = inspect(path)
         saved = recover(path, out)
         peak_bytes = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()

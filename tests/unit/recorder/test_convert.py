@@ -13,7 +13,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.csv_file import read_csv, write_csv
 from reactorwatch.records.record import Record, join_runs
 from recorder.tools.convert import export_csv, import_csv
-from recorder.tools.inspect import look_over
+from recorder.tools.inspect import inspect
 from recorder.tools.mcap_file import read_messages, read_metadata, read_record
 from tests.unit.records.test_csv_file import A_VALUE, assert_same
 
@@ -61,7 +61,7 @@ def assert_comes_back(tmp_path: Path, record: Record, zero_ns: int) -> None:
     entries = list(read_messages(tmp_path / "run.mcap"))
     assert all(entry.publish_time_ns >= 0 for entry in entries)
     assert [entry.log_time_ns for entry in entries] == sorted(entry.log_time_ns for entry in entries)
-    seen = look_over(tmp_path / "run.mcap")
+    seen = inspect(tmp_path / "run.mcap")
     assert seen.overview.lost == seen.overview.duplicated == 0
     assert seen.overview.out_of_place == 0
     assert len(seen.overview.runs["cstr"]) == len(record.run_starts)
@@ -93,7 +93,7 @@ def test_a_recording_of_negative_minutes_holds_shifted_times_and_their_zero_and_
     assert read_metadata(mcap)["zero_ns"] == str(2880 * 60 * 10**9)  # two days
     record = read_record(mcap)
     assert (record.time_min.tolist(), record.zero, record.zero_ns) == ([-1500.0, 0.0], None, 0)
-    seen = info_object(look_over(mcap), mcap)
+    seen = info_object(inspect(mcap), mcap)
     assert (seen["from_min"], seen["to_min"], seen["zero"]) == (-1500.0, 0.0, None)
 
 

@@ -11,7 +11,7 @@ from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from recorder.message import RecordedMessage
-from recorder.tools.cut import cut, merge, received_between, sampled_between
+from recorder.tools.cut import cut, merge, receipt_window, sample_window
 from recorder.tools.mcap_file import RecordingWriter, plants_in, read_messages, read_metadata, read_record
 from tests.unit.recorder import golden
 
@@ -36,7 +36,7 @@ def at(minutes: float) -> int:
 
 def test_a_cut_by_receipt_holds_what_was_received_then(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES)
-    window = received_between(ENTRIES[250].log_time_ns, ENTRIES[449].log_time_ns)
+    window = receipt_window(ENTRIES[250].log_time_ns, ENTRIES[449].log_time_ns)
     assert cut([source], tmp_path / "cut.mcap", window, {}) == 200
     kept = [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.latched]
     assert kept == ENTRIES[250:450]
@@ -45,7 +45,7 @@ def test_a_cut_by_receipt_holds_what_was_received_then(tmp_path: Path) -> None:
 def test_a_cut_by_sample_time_holds_what_speaks_of_it_and_what_was_received_meanwhile(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     out = tmp_path / "cut.mcap"
-    cut([source], out, sampled_between([source], at(10.0), at(20.0)), {})
+    cut([source], out, sample_window([source], at(10.0), at(20.0)), {})
     kept = [entry for entry in read_messages(out) if not entry.latched]
     spoken = [entry for entry in ENTRIES if "/health/" not in entry.key]
     expected = [entry for entry in spoken if at(10.0) <= entry.publish_time_ns <= at(20.0)]
@@ -63,19 +63,19 @@ def test_a_cut_says_first_how_things_stood(tmp_path: Path) -> None:
     """The fault sets in at 20 min and the alarm comes at 22: both stand when the cut begins."""
     source = recorded(tmp_path / "run.mcap", ENTRIES)
     out = tmp_path / "cut.mcap"
-    cut([source], out, sampled_between([source], at(24.0), at(30.0)), {})
+    cut([source], out, sample_window([source], at(24.0), at(30.0)), {})
     entries = list(read_messages(out))
     standing = [entry for entry in entries if entry.latched]
     assert entries[: len(standing)] == standing
     assert [entry.key.split("/", 2)[2] for entry in standing] == ["fault/coolant_flow", "alarm/shewhart/T"]
     again = tmp_path / "again.mcap"
-    cut([out], again, sampled_between([out], at(25.0), at(26.0)), {})
+    cut([out], again, sample_window([out], at(25.0), at(26.0)), {})
     assert [entry[:3] for entry in read_messages(again) if entry.latched] == [entry[:3] for entry in standing]
 
 
 def test_a_cut_of_several_files_goes_across_them(tmp_path: Path) -> None:
     halves = [recorded(tmp_path / "b.mcap", ENTRIES[800:]), recorded(tmp_path / "a.mcap", ENTRIES[:800])]
-    window = received_between(ENTRIES[700].log_time_ns, ENTRIES[899].log_time_ns)
+    window = receipt_window(ENTRIES[700].log_time_ns, ENTRIES[899].log_time_ns)
     assert cut(halves, tmp_path / "cut.mcap", window, {}) == 200
     assert [entry for entry in read_messages(tmp_path / "cut.mcap") if not entry.latched] == ENTRIES[700:900]
 
@@ -89,7 +89,7 @@ def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
         for entry in ENTRIES[:10]:
             writer.write(entry)
         writer.write(strange, readable=False)
-    window = received_between(ENTRIES[5].log_time_ns, strange.log_time_ns)
+    window = receipt_window(ENTRIES[5].log_time_ns, strange.log_time_ns)
     cut([path], tmp_path / "cut.mcap", window, {})
     assert list(read_messages(tmp_path / "cut.mcap")) == [*ENTRIES[5:10], strange]
 
@@ -97,16 +97,16 @@ def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
 def test_where_nothing_was_received_no_file_is_written(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES[:50])
     with pytest.raises(InputError, match="holds no message of that time"):
-        cut([source], tmp_path / "cut.mcap", received_between(0, 10), {})
+        cut([source], tmp_path / "cut.mcap", receipt_window(0, 10), {})
     with pytest.raises(InputError, match="holds no sample of that time"):
-        sampled_between([source], at(500.0), at(600.0))
+        sample_window([source], at(500.0), at(600.0))
     assert list(tmp_path.iterdir()) == [source]
 
 
 def test_no_source_is_written_over(tmp_path: Path) -> None:
     source = recorded(tmp_path / "run.mcap", ENTRIES[:50])
     with pytest.raises(InputError, match="is one of the files that are read"):
-        cut([source], source, received_between(0, 2**63), {})
+        cut([source], source, receipt_window(0, 2**63), {})
     with pytest.raises(InputError, match="is one of the files that are read"):
         merge([source], source, {})
 
@@ -142,7 +142,7 @@ def test_cutting_in_two_and_merging_gives_the_same_record(tmp_path: Path) -> Non
     parts = []
     for number, (begin, end) in enumerate(((0.0, 15.0), (15.05, 40.0))):
         parts.append(tmp_path / f"{number}.mcap")
-        cut([source], parts[-1], sampled_between([source], at(begin), at(end)), {})
+        cut([source], parts[-1], sample_window([source], at(begin), at(end)), {})
     merge(parts, tmp_path / "again.mcap", {})
     first, again = read_record(source), read_record(tmp_path / "again.mcap")
     assert np.array_equal(first.time_min, again.time_min)
@@ -161,7 +161,7 @@ def test_the_model_that_stands_is_that_of_the_moment_and_not_a_later_one(tmp_pat
                 encoded = encode(Publication(keys.key("cstr", what, "T"), message))
                 entries.append(RecordedMessage(*encoded[:3], 10 + number * MINUTE, number * MINUTE))
     source = recorded(tmp_path / "run.mcap", entries, every=1000)
-    cut([source], tmp_path / "cut.mcap", sampled_between([source], 12 * MINUTE, 14 * MINUTE), {})
+    cut([source], tmp_path / "cut.mcap", sample_window([source], 12 * MINUTE, 14 * MINUTE), {})
     (standing,) = [entry for entry in read_messages(tmp_path / "cut.mcap") if entry.latched]
     model = decode(standing.payload, standing.encoding)
     assert isinstance(model, messages.ModelSnapshot)

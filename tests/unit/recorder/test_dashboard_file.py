@@ -13,17 +13,16 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from reactorwatch.errors import InputError
-from recorder.columns.run import Measured, Run
-from recorder.columns.run_reader import read_run, stretches
+from recorder.columns.run import RunColumns, SampleColumns
+from recorder.columns.run_reader import read_run, read_segments
 from recorder.dashboard.file import write_rrd, write_views
-from recorder.dashboard.reading import read_time_plots
+from recorder.dashboard.read_plots import read_time_plots
 from recorder.dashboard.stream import BATCH_ROWS, RUN_TIME, SAMPLE_TIME
-from recorder.dashboard.viewer import viewer_program
+from recorder.dashboard.viewer_process import viewer_program
 from recorder.panels import PANELS
 from recorder.panels.base import (
     MEASURED,
     PREDICTED,
-    Again,
     EventLog,
     Panel,
     PlanePlot,
@@ -31,6 +30,7 @@ from recorder.panels.base import (
     StateLines,
     TimePlot,
     View,
+    ViewReference,
 )
 from tests.unit.recorder import golden
 
@@ -38,12 +38,12 @@ V = TypeVar("V", bound=View)
 
 
 @pytest.fixture(scope="module")
-def run() -> Run:
+def run() -> RunColumns:
     return read_run(golden.entries())
 
 
 @pytest.fixture(scope="module")
-def drawn(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drawn(run: RunColumns, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("rrd") / "run.rrd"
     write_rrd(run, path)
     return path
@@ -81,12 +81,12 @@ def entity(*parts: str) -> str:
     return "/" + "/".join(re.sub(r"([^\w-])", r"\\\1", part) for part in parts)
 
 
-def drawn_by(panel: str, run: Run, kind: type[V]) -> list[V]:
+def drawn_by(panel: str, run: RunColumns, kind: type[V]) -> list[V]:
     (found,) = (item for item in PANELS if item.title == panel)
     return [view for view in found.draw(run) if isinstance(view, kind)]
 
 
-def test_every_series_reads_back_exactly_on_both_timelines(run: Run, drawn: Path) -> None:
+def test_every_series_reads_back_exactly_on_both_timelines(run: RunColumns, drawn: Path) -> None:
     found = over_time(drawn)
     plots = [(panel, view) for panel in PANELS for view in panel.draw(run) if isinstance(view, TimePlot)]
     lines = [(panel.title, plot.title, series) for panel, plot in plots for series in plot.series]
@@ -99,10 +99,10 @@ def test_every_series_reads_back_exactly_on_both_timelines(run: Run, drawn: Path
         assert np.array_equal(times(parts, RUN_TIME), series.time_ns - first_ns)
 
 
-def test_a_cut_keeps_the_minutes_of_the_run_it_is_of(run: Run, tmp_path: Path) -> None:
+def test_a_cut_keeps_the_minutes_of_the_run_it_is_of(run: RunColumns, tmp_path: Path) -> None:
     """Its first sample is at minute 140, say, on the timeline and in the log."""
     zero_ns = run.first_ns - 140 * 60_000_000_000
-    write_rrd(stretches(golden.entries(), 1000, zero_ns), tmp_path / "cut.rrd")
+    write_rrd(read_segments(golden.entries(), 1000, zero_ns), tmp_path / "cut.rrd")
     found = over_time(tmp_path / "cut.rrd")
     measured = times(found[entity("Overview", "T: temperature of the reactor", "measured")], RUN_TIME)
     assert measured[0] == 140 * 60_000_000_000
@@ -116,14 +116,14 @@ def test_a_cut_keeps_the_minutes_of_the_run_it_is_of(run: Run, tmp_path: Path) -
     assert lane[0] >= run.first_ns, "nothing is drawn of before the cut"
 
 
-def test_the_log_reads_back(run: Run, drawn: Path) -> None:
+def test_the_log_reads_back(run: RunColumns, drawn: Path) -> None:
     (log,) = drawn_by("Alarms", run, EventLog)
     (chunk,) = over_time(drawn)[entity("Alarms", log.title)]
     assert chunk.column("TextLog:text").flatten().to_pylist() == [event.text for event in log.events]
     assert chunk.column("TextLog:level").flatten().to_pylist() == [event.kind for event in log.events]
 
 
-def test_the_states_of_alarms_and_nodes_read_back(run: Run, drawn: Path) -> None:
+def test_the_states_of_alarms_and_nodes_read_back(run: RunColumns, drawn: Path) -> None:
     for panel, path in (("Alarms", ("alarm-states", "shewhart", "T")), ("Health", ("node-phases", "monitor"))):
         (lanes,) = drawn_by(panel, run, StateLines)
         parts = over_time(drawn)[entity(*path)]
@@ -132,7 +132,7 @@ def test_the_states_of_alarms_and_nodes_read_back(run: Run, drawn: Path) -> None
         assert tuple(times(parts, SAMPLE_TIME)) == lanes.lines[0].time_ns
 
 
-def test_the_plane_holds_the_path_and_the_steady_states(run: Run, drawn: Path) -> None:
+def test_the_plane_holds_the_path_and_the_steady_states(run: RunColumns, drawn: Path) -> None:
     near, far = drawn_by("Phase plane", run, PlanePlot)
     found = over_time(drawn)
     for plane in (near, far):
@@ -161,7 +161,7 @@ def everything(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def test_stretch_by_stretch_the_same_is_drawn(drawn: Path, tmp_path: Path) -> None:
-    write_rrd(stretches(golden.entries(), 77), tmp_path / "run.rrd")
+    write_rrd(read_segments(golden.entries(), 77), tmp_path / "run.rrd")
     whole, pieces = everything(drawn), everything(tmp_path / "run.rrd")
     assert whole.keys() == pieces.keys()
     for name, values in whole.items():
@@ -178,10 +178,10 @@ def test_stretch_by_stretch_the_same_is_drawn(drawn: Path, tmp_path: Path) -> No
 
 def test_of_the_stretches_that_were_drawn_none_is_kept(tmp_path: Path) -> None:
     """So a recording larger than memory can be drawn; the last is there until the next has been read."""
-    read: list[weakref.ref[Run]] = []
+    read: list[weakref.ref[RunColumns]] = []
 
-    def watched() -> Iterator[Run]:
-        for stretch in stretches(golden.entries(), 300):
+    def watched() -> Iterator[RunColumns]:
+        for stretch in read_segments(golden.entries(), 300):
             read.append(weakref.ref(stretch))
             yield stretch
             assert not [item for item in read[:-1] if item() is not None]
@@ -192,8 +192,8 @@ def test_of_the_stretches_that_were_drawn_none_is_kept(tmp_path: Path) -> None:
 
 def test_a_long_run_is_written_in_batches_and_is_whole(tmp_path: Path) -> None:
     rows = 2 * BATCH_ROWS + 5
-    measured = Measured(np.arange(rows, dtype=np.int64) * 10**9, np.random.default_rng(1).normal(size=rows))
-    run = Run("cstr", {"T": "K"}, {"T": measured}, {}, {}, (), ())
+    measured = SampleColumns(np.arange(rows, dtype=np.int64) * 10**9, np.random.default_rng(1).normal(size=rows))
+    run = RunColumns("cstr", {"T": "K"}, {"T": measured}, {}, {}, (), ())
     write_rrd(run, tmp_path / "run.rrd")
     parts = over_time(tmp_path / "run.rrd")[entity("Overview", "T: temperature of the reactor", "measured")]
     assert np.array_equal(numbers(parts), measured.value)
@@ -214,7 +214,7 @@ def layout(path: Path) -> dict[str, list[Any]]:
     return settings
 
 
-def test_it_opens_on_the_whole_run_with_a_tab_for_each_panel(run: Run, drawn: Path) -> None:
+def test_it_opens_on_the_whole_run_with_a_tab_for_each_panel(run: RunColumns, drawn: Path) -> None:
     settings = layout(drawn)
     drawn_views = [(panel, view) for panel in PANELS for view in panel.draw(run)]
     shown = {view.title for _, view in drawn_views}
@@ -224,13 +224,13 @@ def test_it_opens_on_the_whole_run_with_a_tab_for_each_panel(run: Run, drawn: Pa
     tabs = [name[0] for name in settings["ContainerBlueprint:display_name"] if name]
     assert sorted(tabs) == sorted(panel.title for panel in PANELS if panel.draw(run))
     over_time = [view for _, view in drawn_views if isinstance(view, TimePlot | StateLines)]
-    again = [view for _, view in drawn_views if isinstance(view, Again) and view.title == "Alarm states"]
+    again = [view for _, view in drawn_views if isinstance(view, ViewReference) and view.title == "Alarm states"]
     endless = {"start": None, "end": None}
     assert settings["TimeAxis:view_range"] == [[endless]] * (len(over_time) + len(again))
     assert settings["TimePanelBlueprint:timeline"] == [[RUN_TIME]]
 
 
-def test_the_layout_of_the_same_views_is_the_same(drawn: Path, run: Run, tmp_path: Path) -> None:
+def test_the_layout_of_the_same_views_is_the_same(drawn: Path, run: RunColumns, tmp_path: Path) -> None:
     """A live viewer that gets it again keeps what people did to its views."""
     write_rrd(run, tmp_path / "again.rrd")
     paths = [
@@ -240,8 +240,8 @@ def test_the_layout_of_the_same_views_is_the_same(drawn: Path, run: Run, tmp_pat
     assert paths[0] == paths[1]
 
 
-def test_a_diagnosis_becomes_a_tab_on_the_time_of_the_run(run: Run, tmp_path: Path) -> None:
-    time_ns = run.measured["T"].time_ns[100:110]
+def test_a_diagnosis_becomes_a_tab_on_the_time_of_the_run(run: RunColumns, tmp_path: Path) -> None:
+    time_ns = run.samples["T"].time_ns[100:110]
     size = Series("most likely", time_ns, np.linspace(0.0, -0.15, 10), PREDICTED, width=1.0, held=True, legend="size")
     other = Series("measured", time_ns, np.full(10, np.nan), MEASURED)
     views = [TimePlot("Zeal", "K", (size,)), TimePlot("Another/one", "", (size, other))]
@@ -262,7 +262,9 @@ def test_a_diagnosis_becomes_a_tab_on_the_time_of_the_run(run: Run, tmp_path: Pa
 
 
 @pytest.mark.parametrize(("content", "told"), [(None, "there is no such file"), (b"no dashboard", "is no dashboard")])
-def test_what_is_no_drawing_of_a_diagnosis_is_told(content: bytes | None, told: str, run: Run, tmp_path: Path) -> None:
+def test_what_is_no_drawing_of_a_diagnosis_is_told(
+    content: bytes | None, told: str, run: RunColumns, tmp_path: Path
+) -> None:
     if content is not None:
         (tmp_path / "report.rrd").write_bytes(content)
     with pytest.raises(InputError, match=told):
@@ -274,7 +276,7 @@ def test_a_run_of_nothing_can_be_drawn(tmp_path: Path) -> None:
     assert over_time(tmp_path / "run.rrd") == {}
 
 
-def test_what_fails_leaves_nothing_behind(run: Run, tmp_path: Path) -> None:
+def test_what_fails_leaves_nothing_behind(run: RunColumns, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         write_rrd(run, tmp_path / "no" / "run.rrd")
     plane = drawn_by("Phase plane", run, PlanePlot)[0]

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from reactorwatch.contract.codec import Encoded
-from recorder.columns.run import Run
+from recorder.columns.run import RunColumns
 from recorder.columns.run_reader import read_run
-from recorder.dashboard.drawing import Drawing
-from recorder.dashboard.live import DRAW_EVERY_NS, LiveDashboard
+from recorder.dashboard.live import DRAW_INTERVAL_NS, LiveDashboard
+from recorder.dashboard.renderer import Renderer
 from recorder.dashboard.stream import SAMPLE_TIME
 from tests.unit.recorder import golden
 
@@ -20,7 +20,7 @@ MESSAGES = [Encoded(entry.key, entry.payload, entry.encoding) for entry in golde
 
 
 @pytest.fixture(scope="module")
-def run() -> Run:
+def run() -> RunColumns:
     return read_run(MESSAGES)
 
 
@@ -38,7 +38,7 @@ def drawn(path: Path) -> dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]
 
 
 @pytest.mark.parametrize("each_ns", [1_000_000, 40_000_000], ids=["many messages a picture", "few messages a picture"])
-def test_all_of_a_run_is_sent_in_whatever_pieces_it_comes(run: Run, tmp_path: Path, each_ns: int) -> None:
+def test_all_of_a_run_is_sent_in_whatever_pieces_it_comes(run: RunColumns, tmp_path: Path, each_ns: int) -> None:
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "sent.rrd")
     dashboard = LiveDashboard(recording, lambda: False, 0)
@@ -52,7 +52,7 @@ def test_all_of_a_run_is_sent_in_whatever_pieces_it_comes(run: Run, tmp_path: Pa
     recording.flush()
     recording.disconnect()
     sent = drawn(tmp_path / "sent.rrd")
-    for signal, measured in run.measured.items():
+    for signal, measured in run.samples.items():
         (times, values), *others = (
             columns
             for path, columns in sent.items()
@@ -65,18 +65,18 @@ def test_all_of_a_run_is_sent_in_whatever_pieces_it_comes(run: Run, tmp_path: Pa
 
 
 def test_it_draws_twice_a_second_and_not_message_by_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    drawings: list[Run] = []
-    monkeypatch.setattr(Drawing, "draw", lambda _self, run, _panels: drawings.append(run))
+    drawings: list[RunColumns] = []
+    monkeypatch.setattr(Renderer, "draw", lambda _self, run, _panels: drawings.append(run))
     dashboard = LiveDashboard(rr.RecordingStream("test"), lambda: False, 0)
     for number, message in enumerate(MESSAGES[:100]):
         dashboard.on_message(message, number)
     assert not drawings
-    assert dashboard.next_tick_ns() == DRAW_EVERY_NS
-    dashboard.on_tick(DRAW_EVERY_NS)
-    dashboard.on_tick(2 * DRAW_EVERY_NS)
+    assert dashboard.next_tick_ns() == DRAW_INTERVAL_NS
+    dashboard.on_tick(DRAW_INTERVAL_NS)
+    dashboard.on_tick(2 * DRAW_INTERVAL_NS)
     (run,) = drawings  # what has nothing new is not drawn
-    assert run.measured["T"].time_ns.size > 10
-    assert dashboard.next_tick_ns() == 3 * DRAW_EVERY_NS
+    assert run.samples["T"].time_ns.size > 10
+    assert dashboard.next_tick_ns() == 3 * DRAW_INTERVAL_NS
 
 
 def test_the_layout_is_sent_when_there_is_something_new_and_not_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,7 +86,7 @@ def test_the_layout_is_sent_when_there_is_something_new_and_not_again(monkeypatc
     monkeypatch.setattr(rr.RecordingStream, "send_blueprint", lambda *_: sent.append(number))
     dashboard = LiveDashboard(rr.RecordingStream("test"), lambda: False, 0)
     for number, message in enumerate(MESSAGES):
-        dashboard.on_message(message, number * DRAW_EVERY_NS // 20)
+        dashboard.on_message(message, number * DRAW_INTERVAL_NS // 20)
     alarm = next(number for number, message in enumerate(MESSAGES) if "/alarm/" in message.key)
     assert sent[0] <= 20, "at once"
     assert any(alarm <= number <= alarm + 20 for number in sent), "the tab of the alarms"

@@ -10,7 +10,7 @@ from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from recorder.storage.mcap_scan import LATEST_NS
 from recorder.storage.recover import recover
-from recorder.tools.cut import cut, merge, received_between
+from recorder.tools.cut import cut, merge, receipt_window
 
 MINUTE_NS = 60 * 10**9
 CALIBRATION = {"sensor": "T", "offset": "0.2"}
@@ -57,7 +57,7 @@ def whole(notes: str = "") -> Parts:
 
 def test_a_cut_keeps_them(tmp_path: Path) -> None:
     source = foreign(tmp_path / "a.mcap", notes="a")
-    cut([source], tmp_path / "new.mcap", received_between(0, LATEST_NS), {})
+    cut([source], tmp_path / "new.mcap", receipt_window(0, LATEST_NS), {})
     assert parts(tmp_path / "new.mcap") == whole("a") == parts(source)
 
 

@@ -12,8 +12,8 @@ from recorder.__main__ import open_files
 from recorder.config import RecorderConfig
 from recorder.storage.gaps import from_metadata, to_metadata
 from recorder.storage.recover import recover
-from recorder.tools.cut import cut, merge, received_between
-from recorder.tools.inspect import look_over
+from recorder.tools.cut import cut, merge, receipt_window
+from recorder.tools.inspect import inspect
 
 from .recording import SECOND, Fed, recorder
 
@@ -44,8 +44,8 @@ def test_a_gap_says_all_that_is_known_of_it() -> None:
 
 def test_it_is_in_the_file_and_counted_as_lost(fed: Fed, tmp_path: Path) -> None:
     fed.stop()
-    assert look_over(tmp_path / "run.mcap").gaps == (ALARMS,)
-    assert look_over(tmp_path).gaps == (ALARMS,)
+    assert inspect(tmp_path / "run.mcap").gaps == (ALARMS,)
+    assert inspect(tmp_path).gaps == (ALARMS,)
     assert fed.last_health().lost == 3
 
 
@@ -64,9 +64,9 @@ def test_recovery_and_merging_keep_it_and_a_cut_keeps_those_of_its_time(fed: Fed
     (tmp_path / "cut_off.mcap").write_bytes(run.read_bytes()[:-1])
     recover(tmp_path / "cut_off.mcap", tmp_path / "saved.mcap")
     merge([run], tmp_path / "merged.mcap", {})
-    cut([run], tmp_path / "with.mcap", received_between(11 * SECOND, 20 * SECOND), {})
-    cut([run], tmp_path / "without.mcap", received_between(11 * SECOND, 19 * SECOND), {})
-    kept = {name: look_over(tmp_path / f"{name}.mcap").gaps for name in ("saved", "merged", "with", "without")}
+    cut([run], tmp_path / "with.mcap", receipt_window(11 * SECOND, 20 * SECOND), {})
+    cut([run], tmp_path / "without.mcap", receipt_window(11 * SECOND, 19 * SECOND), {})
+    kept = {name: inspect(tmp_path / f"{name}.mcap").gaps for name in ("saved", "merged", "with", "without")}
     assert kept == {"saved": (ALARMS,), "merged": (ALARMS,), "with": (ALARMS,), "without": ()}
 
 
@@ -85,4 +85,4 @@ def test_what_the_files_before_hold_is_not_written_again_once(tmp_path: Path) ->
     path = again.files.path
     again.stop()
     assert path is not None
-    assert look_over(path).overview.topics[told[0].key].count == 2
+    assert inspect(path).overview.topics[told[0].key].count == 2

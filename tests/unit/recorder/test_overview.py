@@ -8,7 +8,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
 from recorder.message import RecordedMessage
-from recorder.tools.inspect import Look, look_over, zero_ns_of
+from recorder.tools.inspect import FileInfo, inspect, zero_ns_of
 from recorder.tools.mcap_file import RecordingWriter
 from recorder.tools.overview import Gap, overview
 from tests.unit.recorder import golden
@@ -93,12 +93,12 @@ def test_a_file_that_is_cut_off_is_looked_over_as_far_as_it_goes(tmp_path: Path)
             if number == 1000:
                 writer.flush()
                 half = (tmp_path / "run.mcap.part").stat().st_size
-    whole = look_over(path)
+    whole = inspect(path)
     assert (whole.overview.messages, whole.damages, whole.metadata["seed"]) == (len(entries), (), "5")
     assert whole.zero_ns == zero_ns_of(path) == golden.ZERO_NS
-    assert look_over(tmp_path).overview == whole.overview
+    assert inspect(tmp_path).overview == whole.overview
     path.write_bytes(path.read_bytes()[:half])
-    cut_off = look_over(path)
+    cut_off = inspect(path)
     assert cut_off.overview.messages == 1000
     assert cut_off.damages == (f"cut off at byte {half}",)
 
@@ -113,6 +113,6 @@ def test_a_sample_at_time_0_is_a_sample() -> None:
     assert overview(entries[1:2]).sample_span_ns == (0, 0)
     assert overview(entries).sample_span_ns == (-SECOND, SECOND)
     assert overview([]).sample_span_ns is None
-    said = info_object(Look(overview(entries[1:2]), {"zero_ns": "0"}, 0, ()), Path("x.mcap"))
+    said = info_object(FileInfo(overview(entries[1:2]), {"zero_ns": "0"}, 0, ()), Path("x.mcap"))
     assert (said["from_min"], said["to_min"], said["zero"]) == (0.0, 0.0, None)
-    assert info_object(Look(overview([]), {}, 0, ()), Path("x.mcap"))["from_min"] is None
+    assert info_object(FileInfo(overview([]), {}, 0, ()), Path("x.mcap"))["from_min"] is None

@@ -10,17 +10,27 @@ import pytest
 
 import recorder.panels
 from reactorwatch.contract import messages_pb2 as messages
-from recorder.columns.run import ADAPTS, EQUATIONS, HELD, JUDGES, Charted, Reconstructed, Report, Run, Snapshot
-from recorder.columns.run_reader import read_run, stretches
+from recorder.columns.run import (
+    ADAPTIVE,
+    EQUATIONS,
+    FROZEN,
+    REFERENCE,
+    ChartColumns,
+    HealthReport,
+    ReconstructionColumns,
+    RunColumns,
+    Snapshot,
+)
+from recorder.columns.run_reader import read_run, read_segments
 from recorder.panels import PANELS, alarms, charts, health, model, overview
-from recorder.panels.base import ALARM, Again, EventLog, Panel, PlanePlot, StateLines, TimePlot, View
+from recorder.panels.base import ALARM, EventLog, Panel, PlanePlot, StateLines, TimePlot, View, ViewReference
 from tests.unit.recorder import golden
 
 V = TypeVar("V", bound=View)
 
 
 @pytest.fixture(scope="module")
-def run() -> Run:
+def run() -> RunColumns:
     return read_run(golden.entries())
 
 
@@ -28,15 +38,15 @@ def of_kind(views: Sequence[View], kind: type[V]) -> Iterator[V]:
     return (view for view in views if isinstance(view, kind))
 
 
-def log_of(run: Run) -> EventLog:
+def log_of(run: RunColumns) -> EventLog:
     return next(of_kind(alarms.draw(run), EventLog))
 
 
-def only(run: Run, *signals_left: str) -> Run:
+def only(run: RunColumns, *signals_left: str) -> RunColumns:
     """The run of a plant that had but these signals, and no monitor."""
-    measured = {name: run.measured[name] for name in signals_left}
-    seen = {name: run.seen[name] for name in signals_left}
-    return replace(run, measured=measured, seen=seen, estimated={}, charts={}, alarms=(), faults=(), health={})
+    measured = {name: run.samples[name] for name in signals_left}
+    seen = {name: run.statistics[name] for name in signals_left}
+    return replace(run, samples=measured, statistics=seen, estimates={}, charts={}, alarms=(), faults=(), health={})
 
 
 def test_every_file_of_the_folder_is_in_the_catalogue() -> None:
@@ -47,18 +57,16 @@ def test_every_file_of_the_folder_is_in_the_catalogue() -> None:
     assert len(PANELS) == len(files)
 
 
-def some_runs(run: Run) -> Iterator[Run]:
+def some_runs(run: RunColumns) -> Iterator[RunColumns]:
     yield run
-    yield replace(
-        run, measured={**run.measured, "C": replace(run.measured["C"], value=run.measured["C"].value * np.nan)}
-    )
+    yield replace(run, samples={**run.samples, "C": replace(run.samples["C"], value=run.samples["C"].value * np.nan)})
     for left in (("T",), ("C", "T"), ("qc", "C", "T"), ()):
         yield only(run, *left)
-    yield from stretches(golden.entries(), 150)
+    yield from read_segments(golden.entries(), 150)
 
 
 @pytest.mark.parametrize("panel", PANELS, ids=lambda panel: panel.title)
-def test_every_panel_describes_any_run(panel: Panel, run: Run) -> None:
+def test_every_panel_describes_any_run(panel: Panel, run: RunColumns) -> None:
     """Names are told apart, times ascend, columns are of one length; also where next to nothing was recorded."""
     for some_run in some_runs(run):
         views = panel.draw(some_run)
@@ -82,77 +90,81 @@ def test_every_panel_describes_any_run(panel: Panel, run: Run) -> None:
                 assert all(path.x.shape == path.y.shape for path in view.paths)
 
 
-def test_what_is_shown_again_is_there(run: Run) -> None:
-    titles = {(panel.title, view.title) for panel in PANELS for view in panel.draw(run) if not isinstance(view, Again)}
+def test_what_is_shown_again_is_there(run: RunColumns) -> None:
+    titles = {
+        (panel.title, view.title) for panel in PANELS for view in panel.draw(run) if not isinstance(view, ViewReference)
+    }
     for panel in PANELS:
-        for view in of_kind(panel.draw(run), Again):
+        for view in of_kind(panel.draw(run), ViewReference):
             assert (view.panel, view.title) in titles
 
 
-def test_signals_show_measured_predicted_and_limits_in_colours_of_their_own(run: Run) -> None:
+def test_signals_show_measured_predicted_and_limits_in_colours_of_their_own(run: RunColumns) -> None:
     plots = {plot.title: plot for plot in of_kind(overview.draw(run), TimePlot)}
     assert list(plots) == ["C: concentration of A in the reactor", "T: temperature of the reactor", "qc: coolant flow"]
     temperature = plots["T: temperature of the reactor"]
     assert temperature.unit == "K"
     lines = {series.name: series for series in temperature.series}
     assert list(lines) == ["upper limit", "lower limit", "measured", "predicted"]
-    assert lines["measured"].value is run.measured["T"].value
-    assert lines["predicted"].value is run.estimated["T"].prediction
-    assert lines["upper limit"].value is run.estimated["T"].upper_limit
+    assert lines["measured"].value is run.samples["T"].value
+    assert lines["predicted"].value is run.estimates["T"].prediction
+    assert lines["upper limit"].value is run.estimates["T"].upper_limit
     assert len({lines[name].colour for name in ("upper limit", "measured", "predicted")}) == 3
     (flow,) = plots["qc: coolant flow"].series
     assert flow.held
 
 
-def test_what_a_suspected_sensor_should_read_is_drawn_beside_what_it_reads(run: Run) -> None:
-    rebuilt = Reconstructed(run.measured["T"].time_ns[5:9], np.arange(4.0), np.ones(4))
+def test_what_a_suspected_sensor_should_read_is_drawn_beside_what_it_reads(run: RunColumns) -> None:
+    rebuilt = ReconstructionColumns(run.samples["T"].time_ns[5:9], np.arange(4.0), np.ones(4))
     plots = {
-        plot.title[0]: plot for plot in of_kind(overview.draw(replace(run, reconstructed={"T": rebuilt})), TimePlot)
+        plot.title[0]: plot for plot in of_kind(overview.draw(replace(run, reconstructions={"T": rebuilt})), TimePlot)
     }
     assert next(series for series in plots["T"].series if series.name == "reconstructed").value is rebuilt.value
     assert "reconstructed" not in {series.name for series in plots["C"].series}
 
 
-def test_signals_of_no_known_process_are_drawn_by_their_names(run: Run) -> None:
+def test_signals_of_no_known_process_are_drawn_by_their_names(run: RunColumns) -> None:
     """A run says names and units; nothing has to be the reactor."""
-    strange = replace(only(run, "T"), measured={"pH": run.measured["T"]}, units={"pH": ""}, seen={"pH": run.seen["T"]})
+    strange = replace(
+        only(run, "T"), samples={"pH": run.samples["T"]}, units={"pH": ""}, statistics={"pH": run.statistics["T"]}
+    )
     (plot,) = of_kind(overview.draw(strange), TimePlot)
     assert (plot.title, plot.unit) == ("pH", "")
 
 
-def test_residuals_open_on_what_was_judged(run: Run) -> None:
+def test_residuals_open_on_what_was_judged(run: RunColumns) -> None:
     """A first prediction that is wild does not set the scale."""
-    wild = run.estimated["T"].residual.copy()
+    wild = run.estimates["T"].residual.copy()
     wild[0] = 1e6
-    changed = replace(run, estimated={"T": replace(run.estimated["T"], residual=wild)}, charts={})
+    changed = replace(run, estimates={"T": replace(run.estimates["T"], residual=wild)}, charts={})
     (plot,) = charts.draw(changed)
-    watched = np.isfinite(run.estimated["T"].upper_limit)
+    watched = np.isfinite(run.estimates["T"].upper_limit)
     assert plot.shown is not None
     lower, upper = plot.shown
     assert lower < wild[watched].min() < wild[watched].max() < upper < 1.0
-    learning = replace(run.estimated["T"], lower_limit=wild * np.nan, upper_limit=wild * np.nan)
-    (plot,) = charts.draw(replace(run, estimated={"T": learning}, charts={}))
+    learning = replace(run.estimates["T"], lower_limit=wild * np.nan, upper_limit=wild * np.nan)
+    (plot,) = charts.draw(replace(run, estimates={"T": learning}, charts={}))
     assert plot.shown is None
 
 
-def chart(*statistic: float) -> Charted:
+def chart(*statistic: float) -> ChartColumns:
     """A chart with limits at +-3 around 1."""
     ones, value = np.ones(len(statistic)), np.array(statistic)
     out = np.abs(value - 1.0) > 3.0
-    return Charted(np.arange(len(statistic)) * 10**9, value, ones, ones - 3.0, ones + 3.0, out.astype(float))
+    return ChartColumns(np.arange(len(statistic)) * 10**9, value, ones, ones - 3.0, ones + 3.0, out.astype(float))
 
 
-def test_every_chart_is_drawn_with_its_limits_those_of_all_signals_last(run: Run) -> None:
+def test_every_chart_is_drawn_with_its_limits_those_of_all_signals_last(run: RunColumns) -> None:
     names = ("shewhart/T", "mewma/all", "ewma/C")
-    plots = charts.draw(replace(run, estimated={}, charts=dict.fromkeys(names, chart(0.0, 1.0))))
+    plots = charts.draw(replace(run, estimates={}, charts=dict.fromkeys(names, chart(0.0, 1.0))))
     assert [plot.title for plot in plots] == ["Chart ewma/C", "Chart shewhart/T", "Chart mewma/all"]
     lines = {series.name: series.value.tolist() for series in plots[0].series}
     assert (lines["upper limit"], lines["centre"], lines["lower limit"]) == ([4.0, 4.0], [1.0, 1.0], [-2.0, -2.0])
     assert lines["statistic"] == [0.0, 1.0]
 
 
-def test_what_is_out_of_limits_is_drawn_as_an_alarm(run: Run) -> None:
-    (plot,) = charts.draw(replace(run, estimated={}, charts={"ewma/T": chart(1.0, 2.0, 9.0, 8.0, 2.0)}))
+def test_what_is_out_of_limits_is_drawn_as_an_alarm(run: RunColumns) -> None:
+    (plot,) = charts.draw(replace(run, estimates={}, charts={"ewma/T": chart(1.0, 2.0, 9.0, 8.0, 2.0)}))
     out = next(series for series in plot.series if series.name == "statistic out")
     assert out.colour == ALARM
     # the line comes from where it was, and ends with the last that is out
@@ -160,8 +172,8 @@ def test_what_is_out_of_limits_is_drawn_as_an_alarm(run: Run) -> None:
     assert plot.shown is None
 
 
-def test_a_statistic_that_goes_through_the_roof_leaves_the_limits_visible(run: Run) -> None:
-    (plot,) = charts.draw(replace(run, estimated={}, charts={"mewma/all": chart(1.0, 1e6, -1e6)}))
+def test_a_statistic_that_goes_through_the_roof_leaves_the_limits_visible(run: RunColumns) -> None:
+    (plot,) = charts.draw(replace(run, estimates={}, charts={"mewma/all": chart(1.0, 1e6, -1e6)}))
     assert plot.shown is not None
     lower, upper = plot.shown
     assert 4.0 < upper < 100.0
@@ -172,7 +184,7 @@ def test_a_statistic_that_goes_through_the_roof_leaves_the_limits_visible(run: R
     assert max(series.value.max() for series in plot.series if series.name == "statistic") == 1e6, "nothing is cut off"
 
 
-def test_the_log_tells_alarms_and_faults_in_order(run: Run) -> None:
+def test_the_log_tells_alarms_and_faults_in_order(run: RunColumns) -> None:
     assert [(event.kind, event.text) for event in log_of(run).events] == [
         ("fault", "20.0 min  injected: coolant_flow:step:-0.05@20min"),
         ("raised", "22.0 min  shewhart/T: T is lower than the model expects"),
@@ -181,11 +193,11 @@ def test_the_log_tells_alarms_and_faults_in_order(run: Run) -> None:
 
 
 def test_the_log_of_a_stretch_counts_from_the_beginning_of_the_run() -> None:
-    texts = [event.text for part in stretches(golden.entries(), 500) for event in log_of(part).events]
+    texts = [event.text for part in read_segments(golden.entries(), 500) for event in log_of(part).events]
     assert [text.split("  ")[0] for text in texts] == ["20.0 min", "22.0 min", "27.0 min"]
 
 
-def test_the_log_tells_the_suspects_of_one_look_once(run: Run) -> None:
+def test_the_log_tells_the_suspects_of_one_look_once(run: RunColumns) -> None:
     suspect = messages.Suspect(cause="coolant_flow", probability=0.9, profile="step", size=-0.05, unit="1")
     suspect.onset_ns = run.span_ns[0] + 20 * 60_000_000_000
     look = run.alarms[0]._replace(event="suspected", suspects=[suspect])
@@ -196,11 +208,11 @@ def test_the_log_tells_the_suspects_of_one_look_once(run: Run) -> None:
         ("raised", "22.0 min  shewhart/T: T is lower than the model expects"),
         told,
     ]
-    known = replace(twice, earlier=replace(run.earlier, suspected_ns=look.time_ns))
+    known = replace(twice, context=replace(run.context, suspects_ns=look.time_ns))
     assert told not in [(event.kind, event.text) for event in log_of(known).events], "told by the stretch before"
 
 
-def test_every_state_of_an_alarm_has_a_word_and_a_colour(run: Run) -> None:
+def test_every_state_of_an_alarm_has_a_word_and_a_colour(run: RunColumns) -> None:
     changes = [
         run.alarms[0]._replace(state=state, time_ns=state + 1) for state in messages.AlarmState.values() if state
     ]
@@ -210,7 +222,7 @@ def test_every_state_of_an_alarm_has_a_word_and_a_colour(run: Run) -> None:
     assert set(line.states) <= lanes.colours.keys()
 
 
-def test_the_life_of_an_alarm_is_a_line_that_begins_with_the_run(run: Run) -> None:
+def test_the_life_of_an_alarm_is_a_line_that_begins_with_the_run(run: RunColumns) -> None:
     first = run.alarms[0]._replace(event="raised")
     (lanes,) = of_kind(alarms.draw(replace(run, alarms=(first, *run.alarms[1:]))), StateLines)
     (line,) = lanes.lines
@@ -220,49 +232,51 @@ def test_the_life_of_an_alarm_is_a_line_that_begins_with_the_run(run: Run) -> No
     assert line.time_ns == tuple(golden.time_ns(round(at / golden.STEP_MIN)) for at in minutes)
 
 
-def test_what_is_known_of_an_alarm_from_before_is_not_said_again(run: Run) -> None:
-    earlier = replace(run.earlier, first_ns=run.span_ns[0], states={"shewhart/T": messages.ALARM_STATE_NORMAL})
-    again = replace(run, alarms=(run.alarms[0]._replace(event="raised"),), earlier=earlier)
+def test_what_is_known_of_an_alarm_from_before_is_not_said_again(run: RunColumns) -> None:
+    earlier = replace(run.context, first_ns=run.span_ns[0], alarm_states={"shewhart/T": messages.ALARM_STATE_NORMAL})
+    again = replace(run, alarms=(run.alarms[0]._replace(event="raised"),), context=earlier)
     (lanes,) = of_kind(alarms.draw(again), StateLines)
     assert lanes.lines[0].states == ("raised",)
 
 
-@pytest.mark.parametrize(("use", "name"), [(JUDGES, "judged by"), (HELD, "held since the training")])
-def test_parameters_of_both_models_are_drawn_with_their_intervals(run: Run, use: str, name: str) -> None:
-    """A model that judges nothing is not said to."""
+@pytest.mark.parametrize(
+    ("purpose", "name"), [(REFERENCE, "reference model"), (FROZEN, "model frozen since the training")]
+)
+def test_parameters_of_both_models_are_drawn_with_their_intervals(run: RunColumns, purpose: str, name: str) -> None:
+    """A model that is not the reference is not labelled as it."""
     adapting = tuple(Snapshot(at, {"a1": (0.9 + at, 0.1), "b1": (2.0, 0.5)}, 0.02 * at, 50.0) for at in (1, 2))
     judged = (Snapshot(2, {"a1": (0.8, 0.1), "b1": (1.9, 0.5)}, 0.03, 33.0),)
-    plots = model.draw(replace(run, models={("T", ADAPTS): adapting, ("T", use): judged}))
+    plots = model.draw(replace(run, models={("T", ADAPTIVE): adapting, ("T", purpose): judged}))
     assert [plot.title.split(" of ")[0] for plot in plots] == [
         "Parameters a",
         "Parameters b",
-        "Excitation that the model",
+        "Excitation",
     ]
     lines = {series.name: series.value for series in plots[0].series}
     assert lines["a1"] == pytest.approx([1.9, 2.9])
     assert lines["a1 upper end"] - lines["a1"] == pytest.approx(0.196)
     assert lines[f"a1 {name}"] == pytest.approx([0.8])
     excitation = {series.name: series.value.tolist() for series in plots[-1].series}
-    assert excitation == {f"of the model {name}": [0.03], "of the model that adapts": [0.02, 0.04]}
+    assert excitation == {name: [0.03], "adaptive model": [0.02, 0.04]}
 
 
-def test_the_noise_levels_of_the_equations_that_judge_are_drawn(run: Run) -> None:
+def test_the_noise_levels_of_the_equations_that_judge_are_drawn(run: RunColumns) -> None:
     judged = tuple(Snapshot(at, {"sensor_sd": (0.3, 0.0), "C_sd": (1e-4, 0.0)}, 0.0, 0.0) for at in (1, 2))
     (plot,) = model.draw(replace(run, models={("T", EQUATIONS): judged}))
-    assert plot.title == "Noise levels by which the equations judge T"
+    assert plot.title == "Noise levels of the equations for T"
     assert {series.name: series.value.tolist() for series in plot.series} == {
         "sensor_sd": [0.3, 0.3],
         "C_sd": [1e-4, 1e-4],
     }
 
 
-def test_health_shows_phases_lag_and_troubles_of_each_node(run: Run) -> None:
+def test_health_shows_phases_lag_and_troubles_of_each_node(run: RunColumns) -> None:
     reports = {
         "monitor": (
-            Report(5, "training", 1.5, {"lost": 0, "late": 0}),
-            Report(9, "watching", 2.5, {"lost": 3, "late": 4}),
+            HealthReport(5, "training", 1.5, {"lost": 0, "late": 0}),
+            HealthReport(9, "watching", 2.5, {"lost": 3, "late": 4}),
         ),
-        "plant": (Report(5, "running", 0.0, {"lost": 0, "late": 0}),),
+        "plant": (HealthReport(5, "running", 0.0, {"lost": 0, "late": 0}),),
     }
     phases, lag, troubles = health.draw(replace(run, health=reports))
     assert isinstance(phases, StateLines)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from reactorwatch.records.record import UNITS
-from recorder.columns.run import Measured, Run, Seen
-from recorder.columns.run_reader import read_run, stretches
+from recorder.columns.run import RunColumns, SampleColumns, SignalStatistics
+from recorder.columns.run_reader import read_run, read_segments
 from recorder.panels import phase_plane
 from recorder.panels.base import STABLE, UNSTABLE, PlanePlot
 from tests.unit.recorder import golden
@@ -18,27 +18,33 @@ AT_103 = [(0.96389, 353.553, True), (0.47622, 401.530, False), (0.1000129, 438.5
 
 
 @pytest.fixture(scope="module")
-def run() -> Run:
+def run() -> RunColumns:
     return read_run(golden.entries())
 
 
-def at(run: Run, coolant_flow: float) -> Run:
+def at(run: RunColumns, coolant_flow: float) -> RunColumns:
     """The run at another mean of the coolant flow."""
-    return replace(run, seen={**run.seen, "qc": Seen(300, coolant_flow, coolant_flow - 1.0, coolant_flow + 1.0)})
+    return replace(
+        run,
+        statistics={
+            **run.statistics,
+            "qc": SignalStatistics(300, coolant_flow, coolant_flow - 1.0, coolant_flow + 1.0),
+        },
+    )
 
 
-def both(run: Run) -> tuple[PlanePlot, PlanePlot]:
+def both(run: RunColumns) -> tuple[PlanePlot, PlanePlot]:
     near, far = phase_plane.draw(run)
     return near, far
 
 
-def test_nothing_is_drawn_of_a_process_that_is_not_known(run: Run) -> None:
-    strange = {name: run.seen[other] for name, other in (("u", "qc"), ("y", "T"), ("z", "C"))}
-    assert phase_plane.draw(replace(run, seen=strange)) == ()
-    assert phase_plane.draw(replace(run, seen={"T": run.seen["T"]})) == ()
+def test_nothing_is_drawn_of_a_process_that_is_not_known(run: RunColumns) -> None:
+    strange = {name: run.statistics[other] for name, other in (("u", "qc"), ("y", "T"), ("z", "C"))}
+    assert phase_plane.draw(replace(run, statistics=strange)) == ()
+    assert phase_plane.draw(replace(run, statistics={"T": run.statistics["T"]})) == ()
 
 
-def test_all_steady_states_at_the_coolant_flow_of_the_run_are_marked_stable_or_not(run: Run) -> None:
+def test_all_steady_states_at_the_coolant_flow_of_the_run_are_marked_stable_or_not(run: RunColumns) -> None:
     near, far = both(at(run, 103.41))
     marks = {mark.name: mark for mark in far.marks}
     for (c, t, stable), mark in zip(AT_103, far.marks, strict=True):
@@ -51,10 +57,10 @@ def test_all_steady_states_at_the_coolant_flow_of_the_run_are_marked_stable_or_n
     assert "qc = 103.4 l/min" in far.note
 
 
-def test_the_operating_branch_goes_through_the_steady_states_of_other_flows(run: Run) -> None:
+def test_the_operating_branch_goes_through_the_steady_states_of_other_flows(run: RunColumns) -> None:
     """The table of docs/plant.md; past 111 l/min the branch loses its stability."""
-    seen = {**run.seen, "qc": Seen(300, 100.0, 85.0, 115.0)}
-    near, _ = both(replace(run, seen=seen))
+    seen = {**run.statistics, "qc": SignalStatistics(300, 100.0, 85.0, 115.0)}
+    near, _ = both(replace(run, statistics=seen))
     curves = {curve.name: curve for curve in near.curves}
     points = np.column_stack([curves["stable branch"].x, curves["stable branch"].y])
     for c, t in ((0.0521787, 452.4796), (0.0620407, 448.7522), (0.0882316, 441.2184), (0.1298253, 432.9487)):
@@ -65,24 +71,24 @@ def test_the_operating_branch_goes_through_the_steady_states_of_other_flows(run:
     assert not np.isfinite(curves["stable branch"].x[beyond]).any()
 
 
-def test_where_the_branch_ends_nothing_is_made_up(run: Run) -> None:
+def test_where_the_branch_ends_nothing_is_made_up(run: RunColumns) -> None:
     """At 120 l/min only the extinguished state is left, and no line jumps down to it."""
-    near, far = both(replace(run, seen={**run.seen, "qc": Seen(300, 105.0, 90.0, 130.0)}))
+    near, far = both(replace(run, statistics={**run.statistics, "qc": SignalStatistics(300, 105.0, 90.0, 130.0)}))
     for curve in near.curves:
         assert np.nanmax(curve.x) < 0.3
     assert len(far.marks) == 3
 
 
-def test_a_flow_that_the_equations_do_not_know_has_no_steady_states(run: Run) -> None:
+def test_a_flow_that_the_equations_do_not_know_has_no_steady_states(run: RunColumns) -> None:
     near, far = both(at(run, 80_000.0))
     assert (near.curves, near.marks, far.marks) == ((), (), ())
     assert near.paths
 
 
-def test_the_path_changes_colour_while_the_alarm_stands_without_a_break(run: Run) -> None:
+def test_the_path_changes_colour_while_the_alarm_stands_without_a_break(run: RunColumns) -> None:
     plane, _ = both(run)
     quiet, alarmed = plane.paths
-    assert (quiet.name, alarmed.name) == ("no alarm", "alarm stands")
+    assert (quiet.name, alarmed.name) == ("no alarm", "alarm active")
     raised, cleared = (round(minutes / golden.STEP_MIN) for minutes in (golden.RAISED_MIN, golden.CLEARED_MIN))
     rows = np.arange(golden.ROWS)
     assert np.array_equal(np.isfinite(alarmed.x), (rows >= raised - 1) & (rows < cleared))
@@ -101,15 +107,15 @@ def steps(planes: Iterable[PlanePlot]) -> dict[str, set[tuple[float, ...]]]:
 
 
 @pytest.mark.parametrize("each", [37, 250, 1000])
-def test_stretch_by_stretch_the_path_is_the_same_wherever_it_is_cut(run: Run, each: int) -> None:
+def test_stretch_by_stretch_the_path_is_the_same_wherever_it_is_cut(run: RunColumns, each: int) -> None:
     """But for the colour of a step at a cut, whose alarm is heard of in the next stretch only."""
     whole = steps([both(run)[0]])
-    drawn = steps(near for part in stretches(golden.entries(), each) for near in phase_plane.draw(part)[:1])
+    drawn = steps(near for part in read_segments(golden.entries(), each) for near in phase_plane.draw(part)[:1])
     assert set().union(*drawn.values()) == set().union(*whole.values())
-    assert len(drawn["alarm stands"] ^ whole["alarm stands"]) <= 2
+    assert len(drawn["alarm active"] ^ whole["alarm active"]) <= 2
 
 
-def test_the_plane_marks_the_fault_and_the_first_alarm(run: Run) -> None:
+def test_the_plane_marks_the_fault_and_the_first_alarm(run: RunColumns) -> None:
     plane, _ = both(run)
     assert (plane.x_label, plane.y_label) == ("C, mol/l", "T, K")
     places = {mark.name: (mark.x, mark.y) for mark in plane.events}
@@ -124,10 +130,12 @@ def test_of_very_many_rows_the_farthest_are_drawn() -> None:
     columns = {"qc": np.full(rows, 100.0), "C": 0.1 + 0.01 * rng.normal(size=rows), "T": 440.0 + rng.normal(size=rows)}
     columns["T"][12_345], columns["C"][30_001] = 470.0, 0.25
     times = np.arange(rows, dtype=np.int64) * 6 * 10**9
-    seen = {name: Seen(rows, float(v.mean()), float(v.min()), float(v.max())) for name, v in columns.items()}
-    measured = {name: Measured(times, values) for name, values in columns.items()}
-    near, _ = both(Run("cstr", UNITS, measured, {}, {}, (), (), seen=seen))
+    seen = {
+        name: SignalStatistics(rows, float(v.mean()), float(v.min()), float(v.max())) for name, v in columns.items()
+    }
+    measured = {name: SampleColumns(times, values) for name, values in columns.items()}
+    near, _ = both(RunColumns("cstr", UNITS, measured, {}, {}, (), (), statistics=seen))
     (path,) = near.paths
-    assert path.x.size <= phase_plane.MOST_POINTS
+    assert path.x.size <= phase_plane.MAX_POINTS
     assert (path.y.max(), path.x.max()) == (470.0, 0.25)
     assert path.y.min() == columns["T"].min()

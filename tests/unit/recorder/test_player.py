@@ -11,7 +11,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.records.record import Record
 from recorder.message import RecordedMessage
-from recorder.tools.player import BATCH, EVERYTHING, NEVER_NS, Player, between, playable, samples_of
+from recorder.tools.player import BATCH, EVERYTHING, NEVER_NS, Player, filter_playable, filter_time, samples_of
 from tests.unit.recorder import golden
 
 SECOND = 10**9
@@ -80,15 +80,15 @@ def test_nothing_to_play_is_finished_at_once() -> None:
 
 
 def test_only_samples_go_out_unless_more_is_asked_for() -> None:
-    kinds = {keys.parse(publication.key).kind for publication in playable(golden.entries())}  # type: ignore[union-attr]
+    kinds = {keys.parse(publication.key).kind for publication in filter_playable(golden.entries())}  # type: ignore[union-attr]
     assert kinds == {keys.SAMPLE}
-    more = list(playable(golden.entries(), kinds=EVERYTHING))
+    more = list(filter_playable(golden.entries(), kinds=EVERYTHING))
     assert [item.key for item in more] == [entry.key for entry in golden.entries() if keys.HEALTH not in entry.key]
 
 
 def test_what_goes_out_is_what_was_recorded_byte_for_byte_under_the_name_asked_for() -> None:
     recorded = [entry for entry in golden.entries() if "/sample/" in entry.key]
-    again = [encode(publication) for publication in playable(golden.entries(), "twin")]
+    again = [encode(publication) for publication in filter_playable(golden.entries(), "twin")]
     assert [message.payload for message in again] == [entry.payload for entry in recorded]
     assert [message.key for message in again] == [entry.key.replace("cstr", "twin") for entry in recorded]
 
@@ -100,7 +100,7 @@ def test_what_cannot_be_decoded_or_is_no_publication_is_left_out() -> None:
         RecordedMessage("reactor/cstr/sample/T", b"", "application/protobuf;reactorwatch.v1.SetInput", 0, 0),
         RecordedMessage("reactor", b"", "application/protobuf;reactorwatch.v1.Sample", 0, 0),
     ]
-    assert list(playable(strange)) == []
+    assert list(filter_playable(strange)) == []
 
 
 def test_a_record_becomes_the_samples_of_a_plant() -> None:
@@ -138,7 +138,7 @@ def test_a_slow_play_takes_ten_times_as_long() -> None:
 
 def test_a_stretch_is_played_with_both_its_ends_at_the_times_of_its_samples() -> None:
     tape = at(0, 10, 11, 14, 15, 90)
-    player = Player(lambda: between(tape(), 10 * SECOND, 15 * SECOND), 1.0)
+    player = Player(lambda: filter_time(tape(), 10 * SECOND, 15 * SECOND), 1.0)
     assert played(player, 100 * SECOND) == [(100, 10), (101, 11), (104, 14), (105, 15)]
 
 

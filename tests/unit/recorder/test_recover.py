@@ -117,8 +117,8 @@ def test_a_length_that_is_damaged_costs_its_chunk_and_no_more(tmp_path: Path, wh
 def test_a_byte_that_is_wrong_costs_one_chunk_at_most_and_no_message_is_altered(tmp_path: Path, whole: bytes) -> None:
     path = tmp_path / "damaged.mcap"
     out = tmp_path / "out.mcap"
-    stretches = [ENTRIES[at : at + CHUNK] for at in range(0, len(ENTRIES), CHUNK)]
-    may_be_left = [[entry for other in stretches if other is not lost for entry in other] for lost in stretches]
+    read_segments = [ENTRIES[at : at + CHUNK] for at in range(0, len(ENTRIES), CHUNK)]
+    may_be_left = [[entry for other in read_segments if other is not lost for entry in other] for lost in read_segments]
     for place in range(0, len(whole), 61):
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
         saved = recover(path, out)

@@ -6,14 +6,14 @@ import pytest
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.errors import InputError
-from recorder.columns.run import ADAPTS, EQUATIONS, HELD, JUDGES, Earlier, Run
-from recorder.columns.run_reader import read_run, stretches
+from recorder.columns.run import ADAPTIVE, EQUATIONS, FROZEN, REFERENCE, RunColumns, SegmentContext
+from recorder.columns.run_reader import read_run, read_segments
 from recorder.message import RecordedMessage
 from tests.unit.recorder import golden
 
 
 @pytest.fixture(scope="module")
-def run() -> Run:
+def run() -> RunColumns:
     return read_run(golden.entries())
 
 
@@ -21,9 +21,9 @@ ROWS = np.arange(golden.ROWS)
 TIMES = np.array([golden.time_ns(row) for row in range(golden.ROWS)])
 
 
-def test_measured_values_are_those_published(run: Run) -> None:
-    assert sorted(run.measured) == ["C", "T", "qc"]
-    for signal, measured in run.measured.items():
+def test_measured_values_are_those_published(run: RunColumns) -> None:
+    assert sorted(run.samples) == ["C", "T", "qc"]
+    for signal, measured in run.samples.items():
         assert np.array_equal(measured.time_ns, TIMES)
         assert measured.value.tolist() == [golden.value(signal, row) for row in range(golden.ROWS)]
     assert run.plant == "cstr"
@@ -31,20 +31,20 @@ def test_measured_values_are_those_published(run: Run) -> None:
     assert run.span_ns == (TIMES[0], TIMES[-1])
 
 
-def test_estimates_have_limits_once_these_are_learned(run: Run) -> None:
-    assert sorted(run.estimated) == ["C", "T"]
+def test_estimates_have_limits_once_these_are_learned(run: RunColumns) -> None:
+    assert sorted(run.estimates) == ["C", "T"]
     learned = ROWS * golden.STEP_MIN >= golden.LEARNED_MIN
-    for signal, estimated in run.estimated.items():
+    for signal, estimated in run.estimates.items():
         expected = np.array([golden.expected(signal, row) for row in range(golden.ROWS)])
         assert np.array_equal(estimated.prediction, expected)
-        assert np.array_equal(estimated.residual, run.measured[signal].value - expected)
+        assert np.array_equal(estimated.residual, run.samples[signal].value - expected)
         assert np.array_equal(np.isfinite(estimated.upper_limit), learned)
         limit = 3.0 * golden.NOISE[signal]
         assert estimated.residual_upper_limit[learned] == pytest.approx(limit, rel=1e-9)
         assert estimated.residual_lower_limit[learned] == pytest.approx(-limit, rel=1e-9)
 
 
-def test_chart_points_alarms_and_faults_are_there(run: Run) -> None:
+def test_chart_points_alarms_and_faults_are_there(run: RunColumns) -> None:
     chart = run.charts["shewhart/T"]
     assert chart.time_ns.size == np.sum(ROWS * golden.STEP_MIN >= golden.LEARNED_MIN)
     assert np.array_equal(chart.out == 1.0, np.abs(chart.statistic) > 3.0)
@@ -55,10 +55,10 @@ def test_chart_points_alarms_and_faults_are_there(run: Run) -> None:
     assert [(fault.cause, fault.active) for fault in run.faults] == [("coolant_flow", True)]
 
 
-def test_the_order_of_receipt_does_not_matter(run: Run) -> None:
+def test_the_order_of_receipt_does_not_matter(run: RunColumns) -> None:
     backwards = read_run(reversed(list(golden.entries())))
-    assert np.array_equal(backwards.measured["T"].value, run.measured["T"].value)
-    assert np.array_equal(backwards.estimated["C"].residual, run.estimated["C"].residual)
+    assert np.array_equal(backwards.samples["T"].value, run.samples["T"].value)
+    assert np.array_equal(backwards.estimates["C"].residual, run.estimates["C"].residual)
     assert backwards.alarms == run.alarms
 
 
@@ -77,13 +77,13 @@ def test_unusable_values_are_gaps_and_what_cannot_be_read_is_passed_over() -> No
             RecordedMessage("reactor", b"", "text/plain", 0, 0),
         ]
     )
-    assert np.isnan(run.measured["T"].value).tolist() == [True, True]
+    assert np.isnan(run.samples["T"].value).tolist() == [True, True]
     assert (run.plant, run.faults) == ("cstr", ())
 
 
 def test_a_run_of_nothing_is_a_run() -> None:
     run = read_run([])
-    assert (run.plant, run.measured, run.alarms, run.span_ns) == ("", {}, (), (0, 0))
+    assert (run.plant, run.samples, run.alarms, run.span_ns) == ("", {}, (), (0, 0))
 
 
 def test_a_run_is_of_one_plant() -> None:
@@ -92,11 +92,11 @@ def test_a_run_is_of_one_plant() -> None:
         read_run([*golden.entries(), *other])
 
 
-def test_stretches_hold_the_run_and_each_message_once(run: Run) -> None:
-    parts = list(stretches(golden.entries(), 111))
+def test_stretches_hold_the_run_and_each_message_once(run: RunColumns) -> None:
+    parts = list(read_segments(golden.entries(), 111))
     assert len(parts) > 15
-    for signal, measured in run.measured.items():
-        found = [part.measured[signal] for part in parts if signal in part.measured]
+    for signal, measured in run.samples.items():
+        found = [part.samples[signal] for part in parts if signal in part.samples]
         assert np.array_equal(np.concatenate([item.time_ns for item in found]), measured.time_ns)
         assert np.array_equal(np.concatenate([item.value for item in found]), measured.value)
     assert [change for part in parts for change in part.alarms] == list(run.alarms)
@@ -106,31 +106,31 @@ def test_stretches_hold_the_run_and_each_message_once(run: Run) -> None:
     ]
 
 
-def test_a_stretch_knows_what_was_before_it(run: Run) -> None:
-    parts = list(stretches(golden.entries(), 500))
-    assert parts[0].earlier == Earlier()
+def test_a_stretch_knows_what_was_before_it(run: RunColumns) -> None:
+    parts = list(read_segments(golden.entries(), 500))
+    assert parts[0].context == SegmentContext()
     for number, part in enumerate(parts[1:], start=1):
         assert part.first_ns == run.first_ns == TIMES[0]
-        before = [item.measured["T"] for item in parts[:number]]
+        before = [item.samples["T"] for item in parts[:number]]
         newest = np.concatenate([item.value for item in before])[-2:]
-        assert np.array_equal(part.earlier.last["T"].value, newest)
-    states = [part.earlier.states.get("shewhart/T") for part in parts]
+        assert np.array_equal(part.context.last_samples["T"].value, newest)
+    states = [part.context.alarm_states.get("shewhart/T") for part in parts]
     assert states[0] is None
     assert states[-1] == messages.ALARM_STATE_UNACKNOWLEDGED, "it clears in the last"
     onset_ns = golden.time_ns(round(golden.ONSET_MIN / golden.STEP_MIN))
-    assert (parts[0].earlier.onset_ns, parts[-1].earlier.onset_ns) == (None, onset_ns)
+    assert (parts[0].context.onset_ns, parts[-1].context.onset_ns) == (None, onset_ns)
 
 
-def test_what_has_been_seen_of_a_signal_does_not_depend_on_the_stretches(run: Run) -> None:
-    (*_, last) = stretches(golden.entries(), 97)
-    for signal, measured in run.measured.items():
-        seen = last.seen[signal]
+def test_what_has_been_seen_of_a_signal_does_not_depend_on_the_stretches(run: RunColumns) -> None:
+    (*_, last) = read_segments(golden.entries(), 97)
+    for signal, measured in run.samples.items():
+        seen = last.statistics[signal]
         assert seen.rows == golden.ROWS
         assert seen.mean == pytest.approx(measured.value.mean(), rel=1e-12)
         assert (seen.lowest, seen.highest) == (measured.value.min(), measured.value.max())
 
 
-def test_a_node_s_report_stands_at_the_newest_sample_of_its_receipt(run: Run) -> None:
+def test_a_node_s_report_stands_at_the_newest_sample_of_its_receipt(run: RunColumns) -> None:
     """A node speaks by the clock; at an accelerated plant that is another time than the run's."""
     rows = [row for row in range(golden.ROWS) if row % 50 == 0]
     assert [report.time_ns for report in run.health["monitor"]] == [golden.time_ns(row) for row in rows]
@@ -144,10 +144,10 @@ def test_models_are_told_apart_by_what_they_are_for() -> None:
     ]
     published.append(messages.ModelSnapshot(time_ns=4, structure="equations", reference=True, held=True))
     run = read_run(encode(Publication("reactor/cstr/model/T", item)) for item in published)
-    assert [item.time_ns for item in run.models["T", ADAPTS]] == [1, 2]
-    assert [item.time_ns for item in run.models["T", HELD]] == [3]
+    assert [item.time_ns for item in run.models["T", ADAPTIVE]] == [1, 2]
+    assert [item.time_ns for item in run.models["T", FROZEN]] == [3]
     assert [item.time_ns for item in run.models["T", EQUATIONS]] == [4]
-    (judged,) = run.models["T", JUDGES]
+    (judged,) = run.models["T", REFERENCE]
     assert judged.parameters == {"a1": (0.9, 0.1)}
     assert judged.excitation == pytest.approx(0.2)
 
@@ -155,5 +155,5 @@ def test_models_are_told_apart_by_what_they_are_for() -> None:
 def test_a_reconstruction_is_a_column_beside_its_signal() -> None:
     told = [messages.Reconstruction(time_ns=at, value=440.0 + at, sd=0.5, unit="K") for at in (1, 2, 3)]
     run = read_run(encode(Publication("reactor/cstr/reconstruction/T", item)) for item in told)
-    assert run.reconstructed["T"].value.tolist() == [441.0, 442.0, 443.0]
-    assert run.reconstructed["T"].sd.tolist() == [0.5, 0.5, 0.5]
+    assert run.reconstructions["T"].value.tolist() == [441.0, 442.0, 443.0]
+    assert run.reconstructions["T"].sd.tolist() == [0.5, 0.5, 0.5]

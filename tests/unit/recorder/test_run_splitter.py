@@ -58,7 +58,7 @@ def test_every_sample_is_of_its_run_and_none_is_missing(runs: list[Session], sta
     found = samples(runs, start_ns)
     assert [splitter.update(*sample[1:]) for sample in found] == [sample[0] for sample in found]
     assert [run.last_ns - run.first_ns for run in splitter.runs] == [(run.rows - 1) * PERIOD for run in runs]
-    assert [(check.lost, check.duplicated) for check in splitter.checks.values()] == [(0, 0)] * 3
+    assert [(check.lost, check.duplicated) for check in splitter.counters.values()] == [(0, 0)] * 3
 
 
 @given(sessions(), st.data())
@@ -76,8 +76,8 @@ def test_what_comes_late_or_twice_within_a_run_starts_no_run(runs: list[Session]
     found.insert(target + 1, found[target])
     splitter = RunSplitter()
     assert [splitter.update(*sample[1:]) for sample in found] == [sample[0] for sample in found]
-    assert sum(check.lost for check in splitter.checks.values()) == 0
-    assert sum(check.duplicated for check in splitter.checks.values()) == 1
+    assert sum(check.lost for check in splitter.counters.values()) == 0
+    assert sum(check.duplicated for check in splitter.counters.values()) == 1
 
 
 def test_a_signal_that_was_absent_where_the_clock_stepped_back_joins_the_run_of_the_others() -> None:
@@ -98,7 +98,9 @@ def test_a_publisher_that_does_not_count_has_one_run_while_its_clock_goes_on() -
 @given(sessions())
 def test_continuous_times_increase_and_keep_the_spacing_of_rows(runs: list[Session]) -> None:
     clock = ContinuousTime()
-    found = [(run, clock.of(signal, Sample(sequence=n, time_ns=t)), t) for run, signal, n, t in samples(runs, 0)]
+    found = [
+        (run, clock.continuous_ns(signal, Sample(sequence=n, time_ns=t)), t) for run, signal, n, t in samples(runs, 0)
+    ]
     rows = [found[index] for index in range(0, len(found), len(SIGNALS))]
     assert all(found[index][1] == found[index + 2][1] for index in range(0, len(found), len(SIGNALS)))
     for before, after in pairwise(rows):
@@ -110,10 +112,10 @@ def test_continuous_times_increase_and_keep_the_spacing_of_rows(runs: list[Sessi
 def test_what_is_said_of_the_run_before_stays_with_it() -> None:
     clock = ContinuousTime()
     for number in range(10):
-        clock.of(T, Sample(sequence=number, time_ns=number * PERIOD))
-    assert clock.of(T, Sample(sequence=0, time_ns=2 * PERIOD)) == 10 * PERIOD
-    assert clock.of("alarm", Alarm(time_ns=9 * PERIOD)) == 9 * PERIOD
-    assert clock.of("alarm", Alarm(time_ns=2 * PERIOD)) == 10 * PERIOD
+        clock.continuous_ns(T, Sample(sequence=number, time_ns=number * PERIOD))
+    assert clock.continuous_ns(T, Sample(sequence=0, time_ns=2 * PERIOD)) == 10 * PERIOD
+    assert clock.continuous_ns("alarm", Alarm(time_ns=9 * PERIOD)) == 9 * PERIOD
+    assert clock.continuous_ns("alarm", Alarm(time_ns=2 * PERIOD)) == 10 * PERIOD
 
 
 @given(
@@ -133,7 +135,7 @@ def test_a_damaged_time_is_out_of_place_and_cuts_no_run(row: int, which: tuple[i
     strays = 0 if fits else len(which)
     assert [number for place, number in enumerate(numbers) if place // 3 != row] == expected[3:]
     assert (splitter.strays, len(splitter.runs)) == (strays, 1)
-    assert [check.lost for check in splitter.checks.values()] == [0] * 3
+    assert [check.lost for check in splitter.counters.values()] == [0] * 3
     assert fits or splitter.runs == [(0, 99 * PERIOD)]
 
 
@@ -146,4 +148,4 @@ def test_a_damaged_number_is_out_of_place_and_what_it_replaces_is_missing(row: i
         splitter.update(*sample[1:])
     damaged = int(number != row)
     assert (splitter.strays, len(splitter.runs)) == (damaged, 1)
-    assert sum(check.lost for check in splitter.checks.values()) == damaged
+    assert sum(check.lost for check in splitter.counters.values()) == damaged

@@ -11,9 +11,9 @@ from reactorwatch.records.record import Record
 from recorder.columns.run_reader import read_run
 from recorder.message import RecordedMessage
 from recorder.tools.convert import export_csv
-from recorder.tools.inspect import look_over, zero_ns_of
+from recorder.tools.inspect import inspect, zero_ns_of
 from recorder.tools.mcap_file import RecordingWriter, read_messages, read_record
-from recorder.tools.player import Player, playable, samples_of
+from recorder.tools.player import Player, filter_playable, samples_of
 
 SECOND = 1_000_000_000
 START_NS = 1_772_352_000 * SECOND
@@ -43,7 +43,7 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 def test_no_sample_is_missing_where_none_is(folder: Path) -> None:
-    seen = look_over(folder)
+    seen = inspect(folder)
     assert (seen.overview.lost, seen.overview.duplicated, seen.overview.gaps) == (0, 0, [])
     assert len(info_object(seen, folder)["runs"]) == 3
     assert info_object(seen, folder)["zero"] == "2026-03-01T08:00:00Z"
@@ -74,14 +74,14 @@ def test_minutes_count_from_the_first_row_of_the_first_run(tmp_path: Path) -> No
 
 
 def test_a_drawing_shows_one_run_after_the_other(folder: Path) -> None:
-    shown = read_run(read_messages(folder)).measured["T"]
+    shown = read_run(read_messages(folder)).samples["T"]
     assert shown.time_ns.size == 3 * ROWS
     assert (np.diff(shown.time_ns) > 0).all()
     assert (np.diff(shown.value) > 0).all()
 
 
 def test_each_run_is_played_at_its_pace(folder: Path) -> None:
-    player = Player(lambda: playable(read_messages(folder)), 1.0)
+    player = Player(lambda: filter_playable(read_messages(folder)), 1.0)
     now_ns, moments = 0, []
     while not player.finished:
         now_ns = max(now_ns, player.next_tick_ns())

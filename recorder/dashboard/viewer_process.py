@@ -1,4 +1,4 @@
-"""Rerun's viewer as a process of ours: on loopback unless asked, and ended with the context."""
+"""Run the Rerun viewer as a child process, on loopback by default."""
 
 import os
 import subprocess
@@ -9,11 +9,11 @@ from pathlib import Path
 
 from reactorwatch.errors import InputError
 
-END_WITHIN_S = 5.0
+EXIT_TIMEOUT_S = 5.0
 
 
 def viewer_program() -> Path:
-    """The viewer itself; the command `rerun` is a script that starts it, and does not end it when it is ended."""
+    """Path of the viewer; the command `rerun` is a script that does not terminate the viewer with itself."""
     package = find_spec("rerun_cli")
     if package is None or package.origin is None:
         raise InputError("no picture: this build of rerun comes without its viewer; install rerun-sdk from PyPI")
@@ -24,20 +24,20 @@ def viewer_program() -> Path:
 def viewer(
     *arguments: str, port: int, bind: str, log: Path, environment: Mapping[str, str] | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A viewer's process.
+    """Run a viewer within the context.
 
     Args:
-        arguments: of its command line.
-        port: that it listens at for what to show.
-        bind: the address that it listens on.
-        log: where what it says goes.
-        environment: variables beside our own.
+        arguments: arguments of its command line.
+        port: port for data.
+        bind: address to listen on.
+        log: file for its output.
+        environment: additional environment variables.
     """
     command = [str(viewer_program()), "--bind", bind, "--port", str(port), "--hide-welcome-screen", *arguments]
     with log.open("wb") as output:
         process = subprocess.Popen(  # noqa: S603 (the program is Rerun's own, the arguments are paths and numbers)
             command,
-            # without the level, what the viewer logs lies over the picture for some seconds
+            # without the level, log lines of the viewer cover the picture for some seconds
             env={**os.environ, "RUST_LOG": "error", **(environment or {})},
             stdin=subprocess.DEVNULL,
             stdout=output,
@@ -48,7 +48,7 @@ def viewer(
         finally:
             process.terminate()
             try:
-                process.wait(END_WITHIN_S)
+                process.wait(EXIT_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()

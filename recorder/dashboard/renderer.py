@@ -1,4 +1,4 @@
-"""What panels describe, drawn with Rerun, stretch by stretch: into a file, or in a viewer that is running."""
+"""Draw the views of panels with Rerun, segment by segment, into a file or a running viewer."""
 
 from collections.abc import Sequence
 from typing import assert_never
@@ -6,12 +6,11 @@ from typing import assert_never
 import numpy as np
 import rerun as rr
 
-from recorder.columns.run import Run
+from recorder.columns.run import RunColumns
 from recorder.dashboard.layout import Layout, origin
 from recorder.dashboard.plane import draw_plane
 from recorder.dashboard.stream import Stream, path_of
 from recorder.panels.base import (
-    Again,
     Arrangement,
     EventLog,
     Panel,
@@ -21,22 +20,23 @@ from recorder.panels.base import (
     StateLines,
     TimePlot,
     View,
+    ViewReference,
 )
 
 
-class Drawing:
-    """What has been drawn.
+class Renderer:
+    """Draws views onto a Rerun stream.
 
     Args:
-        recording: the stream that it is drawn onto.
+        recording: the stream.
     """
 
     def __init__(self, recording: rr.RecordingStream) -> None:
         self._stream = Stream(recording)
         self.layout = Layout()
 
-    def draw(self, run: Run, panels: Sequence[Panel]) -> None:
-        """Draw a run, or the next stretch of it."""
+    def draw(self, run: RunColumns, panels: Sequence[Panel]) -> None:
+        """Draw a run, or its next segment."""
         for panel in panels:
             self.add(panel.title, panel.arranged, panel.draw(run), run.zero_ns)
 
@@ -44,12 +44,12 @@ class Drawing:
         """Draw views.
 
         Args:
-            tab: title of the one that they are in.
-            arranged: how they are.
-            views: the views; one of a title that was there is added to that.
-            zero_ns: the time that the run counts from.
+            tab: title of their tab.
+            arranged: arrangement of the tab.
+            views: the views; data of a view with a known title are added to it.
+            zero_ns: time that minutes count from.
         """
-        self.layout.note(tab, arranged, views)
+        self.layout.update(tab, arranged, views)
         for view in views:
             path = origin(tab, view)
             match view:
@@ -63,14 +63,14 @@ class Drawing:
                         self._draw_states(path + path_of(*line.name.split("/")), line, view, zero_ns)
                 case PlanePlot():
                     draw_plane(self._stream, path, view, self.layout.frame(path), zero_ns)
-                case Again():
+                case ViewReference():
                     pass
                 case _:
                     assert_never(view)
 
     def _draw_series(self, path: str, series: Series, zero_ns: int) -> None:
         mode = rr.components.InterpolationMode.StepAfter if series.held else rr.components.InterpolationMode.Linear
-        look = rr.SeriesLines(
+        style = rr.SeriesLines(
             colors=[series.colour],
             widths=[series.width],
             names=[series.legend or series.name],
@@ -78,7 +78,7 @@ class Drawing:
             # by default Rerun draws the average where several points fall on a pixel, and so hides every peak
             aggregation_policy=rr.components.AggregationPolicy.MinMax,
         )
-        self._stream.say(path, (series.colour, series.width, series.legend, series.held), look)
+        self._stream.log_static(path, (series.colour, series.width, series.legend, series.held), style)
         self._stream.send_numbers(path, series.time_ns, zero_ns, series.value)
 
     def _draw_log(self, path: str, log: EventLog, zero_ns: int) -> None:
@@ -93,6 +93,6 @@ class Drawing:
 
     def _draw_states(self, path: str, line: StateLine, lanes: StateLines, zero_ns: int) -> None:
         words, colours = list(lanes.colours), list(lanes.colours.values())
-        self._stream.say(path, tuple(words), rr.StateConfiguration(values=words, colors=colours))
+        self._stream.log_static(path, tuple(words), rr.StateConfiguration(values=words, colors=colours))
         columns = rr.StateChange.columns(state=list(line.states))
         self._stream.send(path, np.array(line.time_ns, np.int64), zero_ns, columns)

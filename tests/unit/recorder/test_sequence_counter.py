@@ -4,12 +4,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.columns.sequences import MOST_GAPS, SequenceCheck
+from recorder.columns.sequence_counter import MAX_GAPS, SequenceCounter
 
 
 def counted(sequences: list[int]) -> tuple[int, int, int]:
     """(lost, duplicated, out of order) of samples of one publisher: a number's sample time grows with it."""
-    check = SequenceCheck()
+    check = SequenceCounter()
     for sequence in sequences:
         check.update(sequence, sequence * 100)
     return check.lost, check.duplicated, check.out_of_order
@@ -34,7 +34,7 @@ def test_counts(sequences: list[int], lost: int, duplicated: int, out_of_order: 
 
 
 def test_a_publisher_that_is_started_anew_loses_only_what_its_new_run_skipped() -> None:
-    check = SequenceCheck()
+    check = SequenceCounter()
     for sequence, time_ns in ((0, 0), (1, 100), (2, 200), (0, 1000), (1, 1100), (4, 1400)):
         check.update(sequence, time_ns)
     assert (check.lost, check.duplicated, check.out_of_order) == (2, 0, 0)
@@ -52,6 +52,6 @@ def test_what_came_at_last_is_not_lost_in_whatever_order_it_came(order: list[int
 
 
 def test_the_memory_of_gaps_is_bounded() -> None:
-    skipping = list(range(0, 8 * MOST_GAPS, 2))
+    skipping = list(range(0, 8 * MAX_GAPS, 2))
     lost, duplicated, out_of_order = counted([*skipping, 1, skipping[-1] - 1])
     assert (lost, duplicated, out_of_order) == (len(skipping) - 2, 1, 1)

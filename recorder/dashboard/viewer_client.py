@@ -1,4 +1,4 @@
-"""A viewer of Rerun's that runs: asked what it shows, and which tab is to be in front."""
+"""Client of a running Rerun viewer: state, screenshots and tabs."""
 
 from typing import Any
 
@@ -6,13 +6,13 @@ from rerun.experimental import ViewerClient
 
 
 class Viewer:
-    """A viewer on this machine.
+    """Client of a viewer on this machine.
 
     Args:
-        port: that it listens at.
+        port: port of the viewer.
 
     Raises:
-        ConnectionError: nothing listens there.
+        ConnectionError: nothing listens on the port.
     """
 
     def __init__(self, port: int) -> None:
@@ -20,29 +20,29 @@ class Viewer:
 
     @property
     def is_ready(self) -> bool:
-        """Whether there is something on the screen, and nothing that is still being loaded."""
+        """True if a view is shown and nothing is being loaded."""
         state = self._client.get_state()
         return bool(state.views) and not state.loading
 
     def hide_top(self) -> None:
-        """Hide the bar at the top: it warns of slow drawing, which is no matter in a picture."""
+        """Hide the bar at the top, whose warning of slow drawing does not matter in a picture."""
         self._client.run_command("ui.toggle_top_panel")
 
     def screenshot(self) -> bytes:
-        """What is on the screen, as PNG."""
+        """Screenshot as PNG."""
         return self._client.take_screenshot()
 
     @property
     def tabs(self) -> dict[str, str]:
-        """The tabs: by title, what the layout calls each."""
+        """Identifiers of the tabs in the layout, by title."""
         layout = self._layout()
         _, root = _tabbed(layout)
         contents = root.get("contents", [])
-        paths = [contents] if isinstance(contents, str) else contents  # the viewer gives a list of one as its item
+        paths = [contents] if isinstance(contents, str) else contents  # the viewer returns a list of one as its item
         return {layout[f"/{path}"]["ContainerBlueprint"]["display_name"]: path for path in paths}
 
     def open_tab(self, tab: str) -> None:
-        """Bring a tab to the front, by what the layout calls it."""
+        """Activate a tab by its identifier in the layout."""
         layout = self._layout()
         path, root = _tabbed(layout)
         layout[path]["ContainerBlueprint"] = {**root, "active_tab": tab}
@@ -53,7 +53,7 @@ class Viewer:
 
 
 def _tabbed(layout: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The container of the tabs, its path first; one without any if there is none."""
+    """Path and container of the tabs; empty if there is none."""
     for path, archetypes in layout.items():
         container = archetypes.get("ContainerBlueprint", {})
         if container.get("container_kind") == "Tabs":

@@ -11,9 +11,9 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
-from recorder.dashboard import late_joiner
-from recorder.dashboard.late_joiner import Past, PastQuery, ask_for_past, changes
-from recorder.dashboard.live import DRAW_EVERY_NS, ZERO_WITHIN_NS, LiveDashboard
+from recorder.dashboard import history_query
+from recorder.dashboard.history_query import HistoryQuery, RunHistory, alarm_changes, query_history
+from recorder.dashboard.live import DRAW_INTERVAL_NS, ZERO_TIMEOUT_NS, LiveDashboard
 from recorder.dashboard.stream import RUN_TIME
 
 MINUTE = 60_000_000_000
@@ -53,15 +53,15 @@ class Remembering(MemoryBus):
 
 
 @pytest.fixture
-def past(monkeypatch: pytest.MonkeyPatch) -> Past:
-    monkeypatch.setattr(late_joiner, "ANSWER_WITHIN_S", 60.0)
+def past(monkeypatch: pytest.MonkeyPatch) -> RunHistory:
+    monkeypatch.setattr(history_query, "REPLY_TIMEOUT_S", 60.0)
     exchange = Exchange()
 
     def answer(request: Request) -> None:
         request.reply(messages.CommandReply(accepted=True, alarms=LISTED))
 
     MemoryBus(exchange).declare_queryable(keys.key("cstr", keys.COMMAND, "list_alarms"), answer)
-    return ask_for_past(Remembering(exchange), "cstr")
+    return query_history(Remembering(exchange), "cstr")
 
 
 def logged(path: Path) -> list[tuple[float, str]]:
@@ -76,13 +76,13 @@ def logged(path: Path) -> list[tuple[float, str]]:
     return sorted(found)
 
 
-def shown(tmp_path: Path, past: Past, received: list[Encoded]) -> list[tuple[float, str]]:
+def shown(tmp_path: Path, past: RunHistory, received: list[Encoded]) -> list[tuple[float, str]]:
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "sent.rrd")
     dashboard = LiveDashboard(recording, lambda: False, 0, past)
     for number, message in enumerate(received):
         dashboard.on_message(message, number)
-    dashboard.on_tick(DRAW_EVERY_NS)
+    dashboard.on_tick(DRAW_INTERVAL_NS)
     recording.flush()
     recording.disconnect()
     return logged(tmp_path / "sent.rrd")
@@ -95,7 +95,7 @@ def sample(time_ns: int) -> Encoded:
 
 @pytest.mark.parametrize("is_silent", [False, True])
 def test_all_active_alarms_are_shown_with_their_suspects_at_their_minutes(
-    tmp_path: Path, past: Past, *, is_silent: bool
+    tmp_path: Path, past: RunHistory, *, is_silent: bool
 ) -> None:
     """Also of a plant that sends no sample any more."""
     assert past.zero_ns == ZERO_NS
@@ -108,7 +108,7 @@ def test_all_active_alarms_are_shown_with_their_suspects_at_their_minutes(
     assert not any("stuck/T" in text for _, text in lines)
 
 
-def test_a_change_that_publishers_remember_is_shown_once(tmp_path: Path, past: Past) -> None:
+def test_a_change_that_publishers_remember_is_shown_once(tmp_path: Path, past: RunHistory) -> None:
     again = alarm("drift/C")
     again.time_ns, again.event = again.raised_ns, "raised"
     remembered = encode(Publication("reactor/cstr/alarm/drift/C", again))
@@ -116,8 +116,8 @@ def test_a_change_that_publishers_remember_is_shown_once(tmp_path: Path, past: P
     assert sum("drift/C" in text for _, text in lines) == 1
 
 
-def test_the_present_state_of_each_is_the_last_that_is_known(past: Past) -> None:
-    last = {change.alarm: change.state for change in changes(LISTED) if change.event != "suspected"}
+def test_the_present_state_of_each_is_the_last_that_is_known(past: RunHistory) -> None:
+    last = {change.alarm: change.state for change in alarm_changes(LISTED) if change.event != "suspected"}
     assert last == STATES
 
 
@@ -129,25 +129,25 @@ def test_alarms_that_come_before_the_first_sample_are_not_lost(tmp_path: Path) -
     recording.save(tmp_path / "sent.rrd")
     dashboard = LiveDashboard(recording, lambda: False, 0)
     dashboard.on_message(encode(Publication("reactor/cstr/alarm/ewma/T", raised)), 0)
-    dashboard.on_tick(DRAW_EVERY_NS)
-    dashboard.on_message(sample(ZERO_NS), DRAW_EVERY_NS)
-    dashboard.on_tick(2 * DRAW_EVERY_NS)
+    dashboard.on_tick(DRAW_INTERVAL_NS)
+    dashboard.on_message(sample(ZERO_NS), DRAW_INTERVAL_NS)
+    dashboard.on_tick(2 * DRAW_INTERVAL_NS)
     recording.flush()
     recording.disconnect()
     assert [text for _, text in logged(tmp_path / "sent.rrd")] == ["312.5 min  ewma/T: text of ewma/T"]
 
 
 def test_without_a_monitor_nothing_is_waited_for_and_nothing_is_known() -> None:
-    assert ask_for_past(MemoryBus(Exchange()), "cstr") == Past()
+    assert query_history(MemoryBus(Exchange()), "cstr") == RunHistory()
 
 
 class Answering:
     """What a plant's past is, answer by answer; the last one again and again."""
 
-    def __init__(self, *answers: Past) -> None:
+    def __init__(self, *answers: RunHistory) -> None:
         self._answers, self.asked, self.was_last = list(answers), 0, threading.Event()
 
-    def __call__(self) -> Past:
+    def __call__(self) -> RunHistory:
         self.asked += 1
         answer = self._answers.pop(0) if len(self._answers) > 1 else self._answers[0]
         if len(self._answers) == 1 and answer.answered:
@@ -159,16 +159,16 @@ MONITOR = keys.key("cstr", keys.ALIVE, "monitor")
 
 
 def test_a_monitor_that_comes_later_answers_late_and_restarts_is_asked_until_it_answers(
-    tmp_path: Path, past: Past, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, past: RunHistory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each alarm is shown once, also those that came by themselves."""
-    monkeypatch.setattr(late_joiner, "AGAIN_S", 0.0)
+    monkeypatch.setattr(history_query, "RETRY_S", 0.0)
     assert past.answered == {"monitor"}
-    ask = Answering(Past(), Past(), past)
-    query = PastQuery(ask)
+    ask = Answering(RunHistory(), RunHistory(), past)
+    query = HistoryQuery(ask)
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "sent.rrd")
-    dashboard = LiveDashboard(recording, lambda: False, 0, Past(zero_ns=ZERO_NS), query)
+    dashboard = LiveDashboard(recording, lambda: False, 0, RunHistory(zero_ns=ZERO_NS), query)
     dashboard.on_message(sample(NOW_NS), 0)
     by_itself = alarm("drift/C")
     by_itself.time_ns, by_itself.event = by_itself.raised_ns, "raised"
@@ -182,9 +182,9 @@ def test_a_monitor_that_comes_later_answers_late_and_restarts_is_asked_until_it_
             thread.join(60.0)
         dashboard.on_alive(MONITOR, True, 0)  # as a token that is shown again; it has answered
         assert ask.asked == 3 + round_of
-        dashboard.on_tick(DRAW_EVERY_NS * (1 + round_of))
+        dashboard.on_tick(DRAW_INTERVAL_NS * (1 + round_of))
         dashboard.on_alive(MONITOR, False, 0)
-    dashboard.on_stop(DRAW_EVERY_NS * 10)
+    dashboard.on_stop(DRAW_INTERVAL_NS * 10)
     recording.flush()
     recording.disconnect()
     lines = logged(tmp_path / "sent.rrd")
@@ -193,7 +193,7 @@ def test_a_monitor_that_comes_later_answers_late_and_restarts_is_asked_until_it_
 
 
 def test_a_monitor_that_never_answers_is_asked_no_more_once_the_view_ends() -> None:
-    query = PastQuery(Answering(Past()))
+    query = HistoryQuery(Answering(RunHistory()))
     query.on_alive(MONITOR, True)
     thread = query._thread
     assert thread is not None
@@ -203,18 +203,18 @@ def test_a_monitor_that_never_answers_is_asked_no_more_once_the_view_ends() -> N
 
 @pytest.mark.parametrize("reports", [True, False])
 def test_the_minutes_of_a_fleet_s_plant_count_from_its_first_sample_once_its_monitor_reports(
-    tmp_path: Path, past: Past, *, reports: bool
+    tmp_path: Path, past: RunHistory, *, reports: bool
 ) -> None:
     """Nothing is drawn before; without a report, they count from the first sample that came, after a while."""
     recording = rr.RecordingStream("test")
     recording.save(tmp_path / "sent.rrd")
     dashboard = LiveDashboard(recording, lambda: False, 0, past._replace(zero_ns=None))
     dashboard.on_message(sample(NOW_NS), 0)
-    dashboard.on_tick(DRAW_EVERY_NS)
+    dashboard.on_tick(DRAW_INTERVAL_NS)
     recording.flush()
     if reports:
-        dashboard.on_message(encode(Publication("reactor/cstr/health/monitor", HEALTH)), DRAW_EVERY_NS)
-    dashboard.on_tick(2 * DRAW_EVERY_NS if reports else ZERO_WITHIN_NS)
+        dashboard.on_message(encode(Publication("reactor/cstr/health/monitor", HEALTH)), DRAW_INTERVAL_NS)
+    dashboard.on_tick(2 * DRAW_INTERVAL_NS if reports else ZERO_TIMEOUT_NS)
     recording.flush()
     recording.disconnect()
     minutes = {text.partition("  ")[2].partition(":")[0]: minute for minute, text in logged(tmp_path / "sent.rrd")}
