@@ -30,7 +30,7 @@ from scipy.signal import savgol_filter
 from benchmarks.hidden.classes import class_named, drawn
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.holdout import held_out_rows
-from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.library.cstr.model import cstr
@@ -111,7 +111,7 @@ def main() -> None:
 
 def compared(hidden: Hidden) -> Compared:
     """Both on one record."""
-    run = run_of(hidden.record, cstr())
+    run = make_run(hidden.record, cstr())
     said = diagnose(hidden.record, cstr())
     noise_sd = np.array(hidden.circumstances.noise_sd)
     held_out = [said.gain.held_out[name] for name in ("C", "T")]

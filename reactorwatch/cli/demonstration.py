@@ -180,7 +180,7 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folde
 def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str) -> int:
     """Diagnose the recording, draw it, read from it what happened, and write that down."""
     from reactorwatch.cli.diagnosis import DRAWING, MODEL, PAGE, Asked, case_of, diagnosed, write_report
-    from reactorwatch.diagnosis.report.words import verdict
+    from reactorwatch.diagnosis.report.words import describe_verdict
     from reactorwatch.process import effects_of
     from recorder.columns.run_reader import stretches
     from recorder.dashboard.file import write_rrd
@@ -230,7 +230,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         + (", ".join(f"`{alarm.alarm}` at {at(alarm.time_ns)}" for alarm in before) or "none")
         + f" ({again.expected_false_alarms:.2g} to be expected in the whole run)."
     )
-    lines.append(f"- Diagnosis of the whole recording: {verdict(diagnosis, effects_of(case.model))}")
+    lines.append(f"- Diagnosis of the whole recording: {describe_verdict(diagnosis, effects_of(case.model))}")
     lines.append(f"- Back-test over the recording: {'the same alarms, value for value' if same else 'OTHER ALARMS'}.")
     lines += [
         "",

@@ -11,9 +11,9 @@ import msgspec
 
 from reactorwatch.cli.batch import SUMMARY, Answer, Kind, Row, as_table
 from reactorwatch.cli.diagnosis import EXPERIMENT, PAGE, REPORT, Asked, Case, case_of, diagnosed, write_report
-from reactorwatch.diagnosis.experiment.constraints import checked_limits
-from reactorwatch.diagnosis.parameter_priors import stated
-from reactorwatch.diagnosis.practical_significance import checked_tolerance
+from reactorwatch.diagnosis.experiment.constraints import check_limits
+from reactorwatch.diagnosis.parameter_priors import parse_priors
+from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import Cause, Diagnosis
@@ -108,9 +108,9 @@ def answer(job: Job) -> Answer:
 def _check(asked: Asked) -> None:
     model = cstr() if asked.model is None else read_extended_model(asked.model).build()
     if asked.uncertain is not None:
-        stated(asked.uncertain, model)
-    checked_limits(model, asked.limits)
-    checked_tolerance(model, asked.tolerance)
+        parse_priors(asked.uncertain, model)
+    check_limits(model, asked.limits)
+    check_tolerance(model, asked.tolerance)
 
 
 def _said(case: Case, diagnosis: Diagnosis, seconds: float, *, as_json: bool) -> str:
