@@ -85,9 +85,10 @@ class FittedProfile(ABC):
     def basis_functions(self, shape: Array) -> tuple[Array, Array]:
         """Basis functions and their integrals from the first row, each of shape (rows, n_linear)."""
 
-    @abstractmethod
     def profile_values(self, parameters: Array) -> dict[str, float]:
         """Parameter values of the profile by name, `size` first."""
+        shape = zip(self.nonlinear_parameters, parameters[self.n_linear :].tolist(), strict=True)
+        return {"size": float(parameters[0])} | {item.name: value for item, value in shape}
 
     def unit(self, name: str, unit_of_size: str) -> str:
         """Unit of a profile parameter."""
@@ -165,10 +166,6 @@ class Constant(FittedProfile):
         """See `FittedProfile`."""
         return np.ones((self.time_min.size, 1)), self.time_min[:, None] - self.start_min
 
-    def profile_values(self, parameters: Array) -> dict[str, float]:
-        """See `FittedProfile`."""
-        return {"size": float(parameters[0])}
-
 
 class Step(FittedProfile):
     """Step at the onset."""
@@ -184,10 +181,6 @@ class Step(FittedProfile):
         """See `FittedProfile`."""
         age = self.time_min - shape[0]
         return (age >= 0.0).astype(float)[:, None], np.maximum(age, 0.0)[:, None]
-
-    def profile_values(self, parameters: Array) -> dict[str, float]:
-        """See `FittedProfile`."""
-        return {"size": float(parameters[0]), "onset": float(parameters[1])}
 
 
 class Ramp(FittedProfile):
@@ -207,7 +200,7 @@ class Ramp(FittedProfile):
 
     def profile_values(self, parameters: Array) -> dict[str, float]:
         """See `FittedProfile`."""
-        return {"size": float(parameters[0]), "onset": float(parameters[1]), "end": self.end_min}
+        return super().profile_values(parameters) | {"end": self.end_min}
 
 
 class Decay(FittedProfile):
@@ -226,10 +219,6 @@ class Decay(FittedProfile):
         age = np.maximum(self.time_min - shape[0], 0.0)
         approach = -np.expm1(-age / shape[1])
         return approach[:, None], (age - shape[1] * approach)[:, None]
-
-    def profile_values(self, parameters: Array) -> dict[str, float]:
-        """See `FittedProfile`."""
-        return {"size": float(parameters[0]), "onset": float(parameters[1]), "time_constant": float(parameters[2])}
 
 
 class Sine(FittedProfile):
