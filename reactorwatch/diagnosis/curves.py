@@ -49,8 +49,8 @@ def curves_of(
         dict(zip(outputs, whole.measured.T, strict=True)),
         dict(zip(outputs, before.T, strict=True)),
         dict(zip(outputs, after.T, strict=True)),
-        dict(zip(outputs, _standardised(nominal).T, strict=True)),
-        dict(zip(outputs, _standardised(best).T, strict=True)),
+        dict(zip(outputs, _standardise(nominal).T, strict=True)),
+        dict(zip(outputs, _standardise(best).T, strict=True)),
         deviation,
         deviation_sd,
     )
@@ -74,5 +74,5 @@ def differences_of(model: ProcessModel, noise_sd: Array, curves: Curves) -> dict
     }
 
 
-def _standardised(item: FittedHypothesis) -> Array:
+def _standardise(item: FittedHypothesis) -> Array:
     return np.asarray(item.fit.innovations.residual / item.fit.innovations.sd)

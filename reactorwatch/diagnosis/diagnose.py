@@ -182,7 +182,7 @@ def _is_unknown(
         return better and bool(best.label)
     if not best.label or log_p >= (MUCH_RESIDUAL if len(best.label) == 1 else MUCH_RESIDUAL_OF_TWO):
         return True
-    return better or not _nearly_explained(result, evaluate_holdout(run, result.nominal, best)[1])
+    return better or not _is_nearly_explained(result, evaluate_holdout(run, result.nominal, best)[1])
 
 
 def _seems_noisy(result: SearchResult, model: ProcessModel) -> bool:
@@ -192,7 +192,7 @@ def _seems_noisy(result: SearchResult, model: ProcessModel) -> bool:
     return max(shares) > NOISY_SHARE
 
 
-def _nearly_explained(result: SearchResult, after: Errors) -> bool:
+def _is_nearly_explained(result: SearchResult, after: Errors) -> bool:
     """Return true if the simulation's errors on held-out rows are close to the noise."""
     outputs = result.nominal.hypothesis.filter.model.output_names
     return bool(np.all(after.simulation < NEARLY * result.noise.sensor_sd(outputs)))

@@ -49,7 +49,7 @@ class Errors(NamedTuple):
     values: NDArray[np.bool_]
 
 
-def held_out_rows(run: Run, onsets_min: Sequence[float] = ()) -> Array:
+def holdout_rows(run: Run, onsets_min: Sequence[float] = ()) -> Array:
     """Mask of the held-out rows, shape (rows,).
 
     Args:
@@ -74,7 +74,7 @@ def evaluate_holdout(run: Run, nominal: FittedHypothesis, best: FittedHypothesis
 
     Uncertain parameters have the best hypothesis's values in both, so the difference is that of the causes alone.
     """
-    hidden = held_out_rows(run, _onsets(best))
+    hidden = holdout_rows(run, _onsets(best))
     seen = replace(run, measured=np.where(hidden[:, None], np.nan, run.measured))
     fit = best.fit
     if best is not nominal:

@@ -49,7 +49,7 @@ SEED = 11
 
 
 @dataclass(frozen=True, eq=False)
-class _Evaluated:
+class _Trial:
     """An input sequence, and the evidence of one pattern between each pair of alternatives."""
 
     sequence: InputSequence
@@ -91,11 +91,8 @@ class ExperimentSearch:
 
     def search(self) -> Experiment | str:
         """Find the best experiment, or the reason why there is none."""
-        tried = [
-            item
-            for item in (self._evaluate_within_limits(sequence) for sequence in initial_sequences(PATTERN_ROWS))
-            if item is not None
-        ]
+        trials = (self._evaluate_within_limits(sequence) for sequence in initial_sequences(PATTERN_ROWS))
+        tried = [item for item in trials if item is not None]
         if not tried:
             name = self._model.input_names[0]
             return f"No experiment is proposed: {self._describe_limits()} leave {name} no room to move."
@@ -180,18 +177,15 @@ class ExperimentSearch:
         reached = []
         for towards in (-1.0, 1.0):
             sequence = staircase(ROWS_A_STEP, STEPS, towards)
-            steps = STEPS
-            while (
-                steps
-                and self._alternatives.runs(sequence.first(steps).levels(ends, QUIET_ROWS + steps * ROWS_A_STEP))
-                is None
-            ):
-                steps -= 1
+            for steps in range(STEPS, -1, -1):
+                levels = sequence.first(steps).levels(ends, QUIET_ROWS + steps * ROWS_A_STEP)
+                if not steps or self._alternatives.runs(levels) is not None:
+                    break
             reached.append(steps / STEPS)
         low, high = (float(value) for value in ends.levels(np.array([-reached[0], reached[1]])))
         return InputRange(low, high, ends.rest)
 
-    def _evaluate_within_limits(self, sequence: InputSequence) -> _Evaluated | None:
+    def _evaluate_within_limits(self, sequence: InputSequence) -> _Trial | None:
         """Evaluate the sequence as large as the outputs allow; None if it cannot be used."""
         for share in SMALLER:
             noncentralities = self._evaluate(sequence.shrink(share))
@@ -201,7 +195,7 @@ class ExperimentSearch:
 
     def _evaluate(
         self, sequence: InputSequence, expected: Array | None = None, least: Array | None = None
-    ) -> _Evaluated | None:
+    ) -> _Trial | None:
         """Evidence of one pattern.
 
         Args:
@@ -221,9 +215,9 @@ class ExperimentSearch:
             evidence[index] = self._alternatives.noncentrality(self._alternatives.pairs[index], runs)
             if least is not None and evidence[index] <= least[index] and least[index] > 0.0:
                 return None
-        return _Evaluated(sequence, evidence)
+        return _Trial(sequence, evidence)
 
-    def _improve(self, best: _Evaluated, in_reach: Array) -> _Evaluated:
+    def _improve(self, best: _Trial, in_reach: Array) -> _Trial:
         """Improve by random exchanges."""
         random = np.random.default_rng(SEED)
         for _ in range(EXCHANGES):
@@ -268,7 +262,7 @@ class ExperimentSearch:
         return f"the limits ({', '.join(parts)})"
 
 
-def _score(item: _Evaluated, in_reach: Array) -> float:
+def _score(item: _Trial, in_reach: Array) -> float:
     """Evidence of the pair that is separated least, among those in reach."""
     return float(np.min(item.evidence[in_reach]))
 

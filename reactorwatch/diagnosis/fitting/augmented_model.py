@@ -44,11 +44,10 @@ class AugmentedModel:
 
     def inputs(self, time_min: Array, inputs: Array, signals: Sequence[Signal]) -> Array:
         """Stack the record's inputs and the magnitudes, shape (rows, n_u + 2 effects)."""
-        shifts = zip(signals, self.shifts_time, strict=True)
-        interval_input = [
-            input_timing.effective_timing(signal, time_min) if moves else signal for signal, moves in shifts
-        ]
-        return np.column_stack([inputs, *(item for signal in interval_input for item in signal)])
+        columns = [inputs]
+        for signal, shifts in zip(signals, self.shifts_time, strict=True):
+            columns += input_timing.effective_timing(signal, time_min) if shifts else signal
+        return np.column_stack(columns)
 
 
 @lru_cache(maxsize=COMPILED)

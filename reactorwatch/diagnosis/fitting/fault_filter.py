@@ -87,13 +87,13 @@ class FaultFilter:
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], noise: Noise, period_min: float = 0.1) -> None:
         self.effects = tuple(effects)
-        places = [index for index, effect in enumerate(self.effects) if effect.late_output is not None]
-        self.delay_index = places[0] if places else None
+        delays = (index for index, effect in enumerate(self.effects) if effect.late_output is not None)
+        self.delay_index = next(delays, None)
         self._plant, self._noise, self._period_min = model, noise, period_min
-        ekf = augment_model(model, tuple(item for item in self.effects if item.late_output is None))
+        augmented = augment_model(model, tuple(item for item in self.effects if item.late_output is None))
         if noise.colored:
-            ekf = replace(ekf, model=add_colored_noise(ekf.model, noise.colored, period_min))
-        self._augmented = ekf
+            augmented = replace(augmented, model=add_colored_noise(augmented.model, noise.colored, period_min))
+        self._augmented = augmented
         self._filters = [Filter(self.model, self._all_levels(noise))]  # twins, one for each lane used so far
         self._errors = self._augmented.errors.with_noise(self.noise_levels)
         self.noise = noise
@@ -125,7 +125,6 @@ class FaultFilter:
 
     @noise.setter
     def noise(self, noise: Noise) -> None:
-        """Noise levels of the plant and its sensors. A new value must have coloured noise of the same sensors."""
         self._noise, levels = noise, self._all_levels(noise)
         for item in self._filters:
             item.noise = levels

@@ -149,11 +149,9 @@ class Hypothesis:
         An onset matters only where something happens, so the derivative by it depends on the difference step. The step
         is about one standard deviation.
         """
-        dynamics = (
-            None
-            if self.filter.delay_index is not None
-            else self.filter.error_dynamics(run, self._signals(fit.parameters), fit.innovations)
-        )
+        dynamics = None
+        if self.filter.delay_index is None:
+            dynamics = self.filter.error_dynamics(run, self._signals(fit.parameters), fit.innovations)
         differences = self._difference_steps()
         for _ in range(_WIDENINGS):
             result = self._covariance(self._jacobian(run, fit, differences, dynamics))

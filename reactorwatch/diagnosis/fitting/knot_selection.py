@@ -51,13 +51,13 @@ def select_knots(
     for count in range(FEWEST_KNOTS, MOST_KNOTS + 1):
         on_grid = _on_grid(count)
         a = on_grid.T @ gradient
-        parameters = _solved(on_grid.T @ information @ on_grid, a)
+        parameters = _solve(on_grid.T @ information @ on_grid, a)
         promised.append((count * log(run.values) - float(a @ parameters), parameters))
     _, parameters = min(promised, key=lambda item: item[0])
     return PiecewiseLinear(run.time_min, parameters.size), parameters
 
 
-def _solved(information: Array, a: Array) -> Array:
+def _solve(information: Array, a: Array) -> Array:
     try:
         return np.asarray(np.linalg.solve(information, a))
     except np.linalg.LinAlgError:  # the record carries no information about the effect

@@ -47,7 +47,7 @@ def find_gross_outliers(measured: Array) -> NDArray[np.bool_]:
     """Mask of values that deviate by more than anything around them varies, shape (rows, n_y)."""
     result = np.zeros(measured.shape, dtype=np.bool_)
     for index, column in enumerate(measured.T):
-        ordered, count = _ordered(_around(column))
+        ordered, count = _sort_rows(_neighbours(column))
         low, high = ordered[:, 0], _at(ordered, count - 1)
         with np.errstate(invalid="ignore"):
             beyond = np.maximum(low - column, column - high)
@@ -64,26 +64,26 @@ def find_outliers(measured: Array, residual: Array) -> NDArray[np.bool_]:
     """
     result = np.zeros(residual.shape, dtype=np.bool_)
     for index, (values, column) in enumerate(zip(measured.T, residual.T, strict=True)):
-        around = _around(column)
+        around = _neighbours(column)
         before, after = _medians(around[:, :SIDE_ROWS]), _medians(around[:, SIDE_ROWS:])
         with np.errstate(invalid="ignore"):
             off = np.maximum(np.minimum(column - before, column - after), np.minimum(before - column, after - column))
             # A reactor that ignites at another time than its simulation causes peaks that are no outliers.
-            beside = _around(values)
+            beside = _neighbours(values)
             line = 0.5 * (_medians(beside[:, :SIDE_ROWS]) + _medians(beside[:, SIDE_ROWS:]))
             shows = (np.abs(values - line) > SHOWN * off) & (off > SHOWN * _moves(beside))
             result[:, index] = shows & (off > FAR * _noise_sd(column) + RANGES * _moves(around))
     return result
 
 
-def _around(column: Array) -> Array:
+def _neighbours(column: Array) -> Array:
     """Values before and after each row, shape (rows, 2 SIDE_ROWS); NaN beyond the ends."""
     edge = np.full(SIDE_ROWS, np.nan)
     windows = sliding_window_view(np.concatenate([edge, column, edge]), 2 * SIDE_ROWS + 1)
     return np.delete(windows, SIDE_ROWS, axis=1)
 
 
-def _ordered(values: Array) -> tuple[Array, NDArray[np.int64]]:
+def _sort_rows(values: Array) -> tuple[Array, NDArray[np.int64]]:
     """Sort each row, with missing values as infinity at the end; also the number of values that are not missing."""
     finite = np.isfinite(values)
     return np.sort(np.where(finite, values, np.inf), axis=1), np.count_nonzero(finite, axis=1)
@@ -95,13 +95,13 @@ def _at(ordered: Array, index: NDArray[np.int64]) -> Array:
 
 def _moves(around: Array) -> Array:
     """Range of the values around without the lowest and the highest, which may be outliers; infinite if too few."""
-    ordered, count = _ordered(around)
+    ordered, count = _sort_rows(around)
     return np.where(count > SIDE_ROWS, _at(ordered, count - 2) - _at(ordered, np.minimum(1, count - 1)), inf)
 
 
 def _medians(values: Array) -> Array:
     """Median of each row's values; NaN without any."""
-    ordered, count = _ordered(values)
+    ordered, count = _sort_rows(values)
     with np.errstate(invalid="ignore"):
         return np.where(
             count > 0, 0.5 * (_at(ordered, (count - 1) // 2) + _at(ordered, count // 2 - (count == 0))), np.nan

@@ -69,9 +69,7 @@ def gram(dynamics: Ways, cause: int, interval_mean: Array, sample_value: Array) 
 
 def adjoint(dynamics: Ways) -> tuple[Array, Array]:
     """Derivatives of sum(w g) by each interval's mean and by the value at its end, shapes (rows - 1, causes)."""
-    interval_mean, sample_value = _adjoint(
-        *_matrices(dynamics), *_input_matrices(dynamics), np.ascontiguousarray(dynamics.w)
-    )
+    interval_mean, sample_value = _adjoint(*_matrices(dynamics), *_inputs_and_innovations(dynamics))
     return np.asarray(interval_mean), np.asarray(sample_value)
 
 
@@ -84,19 +82,15 @@ def onset_scan(dynamics: Ways, beta: Array, gamma: Array, mean: Array) -> OnsetS
         gamma: see the module, shape (others, rows - 1).
         mean: the mean deviation of an interval is a + mean b, shape (others, rows - 1).
     """
-    return OnsetScan(
-        *_onset_scan(
-            *_matrices(dynamics), *_input_matrices(dynamics), np.ascontiguousarray(dynamics.w), beta, gamma, mean
-        )
-    )
+    return OnsetScan(*_onset_scan(*_matrices(dynamics), *_inputs_and_innovations(dynamics), beta, gamma, mean))
 
 
 def _matrices(dynamics: Ways) -> tuple[Array, Array, Array, Array]:
     return dynamics.F, dynamics.H, dynamics.K, dynamics.L_inverse
 
 
-def _input_matrices(dynamics: Ways) -> tuple[Array, Array]:
-    return np.ascontiguousarray(dynamics.G), np.ascontiguousarray(dynamics.D)
+def _inputs_and_innovations(dynamics: Ways) -> tuple[Array, Array, Array]:
+    return np.ascontiguousarray(dynamics.G), np.ascontiguousarray(dynamics.D), np.ascontiguousarray(dynamics.w)
 
 
 @compiled

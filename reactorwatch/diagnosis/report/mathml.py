@@ -81,12 +81,12 @@ class _Writer:
         if now.n_dep() == 2:
             wrapped = [ca.is_equal(now.dep(place), before, _DEPTH) for place in (0, 1)]
             if any(wrapped) and now.op() in (ca.OP_ADD, ca.OP_SUB):
-                return self._wrapped(now, wrapped.index(True), binds)
+                return self._write_sum(now, wrapped.index(True), binds)
         if not before.is_symbolic() and now.op() == before.op() and now.n_dep() == before.n_dep():
             return self._plain(now, tuple(before.dep(place) for place in range(now.n_dep())), binds)
         return self.text(now, None, binds)
 
-    def _wrapped(self, now: ca.SX, old: int, binds: int) -> str:
+    def _write_sum(self, now: ca.SX, old: int, binds: int) -> str:
         """Write the old expression with a new term, marked with its sign."""
         sign = "+" if now.op() == ca.OP_ADD else "−"
         kept = self.text(now.dep(old), now.dep(old), _SUM if old == 0 or sign == "+" else _PRODUCT)

@@ -52,19 +52,16 @@ class DynamicEffectsScreen:
         for effect in self._effects if of is None else of:
             starts = effect.starts or (effect.typical,)
             results = evaluate(effect, [self._constant.signal(np.array([start])) for start in starts])
-            evaluated = [
-                (2.0 * (baseline.loss - item.loss), start, item.w) for start, item in zip(starts, results, strict=True)
-            ]
-            gain, start, _ = max(evaluated, key=lambda item: item[0])
-            if gain > 0.0:
-                result.append(Candidate(effect, self._constant, np.array([start]), gain))
-            before = huber_clip(baseline.w)
-            scaled = [
-                self.scale_signature(effect, before, (before - huber_clip(w)) / start) for _, start, w in evaluated
-            ]
+            gains = [2.0 * (baseline.loss - item.loss) for item in results]
+            best = int(np.argmax(gains))
+            if gains[best] > 0.0:
+                result.append(Candidate(effect, self._constant, np.array([starts[best]]), gains[best]))
+            w = huber_clip(baseline.w)
+            reductions = [(w - huber_clip(item.w)) / start for start, item in zip(starts, results, strict=True)]
+            scaled = [self.scale_signature(effect, w, g) for g in reductions]
             confirmations = self._confirmations(baseline, evaluate, scaled, least_score)
             for candidates, confirmed in zip(scaled, confirmations, strict=True):
-                # A discontinuous effect does not scale: its size has to be scanned, which profiles with one size allow.
+                # A discontinuous effect does not scale: a fit has to scan its size, and can scan only one.
                 result += [
                     replace(item, gain=confirmed * item.gain)
                     for item in candidates

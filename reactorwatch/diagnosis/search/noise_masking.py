@@ -86,10 +86,8 @@ def _scan_effect(search: Search, item: FittedHypothesis, best: FittedHypothesis)
             if closely and hypothesis.profiles[0].name == item.hypothesis.profiles[0].name:
                 fit = grid_search.search_fine(run, hypothesis, item.fit)
             else:
-                values = [
-                    item.fit.parameters[0][0],
-                    *(number.lower for number in hypothesis.profiles[0].nonlinear_parameters),
-                ]
+                lowest = (parameter.lower for parameter in hypothesis.profiles[0].nonlinear_parameters)
+                values = [item.fit.parameters[0][0], *lowest]
                 fit = grid_search.search_coarse(run, hypothesis, hypothesis.evaluate(run, (np.array(values),)))
             item = min(item, search.score_fit(hypothesis, fit), key=lambda each: each.bic)
         search.update_noise(item)

@@ -24,7 +24,7 @@ from reactorwatch.diagnosis.search.screen import KNOTS, Screen, all_finite
 from reactorwatch.kalman.error_dynamics import Ways
 from reactorwatch.process.effect import Effect
 
-TAKEN_AWAY, SINES_SHARE = 2, 0.3
+REMOVED_CAUSES, SINES_SHARE = 2, 0.3
 """Number of causes that are removed in turn to see sines beneath them, and minimum gain of a sine as a fraction of the
 best."""
 
@@ -134,7 +134,7 @@ class PairScreen:
         result: dict[tuple[str, float], Block] = {}
         curves = [block for block in blocks if block.profile is self._free]
         by_gain = sorted(curves, key=lambda block: -_gain(block.columns, w)[0])
-        strongest = _of_different_causes(by_gain)[:TAKEN_AWAY]
+        strongest = _of_different_causes(by_gain)[:REMOVED_CAUSES]
         for residual in [w, *(w - block.columns @ _gain(block.columns, w)[1] for block in strongest)]:
             about = replace(dynamics, w=residual.reshape(dynamics.w.shape))
             candidates = self._screen.sine_candidates(about, self._screen.static_effects)

@@ -34,7 +34,7 @@ LEAST_PAIR_GAIN = 40.0
 SHORTLIST, AGAIN, REFINED = 6, 3, 2
 """Pairs fitted after a screen; pairs fitted again with the noise of the best; pairs refined."""
 
-COURSES, EXCHANGED = 2, 4
+MOST_PROFILES, EXCHANGED = 2, 4
 """Profiles fitted for one cause, and candidates fitted in an exchange."""
 
 NEAR_BEST = 20.0
@@ -121,7 +121,7 @@ class PairSearch:
         best: FittedHypothesis | None = None
         candidates = self._screen_pairs(self._result.best)
         for _ in range(ROUNDS):
-            untried = self._untried(candidates, best)
+            untried = self._skip_tried(candidates, best)
             rough = sorted((self._fit(_parts_of(item), ROUGH_STEPS) for item in untried), key=_bic)
             if not rough:
                 break
@@ -184,7 +184,7 @@ class PairSearch:
         self.single = min(singles, key=_bic)
         return self.single.bic - pair.bic
 
-    def _untried(self, candidates: Sequence[CandidatePair], best: FittedHypothesis | None) -> list[CandidatePair]:
+    def _skip_tried(self, candidates: Sequence[CandidatePair], best: FittedHypothesis | None) -> list[CandidatePair]:
         """Select pairs that were not fitted and predict more than the best pair itself."""
         result = []
         for candidate in candidates:
@@ -237,7 +237,7 @@ class PairSearch:
             candidates = candidates if jumps else self._select_new(candidates, about)
             items = [
                 self._fit(_replace_part(about, index, candidate), EXCHANGE_STEPS, scan=jumps)
-                for candidate in self._search.select(candidates, COURSES, -inf, of_a_cause=COURSES)
+                for candidate in self._search.select(candidates, MOST_PROFILES, -inf, of_a_cause=MOST_PROFILES)
             ]
             best = min(items if provisional and items else [*items, about], key=_bic)
         return self._fit(_parts(best))

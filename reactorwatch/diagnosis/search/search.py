@@ -142,8 +142,8 @@ class Search:
         """Find the best hypotheses with one effect."""
         nominal, nominal_noise = self.fit_nominal(), self.noise
         dynamic = self.dynamic_screen.candidates(nominal.fit, self._evaluate_with, least_score=FIRST_SCORE)
-        dynamic_candidates = self._sorted(dynamic)
-        candidates = self._sorted(self.screen.candidates(nominal.hypothesis, nominal.fit) + dynamic_candidates)
+        dynamic_candidates = self._sort(dynamic)
+        candidates = self._sort(self.screen.candidates(nominal.hypothesis, nominal.fit) + dynamic_candidates)
         best, by_label = nominal, dict[Label, FittedHypothesis]()
         worth = [candidate for candidate in candidates if candidate.score(self.run.values) > _least_score(candidate)]
         for number, candidate in enumerate(_of_different_causes(worth)):
@@ -175,7 +175,7 @@ class Search:
         searched: FittedHypothesis | None = None
         dropped = set[Label]()
         for _ in range(ROUNDS):
-            if not best.label or (best is searched and not self._noise_changed(best)):
+            if not best.label or (best is searched and not self._update_if_better(best)):
                 break
             if best is not searched:
                 self.update_noise(best)
@@ -249,7 +249,7 @@ class Search:
         """These noise levels, and others that were adopted last."""
         return [noise, *(item for item in self._recent if item != noise)][:NOISES]
 
-    def _noise_changed(self, best: FittedHypothesis) -> bool:
+    def _update_if_better(self, best: FittedHypothesis) -> bool:
         """Adopt the noise levels of the best hypothesis's present parameters if they gain enough; return true if so."""
         noise, ekf = self.noise, best.hypothesis.filter
         self.update_noise(best)
@@ -294,7 +294,7 @@ class Search:
                 item = min(item, other, key=lambda item: item.bic)
         return item
 
-    def _sorted(self, candidates: Sequence[Candidate]) -> list[Candidate]:
+    def _sort(self, candidates: Sequence[Candidate]) -> list[Candidate]:
         return sorted(candidates, key=lambda item: -item.score(self.run.values))
 
     def _simpler_profiles(self, candidates: Sequence[Candidate], best: FittedHypothesis) -> list[Candidate]:
@@ -344,10 +344,10 @@ class Search:
         apart = np.abs(candidate.parameters - parameters)[candidate.profile.n_linear :]
         return bool(np.any(apart > _NEAR * candidate.profile.difference_steps))
 
-    def refit(self, fitted: FittedHypothesis, scan: bool = False) -> FittedHypothesis:
-        """Fit again at the present noise levels; magnitudes of discontinuous effects stay unless `scan` is set."""
+    def refit(self, fitted: FittedHypothesis) -> FittedHypothesis:
+        """Fit again at the present noise levels; magnitudes of discontinuous effects stay."""
         self._use_noise(fitted.hypothesis.filter)
-        return self.fit(fitted.hypothesis, fitted.fit.parameters, scan=scan)
+        return self.fit(fitted.hypothesis, fitted.fit.parameters, scan=False)
 
     def evaluate(self, hypothesis: Hypothesis, parameters: Sequence[Array]) -> FittedHypothesis:
         """Evaluate a hypothesis at given parameters."""

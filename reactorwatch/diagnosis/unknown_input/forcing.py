@@ -51,7 +51,7 @@ class Levels:
         red: standard deviation of the red noise, in typical magnitudes of the effect.
         lasts_min: time constant of the red noise, by its clock.
         sensor_sd: standard deviation of the sensors' noise, one for each output.
-        clock: index among the clocks of `Linearised`.
+        clock: index among the clocks of `LinearisedForcing`.
     """
 
     red: float
@@ -116,7 +116,7 @@ class Forcing:
         self.dependencies = tuple(_dependencies(self._augmented))
         self._errors = self._augmented.errors  # a path has no noise
 
-    def linearise(self, reference: ReferenceTrajectory, run: Run) -> "Linearised":
+    def linearise(self, reference: ReferenceTrajectory, run: Run) -> "LinearisedForcing":
         """Linearise the forcing about a path."""
         inputs = self._augmented.inputs(run.time_min, run.inputs, [reference.size])
         path = self._errors.about(run.time_min, inputs, reference.x, input_uncertainty_of(run, inputs))
@@ -147,7 +147,7 @@ class Forcing:
         seen = np.empty((rows, D.shape[1], offset.shape[2]))
         seen[:, :, 0] = np.nan_to_num(run.measured - path.shown + D * reference.size.sample_value[:, None])
         seen[:, :, 1:] = -D[:, :, None] * terms.sample_value[:, None, :]
-        return Linearised(
+        return LinearisedForcing(
             linear, offset, seen, tuple(clocks), terms, np.asarray(np.linalg.cholesky(covariance)), self.effect
         )
 
@@ -167,7 +167,7 @@ class Forcing:
                 count += KNOTS
         covariance = np.eye(count)
         for begin in range(1, count, KNOTS):
-            covariance[begin : begin + KNOTS, begin : begin + KNOTS] = _bending()
+            covariance[begin : begin + KNOTS, begin : begin + KNOTS] = _bending_covariance()
         typical = self.effect.typical
         return Signal(
             typical * np.concatenate(interval_mean, axis=1), typical * np.concatenate(sample_value, axis=1)
@@ -175,7 +175,7 @@ class Forcing:
 
 
 @dataclass(frozen=True, eq=False)
-class Linearised:
+class LinearisedForcing:
     """A forcing linearised about a path; `smoother` explains `linear`, `offset` and `seen`.
 
     Attributes:
@@ -195,7 +195,7 @@ class Linearised:
 
     def fit(self, levels: Levels) -> ForcingFit:
         """Fit the function at these hyperparameters, its standard deviation included."""
-        w, logs = normalize_columns(self.linear, *self._red(levels), self.offset, self.seen)
+        w, logs = normalize_columns(self.linear, *self._red_noise(levels), self.offset, self.seen)
         w = w.reshape(-1, w.shape[2])
         gram = w.T @ w
         if not np.all(np.isfinite(gram)) or gram[0, 0] > _RUNAWAY:
@@ -211,11 +211,11 @@ class Linearised:
     def smooth_path(self, fitted: ForcingFit) -> tuple[Array, Signal]:
         """Deviation of the most likely path from this one, and the magnitude of the forcing along it."""
         offset, seen = (item[:, :, 0] + item[:, :, 1:] @ fitted.terms for item in (self.offset, self.seen))
-        d, red = smooth(self.linear, *self._red(fitted.levels), offset, seen)
+        d, red = smooth(self.linear, *self._red_noise(fitted.levels), offset, seen)
         sizes = (np.clip(item @ fitted.terms + red, self.effect.lower, self.effect.upper) for item in self.terms)
         return d, Signal(*sizes)
 
-    def _red(self, levels: Levels) -> tuple[Array, Array, float]:
+    def _red_noise(self, levels: Levels) -> tuple[Array, Array, float]:
         sd = levels.red * self.effect.typical
         return np.square(levels.sensor_sd), np.exp(-self.clocks[levels.clock] / levels.lasts_min), sd * sd
 
@@ -226,7 +226,7 @@ def _ticks(values: Array, span_min: float) -> Array:
     return np.asarray(moved * (span_min / max(float(np.sum(moved)), 1e-300)))
 
 
-def _bending() -> Array:
+def _bending_covariance() -> Array:
     """Prior covariance of the function at its knots: Matern 3/2 plus a straight line."""
     knots = np.linspace(0.0, 1.0, KNOTS)
     apart = np.sqrt(3.0) * np.abs(knots[:, None] - knots) / LENGTH

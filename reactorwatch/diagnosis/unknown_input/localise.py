@@ -24,7 +24,13 @@ from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.result import UnknownInputCurve
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
-from reactorwatch.diagnosis.unknown_input.forcing import Forcing, ForcingFit, Levels, Linearised, ReferenceTrajectory
+from reactorwatch.diagnosis.unknown_input.forcing import (
+    Forcing,
+    ForcingFit,
+    Levels,
+    LinearisedForcing,
+    ReferenceTrajectory,
+)
 from reactorwatch.diagnosis.unknown_input.unmodelled_loss import balance_losses
 from reactorwatch.kalman.ekf import LEAST_PROCESS_SD, NoiseLevels
 from reactorwatch.process.effect import Effect
@@ -192,7 +198,7 @@ def _refine(model: ProcessModel, run: Run, trial: _Trial, step: float) -> _Trial
     return _Trial(trial.forcing, reference, fitted, size)
 
 
-def _optimise_levels(about: Linearised, best: ForcingFit, step: float) -> ForcingFit:
+def _optimise_levels(about: LinearisedForcing, best: ForcingFit, step: float) -> ForcingFit:
     """Move each hyperparameter in turn to the minimum of a parabola through three of its values."""
     for index in range(2 + len(best.levels.sensor_sd)):
         h = step if index < 2 else _OF_SENSORS * step

@@ -7,7 +7,7 @@ from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Step
-from reactorwatch.diagnosis.holdout import evaluate_holdout, held_out_rows
+from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.process.library.cstr.effects import EFFECTS
@@ -37,7 +37,7 @@ def test_where_nobody_knows_when_the_input_changed_no_model_is_blamed_for_it() -
         FittedHypothesis(nominal, nominal.evaluate(run, ()), 0.0),
         FittedHypothesis(leaking, leaking.evaluate(run, (truth,)), 0.0),
     )
-    assert np.count_nonzero(held_out_rows(run)) > 500
+    assert np.count_nonzero(holdout_rows(run)) > 500
     assert after.simulation / SENSORS.measurement_sd == pytest.approx(1.0, abs=0.09)  # of 500 values, 3 % by chance
     assert before.simulation[1] > 4.0 * after.simulation[1]
 
@@ -45,4 +45,4 @@ def test_where_nobody_knows_when_the_input_changed_no_model_is_blamed_for_it() -
 def test_where_hardly_a_row_is_free_of_doubt_all_are_judged() -> None:
     time_min = np.linspace(0.0, 99.9, 1000)
     run = Run(time_min, np.zeros((1000, 1)), np.zeros((1000, 2)), tuple(range(20, 1000, 20)))
-    assert np.count_nonzero(held_out_rows(run)) == 200
+    assert np.count_nonzero(holdout_rows(run)) == 200

@@ -29,7 +29,7 @@ def effect_of(name: str) -> Effect:
 
 
 def make_run(plant: ProcessModel, shown: Callable[[Array], Array] = lambda outputs: outputs) -> Run:
-    """Of a plant, its input stepping every minute; `forward_signatures`: what the sensors make of the outputs."""
+    """Run of a plant whose input steps every minute; `shown` maps the outputs to readings."""
     random = np.random.default_rng(5)
     time_min = PERIOD_MIN * np.arange(ROWS, dtype=np.float64)
     qc = np.repeat(random.uniform(90.0, 111.0, ROWS // 10), 10)[:, None]
@@ -53,7 +53,7 @@ def with_rates(of_C: Callable[[ca.SX, ca.SX], ca.SX | float], of_T: Callable[[ca
     return make_run(model.added_to("C", ca.SX(of_C(C, T))).added_to("T", ca.SX(of_T(C, T))))
 
 
-def sine_candidates() -> ca.SX:
+def oscillation() -> ca.SX:
     """Now large, now small, at no constant rate."""
     t = cstr().clock.now
     return ca.sin(0.4 * t + 2.0 * ca.sin(0.05 * t)) + 1.0
@@ -73,12 +73,12 @@ def test_heat_that_leaves_where_it_is_hot() -> None:
 
 
 def test_dilution_that_comes_and_goes() -> None:
-    found = where(with_rates(lambda C, T: -0.05 * sine_candidates() * C, lambda C, T: 0.0))
+    found = where(with_rates(lambda C, T: -0.05 * oscillation() * C, lambda C, T: 0.0))
     assert found.effect.location == "mass_balance"
 
 
 def test_a_feed_that_comes_and_goes_and_how_strong_it_was() -> None:
-    run = with_rates(lambda C, T: 0.01 * sine_candidates(), lambda C, T: 0.0)
+    run = with_rates(lambda C, T: 0.01 * oscillation(), lambda C, T: 0.0)
     found = where(run)
     assert found.effect.name == "feed_concentration"
     truth = 0.01 * (np.sin(0.4 * run.time_min + 2.0 * np.sin(0.05 * run.time_min)) + 1.0)

@@ -22,7 +22,7 @@ SENSORS = Noise((0.002, 0.3), (0.0, 0.0))
 WARMER = "feed_temperature:constant:0.5"
 
 
-def results(run: Run, sds: dict[str, float]) -> tuple[float, float]:
+def estimate_offset(run: Run, sds: dict[str, float]) -> tuple[float, float]:
     """Offset of the feed's temperature in the end, and its standard deviation."""
     noise = Noise(SENSORS.measurement_sd, (0.0,) * (2 + len(sds)))
     _, _, found = FaultFilter(add_priors(cstr(), sds), (), noise).evaluate(run, ())
@@ -48,7 +48,7 @@ def test_the_likelihood_is_that_of_all_offsets_weighed_by_what_was_stated() -> N
 
 def test_what_was_learned_of_a_parameter_outlasts_a_break_in_the_record() -> None:
     run = make_run(WARMER, rows=1000)
-    whole, broken = results(run, {"Tf": 0.5}), results(replace(run, breaks=(500, 980)), {"Tf": 0.5})
+    whole, broken = estimate_offset(run, {"Tf": 0.5}), estimate_offset(replace(run, breaks=(500, 980)), {"Tf": 0.5})
     assert whole[0] == pytest.approx(0.5, abs=4 * whole[1])
     assert broken[0] == pytest.approx(whole[0], abs=2 * whole[1])
     assert broken[1] < 1.2 * whole[1]

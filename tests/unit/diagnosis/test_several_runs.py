@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.holdout import OBSERVED_ROWS, held_out_rows
+from reactorwatch.diagnosis.holdout import OBSERVED_ROWS, holdout_rows
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.plain import as_text
@@ -91,7 +91,7 @@ def test_nothing_is_judged_where_the_free_run_is_still_looking_for_the_state() -
     run = make_run(record, cstr())
     assert run.starts == (700,)
     assert 700 in run.breaks
-    held_out = held_out_rows(run)
+    held_out = holdout_rows(run)
     assert not held_out[700 : 700 + OBSERVED_ROWS].any()
     assert held_out[700:].any()
 

@@ -32,13 +32,13 @@ def run() -> Run:
     return make_run(rows=600)
 
 
-def results(name: str, run: Run, profile: FittedProfile, parameters: Array) -> tuple[Hypothesis, Fit]:
+def fit_at(name: str, run: Run, profile: FittedProfile, parameters: Array) -> tuple[Hypothesis, Fit]:
     hypothesis = Hypothesis(FaultFilter(cstr(), (effect_of(name),), NOISY), (profile,))
     return hypothesis, hypothesis.evaluate(run, (parameters,))
 
 
 def ways_of(name: str, run: Run) -> Ways:
-    hypothesis, fit = results(name, run, Constant(run.time_min), np.zeros(1))
+    hypothesis, fit = fit_at(name, run, Constant(run.time_min), np.zeros(1))
     return hypothesis.filter.error_dynamics(run, hypothesis.signals(fit), fit.innovations)
 
 
@@ -60,7 +60,7 @@ def test_the_signature_is_what_a_small_deviation_does(
     up, down = numbers.copy(), numbers.copy()
     up[: profile.n_linear] *= scale
     down[: profile.n_linear] *= -scale
-    near = [results(name, run, profile, item)[1].w[2:] for item in (down, up)]
+    near = [fit_at(name, run, profile, item)[1].w[2:] for item in (down, up)]
     difference = (near[0] - near[1]) / (2.0 * scale)
     settled = slice(40, None)  # a filter begins at what a sensor shows, its bias included
     assert np.sqrt(np.mean((difference - g)[settled] ** 2)) < 0.03 * np.sqrt(np.mean(g[settled] ** 2))
