@@ -29,8 +29,8 @@ from scipy.signal import savgol_filter
 
 from benchmarks.hidden.classes import class_named, drawn
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.holdout import held_out_rows
-from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.holdout import holdout_rows
+from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.library.cstr.model import cstr
@@ -111,12 +111,12 @@ def main() -> None:
 
 def compared(hidden: Hidden) -> Compared:
     """Both on one record."""
-    run = run_of(hidden.record, cstr())
+    run = make_run(hidden.record, cstr())
     said = diagnose(hidden.record, cstr())
     noise_sd = np.array(hidden.circumstances.noise_sd)
     held_out = [said.gain.held_out[name] for name in ("C", "T")]
     discrepancy, terms = sparse_discrepancy(run, noise_sd)
-    rows = held_out_rows(run)
+    rows = holdout_rows(run)
     return Compared(
         hidden.seed,
         "+".join(hidden.causes) or "nothing",
@@ -130,7 +130,7 @@ def compared(hidden: Hidden) -> Compared:
 
 def sparse_discrepancy(run: Run, noise_sd: Array) -> tuple[ProcessModel, tuple[int, int]]:
     """The nominal model with what pysindy adds to it, and how many terms that are in each balance."""
-    learned = np.logical_not(held_out_rows(run))
+    learned = np.logical_not(holdout_rows(run))
     best, best_error, terms = cstr(), inf, (0, 0)
     for window in WINDOWS:
         for threshold in THRESHOLDS:

@@ -12,29 +12,29 @@ from tests.hidden_effect.judge import NOMINAL, UNKNOWN, Judged
 
 @dataclass(frozen=True)
 class Score:
-    """Of some records; shares from 0 to 1, NaN where there is nothing to take a share of.
+    """Scores of some records; shares from 0 to 1, NaN without a denominator.
 
     Attributes:
-        records: how many.
-        first: share in which exactly what is hidden is named.
-        listed: share in which it is named or listed.
-        count: explanations on the list, on average.
-        wrong: share in which something is claimed that is not there.
+        records: number of records.
+        first: share in which exactly the hidden causes are named.
+        listed: share in which they are named or listed.
+        count: mean number of listed explanations.
+        wrong: share with a false claim.
         unknown: share called unknown.
-        unknown_in_place: share called unknown, with the right place.
-        right_place: share with the right place, whatever it is called.
-        same_profile: share of the right causes whose profile is right too.
-        size: median and 90 % of the relative error of the size.
-        curve: median and 90 % of the relative error of the curve.
-        size_inside: share of the 95 % intervals that hold the size.
-        onset: median and 90 % of the error of a step's onset, in min.
-        onset_inside: share of the 95 % intervals that hold it.
-        held_out: median and 90 % of the error of T on rows not seen over the noise that was drawn in them.
-        held_out_in_sd: the same over the standard deviation of the noise.
-        drawn_in_sd: the same of the truth itself.
-        before: the same of the nominal model.
-        seconds: of a core, median and largest.
-        errors: diagnoses that came to no end.
+        unknown_in_place: share called unknown with the right location.
+        right_place: share with the right location, whatever the name.
+        same_profile: share of the right causes with the right profile.
+        size: median and 90 % quantile of the relative error of the size.
+        curve: median and 90 % quantile of the relative error of the curve.
+        size_inside: share of the 95 % intervals that contain the size.
+        onset: median and 90 % quantile of the error of a step's onset, in min.
+        onset_inside: share of the 95 % intervals that contain the onset.
+        held_out: median and 90 % quantile of the error of T on held-out rows over the noise drawn in them.
+        held_out_in_sd: error of T on held-out rows over the standard deviation of the noise, as `held_out`.
+        drawn_in_sd: error of the truth on held-out rows over the standard deviation of the noise, as `held_out`.
+        before: error of the nominal model over the standard deviation of the noise, as `held_out`.
+        seconds: median and maximum of the core seconds.
+        errors: number of diagnoses that failed.
     """
 
     records: int
@@ -88,7 +88,7 @@ class Score:
 
 
 def confusion(judged: Sequence[Judged]) -> list[tuple[str, list[tuple[str, int]]]]:
-    """What each truth was called, the most frequent first."""
+    """Names given to each truth, the most frequent first."""
     called: dict[str, Counter[str]] = {}
     for item in judged:
         called.setdefault("+".join(item.truth) or NOMINAL, Counter())[item.called] += 1

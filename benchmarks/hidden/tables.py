@@ -66,13 +66,13 @@ def rows_of(found: Mapping[str, Sequence[Judged]]) -> list[list[str]]:
 
 
 def main_table(found: Mapping[str, Sequence[Judged]]) -> str:
-    """As Markdown."""
+    """Main table as Markdown."""
     heading = ["records", *(title for title, _ in COLUMNS)]
     return markdown(heading, rows_of(found))
 
 
 def confusion_table(found: Mapping[str, Sequence[Judged]], kinds: Sequence[str] = ("single", "nominal")) -> str:
-    """What each cause was called, over all classes in which single causes are hidden, or none."""
+    """Names given to each cause, over all classes with single hidden causes, or none."""
     judged = [item for study in CLASSES if study.kind in kinds for item in found.get(study.name, ())]
     rows = []
     for truth, called in confusion(judged):

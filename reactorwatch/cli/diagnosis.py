@@ -11,9 +11,9 @@ import numpy as np
 from reactorwatch.cli.options import check_recording
 from reactorwatch.cli.read_record import load_process_model, record, required_signals
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.parameter_priors import stated
-from reactorwatch.diagnosis.record_checks import run_of
-from reactorwatch.diagnosis.report.machine import with_differences
+from reactorwatch.diagnosis.parameter_priors import parse_priors
+from reactorwatch.diagnosis.record_checks import make_run
+from reactorwatch.diagnosis.report.machine import report_object
 from reactorwatch.diagnosis.result import Diagnosis, Experiment
 from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
@@ -94,8 +94,8 @@ def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path
     """
     measured = record(check_recording(at or file), asked.plant, asked.columns, required_signals(asked.model))
     process = load_process_model(asked.model, measured)
-    known = stated(asked.uncertain, process) if asked.uncertain is not None else {}
-    run_of(measured, process)
+    known = parse_priors(asked.uncertain, process) if asked.uncertain is not None else {}
+    make_run(measured, process)
     return Case(file, measured, process, folder, known)
 
 
@@ -128,7 +128,7 @@ def write_report(diagnosis: Diagnosis, case: Case, seconds: float) -> None:
     files = (str(case.file), str(folder / MODEL), str(folder / EXPERIMENT))
     page = as_page(diagnosis, case.model, catalogue, *files, on_the_bus=on_the_bus)
     plain = msgspec.json.format(
-        msgspec.json.encode(with_differences(diagnosis, str(case.file), seconds, case.measured.zero)), indent=2
+        msgspec.json.encode(report_object(diagnosis, str(case.file), seconds, case.measured.zero)), indent=2
     )
     with fill_folder(folder, "--out") as temporary:
         write_extended_model(temporary / MODEL, diagnosis.extended_model)

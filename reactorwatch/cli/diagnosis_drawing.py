@@ -51,8 +51,8 @@ def _outputs(curves: Curves, model: ProcessModel, time_ns: NDArray[np.int64]) ->
             item.unit,
             (
                 Series("measured", time_ns, curves.measured[item.name], MEASURED, width=2.5),
-                Series("simulation as it was", time_ns, curves.free_before[item.name], ALARM, width=1.0),
-                Series("simulation extended", time_ns, curves.free_after[item.name], PREDICTED, width=1.0),
+                Series("simulation as it was", time_ns, curves.simulated_before[item.name], ALARM, width=1.0),
+                Series("simulation extended", time_ns, curves.simulated_after[item.name], PREDICTED, width=1.0),
             ),
         )
         for item in model.outputs

@@ -20,9 +20,9 @@ from reactorwatch.cli.diagnosis import (
     run_diagnosis,
     write_report,
 )
-from reactorwatch.diagnosis.experiment.constraints import checked_limits
-from reactorwatch.diagnosis.parameter_priors import stated
-from reactorwatch.diagnosis.practical_significance import checked_tolerance
+from reactorwatch.diagnosis.experiment.constraints import check_limits
+from reactorwatch.diagnosis.parameter_priors import parse_priors
+from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import Cause, Diagnosis
@@ -119,9 +119,9 @@ def run_job(job: Job) -> JobResult:
 def _check(asked: DiagnosisOptions) -> None:
     model = cstr() if asked.model is None else read_extended_model(asked.model).build()
     if asked.uncertain is not None:
-        stated(asked.uncertain, model)
-    checked_limits(model, asked.limits)
-    checked_tolerance(model, asked.tolerance)
+        parse_priors(asked.uncertain, model)
+    check_limits(model, asked.limits)
+    check_tolerance(model, asked.tolerance)
 
 
 def _text(case: Case, diagnosis: Diagnosis, seconds: float, *, as_json: bool) -> str:

@@ -24,7 +24,7 @@ from reactorwatch.cli.bus_settings import (
     write_node_settings,
 )
 from reactorwatch.cli.processes import Processes, settings_text, write_settings
-from reactorwatch.diagnosis.practical_significance import checked_tolerance
+from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.folder import make_folder
@@ -136,7 +136,7 @@ def check_against_model(config: DiagnosisConfig) -> None:
     """
     model = cstr() if config.model is None else read_extended_model(Path(config.model)).build()
     try:
-        checked_tolerance(model, config.tolerance)
+        check_tolerance(model, config.tolerance)
     except InputError as error:
         raise InputError(f"settings [diagnosis]: {error}") from error
 

@@ -1,14 +1,14 @@
-"""Measured run and model in; what is wrong, its cause, the extended model and the gain out.
+"""Diagnosis: from a measured run and a model to the cause of their difference, the extended model and its gain.
 
-`diagnose` does it all; the modules, from the bottom up:
+`diagnose` does it all; the parts, from the bottom up:
 
-- `courses`: how a deviation goes in time; `augmented_model`: a model in which it may go so.
-- `signatures`: what it does to a filter's innovations, linearised, of all causes at once.
-- `hypothesis`: effects with courses, fitted to a run.
-- `screen`: which hypotheses are worth fitting; `search`: the best of them, and its rivals.
-- `unknown`: where something acts that no hypothesis has; `forcing`, `smoother`: what it does there.
-- `holdout`, `adequacy`: what was gained, and whether anything is left.
-- `result`: what is said in the end.
+- `fitting`: `profiles` of a deviation in time, the `augmented_model` and its `filter`, linearised `signatures`,
+  and `hypothesis`: effects with profiles, fitted to a run.
+- `search`: `screen` finds hypotheses worth fitting; `search` the best of them and its alternatives.
+- `unknown_input`: `localise` finds where something acts that no effect explains.
+- `experiment`: an input that separates alternatives.
+- `whiteness`, `holdout`: test of the innovations, and gain on rows that were not fitted.
+- `result`: the result; `report`: the result as text, JSON and a page.
 
-Nothing here knows the reactor: it works on any `ProcessModel` and a catalogue of its effects.
+It works on any `ProcessModel` with a catalogue of effects.
 """

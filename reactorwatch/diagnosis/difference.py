@@ -1,8 +1,8 @@
-"""Where, when and at which operating points a simulation differs from a record, and how much of that is noise.
+"""Difference between a simulation and a record, over time and operating points, and the share of noise in it.
 
-The error of a free run is set beside time and beside every input and output: `BINS` stretches of time of one length,
-and as many ranges of each signal that occurred equally often. Operating points are those of the simulation, for in a
-measured one there is noise, which would sort errors by their own size.
+The error of the simulation is grouped by time and by every input and output: `BINS` intervals of equal length in time,
+and as many ranges of each signal that are equally frequent. Operating points are simulated ones, because the noise of
+measured ones would sort errors by their own size.
 """
 
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 
 BINS, LEAST_ROWS = 8, 20
-"""Ranges along each axis, and how many rows one holds at least."""
+"""Number of ranges along each axis, and minimum number of rows in one."""
 
 TIME = "time"
 
@@ -23,11 +23,11 @@ class Range:
     """Part of an axis.
 
     Attributes:
-        lower: where it begins, in the axis's unit.
-        upper: where it ends.
-        mean: error of the simulation, measured minus simulated.
-        rmse: root mean square of that.
-        rows: that lie in it.
+        lower: lower end, in the axis's unit.
+        upper: upper end.
+        mean: mean error, measured minus simulated.
+        rmse: root mean square error.
+        rows: number of rows in the range.
     """
 
     lower: float
@@ -39,15 +39,15 @@ class Range:
 
 @dataclass(frozen=True)
 class Difference:
-    """Of one output.
+    """Difference in one output.
 
     Attributes:
-        rmse: of the nominal free run over the record; NaN if it ran away.
-        noise_sd: of the sensor.
-        one_step: root mean square of the nominal filter's innovations, in the standard deviations that it expects.
-        along: ranges, by axis: time in min, then inputs and outputs in their units; without ranges if it ran away.
-        units: of the axes.
-        unit: of the errors.
+        rmse: root mean square error of the nominal simulation over the record; NaN if it diverged.
+        noise_sd: standard deviation of the sensor's noise.
+        one_step: root mean square of the nominal filter's innovations, in predicted standard deviations.
+        along: ranges by axis: time in min, then inputs and outputs in their units; empty if the simulation diverged.
+        units: units of the axes.
+        unit: unit of the errors.
     """
 
     rmse: float
@@ -59,15 +59,15 @@ class Difference:
 
     @property
     def noise_share(self) -> float:
-        """Of the mean square error."""
+        """Share of noise in the mean square error."""
         return min((self.noise_sd / self.rmse) ** 2, 1.0) if self.rmse > 0.0 else 1.0
 
     def worst(self, axis: str) -> Range | None:
-        """The range of an axis in which the simulation errs most; None if it has none."""
+        """Range of an axis with the largest error; None if it has none."""
         return max(self.along[axis], key=lambda item: item.rmse, default=None)
 
 
-def difference(
+def compute_difference(
     error: Array,
     innovations: Array,
     noise_sd: float,
@@ -75,35 +75,35 @@ def difference(
     time_min: Array,
     signals: Mapping[str, tuple[Array, str]],
 ) -> Difference:
-    """Of one output.
+    """Difference in one output.
 
     Args:
-        error: measured minus simulated, shape (rows,); NaN where there is neither.
-        innovations: in standard deviations, likewise.
-        noise_sd: of the sensor.
-        unit: of the output.
+        error: measured minus simulated, shape (rows,); NaN where either is missing.
+        innovations: innovations in standard deviations, shape (rows,).
+        noise_sd: standard deviation of the sensor's noise.
+        unit: unit of the output.
         time_min: shape (rows,).
-        signals: inputs, and outputs as simulated, by name: values of shape (rows,), and their unit.
+        signals: inputs and simulated outputs by name: values of shape (rows,), and their unit.
     """
     edges = np.linspace(time_min[0], time_min[-1], BINS + 1)
     along, units = {TIME: _ranges(error, time_min, edges)}, {TIME: "min"}
     for name, (values, units[name]) in signals.items():
-        known = values[np.isfinite(values)]
+        finite = values[np.isfinite(values)]
         shares = np.linspace(0.0, 1.0, BINS + 1)
-        along[name] = _ranges(error, values, np.unique(np.quantile(known, shares))) if known.size else ()
+        along[name] = _ranges(error, values, np.unique(np.quantile(finite, shares))) if finite.size else ()
     return Difference(_rms(error), noise_sd, _rms(innovations), along, units, unit)
 
 
 def _ranges(error: Array, values: Array, edges: Array) -> tuple[Range, ...]:
-    found = []
-    place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(edges.size - 2, 0))
+    result = []
+    index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(edges.size - 2, 0))
     for number, (lower, upper) in enumerate(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)):
-        inside = error[(place == number) & np.isfinite(error) & np.isfinite(values)]
+        inside = error[(index == number) & np.isfinite(error) & np.isfinite(values)]
         if inside.size >= LEAST_ROWS:
-            found.append(Range(lower, upper, float(inside.mean()), _rms(inside), inside.size))
-    return tuple(found)
+            result.append(Range(lower, upper, float(inside.mean()), _rms(inside), inside.size))
+    return tuple(result)
 
 
 def _rms(values: Array) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(known**2))) if known.size else float("nan")
+    finite = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(finite**2))) if finite.size else float("nan")

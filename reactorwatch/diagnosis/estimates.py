@@ -1,4 +1,4 @@
-"""The numbers of an explanation, with their intervals."""
+"""Estimated parameters of an explanation, with their intervals."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -7,67 +7,69 @@ from math import inf, sqrt
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.profile_likelihood import settled
-from reactorwatch.diagnosis.result import Adjusted, Cause, Estimate
+from reactorwatch.diagnosis.profile_likelihood import refine
+from reactorwatch.diagnosis.result import AdjustedParameter, Cause, Estimate
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.search import Explained, Search
+from reactorwatch.diagnosis.search.search import FittedHypothesis, Search
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 
 
-def covariances_of(run: Run, best: Explained) -> list[Array]:
-    """Of the numbers of each effect, whatever those of the others."""
-    if not best.key:
+def covariances_of(run: Run, best: FittedHypothesis) -> list[Array]:
+    """Covariance of each effect's parameters, marginal over the others."""
+    if not best.label:
         return []
     whole, parts, begin = best.hypothesis.covariance(run, best.fit), [], 0
-    for theta in best.fit.theta:
-        parts.append(whole[begin : begin + theta.size, begin : begin + theta.size])
-        begin += theta.size
+    for fitted in best.fit.parameters:
+        parts.append(whole[begin : begin + fitted.size, begin : begin + fitted.size])
+        begin += fitted.size
     return parts
 
 
-def with_rough_numbers(search: Search, best: Explained) -> tuple[Explained, list[Array]]:
-    """With the numbers in which the likelihood is rough where it is largest; and the covariances with their spread."""
+def refine_parameters(search: Search, best: FittedHypothesis) -> tuple[FittedHypothesis, list[Array]]:
+    """Move parameters with a rough likelihood to its maximum, and scale the covariances to its spread."""
     covariances = covariances_of(search.run, best)
     sds = [np.sqrt(np.maximum(np.diag(item), 0.0)) for item in covariances]
-    moved, rough = settled(search, best, sds)
+    moved, rough = refine(search, best, sds)
     if moved is not best:
         best, covariances = moved, covariances_of(search.run, moved)
-    for effect, whole, numbers in zip(best.hypothesis.sized.effects, covariances, rough, strict=True):
+    for effect, whole, numbers in zip(best.hypothesis.filter.effects, covariances, rough, strict=True):
         for number, sd in numbers.items():
             share = sd / max(float(np.sqrt(whole[number, number])), 1e-300)
             share = (
                 share if effect.is_discontinuous else max(share, 1.0)
-            )  # by derivatives, all other numbers may move as well
+            )  # the derivatives' spread is marginal over the others
             whole[number] *= share
             whole[:, number] *= share
     return best, covariances
 
 
 def adjusted_parameters(
-    run: Run, model: ProcessModel, uncertain: Mapping[str, float], best: Explained
-) -> dict[str, Adjusted]:
-    """The uncertain parameters under the best explanation, whatever its numbers may be."""
+    run: Run, model: ProcessModel, uncertain: Mapping[str, float], best: FittedHypothesis
+) -> dict[str, AdjustedParameter]:
+    """Estimates of the uncertain parameters under the best hypothesis, marginal over its parameters."""
     sds = best.hypothesis.offset_sds(run, best.fit) if uncertain else {}
-    off = best.hypothesis.offsets(best.fit)
-    found = {}
+    offsets = best.hypothesis.offsets(best.fit)
+    result = {}
     for name, stated_sd in uncertain.items():
         item = model.parameter(name)
-        found[name] = Adjusted(item.value, stated_sd, Estimate(item.value + off[name], sds[name], item.unit))
-    return found
+        result[name] = AdjustedParameter(
+            item.value, stated_sd, Estimate(item.value + offsets[name], sds[name], item.unit)
+        )
+    return result
 
 
-def in_minutes_of_runs(causes: Sequence[Cause], record: Record) -> tuple[Cause, ...]:
-    """Causes with their times in the minutes of the run in which they set in.
+def convert_to_run_minutes(causes: Sequence[Cause], record: Record) -> tuple[Cause, ...]:
+    """Convert the times of causes to minutes of the run in which they set in.
 
     Args:
-        causes: with times that increase over all runs (`Record.continuous_min`).
-        record: that they explain.
+        causes: causes with times that increase over all runs (`Record.continuous_min`).
+        record: record that they explain.
     """
     if record.runs is None:
         return tuple(causes)
     starts_min = record.continuous_min[list(record.run_starts)]
-    found = []
+    result = []
     for cause in causes:
         times = {name for name in cause.parameters if name in ("onset", "end") or name.startswith("time_")}
         times.discard("time_constant")
@@ -78,36 +80,36 @@ def in_minutes_of_runs(causes: Sequence[Cause], record: Record) -> tuple[Cause, 
             name: replace(item, value=item.value - shift_min) if name in times else item
             for name, item in cause.parameters.items()
         }
-        found.append(replace(cause, parameters=parameters, run=run, run_shift_min=shift_min))
-    return tuple(found)
+        result.append(replace(cause, parameters=parameters, run=run, run_shift_min=shift_min))
+    return tuple(result)
 
 
-def causes_of(best: Explained, covariances: Sequence[Array]) -> list[Cause]:
-    """The causes of an explanation, with its numbers.
+def causes_of(best: FittedHypothesis, covariances: Sequence[Array]) -> list[Cause]:
+    """Causes of a hypothesis with their estimated parameters.
 
     Args:
-        best: of the record.
-        covariances: of the numbers of each of its effects.
+        best: fitted hypothesis.
+        covariances: covariance of each effect's parameters.
     """
     hypothesis, causes = best.hypothesis, []
-    for effect, course, theta, part in zip(
-        hypothesis.sized.effects, hypothesis.courses, best.fit.theta, covariances, strict=True
+    for effect, profile, fitted, part in zip(
+        hypothesis.filter.effects, hypothesis.profiles, best.fit.parameters, covariances, strict=True
     ):
-        value = course.parameters(theta)
-        slope = {name: np.zeros(theta.size) for name in value}
-        for place in range(theta.size):
-            step = 0.01 * sqrt(max(float(part[place, place]), 1e-300))
-            near = theta.copy()
-            near[place] += step
-            for name, number in course.parameters(near).items():
-                slope[name][place] = (number - value[name]) / step
+        value = profile.profile_values(fitted)
+        slope = {name: np.zeros(fitted.size) for name in value}
+        for index in range(fitted.size):
+            step = 0.01 * sqrt(max(float(part[index, index]), 1e-300))
+            near = fitted.copy()
+            near[index] += step
+            for name, number in profile.profile_values(near).items():
+                slope[name][index] = (number - value[name]) / step
         parameters = {
             name: Estimate(
-                number, sqrt(max(float(slope[name] @ part @ slope[name]), 0.0)), course.unit(name, effect.unit)
+                number, sqrt(max(float(slope[name] @ part @ slope[name]), 0.0)), profile.unit(name, effect.unit)
             )
             for name, number in value.items()
         }
         causes.append(
-            Cause(effect.name, course.name, effect.labels.get(course.name, effect.label), effect.location, parameters)
+            Cause(effect.name, profile.name, effect.labels.get(profile.name, effect.label), effect.location, parameters)
         )
     return causes

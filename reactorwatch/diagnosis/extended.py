@@ -1,4 +1,4 @@
-"""From the causes that were found to the model that has them in it, in the form of its file."""
+"""Extended model: the model with the diagnosed causes, in the format of its file."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,24 +12,24 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES, free_profile
 
 WITHIN = 1.0 - 1e-12
-"""Of a knot at an effect's bounds: it is written as a share of the size, and their product is rounded."""
+"""Factor for a knot at an effect's bounds: it is stored as a fraction of the size, and their product is rounded."""
 
 
 def extended_model(
     model: ProcessModel, effects: Sequence[Effect], causes: Sequence[Cause], zero_ns: int = 0
 ) -> dict[str, Any]:
-    """The model with the causes in it, as in its file (`reactorwatch.process.extended_model`).
+    """Extended model with the causes, as in its file (`reactorwatch.process.extended_model`).
 
     Args:
-        model: the simulation; the effects that it has already stay.
+        model: process model of the simulation; the effects that it has already stay.
         effects: the catalogue.
-        causes: that were found.
-        zero_ns: what the record's minutes count from; 0: not known.
+        causes: diagnosed causes.
+        zero_ns: time from which the record's minutes count; 0: not known.
     """
     named = {effect.name: effect for effect in effects}
     before = extended_model_of(model, effects, zero_ns=zero_ns)
-    found = [_specification(named[cause.cause], cause) for cause in causes]
-    return replace(before, effects=(*before.effects, *found)).to_object()
+    result = [_specification(named[cause.cause], cause) for cause in causes]
+    return replace(before, effects=(*before.effects, *result)).to_object()
 
 
 def _specification(effect: Effect, cause: Cause) -> FaultSpecification:

@@ -1,7 +1,7 @@
-"""Values that a signal cannot have: cells that stand for "not measured", such as -999, 9999 or 65535.
+"""Values that a signal cannot have: placeholders for "not measured", such as -999, 9999 or 65535.
 
-A filter would take such a value for the plant. An input beyond its bounds cannot be simulated at all; an output may
-exceed those of its state by a scale, for noise and offsets of its sensor.
+A filter would take such a value for the plant. An input beyond its bounds cannot be simulated; an output may exceed the
+bounds of its state by a scale, for noise and offset of its sensor.
 """
 
 from typing import NamedTuple
@@ -13,11 +13,11 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 
 MARGIN = 1.0
-"""In scales of a state: its sensor may show values so far beyond its bounds."""
+"""In scales of a state: its sensor may exceed the bounds by this."""
 
 
 class Bounds(NamedTuple):
-    """Lowest and highest value that a signal can have, in its unit."""
+    """Lowest and highest possible value of a signal, in its unit."""
 
     lower: float
     upper: float
@@ -25,7 +25,7 @@ class Bounds(NamedTuple):
 
 
 def bounds_of(model: ProcessModel) -> dict[str, Bounds]:
-    """Bounds of the inputs, and of those outputs that show a state, by name."""
+    """Bounds of the inputs, and of the outputs that are states, by name."""
     margins = {state.name: (state, MARGIN * state.scale) for state in model.states if state.name in model.output_names}
     margins |= {item.name: (item, 0.0) for item in model.inputs}
     return {
@@ -34,7 +34,7 @@ def bounds_of(model: ProcessModel) -> dict[str, Bounds]:
 
 
 def check_values(record: Record, model: ProcessModel) -> None:
-    """Refuse a record in which a signal of the model has a value that it cannot have; missing columns are passed over.
+    """Check that a record has no impossible values; missing columns are skipped.
 
     Raises:
         InputError: the first such value, by file, row and column.

@@ -1,4 +1,4 @@
-"""Whether a difference matters in practice: that is for the user to say."""
+"""Practical significance: compare differences with user-given tolerances."""
 
 from collections.abc import Mapping
 
@@ -13,14 +13,14 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 
 PRACTICAL_SHARE = 0.02
-"""Of an output's range in the record: a difference in it that matters, where the user does not say."""
+"""Default tolerance as a fraction of the output's range in the record."""
 
 
-def checked_tolerance(model: ProcessModel, tolerance: Mapping[str, float]) -> None:
-    """Hold that tolerances can be meant.
+def check_tolerance(model: ProcessModel, tolerance: Mapping[str, float]) -> None:
+    """Check that tolerances are valid.
 
     Raises:
-        InputError: as `bands_of`.
+        InputError: a tolerance is of no output, or not positive.
     """
     for name, value in tolerance.items():
         if name not in model.output_names:
@@ -29,18 +29,18 @@ def checked_tolerance(model: ProcessModel, tolerance: Mapping[str, float]) -> No
             raise InputError(f"tolerance of {name} must be a positive number, got {value:g}")
 
 
-def bands_of(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> dict[str, float]:
-    """The root mean square difference in each output that does not matter, in its unit.
+def tolerances_of(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> dict[str, float]:
+    """Tolerated root mean square difference of each output, in its unit.
 
     Args:
         run: the record.
-        model: of the plant.
-        tolerance: as the user has it, by output.
+        model: process model of the plant.
+        tolerance: tolerances given by the user, by output.
 
     Raises:
         InputError: a tolerance is of no output, or not positive.
     """
-    checked_tolerance(model, tolerance)
+    check_tolerance(model, tolerance)
     ranges = np.nanquantile(run.measured, 0.99, axis=0) - np.nanquantile(run.measured, 0.01, axis=0)
     return {
         name: tolerance.get(name, PRACTICAL_SHARE * float(size))
@@ -48,30 +48,32 @@ def bands_of(run: Run, model: ProcessModel, tolerance: Mapping[str, float]) -> d
     }
 
 
-def matters(curves: Curves, bands: Mapping[str, float], blind: NDArray[np.bool_]) -> bool:
-    """Compare the simulations by both models with the tolerances; true if an output differs by more.
+def exceeds_tolerance(curves: Curves, bands: Mapping[str, float], blind: NDArray[np.bool_]) -> bool:
+    """Return true if the simulations of the two models differ by more than the tolerance in an output.
 
     Args:
-        curves: of both models.
+        curves: simulations of both models.
         bands: the tolerances, by output.
-        blind: rows of which the filter says nothing, as of the first row of a run, shape (rows,).
+        blind: rows without a prediction of the filter, such as the first row of a run, shape (rows,).
     """
     for output, band in bands.items():
-        difference = (curves.free_after[output] - curves.free_before[output])[~blind]
-        known = difference[np.isfinite(difference)]
-        if known.size < difference.size or float(np.sqrt(np.mean(known**2))) > band:
+        difference = (curves.simulated_after[output] - curves.simulated_before[output])[~blind]
+        finite = difference[np.isfinite(difference)]
+        if finite.size < difference.size or float(np.sqrt(np.mean(finite**2))) > band:
             return True
     return False
 
 
-def left_matters(before: Errors, noise_sd: Array, model: ProcessModel, bands: Mapping[str, float]) -> bool:
-    """Practical significance: true if the nominal free run errs by more than noise and tolerance in an output.
+def residual_exceeds_tolerance(
+    before: Errors, noise_sd: Array, model: ProcessModel, bands: Mapping[str, float]
+) -> bool:
+    """Return true if the nominal simulation's error exceeds noise and tolerance in an output.
 
     Args:
         before: errors of the nominal model.
-        noise_sd: of the sensors, shape (n_y,); without what a filter takes for their noise, see `sensor_noise`.
-        model: of the plant.
+        noise_sd: standard deviation of the sensors' noise, shape (n_y,), see `sensor_noise`.
+        model: process model of the plant.
         bands: tolerances, by output.
     """
-    left = np.sqrt(np.maximum(before.free**2 - noise_sd**2, 0.0))
-    return any(not value <= bands[name] for name, value in zip(model.output_names, left.tolist(), strict=True))
+    residual = np.sqrt(np.maximum(before.simulation**2 - noise_sd**2, 0.0))
+    return any(not value <= bands[name] for name, value in zip(model.output_names, residual.tolist(), strict=True))

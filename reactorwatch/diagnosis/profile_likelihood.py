@@ -1,14 +1,14 @@
-"""Numbers in which the likelihood is rough: when something set in, and how far a valve sticks.
+"""Profile likelihood of parameters in which the likelihood is rough: onsets, and magnitudes of stiction.
 
-The loss is no parabola in them. A sensor shows the same wherever between two rows it went wrong; a lag is seen only
-where the input moves; a valve that sticks does the same for a whole range of sizes; and a fit can stay in a hollow
-between two moves. So about the best fit such a number is moved by hand, the others held, and the likelihood is taken
-for its distribution (Sivia & Skilling 2006, Data Analysis: A Bayesian Tutorial, 2.2). The mean is the estimate, if it
-is about as likely as the likeliest; the root mean square distance from the estimate is the standard deviation.
+The loss is no parabola in them. A sensor fault has the same effect at any onset between two rows; a lag is visible only
+where the input moves; stiction has the same effect for a range of magnitudes; and a fit can stay in a local optimum
+between two input changes. So the parameter is scanned about the best fit with the others fixed, and the likelihood is
+taken as its distribution (Sivia & Skilling 2006, Data Analysis: A Bayesian Tutorial, 2.2). The mean is the estimate if
+it is about as likely as the maximum; the root mean square distance from the estimate is the standard deviation.
 
-Effects with a memory of their own have been looked for at a few sizes only (`dynamic_effects_screen`). For their steps
-all onsets are tried at once: such memory is short, so before the onset the innovations are those of a filter without
-the effect, and after it those of one that has had it from the beginning.
+Effects with internal states were screened at a few magnitudes only (`dynamic_effects_screen`). For their steps all
+onsets are evaluated at once: the states are fast, so before the onset the innovations are those of a filter without the
+effect, and after it those of one with the effect throughout.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,153 +18,158 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
-from reactorwatch.diagnosis.fitting.fault_filter import row_losses
+from reactorwatch.diagnosis.fitting.fault_filter import huber_row_losses
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.fitting.profiles import Step
-from reactorwatch.diagnosis.search.search import Explained, Search
+from reactorwatch.diagnosis.search.search import FittedHypothesis, Search
 
 OFFSETS = (0.5, 1.0, 2.0)
-"""To either side, in standard deviations that the fit has found, and at least rows."""
+"""First values to either side, in standard deviations of the fit, and at least rows."""
 
 WIDENINGS, ROUNDS = 7, 3
 OUT_OF_QUESTION = 7.0
-"""In log likelihood: a value that is worse by more adds nothing, and behind it no other hump is looked for."""
+"""In log likelihood: values that are worse by more add nothing, and end the scan on their side."""
 
 LEAST_GAIN, AS_LIKELY = 0.1, 0.5
-"""In log likelihood: by so much more a value is taken for the likeliest; by so much less it is still as good."""
+"""In log likelihood: minimum gain of a new maximum; and maximum loss of the mean against the maximum."""
 
 FAR_BETWEEN, UNSURE, MOST_MORE, FINER = 1.01, 0.08, 12, 20
-"""In the first look's reaches, what is far between values in question; of the whole, how much of the likelihood may lie
-here or there between two values; how many more are tried for each; and steps between two values tried."""
+"""Maximum distance of likely values, in first reaches; maximum share of the likelihood that is uncertain between two
+values; maximum number of further values for each; interpolation steps between two values."""
 
 HOLLOWS, APART_ROWS = 3, 20
-"""How many onsets of effects with memory are tried, and by how much they differ."""
+"""Onsets tried for effects with internal states, and minimum distance between them."""
 
 WITHIN_ROW = 0.15
-"""Of a row, the least standard deviation of an onset: what acts in part of a row is taken for its mean over the row."""
+"""Minimum standard deviation of an onset in rows, because an effect in part of a row enters by its mean over the
+row."""
 
 LARGEST_SHARE = 0.05
-"""Of the record, for the first look to either side."""
+"""Maximum first reach, as a fraction of the record."""
 
 SIZE_SHARE = 0.005
-"""Of a size that acts in jumps, likewise."""
+"""First reach of a discontinuous magnitude, as a fraction of it."""
 
 
-def settled(search: Search, best: Explained, sds: Sequence[Array]) -> tuple[Explained, list[dict[int, float]]]:
-    """The best explanation, with its rough numbers where the record is likeliest, and their standard deviations.
+def refine(
+    search: Search, best: FittedHypothesis, sds: Sequence[Array]
+) -> tuple[FittedHypothesis, list[dict[int, float]]]:
+    """Move the rough parameters of the best hypothesis to the maximum of their likelihood.
 
     Args:
-        search: that found it.
-        best: with some effects, or none.
-        sds: standard deviations of each effect's numbers, by the fit.
+        search: search that found it.
+        best: hypothesis with or without effects.
+        sds: standard deviations of each effect's parameters, by the fit.
 
     Returns:
-        The explanation; of each effect, the standard deviations of its rough numbers, by their places.
+        The hypothesis; and for each effect, the standard deviations of its rough parameters by index.
     """
-    found = []
-    for place, (effect, course) in enumerate(zip(best.hypothesis.sized.effects, best.hypothesis.courses, strict=True)):
+    result = []
+    for index, (effect, profile) in enumerate(
+        zip(best.hypothesis.filter.effects, best.hypothesis.profiles, strict=True)
+    ):
         rough: dict[int, float] = {}
-        names = [item.name for item in course.numbers]
-        if effect.is_discontinuous and course.coefficients == 1:
-            reach = SIZE_SHARE * abs(float(best.fit.theta[place][0]))
-            best, rough[0] = _Scan(search, place, 0, reach, (effect.lower, effect.upper)).settled(best)
+        names = [item.name for item in profile.nonlinear_parameters]
+        if effect.is_discontinuous and profile.n_linear == 1:
+            reach = SIZE_SHARE * abs(float(best.fit.parameters[index][0]))
+            best, rough[0] = _Scan(search, index, 0, reach, (effect.lower, effect.upper)).refine(best)
         if "onset" in names:
-            if isinstance(course, Step) and effect in search.screen.with_memory:
-                best = _out_of_the_hollow(search, best, place)
-            number = course.coefficients + names.index("onset")
-            # Of what acts in jumps there are no derivatives, and no standard deviation follows from them.
-            sd = 0.0 if effect.is_discontinuous else float(sds[place][number])
-            reach = min(float(np.hypot(sd, course.period_min)), LARGEST_SHARE * search.run.span_min)
-            bounds = (course.begin_min, course.end_min)
-            best, sd = _Scan(search, place, number, reach, bounds).settled(best)
-            rough[number] = max(sd, WITHIN_ROW * course.period_min)
-        found.append(rough)
-    return best, found
+            if isinstance(profile, Step) and effect in search.screen.dynamic_effects:
+                best = _leave_local_optimum(search, best, index)
+            number = profile.n_linear + names.index("onset")
+            # A discontinuous effect has no derivatives, hence no standard deviation from them.
+            sd = 0.0 if effect.is_discontinuous else float(sds[index][number])
+            reach = min(float(np.hypot(sd, profile.period_min)), LARGEST_SHARE * search.run.span_min)
+            bounds = (profile.start_min, profile.end_min)
+            best, sd = _Scan(search, index, number, reach, bounds).refine(best)
+            rough[number] = max(sd, WITHIN_ROW * profile.period_min)
+        result.append(rough)
+    return best, result
 
 
-def _out_of_the_hollow(search: Search, best: Explained, place: int) -> Explained:
-    """The best of the onsets at which the innovations with the effect begin to be better than those without it."""
+def _leave_local_optimum(search: Search, best: FittedHypothesis, index: int) -> FittedHypothesis:
+    """Try the onsets at which the innovations with the effect become better than those without it."""
     run, hypothesis = search.run, best.hypothesis
-    without = row_losses(hypothesis.without(run, best.fit, place))
-    with_it = row_losses(_at(search, best, place, 1, float(run.time_min[0])).w)
+    without = huber_row_losses(hypothesis.innovations_without(run, best.fit, index))
+    with_it = huber_row_losses(_evaluate(search, best, index, 1, float(run.time_min[0])).w)
     total = np.cumsum(without) + np.cumsum(with_it[::-1])[::-1] - with_it
     for _ in range(HOLLOWS):
         row = int(np.argmin(total))
-        trial = _at(search, best, place, 1, float(run.time_min[row]))
+        trial = _evaluate(search, best, index, 1, float(run.time_min[row]))
         if trial.loss < best.fit.loss - LEAST_GAIN:
-            best = search.fit(hypothesis, trial.theta)
+            best = search.fit(hypothesis, trial.parameters)
         total[max(row - APART_ROWS, 0) : row + APART_ROWS] = np.inf
     return best
 
 
 class _Scan:
-    """The likelihood along one number.
+    """Scan of the likelihood along one parameter.
 
     Args:
-        search: for the run.
-        place: of the effect.
-        number: place of the number among those of its course.
-        reach: how far to look first.
-        bounds: of the number.
+        search: search of the run.
+        index: index of the effect.
+        number: index of the parameter.
+        reach: initial reach.
+        bounds: bounds of the parameter.
     """
 
-    def __init__(self, search: Search, place: int, number: int, reach: float, bounds: tuple[float, float]) -> None:
-        self._search, self._place, self._number, self._reach, self._bounds = search, place, number, reach, bounds
+    def __init__(self, search: Search, index: int, number: int, reach: float, bounds: tuple[float, float]) -> None:
+        self._search, self._place, self._number, self._reach, self._bounds = search, index, number, reach, bounds
 
-    def settled(self, best: Explained) -> tuple[Explained, float]:
-        """The best with the number where the record is likeliest near by, and its standard deviation."""
+    def refine(self, best: FittedHypothesis) -> tuple[FittedHypothesis, float]:
+        """Move the parameter to the nearby maximum, or to the mean if it is as likely; also its standard deviation."""
         for _ in range(ROUNDS):
-            here = float(best.fit.theta[self._place][self._number])
-            known = {here: best.fit}
+            here = float(best.fit.parameters[self._place][self._number])
+            fits = {here: best.fit}
             far = OFFSETS[-1] * self._reach
-            sides = [list(self._to_a_side(here, side)) for side in (-1.0, 1.0)]
-            self._try(best, known, [value for side in sides for value in side if abs(value - here) <= far])
+            sides = [list(self._values_to_side(here, side)) for side in (-1.0, 1.0)]
+            self._try(best, fits, [value for side in sides for value in side if abs(value - here) <= far])
             further = [[value for value in side if abs(value - here) > far] for side in sides]
             while further := [side for side in further if side]:
-                self._try(best, known, [side[0] for side in further])
-                further = [side[1:] for side in further if known[side[0]].loss <= best.fit.loss + OUT_OF_QUESTION]
-            likeliest = min(known.values(), key=lambda item: item.loss)
+                self._try(best, fits, [side[0] for side in further])
+                further = [side[1:] for side in further if fits[side[0]].loss <= best.fit.loss + OUT_OF_QUESTION]
+            likeliest = min(fits.values(), key=lambda item: item.loss)
             if likeliest.loss > best.fit.loss - LEAST_GAIN:
                 break
-            best = self._search.fit(best.hypothesis, likeliest.theta)
-        self._look_between(best, known)
-        mean, _ = _moments(known, here)
-        trial = _at(self._search, best, self._place, self._number, mean)
+            best = self._search.fit(best.hypothesis, likeliest.parameters)
+        self._fill_gaps(best, fits)
+        mean, _ = _moments(fits, here)
+        trial = _evaluate(self._search, best, self._place, self._number, mean)
         if trial.loss < best.fit.loss + AS_LIKELY:
-            best, here = self._search.judged(best.hypothesis, trial), mean
-        return best, _moments(known, here)[1]
+            best, here = self._search.score_fit(best.hypothesis, trial), mean
+        return best, _moments(fits, here)[1]
 
-    def _look_between(self, best: Explained, known: dict[float, Fit]) -> None:
-        """Try more values where another hump may be: far between such as are in question, and where it is steep."""
+    def _fill_gaps(self, best: FittedHypothesis, fits: dict[float, Fit]) -> None:
+        """Try more values where another maximum may be: in wide gaps between likely values, and on steep flanks."""
         for _ in range(MOST_MORE // LANES):
-            values, above = self._values(best, known)
+            values, above = self._values(best, fits)
             width = np.where(np.maximum(above[1:], above[:-1]) < OUT_OF_QUESTION, np.diff(values), 0.0)
-            if not self._halved(best, known, width, FAR_BETWEEN * self._reach):
+            if not self._bisect(best, fits, width, FAR_BETWEEN * self._reach):
                 break
         for _ in range(MOST_MORE // LANES):
-            values, above = self._values(best, known)
+            values, above = self._values(best, fits)
             likelihood = np.exp(-above)
             unsure = np.diff(values) * np.abs(np.diff(likelihood))
-            if not self._halved(best, known, unsure, UNSURE * float(np.trapezoid(likelihood, values))):
+            if not self._bisect(best, fits, unsure, UNSURE * float(np.trapezoid(likelihood, values))):
                 break
 
-    def _values(self, best: Explained, known: dict[float, Fit]) -> tuple[Array, Array]:
-        """Those that were tried, in order, and how much worse than the best they are in log likelihood."""
-        values = sorted(known)
-        return np.array(values), np.array([known[value].loss - best.fit.loss for value in values])
+    def _values(self, best: FittedHypothesis, fits: dict[float, Fit]) -> tuple[Array, Array]:
+        """Values tried, in order, and their loss above the best."""
+        values = sorted(fits)
+        return np.array(values), np.array([fits[value].loss - best.fit.loss for value in values])
 
-    def _halved(self, best: Explained, known: dict[float, Fit], of_each: Array, least: float) -> bool:
-        """Try values in the middle between two, where there is most of something; whether there is enough of it."""
-        values, most = sorted(known), np.argsort(-of_each)[:LANES].tolist()
-        middles = [0.5 * (values[place] + values[place + 1]) for place in most if of_each[place] > least]
-        self._try(best, known, middles)
+    def _bisect(self, best: FittedHypothesis, fits: dict[float, Fit], of_each: Array, least: float) -> bool:
+        """Try the middle of the intervals with the largest measure above `least`; return true if there are any."""
+        values, most = sorted(fits), np.argsort(-of_each)[:LANES].tolist()
+        middles = [0.5 * (values[index] + values[index + 1]) for index in most if of_each[index] > least]
+        self._try(best, fits, middles)
         return bool(middles)
 
-    def _try(self, best: Explained, known: dict[float, Fit], values: Sequence[float]) -> None:
-        known.update(zip(values, _at_all(self._search, best, self._place, self._number, values), strict=True))
+    def _try(self, best: FittedHypothesis, fits: dict[float, Fit], values: Sequence[float]) -> None:
+        fits.update(zip(values, _evaluate_all(self._search, best, self._place, self._number, values), strict=True))
 
-    def _to_a_side(self, here: float, side: float) -> Iterator[float]:
-        """Values to try, within the bounds, further and further away."""
+    def _values_to_side(self, here: float, side: float) -> Iterator[float]:
+        """Values to try within the bounds, further and further away."""
         offsets = [*OFFSETS, *(OFFSETS[-1] * 2.0**power for power in range(1, WIDENINGS + 1))]
         before = here
         for offset in offsets:
@@ -174,27 +179,29 @@ class _Scan:
             before = value
 
 
-def _moments(known: dict[float, Fit], here: float) -> tuple[float, float]:
-    """Of the likelihood along a number: the mean, and the root mean square distance from a value."""
-    tried = sorted(known)
+def _moments(fits: dict[float, Fit], here: float) -> tuple[float, float]:
+    """Mean of the likelihood along a parameter, and root mean square distance from a value."""
+    tried = sorted(fits)
     fine = [np.linspace(*pair, FINER, endpoint=False) for pair in pairwise(tried)]
     values = np.array([*np.concatenate(fine), tried[-1]]) if fine else np.array(tried)
-    losses = np.interp(values, tried, [known[item].loss for item in tried])
+    losses = np.interp(values, tried, [fits[item].loss for item in tried])
     likelihood = np.exp(-(losses - losses.min()))
     total = float(np.trapezoid(likelihood, values))
-    if total <= 0.0:  # between two bounds that are one
+    if total <= 0.0:  # the bounds coincide
         return here, 0.0
     mean, square = (float(np.trapezoid(likelihood * item, values)) / total for item in (values, (values - here) ** 2))
     return mean, square**0.5
 
 
-def _at(search: Search, best: Explained, place: int, number: int, value: float) -> Fit:
-    return _at_all(search, best, place, number, [value])[0]
+def _evaluate(search: Search, best: FittedHypothesis, index: int, number: int, value: float) -> Fit:
+    return _evaluate_all(search, best, index, number, [value])[0]
 
 
-def _at_all(search: Search, best: Explained, place: int, number: int, values: Sequence[float]) -> list[Fit]:
-    """With one number of one effect exchanged; together they take less time."""
-    thetas = [[item.copy() for item in best.fit.theta] for _ in values]
-    for theta, value in zip(thetas, values, strict=True):
-        theta[place][number] = value
-    return best.hypothesis.at_all(search.run, thetas)
+def _evaluate_all(
+    search: Search, best: FittedHypothesis, index: int, number: int, values: Sequence[float]
+) -> list[Fit]:
+    """Evaluate other values of one parameter of one effect in parallel."""
+    thetas = [[item.copy() for item in best.fit.parameters] for _ in values]
+    for parameters, value in zip(thetas, values, strict=True):
+        parameters[index][number] = value
+    return best.hypothesis.evaluate_all(search.run, thetas)

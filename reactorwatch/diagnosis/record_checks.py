@@ -1,4 +1,4 @@
-"""From a record to a run of a model, and what a record must have so that anything can be said of it."""
+"""Convert a record to a run of a model, and check that it can be diagnosed."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,25 +13,25 @@ from reactorwatch.records.record import Record
 
 FEWEST_ROWS = 200
 FEWEST_VALUES = 100
-"""Of an output: with less nothing can be told from noise."""
+"""Minimum number of values of an output."""
 
 LEAST_MOVE = 1e-3
-"""Of an input, in its scales: less is no excitation."""
+"""Minimum movement of an input, in its scales."""
 
 FEW_ROWS = 10
-"""Of them missing, the plant is followed through; behind more, a filter begins anew."""
+"""The filter bridges up to this many missing rows, and restarts after more."""
 
 _OFF_GRID, _REGULAR = 0.05, 0.95
-"""Rows are on a grid if steps are whole periods, give or take so much of one, in so many of them."""
+"""Tolerance of steps that are whole periods, and the fraction of steps that must be, for rows on a grid."""
 
 
-def run_of(record: Record, model: ProcessModel) -> Run:
-    """What of the record the model speaks of.
+def make_run(record: Record, model: ProcessModel) -> Run:
+    """Convert a record to a run of the model.
 
-    Missing inputs are taken to be as they were. Of a record of several runs, the times are `continuous_min`.
+    Missing inputs keep their last value. Times of a record with several runs are `continuous_min`.
 
     Raises:
-        InputError: too few rows; a signal that is missing, constant or in another unit; a value that it cannot have.
+        InputError: too few rows; a signal that is missing, constant or in another unit; an impossible value.
     """
     name = record.name
     if record.rows < FEWEST_ROWS:
@@ -45,21 +45,21 @@ def run_of(record: Record, model: ProcessModel) -> Run:
     outputs = []
     for output in model.outputs:
         values = record.columns[output.name]
-        known = values[np.isfinite(values)]
-        if known.size < FEWEST_VALUES:
+        finite = values[np.isfinite(values)]
+        if finite.size < FEWEST_VALUES:
             raise InputError(
-                f"{name}: {output.name} needs at least {FEWEST_VALUES} values, got {known.size}; "
+                f"{name}: {output.name} needs at least {FEWEST_VALUES} values, got {finite.size}; "
                 "is the column the right one, and is the sensor recorded?"
             )
-        if np.ptp(known) == 0.0:
+        if np.ptp(finite) == 0.0:
             raise InputError(
-                f"{name}: {output.name} must vary, it is {known[0]:g} {output.unit} in every row; "
+                f"{name}: {output.name} must vary, it is {finite[0]:g} {output.unit} in every row; "
                 "the sensor is stuck, or the column is not what it seems"
             )
         outputs.append(values)
     inputs = []
     for item in model.inputs:
-        values = np.concatenate([_held(part.columns[item.name]) for part in record.split_runs()])
+        values = np.concatenate([_hold_last(part.columns[item.name]) for part in record.split_runs()])
         if not np.all(np.isfinite(values)):
             of_run = "the first row" if record.runs is None else "the first row of each run"
             raise InputError(
@@ -73,7 +73,7 @@ def run_of(record: Record, model: ProcessModel) -> Run:
     if all(np.ptp(values) <= LEAST_MOVE * item.scale for values, item in zip(inputs, model.inputs, strict=True)):
         raise InputError(
             f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} all the time; "
-            "nothing can be told apart without excitation: record a stretch with steps in it"
+            "nothing can be told apart without excitation: record an interval with steps in it"
         )
     if wrong is not None:
         raise InputError(f"{name}: {wrong.text}")
@@ -85,14 +85,14 @@ def run_of(record: Record, model: ProcessModel) -> Run:
 
 
 def _breaks(
-    time_min: Array, inputs: Array, known: NDArray[np.bool_]
+    time_min: Array, inputs: Array, finite: NDArray[np.bool_]
 ) -> tuple[tuple[int, ...], NDArray[np.intp] | None]:
-    """Rows whose inputs differ from those of the row before, with rows missing between them or the inputs in it.
+    """Rows after a gap in which the inputs changed at an unknown time.
 
-    Nobody knows when they changed. Where rows are irregular by nature none is taken to be missing.
+    In a record with irregular rows none counts as missing.
 
     Returns:
-        Those before which too much is missing, and how many are before the others (see `Run.missing`).
+        Rows after gaps that are too long, and the number of missing rows before the others (see `Run.missing`).
     """
     step = np.diff(time_min)
     period = float(np.median(step))
@@ -100,14 +100,14 @@ def _breaks(
     regular = np.mean(np.abs(counts - np.round(counts)) < _OFF_GRID) > _REGULAR
     changed = np.any(np.diff(inputs, axis=0) != 0.0, axis=1)
     missing = np.round(counts).astype(np.intp) - 1
-    short = changed & regular & (missing > 0) & (missing <= FEW_ROWS) & np.all(known[:-1], axis=1)
-    long = changed & ((counts > 1.5) & regular | ~np.all(known[:-1], axis=1)) & ~short
+    short = changed & regular & (missing > 0) & (missing <= FEW_ROWS) & np.all(finite[:-1], axis=1)
+    long = changed & ((counts > 1.5) & regular | ~np.all(finite[:-1], axis=1)) & ~short
     few = np.append(0, np.where(short, missing, 0))
     return tuple((np.flatnonzero(long) + 1).tolist()), few if np.any(short) else None
 
 
-def _held(values: Array) -> Array:
-    """With what is missing as it was before."""
+def _hold_last(values: Array) -> Array:
+    """Replace missing values by the last value before them."""
     places = np.where(np.isfinite(values), np.arange(values.size), -1)
     places = np.maximum.accumulate(places)
     return np.where(places >= 0, values[np.maximum(places, 0)], np.nan)

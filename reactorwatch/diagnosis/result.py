@@ -1,4 +1,4 @@
-"""What a diagnosis says."""
+"""Result of a diagnosis."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,10 +12,10 @@ from reactorwatch.diagnosis.difference import Difference
 NOMINAL, NAMED, AMBIGUOUS, UNKNOWN = "nominal", "named", "ambiguous", "unknown"
 
 SD_95 = 1.959964
-"""Standard deviations to either side that hold 95 % of a normal distribution."""
+"""Half width of the 95 % interval of a normal distribution, in standard deviations."""
 
 LISTED = 10.0
-"""In BIC: explanations that are worse by less are listed."""
+"""In BIC: alternatives that are worse by less are listed."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Cause:
 
     Attributes:
         cause: name in the catalogue.
-        profile: how it goes in time.
-        label: what a person calls it.
-        location: where it acts.
+        profile: name of its profile in time.
+        label: label for users.
+        location: location where it acts.
         parameters: `size` first, then those of the profile; times in minutes of the run in which it sets in.
-        run: of the record, in which it sets in, counted from 1.
-        run_shift_min: what `Record.continuous_min` adds to the minutes of that run.
+        run: number of that run in the record, from 1.
+        run_shift_min: shift from minutes of that run to `Record.continuous_min`.
     """
 
     cause: str
@@ -51,13 +51,13 @@ class Cause:
 
 
 @dataclass(frozen=True)
-class Adjusted:
-    """A parameter that was stated to be known but roughly, and what the record says of it.
+class AdjustedParameter:
+    """An uncertain parameter with its estimate.
 
     Attributes:
         nominal: its value in the simulation.
-        stated_sd: standard deviation that it was stated to be known to.
-        estimate: of it, from what was stated and the record together.
+        stated_sd: standard deviation of its prior.
+        estimate: posterior of prior and record.
     """
 
     nominal: float
@@ -65,18 +65,18 @@ class Adjusted:
     estimate: Estimate
 
     @property
-    def off(self) -> bool:
-        """Whether the record says that it is not the nominal value: that is out of its 95 % interval."""
+    def differs(self) -> bool:
+        """True if the nominal value is outside the 95 % interval."""
         return abs(self.estimate.value - self.nominal) > SD_95 * self.estimate.sd
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another explanation.
+    """An alternative explanation.
 
     Attributes:
         explanation: its causes.
-        delta_bic: by how much it is worse than the one that is named.
+        delta_bic: its BIC minus that of the named explanation.
     """
 
     explanation: tuple[Cause, ...]
@@ -90,15 +90,15 @@ class Alternative:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors of one output on rows that the fit did not see, in its unit.
+    """Errors of one output on rows that were not fitted, in its unit.
 
     Attributes:
-        rmse_before: of the free run of the nominal model.
-        rmse_after: of the extended one.
-        one_step_before: of the nominal model's prediction of the next row.
-        one_step_after: of the extended one's.
-        noise_sd: of the sensor: no model comes below.
-        unit: of all of them.
+        rmse_before: error of the nominal model's simulation.
+        rmse_after: error of the extended model's simulation.
+        one_step_before: error of the nominal model's one-step-ahead prediction.
+        one_step_after: error of the extended model's one-step-ahead prediction.
+        noise_sd: standard deviation of the sensor's noise, below which no model comes.
+        unit: unit of all of them.
     """
 
     rmse_before: float
@@ -111,11 +111,11 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Gain:
-    """What the extended model is better by.
+    """Gain of the extended model.
 
     Attributes:
-        delta_bic: of the nominal model over that of the extended one.
-        held_out: by output.
+        delta_bic: BIC of the nominal model minus that of the extended one.
+        held_out: errors on held-out rows, by output.
     """
 
     delta_bic: float
@@ -123,13 +123,13 @@ class Gain:
 
 
 @dataclass(frozen=True)
-class Apart:
-    """How well an experiment tells two explanations apart.
+class Separation:
+    """Separation of two explanations by an experiment.
 
     Attributes:
         between: their names, each its causes joined by a plus.
-        expected_delta_bic: by how much the wrong one is expected to be worse.
-        probability: the probability that it is worse by more than `LISTED`.
+        expected_delta_bic: expected BIC of the wrong one minus that of the true one.
+        probability: probability that this difference exceeds `LISTED`.
     """
 
     between: tuple[str, str]
@@ -139,12 +139,12 @@ class Apart:
 
 @dataclass(frozen=True, eq=False)
 class ExperimentCurves:
-    """What the pictures of an experiment are drawn from; all over its rows.
+    """Curves for the figures of an experiment, all over its rows.
 
     Attributes:
-        time_min: from its start, shape (rows,).
-        level: of the input that is moved.
-        outputs: that each explanation predicts without noise, by its name and the output's.
+        time_min: time from its start, shape (rows,).
+        level: level of the input that is moved.
+        outputs: noise-free outputs by explanation and output.
     """
 
     time_min: Array
@@ -154,21 +154,20 @@ class ExperimentCurves:
 
 @dataclass(frozen=True)
 class Experiment:
-    """An input that would tell rivals apart.
+    """An input that separates alternatives.
 
     Attributes:
-        why: in a sentence.
+        why: the expected result, in a sentence.
         input: (minute, value) of each change.
-        separates: the explanations that it tells apart, each its causes joined by a plus.
-        expected_delta_bic: what it is expected to bring between the two nearest of them.
-        probability: the probability that it brings more than `LISTED`.
-        signal: the input that is moved; the others stay as they were.
-        span_min: how long it takes.
-        limits: that it keeps under every explanation, by signal.
-        apart: of every pair of explanations.
-        predicted: the lowest and highest value of each output without noise, by explanation and output.
-        curves: for pictures; of several runs, over `Record.continuous_min`.
-        runs: of the record.
+        separates: explanations that it separates, each its causes joined by a plus.
+        expected_delta_bic: expected difference in BIC between the two nearest of them.
+        probability: probability that this difference exceeds `LISTED`.
+        signal: input that is moved; the others stay constant.
+        span_min: duration.
+        limits: limits by signal that it keeps under every explanation.
+        separations: separation of every pair of explanations.
+        predicted: lowest and highest noise-free value, by explanation and output.
+        curves: curves for figures.
     """
 
     why: str
@@ -179,18 +178,18 @@ class Experiment:
     signal: str
     span_min: float
     limits: dict[str, tuple[float, float]]
-    apart: tuple[Apart, ...]
+    separations: tuple[Separation, ...]
     predicted: dict[str, dict[str, tuple[float, float]]]
     curves: ExperimentCurves | None = field(default=None, repr=False, compare=False)
 
 
 @dataclass(frozen=True, eq=False)
-class UnknownCourse:
-    """How something that has no name goes in time, told as the size of an effect that pushes at the same place.
+class UnknownInputCurve:
+    """Course of an unknown input in time, as the magnitude of an effect that acts in the same way.
 
     Attributes:
-        label: what a person calls that effect.
-        unit: of its size.
+        label: label of that effect.
+        unit: unit of its magnitude.
         size: m(t), shape (rows,).
     """
 
@@ -201,57 +200,57 @@ class UnknownCourse:
 
 @dataclass(frozen=True, eq=False)
 class Curves:
-    """What the pictures of a diagnosis are drawn from; all over the rows of the record.
+    """Curves for the figures of a diagnosis, all over the rows of the record.
 
     Attributes:
         time_min: shape (rows,).
-        inputs: by name.
-        measured: by output; NaN where missing.
-        free_before: free run of the nominal model, by output.
-        free_after: that of the extended model.
+        inputs: inputs by name.
+        measured: measurements by output; NaN where missing.
+        simulated_before: simulation by the nominal model, by output.
+        simulated_after: simulation by the extended model, by output.
         residual_before: innovations of the nominal model's filter in standard deviations, by output.
-        residual_after: those of the extended one's.
+        residual_after: innovations of the extended model's filter in standard deviations, by output.
         deviation: m(t) of each cause, by its name.
-        deviation_sd: its standard deviation.
-        unknown: what acts where nothing has a name; None: no such.
-        held_out: which values the errors before and after are of, by output.
+        deviation_sd: standard deviation of m(t), by name.
+        unknown: course of an unknown input; None without one.
+        held_out: mask of the values on which errors before and after are evaluated, by output.
     """
 
     time_min: Array
     inputs: dict[str, Array]
     measured: dict[str, Array]
-    free_before: dict[str, Array]
-    free_after: dict[str, Array]
+    simulated_before: dict[str, Array]
+    simulated_after: dict[str, Array]
     residual_before: dict[str, Array]
     residual_after: dict[str, Array]
     deviation: dict[str, Array]
     deviation_sd: dict[str, Array]
-    unknown: UnknownCourse | None = None
+    unknown: UnknownInputCurve | None = None
     held_out: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What is wrong with a simulation, as far as a record tells.
+    """Result of a diagnosis.
 
     Attributes:
-        samples: rows of the record.
-        span_min: from its first row to its last, summed over its runs.
+        samples: number of rows of the record.
+        span_min: duration from its first row to its last, summed over its runs.
         verdict: `nominal`, `named`, `ambiguous` or `unknown`.
-        causes: that explain the record together; empty if nominal or unknown.
+        causes: causes that explain the record together; empty if nominal or unknown.
         alternatives: every other explanation within 10 BIC, the best first.
-        location: where the deviation acts; empty if nominal.
-        significant: whether the nominal model is refuted statistically.
-        practical: whether the difference is larger than the user's tolerance.
-        differences: of the simulation and the record, by output: where, when, and how much of them is noise.
-        gain: what the extended model is better by.
-        adequacy: minus the decimal logarithm of the p-value that what is left is white, by output.
-        experiment: that would tell the alternatives apart; None where there is nothing to tell.
-        extended_model: as in its file (`diagnosis.extended_model`).
-        remarks: what else people should know, in sentences.
-        parameters: that were stated to be uncertain, by name.
-        curves: for pictures; of several runs, over `Record.continuous_min`.
-        runs: of the record.
+        location: location of the deviation; empty if nominal.
+        significant: true if the nominal model is refuted statistically.
+        practical: true if the difference exceeds the user's tolerance.
+        differences: differences between simulation and record, by output.
+        gain: gain of the extended model.
+        adequacy: minus the decimal logarithm of the p-value that the innovations are white, by output.
+        experiment: experiment that would separate the alternatives; None if there is none.
+        extended_model: extended model as in its file (`diagnosis.extended_model`).
+        remarks: further remarks, in sentences.
+        parameters: uncertain parameters, by name.
+        curves: curves for figures; with several runs, over `Record.continuous_min`.
+        runs: number of runs in the record.
     """
 
     samples: int
@@ -268,6 +267,6 @@ class Diagnosis:
     experiment: Experiment | None
     extended_model: dict[str, Any]
     remarks: tuple[str, ...] = ()
-    parameters: dict[str, Adjusted] = field(default_factory=dict)
+    parameters: dict[str, AdjustedParameter] = field(default_factory=dict)
     curves: Curves | None = field(default=None, repr=False, compare=False)
     runs: int = 1

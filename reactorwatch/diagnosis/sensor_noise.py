@@ -1,9 +1,9 @@
-"""Noise of sensors, estimated from the highest frequencies of what a simulation leaves.
+"""Sensor noise, estimated from the highest frequencies of a simulation's residual.
 
-A filter takes for noise of a sensor whatever its model cannot follow, and with it an error of the model that acts at
-that sensor. To judge how much the model errs, the noise has to come from elsewhere: at high frequencies a plant and
-what a model lacks show next to nothing, and the spectrum of noise is known there by its shape, white or white and a
-first-order autoregression. Its two levels are fitted by Whittle's likelihood (Whittle 1953, Arkiv for Matematik 2).
+A filter takes for sensor noise whatever its model cannot follow, and with it model error that acts at the sensor. To
+judge the model error, the noise has to be estimated independently: at high frequencies plant and model error have
+almost no power, and the spectrum of noise has a known shape, white or white plus a first-order autoregression. Its two
+levels are fitted by Whittle's likelihood (Whittle 1953, Arkiv for Matematik 2).
 """
 
 from collections.abc import Sequence
@@ -20,36 +20,38 @@ ROUNDS = 100
 _LEAST_SHARE = 1e-6
 
 
-def sensor_noise(noise: Noise, outputs: Sequence[str], residual: Array, measured: Array, period_min: float) -> Array:
-    """Standard deviation of each sensor's noise, shape (n_y,), at most what the filter takes it for.
+def estimate_sensor_noise(
+    noise: Noise, outputs: Sequence[str], residual: Array, measured: Array, period_min: float
+) -> Array:
+    """Standard deviation of each sensor's noise, shape (n_y,), at most the filter's estimate.
 
     Args:
-        noise: that the filter takes, with the memory of each sensor's noise.
-        outputs: names of the sensors.
-        residual: measured minus simulated by a free run, shape (rows, n_y); NaN where there is neither.
-        measured: shape (rows, n_y); rounding is noise, too.
-        period_min: usual distance of rows.
+        noise: the filter's noise levels, with the time constants of coloured noise.
+        outputs: names of the outputs.
+        residual: measured minus simulated, shape (rows, n_y); NaN where either is missing.
+        measured: measurements, shape (rows, n_y); quantisation is noise, too.
+        period_min: median sampling period.
     """
-    time_min = {item.output: item.time_min for item in noise.wandering}
-    found = noise.sensor_sd(outputs)
-    for place, name in enumerate(outputs):
-        kept = float(np.exp(-period_min / time_min[name])) if name in time_min else 0.0
-        level = _high_frequency_sd(residual[:, place], kept)
-        rounding = resolution(measured[:, place]) / np.sqrt(12.0)
-        found[place] = min(found[place], max(level, rounding))
-    return found
+    time_min = {item.output: item.time_min for item in noise.colored}
+    sd = noise.sensor_sd(outputs)
+    for index, name in enumerate(outputs):
+        decay = float(np.exp(-period_min / time_min[name])) if name in time_min else 0.0
+        level = _high_frequency_sd(residual[:, index], decay)
+        rounding = resolution(measured[:, index]) / np.sqrt(12.0)
+        sd[index] = min(sd[index], max(level, rounding))
+    return sd
 
 
-def _high_frequency_sd(residual: Array, kept: float) -> float:
-    """Standard deviation of white noise and an AR(1) with this coefficient; infinite if the record is too short."""
+def _high_frequency_sd(residual: Array, decay: float) -> float:
+    """Standard deviation of white noise plus an AR(1) with this coefficient; infinite if the record is too short."""
     spectrum = power_spectrum(residual)
     if spectrum is None:
         return float("inf")
     share, power = (column[spectrum[0] >= LOW[0]] for column in spectrum)
-    if kept == 0.0:
+    if decay == 0.0:
         return float(np.sqrt(np.mean(power)))
     shapes = np.stack(
-        [np.ones(share.size), (1.0 - kept**2) / (1.0 - 2.0 * kept * np.cos(np.pi * share) + kept**2)], axis=1
+        [np.ones(share.size), (1.0 - decay**2) / (1.0 - 2.0 * decay * np.cos(np.pi * share) + decay**2)], axis=1
     )
     levels = np.full(2, float(np.mean(power)))
     for _ in range(ROUNDS):  # multiplicative steps keep both levels positive

@@ -1,10 +1,10 @@
-"""Units of a record against those of the model: one check, for every command that reads a record.
+"""Check the units of a record against those of the model, for every command that reads a record.
 
-With its inputs at their median, a plant is somewhere near one of the steady states that the model has there, whatever
-is wrong with it: some scales of its states away at most. If the record is further off, and would rest at such a point
-were one of its signals multiplied by what lies between two units, the unit is wrong; or where a median is no value that
-the signal can have. And a record whose rows come so late that the process has forgotten each before the next, or which
-is over before the process has moved, has times in another unit, or nothing to say.
+With its inputs at their median, a plant is within a few scales of one of the model's steady states, whatever its
+faults. If the record is further off, and would be near one with one of its signals multiplied by a unit conversion, the
+unit is wrong; likewise if a median is out of the signal's bounds. If the rows are so far apart that the process has
+forgotten each before the next, or the record ends before the process has moved, its times have another unit, or it
+carries no information.
 """
 
 from collections.abc import Mapping
@@ -19,21 +19,21 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
 FACTORS = (60.0, 1000.0, 3600.0, 1000.0 / 60.0, 3.6, 1e6, 100.0)
-"""Between units of time, of amounts, of flows (m3/h and l/min), and of shares; either way."""
+"""Unit conversions of time, amounts, flows (m3/h and l/min) and fractions, in either direction."""
 
 FAR, NEAR = 3.0, 0.7
-"""Scales of a state: so far off nothing in the catalogue moves a plant, and so near it is at its point."""
+"""In scales of a state: no effect of the catalogue moves a plant so far; and a plant so near is at the steady state."""
 
 FORGOTTEN, MOVED = 5.0, 6.0
-"""Time constants between two rows, and in the whole record: the slowest one, and the fastest."""
+"""Maximum row distance in slowest time constants, and minimum record length in fastest ones."""
 
 
 class WrongUnit(NamedTuple):
     """A signal, or the times of a record, in another unit than the model's.
 
     Attributes:
-        text: the rule, what was found, and the cure.
-        of_times: whether it is the times that are in another unit.
+        text: the rule, the value and the cure.
+        of_times: true if the times are in another unit.
     """
 
     text: str
@@ -41,10 +41,10 @@ class WrongUnit(NamedTuple):
 
 
 def find_wrong_unit(model: ProcessModel, columns: Mapping[str, Array], time_min: Array) -> WrongUnit | None:
-    """The first unit of a record that is not the model's; None if there is none, or a signal is not in the record.
+    """Find the first unit of a record that is not the model's; None if there is none, or a signal is missing.
 
     Args:
-        model: of the plant.
+        model: process model of the plant.
         columns: values by signal, NaN where not measured; they may differ in length.
         time_min: shape (rows,).
     """
@@ -60,30 +60,30 @@ def find_wrong_unit(model: ProcessModel, columns: Mapping[str, Array], time_min:
         nearest = min(points, key=lambda point: _distance(point, y, scales))
         if _distance(nearest, y, scales) < FAR:
             return _out_of_bounds(own, typical) or _wrong_times(time_min, nearest)
-    for place, item in enumerate(own.inputs):
+    for index, item in enumerate(own.inputs):
         for factor in (*FACTORS, *(1.0 / factor for factor in FACTORS)):
             changed = u.copy()
-            changed[place] = factor * float(u[place])
+            changed[index] = factor * float(u[index])
             if _possible(own, changed) and any(_distance(point, y, scales) < NEAR for point in rests.at(changed, when)):
-                return WrongUnit(_said(item.name, item.unit, float(u[place]), f"times {factor:.4g}"))
-    for place, output in enumerate(own.outputs):
-        for value, hint in _in_other_units(float(y[place]), output.unit):
+                return WrongUnit(_describe(item.name, item.unit, float(u[index]), f"times {factor:.4g}"))
+    for index, output in enumerate(own.outputs):
+        for value, hint in _in_other_units(float(y[index]), output.unit):
             changed = y.copy()
-            changed[place] = value
+            changed[index] = value
             if any(_distance(point, changed, scales) < NEAR for point in points):
-                return WrongUnit(_said(output.name, output.unit, float(y[place]), hint))
+                return WrongUnit(_describe(output.name, output.unit, float(y[index]), hint))
     return _out_of_bounds(own, typical)
 
 
 @lru_cache(maxsize=2)
 def _steady_states(model: ProcessModel) -> SteadyStates:
-    """Compiled once for many records of a plant."""
+    """Steady states, compiled once for many records of a plant."""
     return SteadyStates(model)
 
 
 def _typical_values(model: ProcessModel, columns: Mapping[str, Array]) -> dict[str, float] | None:
-    """Median of each signal, without values that it cannot have if these are few different ones, such as -999."""
-    bounds, found = bounds_of(model), {}
+    """Median of each signal, without impossible values if these are few distinct ones, such as -999."""
+    bounds, result = bounds_of(model), {}
     for name in (*model.input_names, *model.output_names):
         values = columns.get(name, np.empty(0))
         values = values[np.isfinite(values)]
@@ -93,8 +93,8 @@ def _typical_values(model: ProcessModel, columns: Mapping[str, Array]) -> dict[s
             possible = values[(values >= bounds[name].lower) & (values <= bounds[name].upper)]
             if 2 * np.unique(possible).size > np.unique(values).size:
                 values = possible
-        found[name] = float(np.median(values))
-    return found
+        result[name] = float(np.median(values))
+    return result
 
 
 def _possible(model: ProcessModel, u: Array) -> bool:
@@ -102,7 +102,7 @@ def _possible(model: ProcessModel, u: Array) -> bool:
 
 
 def _out_of_bounds(model: ProcessModel, typical: Mapping[str, float]) -> WrongUnit | None:
-    """The first signal whose median is no value that the input or state can have."""
+    """First signal whose median is out of the input's or state's bounds."""
     for name, item in {item.name: item for item in (*model.inputs, *model.states)}.items():
         if name not in typical or item.lower <= typical[name] <= item.upper:
             continue
@@ -134,7 +134,7 @@ def _wrong_times(time_min: Array, point: SteadyState) -> WrongUnit | None:
 
 
 def _scales(model: ProcessModel) -> Array:
-    """Of the outputs: those of the states they are of."""
+    """Scales of the outputs: those of their states."""
     of_states = {state.name: state.scale for state in model.states}
     return np.array([of_states.get(output.name, np.inf) for output in model.outputs])
 
@@ -145,13 +145,13 @@ def _distance(point: SteadyState, y: Array, scales: Array) -> float:
 
 
 def _in_other_units(value: float, unit: str) -> list[tuple[float, str]]:
-    found = [(factor * value, f"times {factor:.4g}") for item in FACTORS for factor in (item, 1.0 / item)]
+    result = [(factor * value, f"times {factor:.4g}") for item in FACTORS for factor in (item, 1.0 / item)]
     if unit == "K":
-        found += [(value + 273.15, "taken as degrees C"), ((value + 459.67) / 1.8, "taken as degrees F")]
-    return found
+        result += [(value + 273.15, "taken as degrees C"), ((value + 459.67) / 1.8, "taken as degrees F")]
+    return result
 
 
-def _said(signal: str, unit: str, median: float, hint: str) -> str:
+def _describe(signal: str, unit: str, median: float, hint: str) -> str:
     return (
         f"{signal} must be in {unit}; with its median of {median:.4g} the simulation rests nowhere near the "
         f"record, but {hint} it would; check its unit"

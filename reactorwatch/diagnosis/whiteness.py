@@ -1,11 +1,10 @@
-"""Is what is left white? If the model is right, whitened innovations are, and nothing in the past tells the next one.
+"""Whiteness test of the normalised innovations.
 
-Of each output, autocorrelations over `LAGS` rows are taken together by the test of Ljung & Box (1978, On a measure of
-lack of fit in time series models, Biometrika 65), and so are the correlations with the changes of the inputs in the
-last `LAGS` rows (Hosking 1980, The multivariate portmanteau statistic, J. American Statistical Association 75, has the
-sum of squares that this is part of); not with one in the same row, for a controller may have answered. The smaller of
-the two p-values counts, twice, since there are two. Large values are cut off first, so that a few outliers do not
-decide.
+For each output, the autocorrelations over `LAGS` rows are tested together (Ljung & Box 1978, On a measure of lack of
+fit in time series models, Biometrika 65), and so are the correlations with the changes of the inputs in the last `LAGS`
+rows (Hosking 1980, The multivariate portmanteau statistic, J. American Statistical Association 75, has the sum of
+squares that this is part of), without that in the same row, because a controller may have answered. The smaller p-value
+counts, times the number of tests. Large values are clipped, so that a few outliers do not decide.
 """
 
 from math import log
@@ -17,14 +16,14 @@ from reactorwatch.arrays import Array
 
 LAGS = 20
 CUT = 4.0
-"""Standard deviations beyond which it does not matter how large a value is."""
+"""Standard deviations at which values are clipped."""
 
 BURN_IN_ROWS = 20
 WHITE = 6.0
-"""Minus the decimal logarithm of the p-value, beyond which what is left is not white: a search looks at a lot."""
+"""Minus the decimal logarithm of the p-value beyond which innovations are not white; a search tests many hypotheses."""
 
 DOUBTFUL = 3.0
-"""Likewise, beyond which it is asked whether something else explains the run better."""
+"""Minus the decimal logarithm of the p-value beyond which another explanation is looked for."""
 
 LARGEST = 999.0
 
@@ -33,23 +32,23 @@ def minus_log10_p(w: Array, inputs: Array) -> Array:
     """Minus the decimal logarithm of the p-value that each output's innovations are white, shape (n_y,).
 
     Args:
-        w: whitened innovations, shape (rows, n_y); NaN where nothing was measured.
+        w: normalised innovations, shape (rows, n_y); NaN where not measured.
         inputs: shape (rows, n_u).
     """
     changes = np.diff(inputs, axis=0)[BURN_IN_ROWS - 1 :]
-    found = []
+    result = []
     for column in w[BURN_IN_ROWS:].T:
-        known = np.isfinite(column)
-        z = np.where(known, np.clip(column, -CUT, CUT), 0.0)
-        z = np.where(known, z - z[known].mean() if known.any() else 0.0, 0.0)
+        finite = np.isfinite(column)
+        z = np.where(finite, np.clip(column, -CUT, CUT), 0.0)
+        z = np.where(finite, z - z[finite].mean() if finite.any() else 0.0, 0.0)
         logs = [_log_sf(_squares(z, z, first=1))]
         logs += [_log_sf(_squares(z, change - change.mean(), first=1)) for change in changes.T if np.ptp(change) > 0.0]
-        found.append(min(max(-(min(logs) + log(len(logs))) / log(10.0), 0.0), LARGEST))
-    return np.array(found)
+        result.append(min(max(-(min(logs) + log(len(logs))) / log(10.0), 0.0), LARGEST))
+    return np.array(result)
 
 
 def _squares(z: Array, past: Array, first: int) -> float:
-    """Sum of the squares of `LAGS` correlations of z with the past, each over its variance by chance."""
+    """Sum of `LAGS` squared correlations of z with the past, each over its variance by chance."""
     n, total = z.size, 0.0
     scale = float(np.sum(z * z) * np.sum(past * past))
     if scale <= 0.0 or n <= 2 * LAGS:
@@ -60,10 +59,10 @@ def _squares(z: Array, past: Array, first: int) -> float:
 
 
 def _log_sf(statistic: float) -> float:
-    """Logarithm of the upper tail of the chi-square distribution with `LAGS` degrees of freedom, at any distance.
+    """Logarithm of the upper tail of the chi-square distribution with `LAGS` degrees of freedom.
 
-    Of an even number of degrees it is a sum of Poisson probabilities (Abramowitz & Stegun 1964, 26.4.21). `scipy.stats`
-    has it only as far as the tail itself does not underflow, and takes half a second to import.
+    For an even number of degrees it is a sum of Poisson probabilities (Abramowitz & Stegun 1964, 26.4.21).
+    `scipy.stats` has it only as far as the tail itself does not underflow, and takes half a second to import.
 
     >>> round(_log_sf(31.4104328442309), 9) == round(log(0.05), 9)
     True

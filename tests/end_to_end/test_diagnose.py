@@ -84,8 +84,8 @@ def test_simulate_with_the_extended_model_is_the_free_run_of_the_diagnosis(
     # the diagnosis lets its filter find the start, the command takes the first row's: the reactor forgets it in minutes
     settled = slice(300, None)
     for name, close in (("C", 5e-4), ("T", 0.05)):
-        np.testing.assert_allclose(simulated[name][settled], known.curves.free_after[name][settled], atol=close)
-        assert np.max(np.abs(known.curves.free_before[name] - simulated[name])[settled]) > 20 * close
+        np.testing.assert_allclose(simulated[name][settled], known.curves.simulated_after[name][settled], atol=close)
+        assert np.max(np.abs(known.curves.simulated_before[name] - simulated[name])[settled]) > 20 * close
 
 
 def test_the_same_record_against_the_extended_model_is_nominal(
@@ -218,7 +218,7 @@ def test_the_drawing_has_both_models_on_one_timeline(
             if name.endswith("Scalars:scalars"):
                 values = [value for row in table.column(name).to_pylist() if row is not None for value in row]
                 drawn.setdefault(str(chunk.entity_path), []).extend(values)
-    for expected in (known.curves.measured["T"], known.curves.free_before["T"], known.curves.free_after["T"]):
+    for expected in (known.curves.measured["T"], known.curves.simulated_before["T"], known.curves.simulated_after["T"]):
         assert any(
             len(values) == ROWS and np.allclose(values, expected, atol=1e-9, equal_nan=True)
             for values in drawn.values()

@@ -41,7 +41,7 @@ def test_plots_and_tables_end_within_the_page(page: Browser, case: str, width: i
     assert page.evaluate("document.querySelectorAll('figure > svg').length") >= 4
     assert page.evaluate(BEYOND) == 0
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    tables = ".wide" if width >= 800 else ".wide:has(.strips), .wide:has(.rivals)"
+    tables = ".wide" if width >= 800 else ".wide:has(.strips), .wide:has(.alternatives)"
     assert page.evaluate(SPILLED.format(selector=tables)) == 0
     assert page.evaluate(SPILLED.format(selector="figure")) == 0
 

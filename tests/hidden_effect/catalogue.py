@@ -1,8 +1,8 @@
-"""Which effects are hidden, how large, and with what courses; and where those act that are in no catalogue.
+"""Effects that are hidden, their sizes and profiles; and the locations of those in no catalogue.
 
 `smallest` is about the least that is worth finding: with the input stepping widely (`excitation.py`), 0.3 K or 0.002
 mol/l on average over the record, as much as the noise of an ordinary thermometer or analyser. `largest` is ten times
-that, or where the reactor begins to leave its branch.
+that, or where the reactor starts to leave its branch.
 """
 
 from dataclasses import dataclass
@@ -87,7 +87,7 @@ _OPEN = {"side_reaction.E2": 15e3, "side_reaction.heat": 100.0, "wall_heat_capac
 
 
 def named() -> tuple[HiddenEffect, ...]:
-    """Those of the catalogue that the software knows by name."""
+    """Effects of the catalogue that the software has."""
     known = {effect.name for effect in EFFECTS}
     return tuple(item for item in CATALOGUE if item.name in known)
 

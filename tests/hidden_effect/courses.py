@@ -1,7 +1,7 @@
-"""How a hidden deviation goes in time, as numbers that the compiled plant of `plant.py` reads.
+"""Profile of a hidden deviation, as numbers that the compiled plant of `plant.py` reads.
 
-Written anew from the words of the catalogue (constant, step, ramp, decay, sine, free), so that what the software's own
-profiles do is checked and not repeated. Beside them `pulses`, which no profile is: on and off, over and over.
+Written independently from the words of the catalogue (constant, step, ramp, decay, sine, free), so that the software's
+profiles are checked and not repeated. Beside them are `pulses`, on and off repeatedly, which are no profile.
 """
 
 from dataclasses import dataclass

@@ -176,7 +176,7 @@ def _random(size: float, begin: float, end: float, rng: np.random.Generator) -> 
 
 
 def _noise(circumstances: Circumstances, rows: int, rng: np.random.Generator) -> Array:
-    """Of the sensors of C and T, shape (rows, 2)."""
+    """Noise of the sensors of C and T, shape (rows, 2)."""
     drawn = rng.standard_normal((rows, 2))
     kept = circumstances.correlation
     if kept:
@@ -187,7 +187,7 @@ def _noise(circumstances: Circumstances, rows: int, rng: np.random.Generator) ->
 def _record(
     plan: Plan, played: Played, noise: Array, circumstances: Circumstances, rng: np.random.Generator
 ) -> tuple[Record, Array]:
-    """What is measured of a run, and what would be without noise."""
+    """Measurements of a run, and their noise-free values."""
     shown = np.stack([played.concentration, played.temperature], axis=1)
     values = shown + noise
     if circumstances.outliers:
@@ -208,7 +208,7 @@ def _record(
 
 
 def _strengths(plan: Plan, played: Played, noise_sd: tuple[float, float]) -> list[float]:
-    """How much each effect of a plan shows, beside the others."""
+    """Strength of each effect of a plan, beside the others."""
     found = []
     for name in plan.deviations:
         others = {other: course for other, course in plan.deviations.items() if other != name}
@@ -217,7 +217,7 @@ def _strengths(plan: Plan, played: Played, noise_sd: tuple[float, float]) -> lis
 
 
 def _strength(plan: Plan, played: Played, others: dict[str, HiddenCourse], noise_sd: tuple[float, float]) -> float:
-    """What a simulation that knows only some of the deviations gets wrong, fed with the qc of the record."""
+    """Error of a simulation with only some of the deviations, fed with the record's qc."""
     fed = replace(plan, command=played.qc, controller=None, deviations=others)
     if plan.controller is not None and fed.start is None:
         fed = replace(fed, start=(float(played.state[0, 0]), float(played.state[0, 1])))

@@ -1,4 +1,4 @@
-"""What is done to the plant while it is recorded, and how the record looks."""
+"""Excitation of the plant during the recording, and the form of the record."""
 
 from dataclasses import dataclass
 
@@ -74,13 +74,13 @@ NAMED_CIRCUMSTANCES: dict[str, Circumstances] = {
 
 @dataclass(frozen=True, eq=False)
 class Handling:
-    """What is done to the plant.
+    """Operation of the plant.
 
     Attributes:
-        time_min: of the rows, shape (rows,).
-        command: of each row, l/min; with a controller the dither.
-        controller: if any.
-        set_point_K: of it, in each row.
+        time_min: times of the rows, shape (rows,).
+        command: command in each row, l/min; with a controller the dither.
+        controller: controller, if any.
+        set_point_K: its set point in each row.
     """
 
     time_min: Array

@@ -1,4 +1,4 @@
-"""What happens in a run, and what is seen of it from outside. The equations are in `reactor.py`."""
+"""Events of a run and their measurements. The equations are in `reactor.py`."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -42,20 +42,20 @@ class Controller(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """What happens in a run.
+    """Plan of a run.
 
     Attributes:
-        time_min: of the rows.
-        command: of each row, l/min, held until the next one; with a controller the dither.
-        deviations: by name of the effect.
-        constants: of the effects, see `reactor`.
-        interpolated: whether the command goes straight from row to row instead.
-        controller: that has the valve, if any.
-        set_point_K: of the controller, in each row.
-        measured_noise_K: on the temperature that the controller sees, in each row.
-        process_sd: of C and T, each in its unit per square root of a minute.
-        seed: of the process noise.
-        start: C and T in the first row; None: where the plant is after `BEFORE_MIN`.
+        time_min: times of the rows.
+        command: command in each row, l/min, held until the next one; with a controller the dither.
+        deviations: deviations by name of the effect.
+        constants: constants of the effects, see `reactor`.
+        interpolated: true if the command is linear between rows instead.
+        controller: controller of the valve, if any.
+        set_point_K: set point of the controller in each row.
+        measured_noise_K: noise of the controller's temperature in each row.
+        process_sd: process noise of C and T, each in its unit per square root of a minute.
+        seed: seed of the process noise.
+        start: C and T in the first row; None: the state after `BEFORE_MIN`.
     """
 
     time_min: Array
@@ -72,12 +72,12 @@ class Plan:
 
 
 class Played(NamedTuple):
-    """What happened, row by row.
+    """Course of a run, row by row.
 
     Attributes:
-        qc: commanded, l/min.
-        concentration: that the analyser shows without noise, mol/l.
-        temperature: that the thermometer shows without noise, K.
+        qc: commanded flow, l/min.
+        concentration: noise-free reading of the analyser, mol/l.
+        temperature: noise-free reading of the thermometer, K.
         state: C and T in the reactor, shape (rows, 2).
     """
 
@@ -183,7 +183,7 @@ def _moments(plan: Plan, input_min: Array) -> Array:
 
 
 def _push(plan: Plan, moments: Array) -> Array:
-    """What the process noise adds to the rates of C and T, held from moment to moment."""
+    """Process noise added to the rates of C and T, held from moment to moment."""
     if not any(plan.process_sd):
         return np.zeros((moments.size - 1, 2))
     place = np.floor((moments[:-1] - moments[0]) / PUSH_MIN + 1e-6).astype(int)

@@ -121,13 +121,13 @@ def duty_of(T: float, flow: float, m: Array) -> float:
 
 @jit
 def flow_of(valve: float, m: Array) -> float:
-    """What flows where the valve stands at some flow, l/min."""
+    """Flow through the valve at its position, l/min."""
     return float(valve * (1.0 + m[COOLANT_FLOW]) * (1.0 + m[CURVED_VALVE] * ((valve - 100.0) / 10.0) ** 2))
 
 
 @jit
 def outlet_of(inside: float, feed: float, m: Array) -> float:
-    """What leaves the reactor, where a share of the feed takes a short cut."""
+    """Outlet of the reactor, where a share of the feed bypasses it."""
     return float((1.0 - m[BYPASS]) * inside + m[BYPASS] * feed)
 
 
@@ -145,13 +145,13 @@ def outlet_concentration(C: float, m: Array) -> float:
 
 @jit
 def shown_temperature(T: float, m: Array) -> float:
-    """What the thermometer shows where its sensing element is at T."""
+    """Reading of the thermometer at its element's temperature T."""
     return float(T + m[TEMPERATURE_BIAS] + m[BOWED_THERMOMETER] * ((T - 438.54) / 10.0) ** 2)
 
 
 @jit
 def shown_concentration(C: float, m: Array) -> float:
-    """What the analyser shows of a sample."""
+    """Reading of the analyser for a sample."""
     sampled = C - m[ANALYSER_SATURATION] * max(C - HIGH_MOL_L, 0.0)
     return float(sampled * (1.0 + m[CONCENTRATION_GAIN]) + m[CONCENTRATION_BIAS])
 

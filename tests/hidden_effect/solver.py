@@ -66,7 +66,7 @@ def deviate(m: Array, effects: Places, flat: Array, offsets: Places, t: float, m
 def analysed(
     time_min: Array, moments: Array, state: Array, effects: Places, flat: Array, offsets: Places, delayed: bool
 ) -> Array:
-    """What the analyser shows in each row."""
+    """Reading of the analyser in each row."""
     m = np.zeros(DEVIATIONS)
     shown = np.empty(time_min.size)
     for row in range(time_min.size):
@@ -92,7 +92,7 @@ def follow(x: Array, valve: float, m: Array) -> None:
 
 @jit
 def moved(valve: float, command: float, m: Array) -> float:
-    """Where the valve stands when it has heard a command."""
+    """Position of the valve after a command."""
     if m[VALVE_BACKLASH] > 0.0:
         half = 0.5 * float(m[VALVE_BACKLASH])
         return min(max(valve, command - half), command + half)

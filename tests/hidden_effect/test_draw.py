@@ -1,4 +1,4 @@
-"""What is drawn is what was asked for: the same from the same seed, and each circumstance as it says."""
+"""Drawn records: the same from the same seed, and each circumstance as specified."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ FEED = CATALOGUE[0]
 
 
 def noise_of(hidden: Hidden) -> Array:
-    """What the sensors added, in standard deviations, shape (rows, 2); only where no row is missing."""
+    """Noise of the sensors in standard deviations, shape (rows, 2); only without missing rows."""
     true = np.stack([hidden.played.concentration, hidden.played.temperature], axis=1)
     shown = np.stack([hidden.record.columns["C"], hidden.record.columns["T"]], axis=1)
     return np.asarray((shown - true) / np.array(hidden.circumstances.noise_sd))

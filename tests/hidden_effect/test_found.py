@@ -71,7 +71,7 @@ def found(name: str) -> tuple[Hidden, Diagnosis, Judged]:
 
 
 def at_least(count: int, share: float) -> int:
-    """How many of so many must be right, if a share is promised."""
+    """Number of correct answers required for a promised share."""
     return int(binom.ppf(UNLUCKY, count, share))
 
 

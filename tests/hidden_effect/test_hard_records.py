@@ -1,4 +1,4 @@
-"""What is promised of hard records (docs/diagnosis.md): what is nominal stays so, and no cause is misnamed alone."""
+"""Promises for hard records (docs/diagnosis.md): nominal ones stay nominal, and no cause is named wrongly alone."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Where the process itself is noisy, sizes are off by as much as their intervals say."""
+"""In a noisy process, the errors of sizes agree with their intervals."""
 
 from dataclasses import replace
 
@@ -6,10 +6,10 @@ import numpy as np
 from scipy.stats import chi2
 
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
-from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import HiddenEffect, named
@@ -24,19 +24,19 @@ UNLUCKY = 1e-3
 
 
 def off_in_sd(hidden_effect: HiddenEffect, seed: int) -> float:
-    """What the size of a constant cause is off by, in standard deviations that its fit says."""
+    """Error of a constant cause's size, in standard deviations of its fit."""
     circumstances = replace(NAMED_CIRCUMSTANCES["more process noise"], span_min=SPAN_MIN)
     hidden = draw(seed, (hidden_effect,), circumstances, ("constant",))
-    run = run_of(hidden.record, cstr())
+    run = make_run(hidden.record, cstr())
     effect = next(item for item in EFFECTS if item.name == hidden_effect.name)
-    sized = Sized(cstr(), (effect,), Noise(circumstances.noise_sd, (0.0, 0.0)))
-    hypothesis = Hypothesis(sized, (Constant(run.time_min),))
+    ekf = FaultFilter(cstr(), (effect,), Noise(circumstances.noise_sd, (0.0, 0.0)))
+    hypothesis = Hypothesis(ekf, (Constant(run.time_min),))
     truth = hidden.courses[0].size
-    fit = hypothesis.at(run, (np.array([truth]),))
+    fit = hypothesis.evaluate(run, (np.array([truth]),))
     for _ in range(2):
-        sized.noise = sized.tuned(run, hypothesis.signals(fit), SMALLEST_SD)
-        fit = hypothesis.fit(run, fit.theta)
-    return float((fit.theta[0][0] - truth) / np.sqrt(hypothesis.covariance(run, fit)[0, 0]))
+        ekf.noise = ekf.estimate_noise(run, hypothesis.signals(fit), SMALLEST_SD)
+        fit = hypothesis.fit(run, fit.parameters)
+    return float((fit.parameters[0][0] - truth) / np.sqrt(hypothesis.covariance(run, fit)[0, 0]))
 
 
 def test_sizes_scatter_about_the_truth_as_their_standard_deviations_say() -> None:

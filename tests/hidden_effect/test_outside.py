@@ -19,7 +19,7 @@ NAMES = [effect.name for effect in OUTSIDE]
 
 @cache
 def found(name: str) -> Judged:
-    """What is said of a record in which an effect is hidden, and how that compares."""
+    """Diagnosis of a record with a hidden effect, and its evaluation."""
     place = NAMES.index(name)
     hidden = draw(SEED + place, (OUTSIDE[place],), replace(NAMED_CIRCUMSTANCES["medium"], span_min=SPAN_MIN))
     return judge(hidden, diagnose(hidden.record, cstr()), seconds=0.0)

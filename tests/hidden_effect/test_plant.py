@@ -19,7 +19,7 @@ Rates = Callable[[float, Array, float], list[float]]
 
 
 def solved(rates: Rates, flow: float, begin: float, end: float, start: Array) -> OdeSolution:
-    """By SciPy's solver of order 8 with the flow held, as good as exact."""
+    """Solution by SciPy's solver of order 8 with the flow held, as good as exact."""
 
     def held(t: float, x: Array) -> list[float]:
         return rates(t, x, flow)
@@ -245,7 +245,7 @@ def test_the_controller_moves_the_valve_in_proportion_to_what_it_sees() -> None:
 
 
 def test_process_noise_makes_a_random_walk_of_the_stated_size() -> None:
-    """Where hardly anything reacts, dT = -a T dt + sd dW, whose variance is sd^2 / 2a (Ornstein & Uhlenbeck)."""
+    """Without reaction dT = -a T dt + sd dW, whose variance is sd^2 / 2a (Ornstein & Uhlenbeck)."""
     time_min, command = 0.1 * np.arange(20_000, dtype=np.float64), np.full(20_000, 100.0)
     quiet, pushed = (
         play(Plan(time_min, command, process_sd=(0.0, sd), seed=4, start=(0.964, 353.55))).state for sd in (0.0, 0.05)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.profiles import Step
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect
@@ -35,7 +35,7 @@ QUICK_LAG, QUICK_DELAY = 0.15, 0.06
 
 
 def relative_error(effect: Effect, size: float, profile: Profile = CONSTANT) -> float:
-    """What the software's run is off by, relative to what the effect makes; the worse of C and T."""
+    """Error of the software's run relative to the effect; the worse of C and T."""
     changes = {f"{effect.name}.size": size} | ({f"{effect.name}.onset": ONSET_MIN} if profile is STEP else {})
     model = effect.extend(cstr(), profile).with_values(changes)
     # By hand the plant has been running at the first flow for half an hour: it is at rest.
@@ -77,6 +77,6 @@ def test_a_filter_that_knows_when_the_stamps_became_late_has_nothing_to_correct(
     timing = next(item for item in EFFECTS if item.name == "sample_timing")
     by_hand = play(Plan(TIME, COMMAND, {"sample_timing": HiddenCourse("step", size, onset_min)}))
     run = Run(TIME, COMMAND[:, None], np.stack([by_hand.concentration, by_hand.temperature], axis=1))
-    knowing = Sized(cstr(), (timing,), Noise((0.002, 0.3), (0.001, 0.3)))
-    followed = knowing.follow(run, [Step(TIME).signal(np.array([size, onset_min]))])
-    assert np.nanmax(np.abs(followed.w)) < 1e-3
+    knowing = FaultFilter(cstr(), (timing,), Noise((0.002, 0.3), (0.001, 0.3)))
+    results = knowing.evaluate(run, [Step(TIME).signal(np.array([size, onset_min]))])
+    assert np.nanmax(np.abs(results.w)) < 1e-3

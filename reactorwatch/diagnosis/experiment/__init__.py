@@ -1,1 +1,1 @@
-"""Design of an experiment that separates explanations."""
+"""Design of an experiment that separates alternative explanations."""

@@ -1,22 +1,21 @@
-"""A rival explanation as it would go on while another input is tried, and how well another could imitate it.
+"""Predictions of an alternative explanation for a new input, and how well another alternative could imitate them.
 
-The causes stay in the plant. What set in stays as large as it was at the end of the record; what swings goes on
-swinging. So an input that has not been tried yet has a predicted course of outputs under each rival.
+The causes stay in the plant: what has set in keeps its magnitude at the end of the record, a sine goes on. So each
+alternative predicts the outputs for an input that has not been tried.
 
-Say rival i is true. What the record of the experiment would hold against rival j is not the difference of the two
-predictions but the part of it that j cannot imitate by other numbers (Atkinson & Fedorov 1975, The design of
-experiments for discriminating between two rival models, Biometrika 62; Hunter & Reiner 1965, Designs for discriminating
-between two rival models, Technometrics 7). It is taken where the diagnosis will take it: the filter of j is run over
-what i predicts, without noise. With w its whitened innovations, g their derivatives by the numbers of j and L what is
-known of these numbers beforehand,
+Assume alternative i is true. The evidence against alternative j is not the difference of the two predictions but the
+part that j cannot imitate with other parameters (Atkinson & Fedorov 1975, The design of experiments for discriminating
+between two rival models, Biometrika 62; Hunter & Reiner 1965, Designs for discriminating between two rival models,
+Technometrics 7). It is computed as in the diagnosis: the filter of j runs over the noise-free prediction of i. With w
+its normalised innovations, g their derivatives by the parameters of j and L the prior information on these parameters,
 
     lambda = w'w - w'g (g'g + L)^-1 g'w
 
-is the noncentrality of the likelihood ratio test of j: with noise, twice the logarithm of the likelihood ratio is on
-average lambda, up to the numbers fitted, and its standard deviation is 2 sqrt(lambda). As that filter has the noise of
-the process in it, evidence that such noise would hide does not count. Of the numbers only their bounds are taken to be
-known, not what the present record says of them: the record of the experiment shall decide by itself, also if the
-cause has grown or shrunk meanwhile. Evaluated together with the present record it says no less.
+is the noncentrality of the likelihood ratio test of j: with noise, twice the log likelihood ratio is on average lambda,
+up to the number of fitted parameters, and its standard deviation is 2 sqrt(lambda). The filter has the process noise,
+so evidence that this noise would hide does not count. L contains only the parameters' bounds and not the present
+record: the record of the experiment has to decide by itself, also if the cause has changed in the meantime. Evaluated
+together with the present record it says no less.
 """
 
 from math import sqrt
@@ -25,37 +24,37 @@ import numpy as np
 from scipy import special
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.grid_search import fitted
+from reactorwatch.diagnosis.fitting.grid_search import fit_hypothesis
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
-from reactorwatch.diagnosis.fitting.profiles import Constant, Course, Sine
+from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, Sine
 from reactorwatch.diagnosis.result import LISTED
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.simulate import Simulator, Trajectory
 
 REFINED_STEPS = 1
-"""Of a fit: the first one leads where the linear equations say, to what the nonlinear ones make of it."""
+"""Steps of a fit: the first takes the linear solution to the nonlinear equations."""
 
 LARGEST_SHARE = 0.5
-"""Of the time that is looked at: what swings more slowly is taken to stay as it is."""
+"""Fraction of the pattern's time: a sine with a longer period is taken as constant."""
 
 
-class Rival:
-    """An explanation that has been fitted to a record, going on after its end.
+class Prediction:
+    """A fitted explanation, extrapolated beyond the end of its record.
 
     Attributes:
         causes: names of its effects.
-        label: what people call them.
-        freedom: how many numbers are fitted to a record of the experiment.
-        begin_min: when the experiment begins.
+        label: labels of its effects.
+        n_parameters: number of parameters fitted to a record of the experiment.
+        start_min: start of the experiment.
 
     Args:
-        hypothesis: with the noise that holds.
-        fit: of it.
+        hypothesis: hypothesis at the present noise levels.
+        fit: its fit.
         run: the record.
-        resting: the inputs at which the plant settles before the experiment, shape (n_u,).
-        rest_rows: how many rows it has for that.
-        pattern_min: what swings must swing faster than this to be taken for swinging.
+        resting: inputs at which the plant settles before the experiment, shape (n_u,).
+        rest_rows: number of rows for settling.
+        pattern_min: length of the pattern; only sines of shorter periods are extrapolated as sines.
     """
 
     def __init__(
@@ -63,91 +62,93 @@ class Rival:
     ) -> None:
         self.causes = hypothesis.causes
         self.label = " with ".join(
-            effect.labels.get(course.name, effect.label)
-            for effect, course in zip(hypothesis.sized.effects, hypothesis.courses, strict=True)
+            effect.labels.get(profile.name, effect.label)
+            for effect, profile in zip(hypothesis.filter.effects, hypothesis.profiles, strict=True)
         )
         self._hypothesis, self._fit, self._pattern_min = hypothesis, fit, pattern_min
-        self._simulator = Simulator(hypothesis.sized.whole.model)
+        self._simulator = Simulator(hypothesis.filter.full_model.model)
         period_min = float(np.median(np.diff(run.time_min)))
         time_min: Array = float(run.time_min[-1]) + period_min * np.arange(rest_rows + 1, dtype=np.float64)
-        self.begin_min = float(time_min[-1])
-        self.freedom = self._going_on(time_min)[0].freedom
-        known = np.flatnonzero(np.all(np.isfinite(fit.found.x), axis=1))
-        start = fit.found.x[known[-1], : hypothesis.sized.own_states]
+        self.start_min = float(time_min[-1])
+        self.n_parameters = self._extrapolate(time_min)[0].n_parameters
+        finite = np.flatnonzero(np.all(np.isfinite(fit.innovations.x), axis=1))
+        start = fit.innovations.x[finite[-1], : hypothesis.filter.n_plant_states]
         rested = self._run(time_min, np.tile(resting, (time_min.size, 1)), start)
         self._start = None if rested is None else rested.states[-1]
 
     @property
     def name(self) -> str:
-        """Its causes, in one word."""
+        """Names of its causes, joined by a plus."""
         return "+".join(self.causes)
 
-    def outputs(self, time_min: Array, inputs: Array) -> Array | None:
-        """What is measured but for noise, from rest, shape (rows, n_y); None if the equations run away.
+    def predict_outputs(self, time_min: Array, inputs: Array) -> Array | None:
+        """Noise-free outputs from rest, shape (rows, n_y); None if the simulation diverges.
 
         Args:
-            time_min: of the rows, after the record's end, shape (rows,).
+            time_min: times of the rows, after the record's end, shape (rows,).
             inputs: shape (rows, n_u).
         """
-        found = None if self._start is None else self._run(time_min, inputs, self._start)
-        return None if found is None else found.outputs
+        result = None if self._start is None else self._run(time_min, inputs, self._start)
+        return None if result is None else result.outputs
 
-    def unexplained(self, truth: Run) -> float:
-        """The lambda of the module: what it cannot imitate of a run."""
-        hypothesis, theta = self._going_on(truth.time_min)
-        return hypothesis.unexplained(truth, hypothesis.at(truth, theta))
+    def noncentrality(self, truth: Run) -> float:
+        """Noncentrality (lambda in the module) of a run that another alternative predicts."""
+        hypothesis, parameters = self._extrapolate(truth.time_min)
+        return hypothesis.unexplained_sum(truth, hypothesis.evaluate(truth, parameters))
 
     def own_loss(self, run: Run) -> float:
-        """Minus the log likelihood of what it predicts itself."""
-        hypothesis, theta = self._going_on(run.time_min)
-        return hypothesis.at(run, theta).loss
+        """Negative log likelihood of its own prediction."""
+        hypothesis, parameters = self._extrapolate(run.time_min)
+        return hypothesis.evaluate(run, parameters).loss
 
     def loss(self, run: Run) -> float:
-        """Minus the log likelihood of what another predicts, at its best."""
-        hypothesis, theta = self._going_on(run.time_min)
-        return fitted(run, hypothesis, theta, REFINED_STEPS).loss
+        """Negative log likelihood of another's prediction, at its best fit."""
+        hypothesis, parameters = self._extrapolate(run.time_min)
+        return fit_hypothesis(run, hypothesis, parameters, REFINED_STEPS).loss
 
-    def _going_on(self, time_min: Array) -> tuple[Hypothesis, list[Array]]:
-        courses, numbers = [], []
-        for course, theta in zip(self._hypothesis.courses, self._fit.theta, strict=True):
-            later, then = going_on(course, theta, time_min, self._pattern_min)
-            courses.append(later)
-            numbers.append(then)
-        return Hypothesis(self._hypothesis.sized, courses), numbers
+    def _extrapolate(self, time_min: Array) -> tuple[Hypothesis, list[Array]]:
+        profiles, values = [], []
+        for profile, parameters in zip(self._hypothesis.profiles, self._fit.parameters, strict=True):
+            later, then = extrapolate(profile, parameters, time_min, self._pattern_min)
+            profiles.append(later)
+            values.append(then)
+        return Hypothesis(self._hypothesis.filter, profiles), values
 
     def _run(self, time_min: Array, inputs: Array, start: Array) -> Trajectory | None:
-        hypothesis, theta = self._going_on(time_min)
-        signals = [course.signal(numbers) for course, numbers in zip(hypothesis.courses, theta, strict=True)]
+        hypothesis, parameters = self._extrapolate(time_min)
+        signals = [profile.signal(values) for profile, values in zip(hypothesis.profiles, parameters, strict=True)]
         try:
-            return self._simulator.run(time_min, hypothesis.sized.whole.inputs(time_min, inputs, signals), start)
+            return self._simulator.run(time_min, hypothesis.filter.full_model.inputs(time_min, inputs, signals), start)
         except SimulationError:
             return None
 
 
-def going_on(course: Course, theta: Array, time_min: Array, pattern_min: float) -> tuple[Course, Array]:
-    """A deviation after the record: its course and numbers.
+def extrapolate(
+    profile: FittedProfile, parameters: Array, time_min: Array, pattern_min: float
+) -> tuple[FittedProfile, Array]:
+    """Extrapolate a deviation beyond the record: its profile and parameters.
 
     Args:
-        course: in the record.
-        theta: its numbers there.
-        time_min: of the rows to come, shape (rows,).
-        pattern_min: see `Rival`.
+        profile: profile in the record.
+        parameters: its parameters there.
+        time_min: times of the new rows, shape (rows,).
+        pattern_min: see `Prediction`.
     """
-    if isinstance(course, Sine) and theta[2] <= LARGEST_SHARE * pattern_min:
-        angle = 2.0 * np.pi / theta[2] * (float(time_min[0]) - course.begin_min)
+    if isinstance(profile, Sine) and parameters[2] <= LARGEST_SHARE * pattern_min:
+        angle = 2.0 * np.pi / parameters[2] * (float(time_min[0]) - profile.start_min)
         turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-        return Sine(time_min), np.append(turn @ theta[:2], theta[2])
-    return Constant(time_min), course.signal(theta).at_row[-1:]
+        return Sine(time_min), np.append(turn @ parameters[:2], parameters[2])
+    return Constant(time_min), profile.signal(parameters).sample_value[-1:]
 
 
-def probability(expected: float, evidence: float) -> float:
-    """The probability that a difference in BIC with this expectation is larger than `LISTED`.
+def probability_decided(expected: float, evidence: float) -> float:
+    """Probability that the difference in BIC exceeds `LISTED`.
 
     Args:
-        expected: the difference in BIC.
-        evidence: the noncentrality in it.
+        expected: expected difference in BIC.
+        evidence: its noncentrality.
 
-    >>> round(probability(30.0, 30.0), 3)
+    >>> round(probability_decided(30.0, 30.0), 3)
     0.966
     """
     return float(special.ndtr((expected - LISTED) / max(2.0 * sqrt(evidence), 1e-9)))

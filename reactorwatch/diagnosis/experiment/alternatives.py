@@ -1,4 +1,4 @@
-"""Several rivals, run with the same input and held to the same limits."""
+"""Several alternatives with the same input and the same limits."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -6,41 +6,41 @@ from itertools import combinations
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.experiment.alternative import Rival
-from reactorwatch.diagnosis.experiment.constraints import Limits, limits_of, within
-from reactorwatch.diagnosis.experiment.input_sequence import Ends
+from reactorwatch.diagnosis.experiment.alternative import Prediction
+from reactorwatch.diagnosis.experiment.constraints import Limits, keeps_limits, limits_of
+from reactorwatch.diagnosis.experiment.input_sequence import InputRange
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.search import Explained
+from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.process.model import ProcessModel
 
 MARGIN_SD = 3.0
-"""Standard deviations of its noise that an output stays away from its limits, so that what is measured keeps them."""
+"""Margin of an output to its limits, in standard deviations of its noise, so that the measurements keep them."""
 
 REST_ROWS = 300
 
 
-class Rivals:
-    """Explanations of one record, going on after its end with other levels of the first input.
+class Predictions:
+    """Explanations of one record, extrapolated with other levels of the first input.
 
     Args:
-        explained: fitted to the record.
+        hypotheses: hypotheses fitted to the record.
         run: the record.
-        model: without any of their causes.
-        noise: of the plant and its sensors.
-        given: limits, by signal; of the others see `limits_of`.
-        pattern_rows: see `Rival`.
+        model: process model without their causes.
+        noise: noise levels of the plant and its sensors.
+        given: limits by signal; for the others see `limits_of`.
+        pattern_rows: rows of the pattern, see `Prediction`.
 
     Attributes:
-        pairs: places of every two of them.
-        limits: of every signal.
-        rest: level of the first input at which the plant settles before; what it mostly was.
-        period_min: between two rows.
+        pairs: indices of every two of them.
+        limits: limits of every signal.
+        rest: level of the first input at which the plant settles before, its median in the record.
+        period_min: sampling period.
     """
 
     def __init__(
         self,
-        explained: Sequence[Explained],
+        hypotheses: Sequence[FittedHypothesis],
         run: Run,
         model: ProcessModel,
         noise: Noise,
@@ -54,46 +54,46 @@ class Rivals:
         low, high = self.limits[model.input_names[0]]
         self._resting = np.median(run.inputs, axis=0)
         rest = min(max(float(self._resting[0]), low), high)
-        self._resting[0] = self.rest = float(Ends(low, high, rest).levels(np.zeros(1))[0])
-        for item in explained:
-            item.hypothesis.sized.noise = noise
+        self._resting[0] = self.rest = float(InputRange(low, high, rest).levels(np.zeros(1))[0])
+        for item in hypotheses:
+            item.hypothesis.filter.noise = noise
         pattern_min = pattern_rows * self.period_min
         self.members = tuple(
-            Rival(item.hypothesis, item.fit, run, self._resting, REST_ROWS, pattern_min) for item in explained
+            Prediction(item.hypothesis, item.fit, run, self._resting, REST_ROWS, pattern_min) for item in hypotheses
         )
         self.pairs = list(combinations(range(len(self.members)), 2))
 
     def runs(self, levels: Array) -> list[Run] | None:
-        """What each predicts, as records without noise; None if under one of them an output leaves its limits.
+        """Noise-free records that each predicts; None if an output of any leaves its limits.
 
         Args:
-            levels: of the first input, shape (rows,).
+            levels: levels of the first input, shape (rows,).
         """
-        time_min = self.members[0].begin_min + self.period_min * np.arange(levels.size, dtype=np.float64)
+        time_min = self.members[0].start_min + self.period_min * np.arange(levels.size, dtype=np.float64)
         inputs = np.tile(self._resting, (levels.size, 1))
         inputs[:, 0] = levels
-        found = []
-        for rival in self.members:
-            outputs = rival.outputs(time_min, inputs)
-            if outputs is None or not within(outputs, self.limits, self._outputs, self._margin):
+        result = []
+        for alternative in self.members:
+            outputs = alternative.predict_outputs(time_min, inputs)
+            if outputs is None or not keeps_limits(outputs, self.limits, self._outputs, self._margin):
                 return None
-            found.append(Run(time_min, inputs, outputs))
-        return found
+            result.append(Run(time_min, inputs, outputs))
+        return result
 
-    def unexplained(self, pair: tuple[int, int], runs: Sequence[Run]) -> float:
-        """What the second of a pair cannot imitate of what the first predicts."""
+    def noncentrality(self, pair: tuple[int, int], runs: Sequence[Run]) -> float:
+        """Part of the first's prediction that the second of a pair cannot imitate, linearised."""
         true, other = pair
-        return self.members[other].unexplained(runs[true])
+        return self.members[other].noncentrality(runs[true])
 
     def noncentralities(self, runs: Sequence[Run]) -> dict[tuple[int, int], float]:
-        """Twice the log likelihood of each of them, if it is true, over each other, without what chance brings.
+        """Twice the log likelihood ratio of each, if true, over each other, without noise.
 
-        Unlike what is `unexplained` it is taken from fits, and so as far from linear as the equations are.
+        Unlike `noncentrality` it comes from fits, so it contains the nonlinearity of the equations.
         """
-        found = {}
+        result = {}
         for true, run in enumerate(runs):
             own = self.members[true].own_loss(run)
-            for other, rival in enumerate(self.members):
+            for other, alternative in enumerate(self.members):
                 if other != true:
-                    found[true, other] = max(2.0 * (rival.loss(run) - own), 0.0)
-        return found
+                    result[true, other] = max(2.0 * (alternative.loss(run) - own), 0.0)
+        return result

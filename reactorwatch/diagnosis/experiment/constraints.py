@@ -1,4 +1,4 @@
-"""Limits that an experiment keeps: of the input that is moved, and of the outputs as each rival predicts them."""
+"""Constraints of an experiment: limits of the input and of the outputs that each alternative predicts."""
 
 from collections.abc import Mapping
 from math import isfinite
@@ -15,17 +15,17 @@ Limits: TypeAlias = dict[str, tuple[float, float]]
 """Lowest and highest value, by signal."""
 
 WIDER, SCALE_SHARE = 0.25, 0.5
-"""Where nothing is said: the record's range, and to either side the larger of such a share of it and of the scale."""
+"""Default limits: the record's range, widened on either side by the larger of a fraction of it and of the scale."""
 
 _TAIL = 0.005
-"""Of an output's values, noise and outliers, that its range leaves out at either end."""
+"""Fraction of an output's values, noise and outliers, that is cut off either end of its range."""
 
 
-def checked_limits(model: ProcessModel, given: Mapping[str, tuple[float, float]]) -> None:
-    """Hold that limits can be meant.
+def check_limits(model: ProcessModel, given: Mapping[str, tuple[float, float]]) -> None:
+    """Check that limits are valid.
 
     Raises:
-        InputError: of no signal of the model, not rising, or beyond what an input can be.
+        InputError: a limit of no signal of the model, not increasing, or beyond an input's bounds.
     """
     inputs = {item.name: item for item in model.inputs}
     for name, (low, high) in given.items():
@@ -41,37 +41,37 @@ def checked_limits(model: ProcessModel, given: Mapping[str, tuple[float, float]]
 
 
 def limits_of(run: Run, model: ProcessModel, given: Mapping[str, tuple[float, float]]) -> Limits:
-    """Those of every signal: as given, else somewhat wider than the record.
+    """Limits of every signal: as given, else somewhat wider than the record.
 
     Args:
         run: the record.
-        model: of the plant.
-        given: by signal, checked.
+        model: process model of the plant.
+        given: checked limits, by signal.
     """
     scales = {item.name: item.scale for item in (*model.states, *model.inputs)}
-    found: Limits = {}
+    result: Limits = {}
     for item, values in zip(model.inputs, run.inputs.T, strict=True):
-        low, high = _widened(float(values.min()), float(values.max()), scales[item.name])
-        found[item.name] = (max(low, item.lower), min(high, item.upper))
+        low, high = _widen(float(values.min()), float(values.max()), scales[item.name])
+        result[item.name] = (max(low, item.lower), min(high, item.upper))
     for name, values in zip(model.output_names, run.measured.T, strict=True):
         low, high = np.nanquantile(values, [_TAIL, 1.0 - _TAIL]).tolist()
-        found[name] = _widened(low, high, scales.get(name, 0.0))
-    return found | dict(given)
+        result[name] = _widen(low, high, scales.get(name, 0.0))
+    return result | dict(given)
 
 
-def within(outputs: Array, limits: Limits, names: tuple[str, ...], margin: Array) -> bool:
-    """Whether outputs keep their limits with a margin.
+def keeps_limits(outputs: Array, limits: Limits, names: tuple[str, ...], margin: Array) -> bool:
+    """Return true if outputs keep their limits with a margin.
 
     Args:
         outputs: shape (rows, n_y).
-        limits: by signal.
-        names: of the outputs.
-        margin: of each, shape (n_y,).
+        limits: limits by signal.
+        names: names of the outputs.
+        margin: margin of each output, shape (n_y,).
     """
     low, high = np.array([limits[name] for name in names]).T
     return bool(np.all((outputs >= low + margin) & (outputs <= high - margin)))
 
 
-def _widened(low: float, high: float, scale: float) -> tuple[float, float]:
+def _widen(low: float, high: float, scale: float) -> tuple[float, float]:
     by = max(WIDER * (high - low), SCALE_SHARE * scale)
     return low - by, high + by

@@ -1,1 +1,1 @@
-"""Fits of one explanation to a record: its sizes, times and noise."""
+"""Fits of one hypothesis to a record: magnitudes, times and noise."""

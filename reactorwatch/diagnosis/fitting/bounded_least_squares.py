@@ -1,4 +1,4 @@
-"""Least squares whose coefficients keep to their ranges, from the sums of squares and products."""
+"""Bounded least squares from the normal equations."""
 
 import numpy as np
 
@@ -7,21 +7,24 @@ from reactorwatch.arrays import Array
 _TURNS, _RIDGE = 4, 1e-9
 
 
-def within(gram: Array, by: Array, lowest: Array, highest: Array) -> tuple[float, Array]:
-    """Twice the gain in log likelihood, and the coefficients; those that leave their range are put to its end."""
+def solve_bounded(gram: Array, by: Array, lowest: Array, highest: Array) -> tuple[float, Array]:
+    """Solve by an active set: coefficients beyond a bound are fixed to it.
+
+    Returns twice the gain in log likelihood, and the solution.
+    """
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    free, theta = np.ones(by.size, dtype=bool), np.zeros(by.size)
+    free, solution = np.ones(by.size, dtype=bool), np.zeros(by.size)
     for _ in range(_TURNS):
         if not free.any():
             break
         inner = gram[np.ix_(free, free)] / np.outer(scale[free], scale[free])
         inner[np.diag_indices_from(inner)] += _RIDGE
-        rest = by[free] - gram[np.ix_(free, ~free)] @ theta[~free]
-        theta[free] = np.linalg.solve(inner, rest / scale[free]) / scale[free]
-        inside = np.clip(theta, lowest, highest)
-        beyond = free & (inside != theta)
-        theta = inside
+        residual = by[free] - gram[np.ix_(free, ~free)] @ solution[~free]
+        solution[free] = np.linalg.solve(inner, residual / scale[free]) / scale[free]
+        inside = np.clip(solution, lowest, highest)
+        beyond = free & (inside != solution)
+        solution = inside
         if not beyond.any():
             break
         free &= ~beyond
-    return float(theta @ (2.0 * by - gram @ theta)), theta
+    return float(solution @ (2.0 * by - gram @ solution)), solution

@@ -1,14 +1,14 @@
-"""Sensors whose noise remembers: what is off in one row is partly still off in the next.
+"""Coloured sensor noise: white noise plus a first-order Gauss-Markov part.
 
-Such a noise is white noise and a part that wanders about zero, v <- phi v + white, with phi = exp(-h / tau) over a row
-of length h: from row to row an autoregression of first order, and between rows far apart nothing. To the filter each is
-one more state, at rest at nothing, that is added to what its sensor shows (Bryson & Johansen 1965, Linear filtering for
-time-varying systems using measurements containing colored noise, IEEE Trans. Automatic Control 10). How large it is and
-how long it remembers is learned with the other noise, by likelihood.
+The coloured part is v <- phi v + white noise, with phi = exp(-h / tau) over a row of length h: a first-order
+autoregression from row to row, uncorrelated between rows far apart. The filter has it as one more state, initially
+zero, that is added to the sensor's output (Bryson & Johansen 1965, Linear filtering for time-varying systems using
+measurements containing colored noise, IEEE Trans. Automatic Control 10). Its standard deviation and time constant are
+estimated with the other noise levels, by maximum likelihood.
 
-A filter with more states is slower, so they are there only where the record calls for them. A quick look tells: what a
-model lacks, and what moves the process at random, has nearly no power at high frequencies, and of white noise there is
-as much at one as at the other. So what a free run leaves is compared there, `LOW` with `HIGH`.
+More states make a filter slower, so coloured noise is modelled only where the record calls for it. Model error and
+process noise have almost no power at high frequencies; white noise has the same power at all of them. So the power of
+the simulation's residual in the band `LOW` is compared with that in the band `HIGH`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,136 +24,141 @@ from reactorwatch.kalman.ekf import NoiseLevels
 from reactorwatch.process.model import ProcessModel, parameter, variable
 
 LOW, HIGH = (0.375, 0.625), (0.75, 1.0)
-"""Bands of frequency, in shares of the highest that a record shows."""
+"""Frequency bands, as fractions of the Nyquist frequency."""
 
 SUSPICIOUS = 1.25
-"""Times as much power in the first as in the second. An autoregression of 0.2 has 1.3, one of 0.5 has 1.6."""
+"""Ratio of the power in `LOW` to that in `HIGH`. An autoregression of 0.2 has 1.3, one of 0.5 has 1.6."""
 
 CUT = 4.0
-"""Standard deviations beyond which it does not matter how far off a value is."""
+"""Standard deviations at which values are clipped."""
 
 SHORTEST_ROWS, LONGEST_ROWS, FIRST_ROWS = 0.3, 10.0, 1.5
-"""How long a sensor's noise may remember, in rows, and where the search begins."""
+"""Bounds of the time constant and its initial value, in rows."""
 
 SHORTEST_MIN = 0.03
-"""A step of the integrator is 0.05 min at most and follows nothing that is much quicker."""
+"""Lower bound of the time constant: the integrator's step is up to 0.05 min and cannot resolve faster dynamics."""
 
 _FEWEST_ROWS = 200
-_SCALES = 10.0  # of a sensor's noise: by that the state's moves in a minute are measured
+_SCALES = 10.0  # the state's scale, in standard deviations of the sensor's noise
 
 
-class Wandering(msgspec.Struct, frozen=True):
-    """The part of a sensor's noise that remembers.
+class ColoredNoise(msgspec.Struct, frozen=True):
+    """The coloured part of a sensor's noise.
 
     Attributes:
-        output: that the sensor shows.
-        sd: standard deviation, in the output's unit.
-        time_min: after which a share of 1/e is left of it.
-        rate_sd: that of the white noise that moves it, in the output's unit per square root of a minute.
-        scale: standard deviation of the sensor's whole noise, were it white.
+        output: name of the sensor's output.
+        sd: stationary standard deviation, in the output's unit.
+        time_min: time constant in minutes.
+        driving_sd: standard deviation of the driving white noise, in the output's unit per square root of a minute.
+        scale: standard deviation of the sensor's total noise if it were white.
     """
 
     output: str
     sd: float
     time_min: float
-    rate_sd: float
+    driving_sd: float
     scale: float
 
 
 class Noise(NoiseLevels, frozen=True):
-    """The noise of a plant and of its sensors.
+    """Noise levels of a plant and its sensors.
 
     Attributes:
-        wandering: what of the sensors' noise remembers; `measurement_sd` is of the rest.
+        colored: coloured parts of the sensors' noise; `measurement_sd` is that of the white parts.
     """
 
-    wandering: tuple[Wandering, ...] = ()
+    colored: tuple[ColoredNoise, ...] = ()
 
     def sensor_sd(self, outputs: Sequence[str]) -> Array:
-        """Standard deviation of each sensor's whole noise, shape (n_y,)."""
-        of = {item.output: item.sd for item in self.wandering}
+        """Standard deviation of each sensor's total noise, shape (n_y,)."""
+        of = {item.output: item.sd for item in self.colored}
         return np.hypot(self.measurement_sd, [of.get(name, 0.0) for name in outputs])
 
     @property
-    def times(self) -> dict[str, float]:
-        """As changes of parameters."""
-        return {f"{item.output}.noise_min": item.time_min for item in self.wandering}
+    def parameter_changes(self) -> dict[str, float]:
+        """Time constants as changes of model parameters, by name."""
+        return {f"{item.output}.noise_min": item.time_min for item in self.colored}
 
 
-def suspected(noise: NoiseLevels, outputs: Sequence[str], residual: Array, period_min: float) -> tuple[Wandering, ...]:
-    """Which sensors' noise may remember; half of it, to begin with.
+def detect_colored_noise(
+    noise: NoiseLevels, outputs: Sequence[str], residual: Array, period_min: float
+) -> tuple[ColoredNoise, ...]:
+    """Find sensors whose noise may be coloured. The initial estimate has the standard deviation of the white noise.
 
     Args:
-        noise: of the sensors, were it white.
-        outputs: their names.
-        residual: what a free run leaves, shape (rows, n_y); NaN where nothing was measured.
-        period_min: usual distance of rows.
+        noise: noise levels estimated with white sensor noise.
+        outputs: names of the outputs.
+        residual: residual of the simulation, shape (rows, n_y); NaN where not measured.
+        period_min: median sampling period.
     """
-    found = []
+    result = []
     for name, sd, column in zip(outputs, noise.measurement_sd, residual.T, strict=True):
         if _power_ratio(column) > SUSPICIOUS:
-            found.append(Wandering(name, sd, _first_min(period_min), first_rate_sd(sd, period_min), sd))
-    return tuple(found)
+            result.append(ColoredNoise(name, sd, _initial_tau_min(period_min), initial_driving_sd(sd, period_min), sd))
+    return tuple(result)
 
 
-def first_rate_sd(sd: float, period_min: float) -> float:
-    """Of a wandering of some standard deviation, with which a search for its numbers begins."""
-    return _rate_sd(sd, _first_min(period_min), period_min)
+def initial_driving_sd(sd: float, period_min: float) -> float:
+    """Initial driving noise of a coloured part with this standard deviation."""
+    return _driving_sd(sd, _initial_tau_min(period_min), period_min)
 
 
-def with_wandering(model: ProcessModel, wandering: Sequence[Wandering], period_min: float) -> ProcessModel:
-    """The model with sensors whose noise remembers; as it is where there are none."""
-    for item in wandering:
-        place = model.output_names.index(item.output)
-        output = model.outputs[place]
+def add_colored_noise(model: ProcessModel, colored: Sequence[ColoredNoise], period_min: float) -> ProcessModel:
+    """Add a state of coloured noise to each of these sensors."""
+    for item in colored:
+        index = model.output_names.index(item.output)
+        output = model.outputs[index]
         scale = _SCALES * item.scale
-        noise = variable(
-            f"{item.output}.noise", output.unit, (-1e3 * scale, 1e3 * scale), scale, "noise that remembers"
-        )
+        noise = variable(f"{item.output}.noise", output.unit, (-1e3 * scale, 1e3 * scale), scale, "coloured noise")
         shortest = max(SHORTEST_ROWS * period_min, SHORTEST_MIN)
         bounds = (shortest, max(LONGEST_ROWS * period_min, 2.0 * shortest))
-        time = parameter(f"{item.output}.noise_min", _first_min(period_min), "min", bounds, "how long it remembers")
+        time = parameter(
+            f"{item.output}.noise_min", _initial_tau_min(period_min), "min", bounds, "time constant of the noise"
+        )
         model = model.with_state(noise, -noise.symbol / time.symbol, ca.SX(0.0))
         shown = replace(output, expression=output.expression + noise.symbol)
-        outputs = (*model.outputs[:place], shown, *model.outputs[place + 1 :])
+        outputs = (*model.outputs[:index], shown, *model.outputs[index + 1 :])
         model = replace(model, outputs=outputs, parameters=(*model.parameters, time))
     return model
 
 
-def learned(
-    wandering: Sequence[Wandering], rate_sd: Sequence[float], times: Mapping[str, float], period_min: float
-) -> tuple[Wandering, ...]:
-    """The same with other numbers.
+def update_colored_noise(
+    colored: Sequence[ColoredNoise], driving_sd: Sequence[float], times: Mapping[str, float], period_min: float
+) -> tuple[ColoredNoise, ...]:
+    """Replace the estimates of the coloured parts.
 
     Args:
-        wandering: of which sensors.
-        rate_sd: of each, see `Wandering`.
-        times: as `Noise.times`.
-        period_min: usual distance of rows.
+        colored: the coloured parts.
+        driving_sd: new driving noise of each, see `ColoredNoise`.
+        times: new time constants as in `Noise.parameter_changes`.
+        period_min: median sampling period.
     """
-    found = []
-    for item, rate in zip(wandering, rate_sd, strict=True):
+    result = []
+    for item, rate in zip(colored, driving_sd, strict=True):
         time_min = times[f"{item.output}.noise_min"]
-        sd = rate / _rate_sd(1.0, time_min, period_min)
-        found.append(Wandering(item.output, sd, time_min, rate, item.scale))
-    return tuple(found)
+        sd = rate / _driving_sd(1.0, time_min, period_min)
+        result.append(ColoredNoise(item.output, sd, time_min, rate, item.scale))
+    return tuple(result)
 
 
-def _first_min(period_min: float) -> float:
+def _initial_tau_min(period_min: float) -> float:
     return max(FIRST_ROWS * period_min, SHORTEST_MIN)
 
 
-def _rate_sd(sd: float, time_min: float, period_min: float) -> float:
-    """Of the white noise that keeps it at a standard deviation, as the filter adds it: its variance times the row."""
+def _driving_sd(sd: float, time_min: float, period_min: float) -> float:
+    """Driving noise that keeps the stationary standard deviation.
+
+    The filter adds its variance times the row's length.
+    """
     return sd * sqrt((1.0 - exp(-2.0 * period_min / time_min)) / period_min)
 
 
 def power_spectrum(residual: Array) -> tuple[Array, Array] | None:
-    """Frequencies, in shares of the highest, and the power there: of white noise on average its variance.
+    """Power at frequencies that are fractions of the Nyquist frequency; None if the residual is too short.
 
-    None if the residual is too short. What is missing is left out, and outliers are clipped.
+    White noise has on average its variance at all of them. Missing values are skipped, outliers are clipped.
     """
-    differences = np.diff(residual[np.isfinite(residual)])  # so that the highest frequencies do not drown in the lowest
+    differences = np.diff(residual[np.isfinite(residual)])  # the low frequencies would mask the highest
     if differences.size < _FEWEST_ROWS:
         return None
     limit = CUT * float(np.median(np.abs(differences))) / 0.6745
@@ -164,7 +169,7 @@ def power_spectrum(residual: Array) -> tuple[Array, Array] | None:
 
 
 def _power_ratio(residual: Array) -> float:
-    """Power of a residual at the lower frequencies over that at the higher ones; 1 if it is too short to tell."""
+    """Power of a residual in `LOW` over that in `HIGH`; 1 if it is too short."""
     spectrum = power_spectrum(residual)
     if spectrum is None:
         return 1.0

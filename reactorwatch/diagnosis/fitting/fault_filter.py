@@ -1,4 +1,4 @@
-"""The filter of a model with some effects in it, whose sizes are signals."""
+"""EKF of a model augmented with effects whose magnitudes are input signals."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,11 +12,16 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.diagnosis.fitting.augmented_model import SizedModel, with_size_inputs
-from reactorwatch.diagnosis.fitting.colored_noise import Noise, first_rate_sd, learned, with_wandering
-from reactorwatch.diagnosis.fitting.measurement_delay import Moved, gathered, moved
+from reactorwatch.diagnosis.fitting.augmented_model import AugmentedModel, augment_model
+from reactorwatch.diagnosis.fitting.colored_noise import (
+    Noise,
+    add_colored_noise,
+    initial_driving_sd,
+    update_colored_noise,
+)
+from reactorwatch.diagnosis.fitting.measurement_delay import ShiftedRun, restore_rows, shift_measurements
 from reactorwatch.diagnosis.fitting.profiles import Signal
-from reactorwatch.diagnosis.run import Run, doubt_of
+from reactorwatch.diagnosis.run import Run, input_uncertainty_of
 from reactorwatch.kalman.batch_runner import run_together
 from reactorwatch.kalman.ekf import Filter, FilterState, NoiseLevels
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
@@ -28,205 +33,211 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
 HUBER = 4.0
-"""Standard deviations beyond which an innovation counts no more than in proportion."""
+"""Standard deviations beyond which the loss of an innovation grows linearly."""
 
-LOST = 100.0
-"""Standard deviations that a value counts as off where the filter has lost the plant."""
+DIVERGED_RESIDUAL = 100.0
+"""Standard deviations charged for a value where the filter has diverged."""
 
-_CLUELESS = 1e6
-"""Standard deviations of a sensor: a filter that is less sure of its prediction has lost the plant."""
+_DIVERGED_SD = 1e6
+"""Ratio of predicted standard deviation to sensor noise beyond which the filter has diverged."""
 
 
-class Known(NamedTuple):
-    """A run of the filter that begins as another one does.
+class SharedPrefix(NamedTuple):
+    """A filter run whose first rows are the same as those of another run.
 
     Attributes:
-        found: it.
-        rows: how many rows are the same.
+        innovations: the run.
+        rows: number of rows that are the same.
     """
 
-    found: FilterResult
+    innovations: FilterResult
     rows: int
 
 
-class Followed(NamedTuple):
-    """What a filter makes of a run.
+class FilterResult(NamedTuple):
+    """Innovations and loss of a filter run.
 
     Attributes:
-        loss: minus the log likelihood, up to a constant that all share.
-        w: whitened innovations, shape (rows, n_y); NaN where nothing was measured.
-        found: the filter's run.
+        loss: negative log likelihood, up to a constant common to all hypotheses.
+        w: normalised innovations, shape (rows, n_y); NaN where not measured.
+        innovations: the filter run.
     """
 
     loss: float
     w: Array
-    found: FilterResult
+    innovations: FilterResult
 
 
-class Sized:
-    """The filter of a model in which the sizes of some effects are inputs.
+class FaultFilter:
+    """EKF of a model in which the magnitudes of some effects are inputs.
 
-    A sensor that is late is left out of the filter's model: its values are moved (see `measurement_delay`).
+    A measurement delay is not part of the filter's model: the delayed values are shifted in time (see
+    `measurement_delay`).
 
     Args:
-        model: of the plant.
-        effects: that are in it; at most one makes an output late.
-        noise: of the plant and its sensors.
-        period_min: usual distance of rows.
+        model: process model of the plant.
+        effects: effects in the model; at most one delays an output.
+        noise: noise levels of the plant and its sensors.
+        period_min: median sampling period.
 
     Attributes:
-        effects: as given.
-        late: place of the effect that makes an output late; None: no such.
+        effects: the effects as given.
+        delay_index: index of the effect that delays an output; None without one.
     """
 
     def __init__(self, model: ProcessModel, effects: Sequence[Effect], noise: Noise, period_min: float = 0.1) -> None:
         self.effects = tuple(effects)
-        places = [place for place, effect in enumerate(self.effects) if effect.delays_output is not None]
-        self.late = places[0] if places else None
+        delays = (index for index, effect in enumerate(self.effects) if effect.delays_output is not None)
+        self.delay_index = next(delays, None)
         self._plant, self._noise, self._period_min = model, noise, period_min
-        sized = with_size_inputs(model, tuple(item for item in self.effects if item.delays_output is None))
-        if noise.wandering:
-            sized = replace(sized, model=with_wandering(sized.model, noise.wandering, period_min))
-        self._filtered = sized
-        self._filters = [Filter(self.model, self._levels_of(noise))]  # twins, as many as went at once so far
-        self._errors = self._filtered.errors.with_noise(self.levels)
+        augmented = augment_model(model, tuple(item for item in self.effects if item.delays_output is None))
+        if noise.colored:
+            augmented = replace(augmented, model=add_colored_noise(augmented.model, noise.colored, period_min))
+        self._augmented = augmented
+        self._filters = [Filter(self.model, self._all_levels(noise))]  # twins, one for each lane used so far
+        self._errors = self._augmented.errors.with_noise(self.noise_levels)
         self.noise = noise
 
     @property
     def model(self) -> ProcessModel:
-        """That the filter has."""
-        return self._filtered.model
+        """Process model of the filter, with effects and coloured noise."""
+        return self._augmented.model
 
     @property
-    def own_states(self) -> int:
-        """How many states the plant has that are no memory; they are the first."""
+    def n_plant_states(self) -> int:
+        """Number of the plant's states that are not internal states of effects; they come first."""
         return sum(state.name not in self._plant.at_rest for state in self._plant.states)
 
     @property
     def is_plain(self) -> bool:
-        """Whether the filter has neither a late output nor sensors whose noise remembers."""
-        return self.late is None and not self._noise.wandering
+        """True if no output is delayed and no sensor noise is coloured."""
+        return self.delay_index is None and not self._noise.colored
 
     @cached_property
-    def whole(self) -> SizedModel:
-        """With all effects in it, for free runs."""
-        return with_size_inputs(self._plant, self.effects)
+    def full_model(self) -> AugmentedModel:
+        """Model with all effects, delays included, for simulation."""
+        return augment_model(self._plant, self.effects)
 
     @property
     def noise(self) -> Noise:
-        """Of the plant and its sensors; the same sensors' noise remembers all the time."""
+        """Noise levels of the plant and its sensors. A new value must have coloured noise of the same sensors."""
         return self._noise
 
     @noise.setter
     def noise(self, noise: Noise) -> None:
-        self._noise, levels = noise, self._levels_of(noise)
+        self._noise, levels = noise, self._all_levels(noise)
         for item in self._filters:
             item.noise = levels
-            item.set_parameters(noise.times)
-        self._errors.noise, self._errors.changes = levels, noise.times
+            item.set_parameters(noise.parameter_changes)
+        self._errors.noise, self._errors.changes = levels, noise.parameter_changes
 
     @property
-    def levels(self) -> NoiseLevels:
-        """The noise as the filter has it, of all its states."""
+    def noise_levels(self) -> NoiseLevels:
+        """Noise levels of all of the filter's states."""
         return self._filters[0].noise
 
     def size_symbols(self, effect: Effect) -> tuple[ca.SX, ca.SX] | None:
-        """The inputs that are the size of an effect, as balances and outputs have it; None if it has none."""
+        """Symbols of an effect's interval and sample inputs; None if the filter's model does not have it."""
         names = [item for item in self.effects if item.delays_output is None]
         if effect not in names:
             return None
-        place = names.index(effect)
-        return self._filtered.rate_symbols[place], self._filtered.output_symbols[place]
+        index = names.index(effect)
+        return self._augmented.interval_inputs[index], self._augmented.sample_inputs[index]
 
-    def moves_clock(self, place: int) -> bool:
-        """Whether one of the effects does, see `input_timing`."""
-        late = self.late
-        return place != late and self._filtered.moves_clock[place - (late is not None and late < place)]
+    def shifts_time(self, index: int) -> bool:
+        """Return true if the effect at this index shifts the timing, see `input_timing`."""
+        late = self.delay_index
+        return index != late and self._augmented.shifts_time[index - (late is not None and late < index)]
 
     def inputs(self, run: Run, signals: Sequence[Signal]) -> Array:
-        """Those of the filter: with the sizes beside them, shape (rows, n_u + 2 effects)."""
-        prompt = [item for place, item in enumerate(signals) if place != self.late]
-        return self._filtered.inputs(run.time_min, run.known_inputs, prompt)
+        """Inputs of the filter, magnitudes included, shape (rows, n_u + 2 effects)."""
+        prompt = [item for index, item in enumerate(signals) if index != self.delay_index]
+        return self._augmented.inputs(run.time_min, run.certain_inputs, prompt)
 
-    def follow(self, run: Run, signals: Sequence[Signal]) -> Followed:
-        """What the filter makes of a run with these deviations."""
-        return self.follow_all(run, [signals])[0]
+    def evaluate(self, run: Run, signals: Sequence[Signal]) -> FilterResult:
+        """Run the filter with these deviations."""
+        return self.evaluate_all(run, [signals])[0]
 
-    def follow_all(
-        self, run: Run, several: Sequence[Sequence[Signal]], begun: Sequence[Known | None] | None = None
-    ) -> list[Followed]:
-        """What filters make of a run, each with other deviations; a few of them take little longer than one.
+    def evaluate_all(
+        self, run: Run, several: Sequence[Sequence[Signal]], shared: Sequence[SharedPrefix | None] | None = None
+    ) -> list[FilterResult]:
+        """Run the filter with several sets of deviations in parallel lanes, which take little longer than one.
 
         Args:
             run: the record.
-            several: of each filter the deviations.
-            begun: of each, a run whose first rows are those of its own; None: none is known.
+            several: sets of deviations, one signal for each effect.
+            shared: for each set, a run with the same first rows or None; None: no such runs.
         """
-        laid = [self._laid_out(run, signals) for signals in several]
-        # Where a sensor is late, a known run is not one of the rows that the filter takes.
-        known = [None] * len(laid) if begun is None or self.late is not None else begun
-        found = self._filtered_rows([rows for rows, _ in laid], known)
-        return [self._judged(run, by, item) for (_, by), item in zip(laid, found, strict=True)]
+        laid = [self._lay_out_rows(run, signals) for signals in several]
+        # With a delayed output the filter's rows depend on the delay, so no prefix is shared.
+        prefixes = [None] * len(laid) if shared is None or self.delay_index is not None else shared
+        innovations = self._filter_rows([rows for rows, _ in laid], prefixes)
+        return [self._evaluate_rows(run, by, item) for (_, by), item in zip(laid, innovations, strict=True)]
 
-    def _judged(self, run: Run, by: Moved | None, found: FilterResult) -> Followed:
+    def _evaluate_rows(self, run: Run, by: ShiftedRun | None, innovations: FilterResult) -> FilterResult:
         measured, unseen, least = run.measured, np.zeros(run.measured.shape, dtype=np.bool_), self.noise.measurement_sd
-        if by is not None and self.late is not None:
-            output = self._output(self.late)
-            found = gathered(found, by, output)
-            # What was true before the beginning counts as expected: a longer delay must neither gain nor lose by it.
-            unseen[:, output], measured = by.before & np.isfinite(measured[:, output]), measured.copy()
-            measured[by.before, output] = np.nan
+        if by is not None and self.delay_index is not None:
+            output = self._output(self.delay_index)
+            innovations = restore_rows(innovations, by, output)
+            # Values that were true before the start count as expected, so that a longer delay neither gains nor loses.
+            unseen[:, output], measured = by.before_start & np.isfinite(measured[:, output]), measured.copy()
+            measured[by.before_start, output] = np.nan
         begins = np.array([int(np.argmax(np.any(np.isfinite(measured), axis=1))), *run.breaks], dtype=np.intp)
         unseen[begins] = False
-        loss, w = _judged(measured, unseen, begins, found.normalized, found.conditional_sd, np.array(least))
-        return Followed(float(loss), w, found)
+        loss, w = _huber_likelihood(
+            measured, unseen, begins, innovations.normalized, innovations.conditional_sd, np.array(least)
+        )
+        return FilterResult(float(loss), w, innovations)
 
-    def _filtered_rows(self, several: Sequence[ResampledRecord], begun: Sequence[Known | None]) -> list[FilterResult]:
-        """The filters' runs over the rows of the record; of rows that are known, nothing is worked out again."""
-        found: list[FilterResult] = []
+    def _filter_rows(self, several: Sequence[ResampledRecord], shared: Sequence[SharedPrefix | None]) -> list[FilterResult]:
+        """Filter the laid-out rows, in batches of `LANES`; rows of shared prefixes are not computed again."""
+        innovations: list[FilterResult] = []
         for begin in range(0, len(several), LANES):
             part = several[begin : begin + LANES]
-            found += self._lanes(part, begun[begin : begin + LANES])
-        return found
+            innovations += self._filter_lanes(part, shared[begin : begin + LANES])
+        return innovations
 
-    def _lanes(self, several: Sequence[ResampledRecord], begun: Sequence[Known | None]) -> list[FilterResult]:
-        """As many at once as there are lanes, so all from the same row on."""
-        first = min(_rows_of(known, rows) for known, rows in zip(begun, several, strict=True))
+    def _filter_lanes(self, several: Sequence[ResampledRecord], shared: Sequence[SharedPrefix | None]) -> list[FilterResult]:
+        """Filter as many records at once as there are lanes, all from the same row on."""
+        first = min(_count_shared_rows(prefix, rows) for prefix, rows in zip(shared, several, strict=True))
         if first == several[0].time_min.size:
-            return [known.found for known in begun if known is not None]
+            return [prefix.innovations for prefix in shared if prefix is not None]
         while len(self._filters) < len(several):
             self._filters.append(self._filters[0].clone())
         runs = []
-        for filtering, (time_min, inputs, measured, uncertainty, _), known in zip(
-            self._filters, several, begun, strict=False
+        for filtering, (time_min, inputs, measured, uncertainty, _), prefix in zip(
+            self._filters, several, shared, strict=False
         ):
-            rest, start = slice(first, None), None
-            if known is not None and first:
-                x, P = known.found.x[first - 1].tolist(), known.found.P[first - 1].ravel().tolist()
+            remaining, start = slice(first, None), None
+            if prefix is not None and first:
+                x, P = prefix.innovations.x[first - 1].tolist(), prefix.innovations.P[first - 1].ravel().tolist()
                 start = FilterState(float(time_min[first - 1]), tuple(inputs[first - 1].tolist()), tuple(x), tuple(P))
-            later = None if uncertainty is None else uncertainty.select(rest)
-            record = FilterRecord.of(time_min[rest], inputs[rest], measured[rest], uncertainty=later)
+            later = None if uncertainty is None else uncertainty.select(remaining)
+            record = FilterRecord.of(time_min[remaining], inputs[remaining], measured[remaining], uncertainty=later)
             runs.append(filtering.run_batched(record, start))
-        found = []
-        for rows, known, new in zip(several, begun, run_together(runs), strict=True):
-            if known is None or not first:
-                found.append(rows.at_original_rows(new))
+        innovations = []
+        for rows, prefix, new in zip(several, shared, run_together(runs), strict=True):
+            if prefix is None or not first:
+                innovations.append(rows.at_original_rows(new))
                 continue
-            both = zip(known.found, new, strict=True)
-            found.append(FilterResult(*(np.concatenate([before[:first], more]) for before, more in both)))
-        return found
+            both = zip(prefix.innovations, new, strict=True)
+            innovations.append(FilterResult(*(np.concatenate([before[:first], more]) for before, more in both)))
+        return innovations
 
-    def tuned(
+    def estimate_noise(
         self, run: Run, signals: Sequence[Signal], smallest_sd: Sequence[float], nearby: Sequence[Noise] = ()
     ) -> Noise:
-        """The noise under which the run is likeliest with these deviations; the search may begin near one of some."""
-        rows, _ = self._laid_out(run, signals)
-        times = self._noise.times
-        # It begins anew with a short memory: a model that lacks something makes it seem long, and there it would stay.
+        """Estimate the noise levels by maximum likelihood, given these deviations.
+
+        `nearby` levels are further initial values.
+        """
+        rows, _ = self._lay_out_rows(run, signals)
+        times = self._noise.parameter_changes
+        # Start again from a short time constant: model error makes it seem long, and the search would stay there.
         first_sd = {
-            f"{item.output}.noise": first_rate_sd(item.scale, self._period_min) for item in self._noise.wandering
+            f"{item.output}.noise": initial_driving_sd(item.scale, self._period_min) for item in self._noise.colored
         }
-        found, times = estimate_noise_and_parameters(
+        levels, times = estimate_noise_and_parameters(
             self.model,
             rows.time_min,
             rows.inputs,
@@ -235,100 +246,103 @@ class Sized:
             tuple(times),
             first_sd,
             rows.uncertainty,
-            [self._levels_of(item) for item in nearby if not item.wandering],
+            [self._all_levels(item) for item in nearby if not item.colored],
             lacking=True,
         )
-        of_sensors = len(found.process_sd) - len(times)
-        wandering = learned(self._noise.wandering, found.process_sd[of_sensors:], times, self._period_min)
-        return Noise(found.measurement_sd, found.process_sd[: len(self._plant.states)], wandering)
+        of_sensors = len(levels.process_sd) - len(times)
+        colored = update_colored_noise(self._noise.colored, levels.process_sd[of_sensors:], times, self._period_min)
+        return Noise(levels.measurement_sd, levels.process_sd[: len(self._plant.states)], colored)
 
-    def ways(self, run: Run, signals: Sequence[Signal], found: FilterResult) -> ErrorDynamics:
-        """The equations of the filter's errors about its run; from the second row on, the first that it predicts."""
-        return ways_between(self._errors, run, self.inputs(run, signals), found, self.used(run))
+    def error_dynamics(self, run: Run, signals: Sequence[Signal], innovations: FilterResult) -> ErrorDynamics:
+        """Error equations about a filter run, from the second row on, the first one that is predicted."""
+        return error_dynamics_between(self._errors, run, self.inputs(run, signals), innovations, self.used_values(run))
 
-    def used(self, run: Run) -> NDArray[np.bool_]:
-        """Which values correct the filter in their own row, shape (rows, n_y); those of a late sensor do it before."""
-        found = np.isfinite(run.measured)
-        if self.late is not None:
-            found[:, self._output(self.late)] = False
-        return found
+    def used_values(self, run: Run) -> NDArray[np.bool_]:
+        """Mask of values that correct the filter in their own row, shape (rows, n_y).
 
-    def _laid_out(self, run: Run, signals: Sequence[Signal]) -> tuple[ResampledRecord, Moved | None]:
-        """The rows that the filter takes; and, if an output is late, where its values went."""
+        Delayed values correct it earlier.
+        """
+        used = np.isfinite(run.measured)
+        if self.delay_index is not None:
+            used[:, self._output(self.delay_index)] = False
+        return used
+
+    def _lay_out_rows(self, run: Run, signals: Sequence[Signal]) -> tuple[ResampledRecord, ShiftedRun | None]:
+        """Rows that the filter takes and, if an output is delayed, the shifted run."""
         inputs = self.inputs(run, signals)
-        if self.late is None:
-            return insert_rows(run.time_min, inputs, run.measured, doubt_of(run, inputs)), None
-        by = self._moved(run, inputs, signals, self.late)
+        if self.delay_index is None:
+            return insert_rows(run.time_min, inputs, run.measured, input_uncertainty_of(run, inputs)), None
+        by = self._shift_measurements(run, inputs, signals, self.delay_index)
         return insert_rows(by.run.time_min, by.run.inputs, by.run.measured, by.uncertainty), by
 
-    def _moved(self, run: Run, inputs: Array, signals: Sequence[Signal], late: int) -> Moved:
+    def _shift_measurements(self, run: Run, inputs: Array, signals: Sequence[Signal], late: int) -> ShiftedRun:
         held: NDArray[np.bool_] = np.ones(inputs.shape[1], dtype=bool)
-        held[run.inputs.shape[1] + 1 :: 2] = False  # what the outputs show
-        return moved(run, inputs, held, self._output(late), signals[late].at_row)
+        held[run.inputs.shape[1] + 1 :: 2] = False  # sample inputs
+        return shift_measurements(run, inputs, held, self._output(late), signals[late].sample_value)
 
     def _output(self, late: int) -> int:
         return self._plant.output_names.index(str(self.effects[late].delays_output))
 
-    def _levels_of(self, noise: Noise) -> NoiseLevels:
-        """States that an effect brings have none of their own; those of the sensors come last."""
-        of_sensors = tuple(item.rate_sd for item in noise.wandering)
+    def _all_levels(self, noise: Noise) -> NoiseLevels:
+        """Noise levels of all states: zero for the internal states of effects; coloured noise comes last."""
+        of_sensors = tuple(item.driving_sd for item in noise.colored)
         more = len(self.model.states) - len(noise.process_sd) - len(of_sensors)
         return NoiseLevels(noise.measurement_sd, (*noise.process_sd, *(0.0,) * more, *of_sensors))
 
 
-def ways_between(
-    errors: ErrorLinearization, run: Run, inputs: Array, found: FilterResult, used: NDArray[np.bool_]
+def error_dynamics_between(
+    errors: ErrorLinearization, run: Run, inputs: Array, innovations: FilterResult, used: NDArray[np.bool_]
 ) -> ErrorDynamics:
-    """The equations of a filter's errors about its run, from the second row on, the first that it predicts."""
-    began = np.all(np.isnan(found.prediction), axis=1)
-    # What inputs did before a break nobody knows, but in the row itself they were measured, and outputs may show them.
+    """Error equations about a filter run, from the second row on, the first one that is predicted."""
+    began = np.all(np.isnan(innovations.prediction), axis=1)
+    # Inputs before a break are unknown, but those of the row itself were measured and may act on its outputs.
     inputs = np.column_stack([run.inputs, inputs[:, run.inputs.shape[1] :]])
-    uncertainty, later = doubt_of(run, inputs), slice(1, None)
+    uncertainty, later = input_uncertainty_of(run, inputs), slice(1, None)
     return errors.dynamics(
         run.time_min[later],
         inputs[later],
-        found.x[later],
-        found.P[later],
-        found.residual[later],
+        innovations.x[later],
+        innovations.P[later],
+        innovations.residual[later],
         used[later],
         began[later],
         None if uncertainty is None else uncertainty.select(later),
     )
 
 
-def _rows_of(known: Known | None, rows: ResampledRecord) -> int:
-    """How many rows of a known run can stand for those of another one, that goes on from the last of them."""
-    if known is None or rows.original_index.size != rows.time_min.size:
+def _count_shared_rows(prefix: SharedPrefix | None, rows: ResampledRecord) -> int:
+    """Number of rows that can be copied from a shared prefix; the filter resumes after the last of them."""
+    if prefix is None or rows.original_index.size != rows.time_min.size:
         return 0
-    last = known.rows - 1
-    if last < 0 or not np.all(np.isfinite(known.found.x[last])) or not np.all(np.isfinite(rows.inputs[last])):
+    last = prefix.rows - 1
+    if last < 0 or not np.all(np.isfinite(prefix.innovations.x[last])) or not np.all(np.isfinite(rows.inputs[last])):
         return 0
-    return known.rows
+    return prefix.rows
 
 
-def clipped(w: Array) -> Array:
-    """Whitened innovations without what is missing and what is far off."""
+def huber_clip(w: Array) -> Array:
+    """Clip normalised innovations to `HUBER`; missing values become 0."""
     return np.asarray(np.clip(np.nan_to_num(w), -HUBER, HUBER))
 
 
 @jit
-def _judged(
+def _huber_likelihood(
     measured: Array, unseen: NDArray[np.bool_], begins: NDArray[np.intp], whitened: Array, sd: Array, least: Array
 ) -> tuple[float, Array]:
-    """Loss and whitened innovations, in one pass: it is done as often as a filter runs."""
+    """Loss and normalised innovations in one pass; called for every filter run."""
     w = np.full(whitened.shape, np.nan)
-    begun = np.zeros(whitened.shape[0], dtype=np.bool_)
-    begun[begins] = True
+    shared = np.zeros(whitened.shape[0], dtype=np.bool_)
+    shared[begins] = True
     losses = spread = 0.0
     for row in range(whitened.shape[0]):
         for output in range(whitened.shape[1]):
-            if np.isfinite(measured[row, output]) and not begun[row]:
-                # Where it had to begin anew it says nothing of what was measured, and did not expect it at all.
+            if np.isfinite(measured[row, output]) and not shared[row]:
+                # Where the filter restarted it predicted nothing; the value counts as wholly unexpected.
                 value, of_value = whitened[row, output], sd[row, output]
-                if np.isfinite(value) and 0.0 < of_value < _CLUELESS * least[output]:
+                if np.isfinite(value) and 0.0 < of_value < _DIVERGED_SD * least[output]:
                     spread += np.log(of_value)
                 else:
-                    value = LOST
+                    value = DIVERGED_RESIDUAL
                 w[row, output], size = value, abs(value)
                 losses += 0.5 * size * size if size < HUBER else HUBER * (size - 0.5 * HUBER)
             elif unseen[row, output]:
@@ -336,12 +350,12 @@ def _judged(
     return losses + spread, w
 
 
-def loss_of(w: Array) -> float:
-    """Of whitened innovations, without what they were divided by."""
-    return float(np.sum(row_losses(w)))
+def huber_loss(w: Array) -> float:
+    """Huber loss of normalised innovations, without their scale."""
+    return float(np.sum(huber_row_losses(w)))
 
 
-def row_losses(w: Array) -> Array:
-    """Likewise, of each row, shape (rows,)."""
+def huber_row_losses(w: Array) -> Array:
+    """Huber loss of each row, shape (rows,)."""
     size = np.abs(np.nan_to_num(w))
     return np.asarray(np.sum(np.where(size < HUBER, 0.5 * size**2, HUBER * (size - 0.5 * HUBER)), axis=1))

@@ -1,11 +1,11 @@
-"""The size and the onset of an effect that acts in jumps, such as a valve that sticks.
+"""Grid search for the magnitude and the onset of a discontinuous effect, such as valve stiction.
 
-Its innovations change with them in jumps, so there is no slope to climb: they are scanned, widely first and then about
-the best. Where the deviation sets in decides as well where the memory of the effect stands from then on, so every row
-after one in which an input moves may be another onset, and with a size that is somewhat off the wrong one may seem
-best. But as soon as an input has moved far, the memory is the same whenever the deviation set in. So what an onset
-explains is roughly what a run without the deviation explains before it, and one with it all along after it: a run for
-each size tells of all onsets, and only the likely ones are tried.
+Its innovations are discontinuous in them, so there is no gradient: magnitudes are scanned on a wide grid, then near the
+best. The onset also decides the internal state of the effect from then on, so every row after an input change may be
+another onset, and with a slightly wrong magnitude the wrong onset may look best. But once an input has moved far, that
+state no longer depends on the onset. So the loss for an onset is roughly that of a run without the deviation before it
+plus that of a run with the deviation throughout after it: one run for each magnitude ranks all onsets, and only the
+likely ones are fitted.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,155 +15,161 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
-from reactorwatch.diagnosis.fitting.fault_filter import loss_of, row_losses
+from reactorwatch.diagnosis.fitting.fault_filter import huber_loss, huber_row_losses
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis
 from reactorwatch.diagnosis.run import Run
 
-_SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # how far to either side, and how many
+_SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # reach to either side as a factor, number of sizes
 _FINELY = ((1.06, 25), (1.006, 25), (1.0006, 25))
 _NEARER = ((1.3, 12), (1.06, 9))
 _BESIDE = ((1.06, 48),)
-_USUAL, _ABOUT = 24, np.geomspace(0.8, 1.25, 24)  # sizes: of those that an effect usually has, and in shares of one
-_LIKELY_ONSETS, _ALL_OVER, _NEAREST_ROWS = 48, 32, 30  # tried with one size: how many, of how many, and how near
-_ONSETS = 6  # that sizes are tried with
+_USUAL, _ABOUT = 24, np.geomspace(0.8, 1.25, 24)  # usual sizes of the effect; sizes relative to one
+_LIKELY_ONSETS, _ALL_OVER, _NEAREST_ROWS = 48, 32, 30  # onsets at one size: best, spread out, rows near the best
+_ONSETS = 6  # onsets for which sizes are scanned
 _LEAST_GAIN = 5.0  # in log likelihood
 
 
-def fitted(run: Run, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS) -> Fit:
-    """The best numbers that are found from a start, with sizes that act in jumps scanned.
+def fit_hypothesis(run: Run, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS) -> Fit:
+    """Fit a hypothesis by least squares, and scan the magnitudes of its discontinuous effects.
 
     Args:
         run: the record.
-        hypothesis: with or without such effects.
-        start: where it begins, theta of each effect.
-        steps: of least squares, at most.
+        hypothesis: hypothesis with or without such effects.
+        start: initial parameters of each effect.
+        steps: maximum number of least-squares steps.
     """
     best = hypothesis.fit(run, start, steps)
-    for place, effect in enumerate(hypothesis.sized.effects):
+    for index, effect in enumerate(hypothesis.filter.effects):
         if effect.is_discontinuous:
-            best = sized(run, hypothesis, best, place)
-            if len(hypothesis.courses) > 1:
-                best = hypothesis.fit(run, best.theta, steps)
+            best = scan_sizes(run, hypothesis, best, index)
+            if len(hypothesis.profiles) > 1:
+                best = hypothesis.fit(run, best.parameters, steps)
     return best
 
 
-def sized(run: Run, hypothesis: Hypothesis, best: Fit, place: int, scans: Sequence[tuple[float, int]] = _SIZES) -> Fit:
-    """With the best size of many, then of nearer ones. Where none of the first few gains anything, none will.
+def scan_sizes(
+    run: Run, hypothesis: Hypothesis, best: Fit, index: int, scans: Sequence[tuple[float, int]] = _SIZES
+) -> Fit:
+    """Scan the magnitude of one effect on ever finer grids; stop if the first grid gains nothing.
 
     Args:
         run: the record.
-        hypothesis: with such an effect.
-        best: where it begins.
-        place: of the effect.
-        scans: how far to either side of the best, and how many sizes.
+        hypothesis: hypothesis with such an effect.
+        best: initial fit.
+        index: index of the effect.
+        scans: reach to either side of the best as a factor, and number of magnitudes, of each grid.
     """
-    nothing = loss_of(hypothesis.without(run, best, place))
+    nothing = huber_loss(hypothesis.innovations_without(run, best, index))
     for reach, count in scans:
-        numbers, course = best.theta[place], hypothesis.courses[place]
-        scaled = np.arange(numbers.size) < course.coefficients
+        values, profile = best.parameters[index], hypothesis.profiles[index]
+        scaled = np.arange(values.size) < profile.n_linear
         shares = np.geomspace(1.0 / reach, reach, count)
-        tried = [np.where(scaled, share * numbers, numbers) for share in shares]
-        best = _best_of(run, hypothesis, best, place, tried)
-        if loss_of(best.w) > nothing - _LEAST_GAIN:
+        tried = [np.where(scaled, share * values, values) for share in shares]
+        best = _best_of(run, hypothesis, best, index, tried)
+        if huber_loss(best.w) > nothing - _LEAST_GAIN:
             break
     return best
 
 
-def roughly(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
-    """With one of the sizes that the effect usually has, or one near it, and if it is a step with a likely onset.
+def search_coarse(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
+    """Search the effect's usual magnitudes and, for a step, the likely onsets.
 
     Args:
-        run: the record; where no input moves before its last row no onset is looked for.
+        run: the record; without an input change before its last row no onset is searched for.
         hypothesis: one such effect, constant or as a step.
-        best: where it begins.
+        best: initial fit.
     """
-    usual, onsets = hypothesis.sized.effects[0].start_values, _between(run)
+    usual, onsets = hypothesis.filter.effects[0].start_values, _onset_grid(run)
     sizes = np.geomspace(usual[0], usual[-1], _USUAL)
-    if not hypothesis.courses[0].numbers or not onsets.size:
-        best = _best_of(run, hypothesis, best, 0, [np.append(size, best.theta[0][1:]) for size in sizes])
-        return sized(run, hypothesis, best, 0, _NEARER)
-    for tried in (sizes, best.theta[0][0] * _ABOUT):
-        lost = zip(tried, _profiles(run, hypothesis, best, tried), strict=True)
+    if not hypothesis.profiles[0].nonlinear_parameters or not onsets.size:
+        best = _best_of(run, hypothesis, best, 0, [np.append(size, best.parameters[0][1:]) for size in sizes])
+        return scan_sizes(run, hypothesis, best, 0, _NEARER)
+    for tried in (sizes, best.parameters[0][0] * _ABOUT):
+        lost = zip(tried, _onset_losses(run, hypothesis, best, tried), strict=True)
         best = _best_of(run, hypothesis, best, 0, [np.array([size, onsets[np.argmin(item)]]) for size, item in lost])
-    return sized(run, hypothesis, _best_onset(run, hypothesis, best, _likely(run, hypothesis, best)), 0, _NEARER)
+    best = _best_onset(run, hypothesis, best, _likely_onsets(run, hypothesis, best))
+    return scan_sizes(run, hypothesis, best, 0, _NEARER)
 
 
-def finely(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
-    """With the best size, to a tenth of a permille, and if it is a step the best onset beside it.
+def search_fine(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
+    """Refine the magnitude to 1e-4 and, for a step, the onset with it.
 
-    With a size that is a little off another onset may seem best, so sizes are tried with each of the best few.
+    With a slightly wrong magnitude another onset may look best, so magnitudes are scanned for each of the best few
+    onsets.
 
     Args:
         run: the record.
         hypothesis: one such effect, constant or as a step.
-        best: roughly, with a size that gains something.
+        best: result of `search_coarse` that gains something.
     """
-    course = hypothesis.courses[0]
-    if course.numbers:
-        rows = course.period_min * np.arange(-_NEAREST_ROWS, _NEAREST_ROWS + 1)
-        onsets = np.concatenate([_likely(run, hypothesis, best), best.theta[0][1] + rows])
-        tried = [sized(run, hypothesis, item, 0, _BESIDE) for item in _moved(run, hypothesis, best, np.sort(onsets))]
+    profile = hypothesis.profiles[0]
+    if profile.nonlinear_parameters:
+        rows = profile.period_min * np.arange(-_NEAREST_ROWS, _NEAREST_ROWS + 1)
+        onsets = np.concatenate([_likely_onsets(run, hypothesis, best), best.parameters[0][1] + rows])
+        fits = _fit_onsets(run, hypothesis, best, np.sort(onsets))
+        tried = [scan_sizes(run, hypothesis, item, 0, _BESIDE) for item in fits]
         best = min([best, *tried], key=lambda item: item.loss)
-        best = _best_onset(run, hypothesis, best, best.theta[0][1] + rows)
-    return sized(run, hypothesis, best, 0, _FINELY)
+        best = _best_onset(run, hypothesis, best, best.parameters[0][1] + rows)
+    return scan_sizes(run, hypothesis, best, 0, _FINELY)
 
 
-def _likely(run: Run, hypothesis: Hypothesis, best: Fit) -> Array:
-    """Onsets to try with its size, increasing."""
-    onsets = _between(run)
-    (lost,) = _profiles(run, hypothesis, best, best.theta[0][:1])
+def _likely_onsets(run: Run, hypothesis: Hypothesis, best: Fit) -> Array:
+    """Onsets worth fitting at the present magnitude, increasing."""
+    onsets = _onset_grid(run)
+    (lost,) = _onset_losses(run, hypothesis, best, best.parameters[0][:1])
     chosen = np.zeros(onsets.size, dtype=np.bool_)
     chosen[np.argsort(lost)[:_LIKELY_ONSETS]] = True
     chosen[:: max(-(-onsets.size // _ALL_OVER), 1)] = True
     return onsets[chosen]
 
 
-def _between(run: Run) -> Array:
-    """Between rows, each after one in which an input moved."""
-    moved = run.moves[:-1]
+def _onset_grid(run: Run) -> Array:
+    """Candidate onsets: midway between a row with an input change and the next row."""
+    moved = run.input_changes[:-1]
     return np.asarray(0.5 * (run.time_min[moved] + run.time_min[moved + 1]))
 
 
-def _profiles(run: Run, hypothesis: Hypothesis, best: Fit, sizes: Array) -> list[Array]:
-    """Of each size what it loses, roughly and up to a constant, with each of the onsets between rows."""
-    never = row_losses(hypothesis.without(run, best, 0))
-    always = _tried(run, hypothesis, best, 0, [np.array([size, run.time_min[0]]) for size in sizes], best)
-    found = []
+def _onset_losses(run: Run, hypothesis: Hypothesis, best: Fit, sizes: Array) -> list[Array]:
+    """Approximate loss of each candidate onset up to a constant, for each magnitude."""
+    never = huber_row_losses(hypothesis.innovations_without(run, best, 0))
+    always = _evaluate_values(run, hypothesis, best, 0, [np.array([size, run.time_min[0]]) for size in sizes], best)
+    result = []
     for item in always:
-        gained = never - row_losses(item.w)
-        found.append(np.cumsum(gained)[run.moves[:-1]] - np.sum(gained))
-    return found
+        gained = never - huber_row_losses(item.w)
+        result.append(np.cumsum(gained)[run.input_changes[:-1]] - np.sum(gained))
+    return result
 
 
-def _moved(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> list[Fit]:
-    """With the best few of these onsets, the best first; one of those that leave the same path."""
+def _fit_onsets(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> list[Fit]:
+    """Fits with the best few of these onsets, the best first; onsets that give the same path count once."""
     if not onsets.size:
         return []
-    size, found = best.theta[0][0], dict[float, Fit]()
-    late = hypothesis.at(run, (np.array([size, np.max(onsets)]),))  # until an onset the filter runs as with a later one
-    for item in _tried(run, hypothesis, best, 0, [np.array([size, onset]) for onset in onsets], late):
-        found[round(item.loss, 1)] = item
-        if len(found) > _ONSETS:
-            del found[max(found)]
-    return [found[loss] for loss in sorted(found)]
+    size, result = best.parameters[0][0], dict[float, Fit]()
+    # Before its onset each run is the same as that with the latest onset.
+    latest = hypothesis.evaluate(run, (np.array([size, np.max(onsets)]),))
+    for item in _evaluate_values(run, hypothesis, best, 0, [np.array([size, onset]) for onset in onsets], latest):
+        result[round(item.loss, 1)] = item
+        if len(result) > _ONSETS:
+            del result[max(result)]
+    return [result[loss] for loss in sorted(result)]
 
 
 def _best_onset(run: Run, hypothesis: Hypothesis, best: Fit, onsets: Array) -> Fit:
-    return min([best, *_moved(run, hypothesis, best, onsets)[:1]], key=lambda item: item.loss)
+    return min([best, *_fit_onsets(run, hypothesis, best, onsets)[:1]], key=lambda item: item.loss)
 
 
-def _best_of(run: Run, hypothesis: Hypothesis, best: Fit, place: int, several: Sequence[Array]) -> Fit:
-    """The best of a fit and of others with other numbers of one effect."""
-    return min(chain([best], _tried(run, hypothesis, best, place, several, best)), key=lambda item: item.loss)
+def _best_of(run: Run, hypothesis: Hypothesis, best: Fit, index: int, several: Sequence[Array]) -> Fit:
+    """Best of a fit and of fits with other parameter values of one effect."""
+    return min(chain([best], _evaluate_values(run, hypothesis, best, index, several, best)), key=lambda item: item.loss)
 
 
-def _tried(
-    run: Run, hypothesis: Hypothesis, best: Fit, place: int, several: Sequence[Array], like: Fit
+def _evaluate_values(
+    run: Run, hypothesis: Hypothesis, best: Fit, index: int, several: Sequence[Array], like: Fit
 ) -> Iterator[Fit]:
-    """Fits with other numbers of one effect, a few at a time; see `Hypothesis.at` for what they are like."""
+    """Evaluate other parameter values of one effect, in batches; `like` as in `Hypothesis.evaluate`."""
     for begin in range(0, len(several), LANES):
         thetas = [
-            [numbers if other == place else item for other, item in enumerate(best.theta)]
-            for numbers in several[begin : begin + LANES]
+            [values if other == index else item for other, item in enumerate(best.parameters)]
+            for values in several[begin : begin + LANES]
         ]
-        yield from hypothesis.at_all(run, thetas, like)
+        yield from hypothesis.evaluate_all(run, thetas, like)

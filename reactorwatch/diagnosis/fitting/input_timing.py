@@ -1,7 +1,7 @@
-"""The size of an effect that moves the clock (`ProcessModel.time_offset`), as signals.
+"""The magnitude of an effect that shifts the input timing (`ProcessModel.time_offset`), as signals.
 
-The states feel how fast such a size grows, and a row shows how large it is. It grows no faster than the clock goes,
-for what has set in cannot act before it does: of a step the states first stand still for as long as it is large.
+The states depend on the rate at which the shift grows, a row on its value. It grows no faster than time passes, for
+nothing acts before it has set in: after a step the states first stand still for as long as the shift is large.
 """
 
 import numpy as np
@@ -10,21 +10,21 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.profiles import Signal
 
 
-def felt(signal: Signal, time_min: Array) -> Signal:
-    """What states and outputs have of a size.
+def effective_timing(signal: Signal, time_min: Array) -> Signal:
+    """Split a timing offset into its rate, which acts on the states, and its value, which acts on the outputs.
 
     Args:
-        signal: the size, shape (rows,).
-        time_min: of the rows, shape (rows,).
+        signal: the magnitude in minutes, shape (rows,).
+        time_min: times of the rows, shape (rows,).
 
     Returns:
-        How fast it grows from each row to the next one, min/min, and how large it is at the row, min.
+        Rate over each interval in min/min, and value at each row in min.
     """
-    ahead, step = np.maximum(signal.at_row, 0.0), np.diff(time_min)
+    ahead, step = np.maximum(signal.sample_value, 0.0), np.diff(time_min)
     rise = np.diff(ahead)
-    # What jumps in a row has been there since the jump, and the mean over the row tells how long.
+    # The mean over an interval with a jump gives the time since the jump.
     with np.errstate(divide="ignore", invalid="ignore"):
-        since = step * np.clip((signal.over_row[:-1] - ahead[:-1]) / rise, 0.0, 1.0)
+        since = step * np.clip((signal.interval_mean[:-1] - ahead[:-1]) / rise, 0.0, 1.0)
     for row in np.flatnonzero(rise > since).tolist():
         later, most = row + 1, ahead[row] + since[row]
         while later < ahead.size and ahead[later] > most:

@@ -1,8 +1,8 @@
-"""A sensor that shows what was there some time ago, for the filter: its values are moved to when they were true.
+"""Measurement delay: the delayed values are shifted back to the time at which they were true.
 
-A delay would cost a filter many states. But a value that a sensor shows m late is exactly one that a prompt sensor
-showed at t - m, so the filter is given it there, between the rows of the other sensors, as a row of its own. What it
-says of that value counts for the row in which it was shown.
+A delay line would cost a filter many states. But a value that a sensor shows with a delay m is the one that a sensor
+without delay showed at t - m. So the filter gets it there, as a row of its own between those of the other sensors. Its
+innovation counts for the row in which it was recorded.
 """
 
 from typing import NamedTuple
@@ -11,38 +11,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.run import Run, doubt_of
+from reactorwatch.diagnosis.run import Run, input_uncertainty_of
 from reactorwatch.kalman.innovations import FilterResult
 from reactorwatch.kalman.input_uncertainty import InputUncertainty
 
 
-class Moved(NamedTuple):
-    """A run with the values of one output moved.
+class ShiftedRun(NamedTuple):
+    """A run with the values of one output shifted in time.
 
     Attributes:
-        run: with more rows; its inputs are those of the run and what else was given for every row.
-        prompt: where the run's rows are in it, shape (rows,).
-        late: where the values of the late output are, shape (rows,).
-        before: whether such a value was true before the filter began, so that nothing tells what it is, shape (rows,).
-        uncertainty: the ways of the run on which nobody knows when inputs changed; None: there are none.
+        run: the run with more rows; its inputs include those that were given for every row.
+        record_rows: positions of the record's rows, shape (rows,).
+        delayed_rows: positions of the delayed values, shape (rows,).
+        before_start: true if the value was true before the filter starts, so that it cannot be predicted, shape
+            (rows,).
+        uncertainty: intervals in which inputs changed at unknown times; None without any.
     """
 
     run: Run
-    prompt: NDArray[np.int64]
-    late: NDArray[np.int64]
-    before: NDArray[np.bool_]
+    record_rows: NDArray[np.int64]
+    delayed_rows: NDArray[np.int64]
+    before_start: NDArray[np.bool_]
     uncertainty: InputUncertainty | None = None
 
 
-def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_min: Array) -> Moved:
-    """The run as if the sensor were prompt.
+def shift_measurements(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_min: Array) -> ShiftedRun:
+    """Shift the values of a delayed output.
 
     Args:
         run: the record.
-        inputs: for every row, shape (rows, n).
-        held: which of the inputs are held from their row on; the others belong to the measurements of their row.
-        output: place of the late output.
-        delay_min: shape (rows,), at least 0.
+        inputs: inputs of every row, shape (rows, n).
+        held: mask of inputs that are held from their row on; the others belong to their row's measurements.
+        output: index of the delayed output.
+        delay_min: delay in minutes, shape (rows,), at least 0.
     """
     rows = run.time_min.size
     begins = np.array([0, *run.breaks])
@@ -55,16 +56,16 @@ def moved(run: Run, inputs: Array, held: NDArray[np.bool_], output: int, delay_m
     source = np.clip(np.searchsorted(run.time_min, times, side="right") - 1, 0, rows - 1)
     spread = inputs[source]
     measured = np.full((times.size, run.measured.shape[1]), np.nan)
-    for place in range(measured.shape[1]):
-        measured[late if place == output else prompt, place] = run.measured[:, place]
+    for index in range(measured.shape[1]):
+        measured[late if index == output else prompt, index] = run.measured[:, index]
     spread[late[:, None], np.flatnonzero(~held)] = inputs[:, ~held]
-    uncertainty = doubt_of(run, spread, np.searchsorted(run.time_min, times, side="left"))
-    return Moved(Run(times, spread, measured), prompt, late, before, uncertainty)
+    uncertainty = input_uncertainty_of(run, spread, np.searchsorted(run.time_min, times, side="left"))
+    return ShiftedRun(Run(times, spread, measured), prompt, late, before, uncertainty)
 
 
-def gathered(found: FilterResult, by: Moved, output: int) -> FilterResult:
-    """The filter's run in the rows of the record."""
-    items = [np.array(item[by.prompt]) for item in found]
-    for item, whole in zip(items[:5], found[:5], strict=True):
-        item[:, output] = whole[by.late, output]
+def restore_rows(innovations: FilterResult, by: ShiftedRun, output: int) -> FilterResult:
+    """Rearrange a filter run of the shifted rows to the rows of the record."""
+    items = [np.array(item[by.record_rows]) for item in innovations]
+    for item, whole in zip(items[:5], innovations[:5], strict=True):
+        item[:, output] = whole[by.delayed_rows, output]
     return FilterResult(*items)

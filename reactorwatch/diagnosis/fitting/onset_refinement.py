@@ -1,7 +1,7 @@
-"""The onset of late stamps: it is felt only where an input moves.
+"""Refine the onset of an input-timing fault; only rows where the input changes are informative.
 
-Between two moves one onset is as good as another, and no slope leads from there to the next stretch. So once the other
-numbers are fitted, the onset is tried in the stretches near by, and goes on to the best of them while that gains.
+Between two input changes all onsets are equivalent, and the loss has no slope towards the next interval. So once the
+other parameters are fitted, nearby intervals are tried; the search moves to the best of them as long as that gains.
 """
 
 import numpy as np
@@ -11,41 +11,41 @@ from reactorwatch.diagnosis.fitting.profiles import Step
 from reactorwatch.diagnosis.run import Run
 
 NEAR = np.array([-8, -4, -2, -1, 1, 2, 4, 8])
-"""Stretches that are tried, from where it is."""
+"""Intervals to try, relative to the present one."""
 
 MOST_ROUNDS = 8
 LEAST_GAIN = 0.1
 """In log likelihood."""
 
 
-def walked(run: Run, hypothesis: Hypothesis, best: Fit, steps: int) -> Fit:
-    """With the onset of a step that moves the clock in the best stretch near by; without such a step, as it is.
+def refine_onset(run: Run, hypothesis: Hypothesis, best: Fit, steps: int) -> Fit:
+    """Refine the onsets of steps that shift the timing; other profiles stay.
 
     Args:
         run: the record.
-        hypothesis: any.
-        best: a fit of it.
-        steps: of least squares, at most.
+        hypothesis: hypothesis with or without such a step.
+        best: fit of the hypothesis.
+        steps: maximum number of least-squares steps.
     """
-    for place, course in enumerate(hypothesis.courses):
-        if isinstance(course, Step) and hypothesis.sized.moves_clock(place):
-            best = _walked(run, hypothesis, best, place, steps)
+    for index, profile in enumerate(hypothesis.profiles):
+        if isinstance(profile, Step) and hypothesis.filter.shifts_time(index):
+            best = _refine_onset(run, hypothesis, best, index, steps)
     return best
 
 
-def _walked(run: Run, hypothesis: Hypothesis, best: Fit, place: int, steps: int) -> Fit:
-    moves_min = np.concatenate([run.time_min[:1], run.time_min[run.moves], run.time_min[-1:]])
+def _refine_onset(run: Run, hypothesis: Hypothesis, best: Fit, index: int, steps: int) -> Fit:
+    moves_min = np.concatenate([run.time_min[:1], run.time_min[run.input_changes], run.time_min[-1:]])
     middles_min = 0.5 * (moves_min[1:] + moves_min[:-1])
     for _ in range(MOST_ROUNDS):
-        size, onset_min = best.theta[place]
+        size, onset_min = best.parameters[index]
         here = int(np.searchsorted(moves_min, onset_min + size, side="right")) - 1
         near = here + NEAR
         trials = [
-            [np.array([size, onset]) if other == place else item for other, item in enumerate(best.theta)]
+            [np.array([size, onset]) if other == index else item for other, item in enumerate(best.parameters)]
             for onset in middles_min[near[(near >= 0) & (near < middles_min.size)]]
         ]
-        likeliest = min(hypothesis.at_all(run, trials, best), key=lambda item: item.loss, default=best)
+        likeliest = min(hypothesis.evaluate_all(run, trials, best), key=lambda item: item.loss, default=best)
         if not likeliest.loss < best.loss - LEAST_GAIN:
             break
-        best = hypothesis.fit(run, likeliest.theta, steps)
+        best = hypothesis.fit(run, likeliest.parameters, steps)
     return best

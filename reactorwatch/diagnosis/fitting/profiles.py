@@ -1,12 +1,12 @@
-"""The course of a deviation in time, m(t): what the profiles of the catalogue are for a fit.
+"""Profiles m(t) of a deviation in time, as functions that can be fitted.
 
-A course is a sum of functions of time whose coefficients enter linearly, and some have numbers that shape these
-functions, such as an onset. Between two rows a process feels the mean of m, a sensor shows what m is at the row. So a
-deviation is two signals: `over_row`, held from each row to the next one, and `at_row`. An onset between two rows
-enters through the mean: the fit follows it continuously.
+A profile is a sum of basis functions of time with linear coefficients; nonlinear parameters, such as an onset, shape
+the functions. Between two rows m acts on a process by its mean, a sensor shows its value at the row. So a deviation is
+two signals: `interval_mean`, held from each row to the next, and `sample_value`. An onset between two rows changes the
+mean, so the fit depends on it continuously.
 
-Times are minutes of the plant. The numbers of a course are written as its profile has them
-(`reactorwatch.process.profiles`), so what was fitted can be put into a model, or into the plant.
+Times are minutes of the plant. Parameters are named as in `reactorwatch.process.profiles`, so a fit can be put into a
+model or into the plant.
 """
 
 from abc import ABC, abstractmethod
@@ -21,27 +21,27 @@ from reactorwatch.arrays import Array
 
 
 class Signal(NamedTuple):
-    """A deviation as signals, or several; shape (rows,) or (rows, n).
+    """A deviation as signals, shape (rows,), or several, shape (rows, n).
 
     Attributes:
-        over_row: mean from each row to the next one; of the last row, as it is then.
-        at_row: at each row.
+        interval_mean: mean from each row to the next; in the last row, the value there.
+        sample_value: value at each row.
     """
 
-    over_row: Array
-    at_row: Array
+    interval_mean: Array
+    sample_value: Array
 
 
 @dataclass(frozen=True)
-class Number:
-    """A number that shapes a course.
+class NonlinearParameter:
+    """A parameter that shapes the basis functions.
 
     Attributes:
-        name: as in the profile.
-        unit: of its value.
+        name: name in the profile.
+        unit: unit of its value.
         lower: smallest value.
         upper: largest value.
-        difference: the least one for its derivative.
+        difference: smallest step for numerical derivatives.
     """
 
     name: str
@@ -51,260 +51,249 @@ class Number:
     difference: float
 
 
-class Course(ABC):
-    """A kind of course over the rows of one record.
+class FittedProfile(ABC):
+    """A kind of profile over the rows of one record.
 
     Args:
-        time_min: of the rows, shape (rows,).
+        time_min: times of the rows, shape (rows,).
 
     Attributes:
-        name: of the profile.
-        coefficients: how many functions are summed.
+        name: name of the profile.
+        n_linear: number of basis functions.
     """
 
     name: ClassVar[str]
-    coefficients: int = 1
+    n_linear: int = 1
 
     def __init__(self, time_min: Array) -> None:
         self.time_min = time_min
-        self.begin_min, self.end_min = float(time_min[0]), float(time_min[-1])
+        self.start_min, self.end_min = float(time_min[0]), float(time_min[-1])
         self.period_min = float(np.median(np.diff(time_min)))
         self._step = np.diff(time_min)
 
     @property
-    def numbers(self) -> tuple[Number, ...]:
-        """That shape its functions."""
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """Parameters that shape the basis functions."""
         return ()
 
     @property
-    def freedom(self) -> int:
-        """How many numbers are fitted."""
-        return self.coefficients + len(self.numbers)
+    def n_parameters(self) -> int:
+        """Number of fitted parameters."""
+        return self.n_linear + len(self.nonlinear_parameters)
 
     @abstractmethod
-    def functions(self, shape: Array) -> tuple[Array, Array]:
-        """The functions and their integrals from the first row, each of shape (rows, coefficients)."""
+    def basis_functions(self, shape: Array) -> tuple[Array, Array]:
+        """Basis functions and their integrals from the first row, each of shape (rows, n_linear)."""
 
-    @abstractmethod
-    def parameters(self, theta: Array) -> dict[str, float]:
-        """The numbers of the profile; `size` first."""
+    def profile_values(self, parameters: Array) -> dict[str, float]:
+        """Parameter values of the profile by name, `size` first."""
+        shape = zip(self.nonlinear_parameters, parameters[self.n_linear :].tolist(), strict=True)
+        return {"size": float(parameters[0])} | {item.name: value for item, value in shape}
 
     def unit(self, name: str, unit_of_size: str) -> str:
-        """Of a parameter."""
+        """Unit of a profile parameter."""
         if name.startswith("value"):
             return "1"
         return {"size": unit_of_size, "phase": "rad"}.get(name, "min")
 
-    def basis(self, shape: Array) -> Signal:
-        """The functions as signals, shape (rows, coefficients), without gaps in memory."""
-        return self._formed(shape) if self.numbers else self._only
+    def basis_signals(self, shape: Array) -> Signal:
+        """Basis functions as signals, shape (rows, n_linear), contiguous in memory."""
+        return self._to_signal(shape) if self.nonlinear_parameters else self._fixed_basis
 
     @cached_property
-    def _only(self) -> Signal:
-        """Of a course whose functions no number shapes."""
-        return self._formed(np.empty(0))
+    def _fixed_basis(self) -> Signal:
+        """Basis of a profile without nonlinear parameters."""
+        return self._to_signal(np.empty(0))
 
-    def _formed(self, shape: Array) -> Signal:
-        value, area = self.functions(shape)
-        over_row = np.append(np.diff(area, axis=0) / self._step[:, None], value[-1:], axis=0)
-        return Signal(over_row, value)
+    def _to_signal(self, shape: Array) -> Signal:
+        value, area = self.basis_functions(shape)
+        interval_mean = np.append(np.diff(area, axis=0) / self._step[:, None], value[-1:], axis=0)
+        return Signal(interval_mean, value)
 
-    def signal(self, theta: Array) -> Signal:
-        """The deviation; theta has the coefficients first, then the numbers."""
-        over_row, at_row = self.basis(theta[self.coefficients :])
-        by = theta[: self.coefficients]
-        return Signal(over_row @ by, at_row @ by)
+    def signal(self, parameters: Array) -> Signal:
+        """Deviation at these parameters: linear ones first, then nonlinear ones."""
+        interval_mean, sample_value = self.basis_signals(parameters[self.n_linear :])
+        by = parameters[: self.n_linear]
+        return Signal(interval_mean @ by, sample_value @ by)
 
-    def derivatives(self, theta: Array, differences: Array) -> Signal:
-        """Of the deviation by theta, shape (rows, freedom).
+    def derivatives(self, parameters: Array, differences: Array) -> Signal:
+        """Derivatives of the deviation by the parameters, shape (rows, n_parameters).
 
         Args:
-            theta: coefficients, then numbers.
-            differences: of the numbers, from which theirs come; at least those of `numbers`.
+            parameters: linear, then nonlinear parameters.
+            differences: steps for the nonlinear parameters, at least `difference_steps`.
         """
-        basis = self.basis(theta[self.coefficients :])
-        if not self.numbers:
+        basis = self.basis_signals(parameters[self.n_linear :])
+        if not self.nonlinear_parameters:
             return basis
         columns = [basis]
-        for place, (number, difference) in enumerate(
-            zip(self.numbers, differences, strict=True), start=self.coefficients
+        for index, (number, difference) in enumerate(
+            zip(self.nonlinear_parameters, differences, strict=True), start=self.n_linear
         ):
-            low, high = theta.copy(), theta.copy()
-            low[place] = max(theta[place] - difference, min(number.lower, theta[place] - number.difference))
-            high[place] = min(theta[place] + difference, max(number.upper, theta[place] + number.difference))
+            low, high = parameters.copy(), parameters.copy()
+            low[index] = max(parameters[index] - difference, min(number.lower, parameters[index] - number.difference))
+            high[index] = min(parameters[index] + difference, max(number.upper, parameters[index] + number.difference))
             near = zip(self.signal(low), self.signal(high), strict=True)
-            columns.append(Signal(*((after - before)[:, None] / (high[place] - low[place]) for before, after in near)))
+            columns.append(Signal(*((after - before)[:, None] / (high[index] - low[index]) for before, after in near)))
         return Signal(*(np.concatenate(items, axis=1) for items in zip(*columns, strict=True)))
 
     @property
-    def least_differences(self) -> Array:
-        """Of the numbers, for their derivatives; shape (numbers,)."""
-        return np.array([number.difference for number in self.numbers])
+    def difference_steps(self) -> Array:
+        """Smallest steps for derivatives by the nonlinear parameters, shape (nonlinear parameters,)."""
+        return np.array([number.difference for number in self.nonlinear_parameters])
 
-    def limited(self, theta: Array, lower: float, upper: float) -> Array:
-        """The nearest possible numbers."""
-        found = theta.copy()
-        found[: self.coefficients] = self._coefficients_limited(theta[: self.coefficients], lower, upper)
-        for place, number in enumerate(self.numbers, start=self.coefficients):
-            found[place] = min(max(found[place], number.lower), number.upper)
-        return found
+    def clip(self, parameters: Array, lower: float, upper: float) -> Array:
+        """Clip the parameters to their bounds."""
+        result = parameters.copy()
+        result[: self.n_linear] = self._clip_linear(parameters[: self.n_linear], lower, upper)
+        for index, number in enumerate(self.nonlinear_parameters, start=self.n_linear):
+            result[index] = min(max(result[index], number.lower), number.upper)
+        return result
 
-    def _coefficients_limited(self, by: Array, lower: float, upper: float) -> Array:
+    def _clip_linear(self, by: Array, lower: float, upper: float) -> Array:
         return np.clip(by, lower, upper)
 
-    def _onset(self) -> Number:
-        return Number("onset", "min", self.begin_min, self.end_min - self.period_min, self.period_min / 2)
+    def _onset(self) -> NonlinearParameter:
+        return NonlinearParameter("onset", "min", self.start_min, self.end_min - self.period_min, self.period_min / 2)
 
 
-class Constant(Course):
-    """There all the time."""
+class Constant(FittedProfile):
+    """Constant deviation over the whole record."""
 
     name = "constant"
 
-    def functions(self, shape: Array) -> tuple[Array, Array]:
-        """See `Course`."""
-        return np.ones((self.time_min.size, 1)), self.time_min[:, None] - self.begin_min
-
-    def parameters(self, theta: Array) -> dict[str, float]:
-        """See `Course`."""
-        return {"size": float(theta[0])}
+    def basis_functions(self, shape: Array) -> tuple[Array, Array]:
+        """See `FittedProfile`."""
+        return np.ones((self.time_min.size, 1)), self.time_min[:, None] - self.start_min
 
 
-class Step(Course):
-    """Sets in at once and stays."""
+class Step(FittedProfile):
+    """Step at the onset."""
 
     name = "step"
 
     @property
-    def numbers(self) -> tuple[Number, ...]:
-        """See `Course`."""
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """See `FittedProfile`."""
         return (self._onset(),)
 
-    def functions(self, shape: Array) -> tuple[Array, Array]:
-        """See `Course`."""
+    def basis_functions(self, shape: Array) -> tuple[Array, Array]:
+        """See `FittedProfile`."""
         age = self.time_min - shape[0]
         return (age >= 0.0).astype(float)[:, None], np.maximum(age, 0.0)[:, None]
 
-    def parameters(self, theta: Array) -> dict[str, float]:
-        """See `Course`."""
-        return {"size": float(theta[0]), "onset": float(theta[1])}
 
-
-class Ramp(Course):
-    """Grows evenly from its onset to the end of the record."""
+class Ramp(FittedProfile):
+    """Linear growth from the onset to the end of the record."""
 
     name = "ramp"
 
     @property
-    def numbers(self) -> tuple[Number, ...]:
-        """See `Course`."""
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """See `FittedProfile`."""
         return (self._onset(),)
 
-    def functions(self, shape: Array) -> tuple[Array, Array]:
-        """See `Course`."""
+    def basis_functions(self, shape: Array) -> tuple[Array, Array]:
+        """See `FittedProfile`."""
         age, span = np.maximum(self.time_min - shape[0], 0.0), max(self.end_min - shape[0], self.period_min)
         return (age / span)[:, None], (0.5 * age**2 / span)[:, None]
 
-    def parameters(self, theta: Array) -> dict[str, float]:
-        """See `Course`."""
-        return {"size": float(theta[0]), "onset": float(theta[1]), "end": self.end_min}
+    def profile_values(self, parameters: Array) -> dict[str, float]:
+        """See `FittedProfile`."""
+        return super().profile_values(parameters) | {"end": self.end_min}
 
 
-class Decay(Course):
-    """Approaches its size exponentially."""
+class Decay(FittedProfile):
+    """First-order approach to the final magnitude."""
 
     name = "decay"
 
     @property
-    def numbers(self) -> tuple[Number, ...]:
-        """See `Course`."""
-        shortest, longest = 5.0 * self.period_min, 3.0 * (self.end_min - self.begin_min)
-        return (self._onset(), Number("time_constant", "min", shortest, longest, 0.1 * shortest))
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """See `FittedProfile`."""
+        shortest, longest = 5.0 * self.period_min, 3.0 * (self.end_min - self.start_min)
+        return (self._onset(), NonlinearParameter("time_constant", "min", shortest, longest, 0.1 * shortest))
 
-    def functions(self, shape: Array) -> tuple[Array, Array]:
-        """See `Course`."""
+    def basis_functions(self, shape: Array) -> tuple[Array, Array]:
+        """See `FittedProfile`."""
         age = np.maximum(self.time_min - shape[0], 0.0)
-        left = -np.expm1(-age / shape[1])
-        return left[:, None], (age - shape[1] * left)[:, None]
-
-    def parameters(self, theta: Array) -> dict[str, float]:
-        """See `Course`."""
-        return {"size": float(theta[0]), "onset": float(theta[1]), "time_constant": float(theta[2])}
+        approach = -np.expm1(-age / shape[1])
+        return approach[:, None], (age - shape[1] * approach)[:, None]
 
 
-class Sine(Course):
-    """Swings about zero, from the first row on."""
+class Sine(FittedProfile):
+    """Sine about zero, from the first row on."""
 
     name = "sine"
-    coefficients = 2
+    n_linear = 2
 
     @property
-    def numbers(self) -> tuple[Number, ...]:
-        """See `Course`."""
-        span = self.end_min - self.begin_min
-        return (Number("period", "min", 4.0 * self.period_min, span, 1e-5 * span),)
+    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
+        """See `FittedProfile`."""
+        span = self.end_min - self.start_min
+        return (NonlinearParameter("period", "min", 4.0 * self.period_min, span, 1e-5 * span),)
 
-    def functions(self, shape: Array) -> tuple[Array, Array]:
-        """See `Course`."""
+    def basis_functions(self, shape: Array) -> tuple[Array, Array]:
+        """See `FittedProfile`."""
         rate = 2.0 * pi / shape[0]
-        angle = rate * (self.time_min - self.begin_min)
+        angle = rate * (self.time_min - self.start_min)
         sine, cosine = np.sin(angle), np.cos(angle)
         return np.stack([sine, cosine], axis=1), np.stack([(1.0 - cosine) / rate, sine / rate], axis=1)
 
-    def parameters(self, theta: Array) -> dict[str, float]:
-        """See `Course`."""
-        size, phase = hypot(theta[0], theta[1]), atan2(theta[1], theta[0])
-        return {"size": size, "onset": self.begin_min, "period": float(theta[2]), "phase": phase}
+    def profile_values(self, parameters: Array) -> dict[str, float]:
+        """See `FittedProfile`."""
+        size, phase = hypot(parameters[0], parameters[1]), atan2(parameters[1], parameters[0])
+        return {"size": size, "onset": self.start_min, "period": float(parameters[2]), "phase": phase}
 
-    def _coefficients_limited(self, by: Array, lower: float, upper: float) -> Array:
-        """A swing goes to both sides; of an effect that has but one, too, as far as that goes."""
+    def _clip_linear(self, by: Array, lower: float, upper: float) -> Array:
+        """Limit the amplitude to the smaller bound; of a one-sided effect, to the other bound."""
         reach = min(-lower, upper) if lower < 0.0 else upper
         return np.asarray(by * min(1.0, reach / max(hypot(*by), 1e-300)))
 
 
-class Free(Course):
-    """A curve: straight between knots at even distances.
+class PiecewiseLinear(FittedProfile):
+    """Piecewise-linear curve with equidistant knots.
 
     Args:
-        time_min: of the rows.
-        knots: how many.
+        time_min: times of the rows.
+        knots: number of knots.
     """
 
     name = "free"
 
     def __init__(self, time_min: Array, knots: int) -> None:
         super().__init__(time_min)
-        self.coefficients = knots
-        self.knots_min = np.linspace(self.begin_min, self.end_min, knots)
-        self._value = hats((time_min - self.begin_min) / (self.end_min - self.begin_min), knots)
+        self.n_linear = knots
+        self.knots_min = np.linspace(self.start_min, self.end_min, knots)
+        self._value = hat_functions((time_min - self.start_min) / (self.end_min - self.start_min), knots)
         means = 0.5 * (self._value[1:] + self._value[:-1]) * self._step[:, None]
         self._area = np.concatenate([np.zeros((1, knots)), np.cumsum(means, axis=0)])
 
-    def functions(self, shape: Array) -> tuple[Array, Array]:
-        """See `Course`."""
+    def basis_functions(self, shape: Array) -> tuple[Array, Array]:
+        """See `FittedProfile`."""
         return self._value, self._area
 
-    def parameters(self, theta: Array) -> dict[str, float]:
-        """See `Course`. The size is the largest deviation, and the values are shares of it."""
-        values = theta[: self.coefficients]
+    def profile_values(self, parameters: Array) -> dict[str, float]:
+        """See `FittedProfile`. The size is the largest deviation; the values are fractions of it."""
+        values = parameters[: self.n_linear]
         size = float(values[np.argmax(np.abs(values))])
-        found = {"size": size}
-        found |= {f"time_{place}": float(time_min) for place, time_min in enumerate(self.knots_min, start=1)}
-        return found | {f"value_{place}": float(value) / (size or 1.0) for place, value in enumerate(values, start=1)}
+        result = {"size": size}
+        result |= {f"time_{index}": float(time_min) for index, time_min in enumerate(self.knots_min, start=1)}
+        return result | {f"value_{index}": float(value) / (size or 1.0) for index, value in enumerate(values, start=1)}
 
 
-def hats(share: Array, count: int) -> Array:
-    """Functions that are straight between knots at even distances, 1 in one and 0 in the others.
+def hat_functions(share: Array, count: int) -> Array:
+    """Hat functions of equidistant knots: 1 at one knot, 0 at the others.
 
     Args:
-        share: where, 0 at the first knot and 1 at the last, within; shape (n,).
-        count: of knots, at least 2.
+        share: positions from 0 at the first knot to 1 at the last, shape (n,).
+        count: number of knots, at least 2.
 
     Returns:
         Shape (n, count).
     """
-    place = share * (count - 1)
-    knot = np.minimum(place.astype(np.intp), count - 2)
-    rows, found = np.arange(share.size), np.zeros((share.size, count))
-    found[rows, knot], found[rows, knot + 1] = 1.0 - (place - knot), place - knot
-    return found
+    index = share * (count - 1)
+    knot = np.minimum(index.astype(np.intp), count - 2)
+    rows, result = np.arange(share.size), np.zeros((share.size, count))
+    result[rows, knot], result[rows, knot + 1] = 1.0 - (index - knot), index - knot
+    return result

@@ -1,20 +1,19 @@
-"""What a deviation of any shape in time does to a filter's innovations, linearised; for all causes at once.
+"""Signatures: the linearised effect of any deviation m(t) on a filter's innovations, for all causes at once.
 
-Whitened innovations w of a filter that does not know of a deviation have the mean g(m), linear in its course m(t)
-(`reactorwatch.kalman.error_dynamics` has the equations). Four things are asked of that map again and again, and each
-costs one pass over the record:
+The normalised innovations w of a filter without the deviation have the mean g(m), linear in m
+(`reactorwatch.kalman.error_dynamics` has the equations). Each of these operations is one pass over the record:
 
-- `shown`: the signature g of some given courses, forwards; and `products`: their sums of products alone.
-- `sought`: for every row, by how much sum(w g) grows with the deviation in that row, backwards. It is the adjoint, so
-  that sum(w g) of any course is the sum over rows of course times this.
-- `onsets`: sum(w g) and sum(g g) of a course that sets in after a row, for every row, backwards: the value of a
-  quadratic form in the filter's error and in what is still to come. With m(t) = a after the onset, where from row to
-  row a <- a + beta b and b <- gamma b, (a, b) begins as (1, 0) for a step and as (0, 1) for a ramp (beta the row's
-  length, gamma 1) or a decay (gamma the share of the way that is left after a row, beta 1 - gamma).
+- `forward_signatures`: signatures g of given profiles; `gram`: their sums of products alone.
+- `adjoint`: derivative of sum(w g) by the deviation in each row, backwards; sum(w g) of any profile is the sum over
+  rows of the profile times this.
+- `onset_scan`: sum(w g) and sum(g g) of a profile that sets in after a row, for every row, backwards: the value of a
+  quadratic form in the filter's error and the deviation's state. With m(t) = a after the onset, and a <- a + beta b, b
+  <- gamma b from row to row, (a, b) starts as (1, 0) for a step and as (0, 1) for a ramp (beta the row's length, gamma
+  1) or a decay (gamma the fraction that remains after a row, beta 1 - gamma).
 
-For a course of the likeliest size, twice the logarithm of the likelihood ratio is sum(w g)^2 / sum(g g) (Willsky &
-Jones 1976, A generalized likelihood ratio approach to the detection and estimation of jumps in linear systems, IEEE
-Trans. Automatic Control 21).
+At the most likely magnitude, twice the log likelihood ratio is sum(w g)^2 / sum(g g) (Willsky & Jones 1976, A
+generalized likelihood ratio approach to the detection and estimation of jumps in linear systems, IEEE Trans. Automatic
+Control 21).
 """
 
 from typing import NamedTuple
@@ -25,21 +24,21 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 
-PART = 256
-"""Rows whose signatures are summed up while they are still at hand."""
+CHUNK_ROWS = 256
+"""Rows whose signatures are summed while they are in the cache."""
 
 _DEAD = 1e-150
-"""Of an error of the state: its square is still a number."""
+"""Errors of the state below this are set to 0; its square is still a normal number."""
 
 
-class Onsets(NamedTuple):
-    """Of courses that set in right after a row.
+class OnsetScan(NamedTuple):
+    """Projections of profiles that set in right after each row.
 
     Attributes:
-        step_a: sum(w g) of a step of size 1, shape (rows - 1, causes).
-        step_b: sum(g g) of it, likewise.
-        other_a: sum(w g) of each other course, shape (others, rows - 1, causes).
-        other_b: sum(g g) of them, likewise.
+        step_a: sum(w g) of a unit step, shape (rows - 1, causes).
+        step_b: sum(g g) of a unit step, shape (rows - 1, causes).
+        other_a: sum(w g) of each other profile, shape (others, rows - 1, causes).
+        other_b: sum(g g) of each other profile, shape (others, rows - 1, causes).
     """
 
     step_a: Array
@@ -48,133 +47,143 @@ class Onsets(NamedTuple):
     other_b: Array
 
 
-def shown(ways: ErrorDynamics, cause: int, over_row: Array, at_row: Array) -> Array:
-    """The signatures of some courses of one cause, shape (rows - 1, n_y, courses).
+def forward_signatures(dynamics: ErrorDynamics, cause: int, interval_mean: Array, sample_value: Array) -> Array:
+    """Signatures of profiles of one cause, shape (rows - 1, n_y, profiles).
 
     Args:
-        ways: between the rows.
-        cause: which of the sizes.
-        over_row: mean deviation from each row to the next one, shape (rows - 1, courses).
-        at_row: the deviation at each row but the first, likewise.
+        dynamics: error equations between the rows.
+        cause: index of the cause.
+        interval_mean: mean deviation from each row to the next, shape (rows - 1, profiles).
+        sample_value: deviation at each row but the first, shape (rows - 1, profiles).
     """
-    G, D = np.ascontiguousarray(ways.G[:, :, cause]), np.ascontiguousarray(ways.D[:, :, cause])
-    return np.asarray(_shown(*_common(ways), G, D, over_row, at_row))
+    G, D = np.ascontiguousarray(dynamics.G[:, :, cause]), np.ascontiguousarray(dynamics.D[:, :, cause])
+    return np.asarray(_forward_signatures(*_matrices(dynamics), G, D, interval_mean, sample_value))
 
 
-def products(ways: ErrorDynamics, cause: int, over_row: Array, at_row: Array) -> tuple[Array, Array]:
-    """The sums w g of all such signatures, shape (courses,), and g g of any two, shape (courses, courses)."""
-    G, D = np.ascontiguousarray(ways.G[:, :, cause]), np.ascontiguousarray(ways.D[:, :, cause])
-    a, b = _products(*_common(ways), G, D, np.ascontiguousarray(ways.w), over_row, at_row)
+def gram(dynamics: ErrorDynamics, cause: int, interval_mean: Array, sample_value: Array) -> tuple[Array, Array]:
+    """Sums w g of such signatures, shape (profiles,), and g g of each two, shape (profiles, profiles)."""
+    G, D = np.ascontiguousarray(dynamics.G[:, :, cause]), np.ascontiguousarray(dynamics.D[:, :, cause])
+    a, b = _gram(*_matrices(dynamics), G, D, np.ascontiguousarray(dynamics.w), interval_mean, sample_value)
     return np.asarray(a), np.asarray(b)
 
 
-def sought(ways: ErrorDynamics) -> tuple[Array, Array]:
-    """How sum(w g) grows with the deviation over each way, and at the row after it; shapes (rows - 1, causes)."""
-    over_row, at_row = _sought(*_common(ways), *_of_sizes(ways), np.ascontiguousarray(ways.w))
-    return np.asarray(over_row), np.asarray(at_row)
+def adjoint(dynamics: ErrorDynamics) -> tuple[Array, Array]:
+    """Derivatives of sum(w g) by each interval's mean and by the value at its end, shapes (rows - 1, causes)."""
+    interval_mean, sample_value = _adjoint(*_matrices(dynamics), *_inputs_and_innovations(dynamics))
+    return np.asarray(interval_mean), np.asarray(sample_value)
 
 
-def onsets(ways: ErrorDynamics, beta: Array, gamma: Array, mean: Array) -> Onsets:
-    """Of a step and of other courses, at every onset.
+def onset_scan(dynamics: ErrorDynamics, beta: Array, gamma: Array, mean: Array) -> OnsetScan:
+    """Scan all onsets of a step and of other profiles.
 
     Args:
-        ways: between the rows.
-        beta: of each way, for each other course, see the module; shape (others, rows - 1).
-        gamma: likewise.
-        mean: over the way the deviation is a + mean b on average, likewise.
+        dynamics: error equations between the rows.
+        beta: see the module, shape (others, rows - 1).
+        gamma: see the module, shape (others, rows - 1).
+        mean: the mean deviation of an interval is a + mean b, shape (others, rows - 1).
     """
-    return Onsets(*_onsets(*_common(ways), *_of_sizes(ways), np.ascontiguousarray(ways.w), beta, gamma, mean))
+    return OnsetScan(*_onset_scan(*_matrices(dynamics), *_inputs_and_innovations(dynamics), beta, gamma, mean))
 
 
-def _common(ways: ErrorDynamics) -> tuple[Array, Array, Array, Array]:
-    return ways.F, ways.H, ways.K, ways.whitening
+def _matrices(dynamics: ErrorDynamics) -> tuple[Array, Array, Array, Array]:
+    return dynamics.F, dynamics.H, dynamics.K, dynamics.whitening
 
 
-def _of_sizes(ways: ErrorDynamics) -> tuple[Array, Array]:
-    return np.ascontiguousarray(ways.G), np.ascontiguousarray(ways.D)
-
-
-@jit
-def _shown(F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, over_row: Array, at_row: Array) -> Array:
-    rows, n_x, n_y, courses = F.shape[0], F.shape[1], H.shape[1], over_row.shape[1]
-    found = np.zeros((rows, n_y, courses))
-    _show(F, H, K, whitening, G, D, over_row, at_row, 0, np.zeros((n_x, courses)), found)
-    return found
+def _inputs_and_innovations(dynamics: ErrorDynamics) -> tuple[Array, Array, Array]:
+    return np.ascontiguousarray(dynamics.G), np.ascontiguousarray(dynamics.D), np.ascontiguousarray(dynamics.w)
 
 
 @jit
-def _products(
-    F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, w: Array, over_row: Array, at_row: Array
-) -> tuple[Array, Array]:
-    rows, n_x, n_y, courses = F.shape[0], F.shape[1], H.shape[1], over_row.shape[1]
-    a, b, e = np.zeros(courses), np.zeros((courses, courses)), np.zeros((n_x, courses))
-    part = np.zeros((PART, n_y, courses))
-    for begin in range(0, rows, PART):
-        count = min(PART, rows - begin)
-        part[:] = 0.0
-        _show(F, H, K, whitening, G, D, over_row, at_row, begin, e, part[:count])
-        g = part[:count].reshape(count * n_y, courses)
-        a += g.T @ w[begin : begin + count].copy().reshape(count * n_y)
-        b += g.T @ g
-    return a, b
+def _forward_signatures(
+    F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, interval_mean: Array, sample_value: Array
+) -> Array:
+    rows, n_x, n_y, profiles = F.shape[0], F.shape[1], H.shape[1], interval_mean.shape[1]
+    result = np.zeros((rows, n_y, profiles))
+    _propagate(F, H, K, whitening, G, D, interval_mean, sample_value, 0, np.zeros((n_x, profiles)), result)
+    return result
 
 
 @jit
-def _show(
+def _gram(
     F: Array,
     H: Array,
     K: Array,
     whitening: Array,
     G: Array,
     D: Array,
-    over_row: Array,
-    at_row: Array,
+    w: Array,
+    interval_mean: Array,
+    sample_value: Array,
+) -> tuple[Array, Array]:
+    rows, n_x, n_y, profiles = F.shape[0], F.shape[1], H.shape[1], interval_mean.shape[1]
+    a, b, e = np.zeros(profiles), np.zeros((profiles, profiles)), np.zeros((n_x, profiles))
+    part = np.zeros((CHUNK_ROWS, n_y, profiles))
+    for begin in range(0, rows, CHUNK_ROWS):
+        count = min(CHUNK_ROWS, rows - begin)
+        part[:] = 0.0
+        _propagate(F, H, K, whitening, G, D, interval_mean, sample_value, begin, e, part[:count])
+        g = part[:count].reshape(count * n_y, profiles)
+        a += g.T @ w[begin : begin + count].copy().reshape(count * n_y)
+        b += g.T @ g
+    return a, b
+
+
+@jit
+def _propagate(
+    F: Array,
+    H: Array,
+    K: Array,
+    whitening: Array,
+    G: Array,
+    D: Array,
+    interval_mean: Array,
+    sample_value: Array,
     begin: int,
     e: Array,
-    found: Array,
+    result: Array,
 ) -> None:
-    """The signatures of rows from one on, of which `found` is still empty; `e` are the errors of the state there."""
-    n_x, n_y, courses = F.shape[1], H.shape[1], over_row.shape[1]
-    before, off = np.zeros((n_x, courses)), np.zeros((n_y, courses))
-    for place in range(found.shape[0]):  # courses innermost, so that several are taken at once
-        k = begin + place
+    """Add the signatures of rows from `begin` on to zeros; `e` holds the errors of the state and is updated."""
+    n_x, n_y, profiles = F.shape[1], H.shape[1], interval_mean.shape[1]
+    predicted, innovation = np.zeros((n_x, profiles)), np.zeros((n_y, profiles))
+    for index in range(result.shape[0]):  # profiles innermost, for SIMD
+        k = begin + index
         for i in range(n_x):
             by = G[k, i]
-            for c in range(courses):
-                before[i, c] = by * over_row[k, c]
+            for c in range(profiles):
+                predicted[i, c] = by * interval_mean[k, c]
             for j in range(n_x):
                 by = F[k, i, j]
-                for c in range(courses):
-                    before[i, c] += by * e[j, c]
+                for c in range(profiles):
+                    predicted[i, c] += by * e[j, c]
         for i in range(n_y):
             by = D[k, i]
-            for c in range(courses):
-                off[i, c] = by * at_row[k, c]
+            for c in range(profiles):
+                innovation[i, c] = by * sample_value[k, c]
             for j in range(n_x):
                 by = H[k, i, j]
-                for c in range(courses):
-                    off[i, c] += by * before[j, c]
+                for c in range(profiles):
+                    innovation[i, c] += by * predicted[j, c]
         for i in range(n_x):
-            for c in range(courses):
-                e[i, c] = before[i, c]
+            for c in range(profiles):
+                e[i, c] = predicted[i, c]
             for j in range(n_y):
                 by = K[k, i, j]
-                for c in range(courses):
-                    e[i, c] -= by * off[j, c]
-            for c in range(courses):  # what has died away takes a hundred times as long to multiply
+                for c in range(profiles):
+                    e[i, c] -= by * innovation[j, c]
+            for c in range(profiles):  # denormal numbers take a hundred times as long to multiply
                 e[i, c] = e[i, c] if abs(e[i, c]) > _DEAD else 0.0
         for i in range(n_y):
             for j in range(i + 1):
                 by = whitening[k, i, j]
-                for c in range(courses):
-                    found[place, i, c] += by * off[j, c]
+                for c in range(profiles):
+                    result[index, i, c] += by * innovation[j, c]
 
 
 @jit
-def _sought(F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, w: Array) -> tuple[Array, Array]:
+def _adjoint(F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, w: Array) -> tuple[Array, Array]:
     rows, n_x, n_y, causes = F.shape[0], F.shape[1], H.shape[1], G.shape[2]
-    over_row, at_row = np.zeros((rows, causes)), np.zeros((rows, causes))
-    after, before, off = np.zeros(n_x), np.zeros(n_x), np.zeros(n_y)
+    interval_mean, sample_value = np.zeros((rows, causes)), np.zeros((rows, causes))
+    after, predicted, innovation = np.zeros(n_x), np.zeros(n_x), np.zeros(n_y)
     for k in range(rows - 1, -1, -1):
         for i in range(n_y):
             value = 0.0
@@ -182,23 +191,23 @@ def _sought(F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, 
                 value += whitening[k, j, i] * w[k, j]
             for j in range(n_x):
                 value -= K[k, j, i] * after[j]
-            off[i] = value
+            innovation[i] = value
         for i in range(n_x):
             value = after[i]
             for j in range(n_y):
-                value += H[k, j, i] * off[j]
-            before[i] = value
+                value += H[k, j, i] * innovation[j]
+            predicted[i] = value
         for c in range(causes):
             for i in range(n_y):
-                at_row[k, c] += D[k, i, c] * off[i]
+                sample_value[k, c] += D[k, i, c] * innovation[i]
             for i in range(n_x):
-                over_row[k, c] += G[k, i, c] * before[i]
+                interval_mean[k, c] += G[k, i, c] * predicted[i]
         for i in range(n_x):
             value = 0.0
             for j in range(n_x):
-                value += F[k, j, i] * before[j]
+                value += F[k, j, i] * predicted[j]
             after[i] = value
-    return over_row, at_row
+    return interval_mean, sample_value
 
 
 @jit
@@ -223,7 +232,7 @@ def _add_transposed(into: Array, by: Array, columns: Array) -> None:
 
 @jit
 def _add_dots(into: Array, one: Array, other: Array) -> None:
-    """Add the products of each column with that of the other matrix."""
+    """Add the dot products of corresponding columns."""
     for i in range(one.shape[0]):
         for c in range(one.shape[1]):
             into[0, c] += one[i, c] * other[i, c]
@@ -231,34 +240,25 @@ def _add_dots(into: Array, one: Array, other: Array) -> None:
 
 @jit
 def _mix(into: Array, share: float, one: Array, slope: float, other: Array) -> None:
-    """Make it share * one + slope * other."""
+    """Set to share * one + slope * other."""
     for i in range(one.shape[0]):
         for c in range(one.shape[1]):
             into[i, c] = share * one[i, c] + slope * other[i, c]
 
 
 @jit
-def _onsets(
-    F: Array,
-    H: Array,
-    K: Array,
-    whitening: Array,
-    G: Array,
-    D: Array,
-    w: Array,
-    beta: Array,
-    gamma: Array,
-    mean: Array,
+def _onset_scan(
+    F: Array, H: Array, K: Array, whitening: Array, G: Array, D: Array, w: Array, beta: Array, gamma: Array, mean: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Of z = (e, a, b) behind a row, sum(g g) = z'N z and sum(w g) = n'z; what only e is in, all causes share.
+    """Backward recursion: with z = (e, a, b) after a row, sum(g g) = z'N z and sum(w g) = n'z.
 
-    Over a row e <- A e + m a + mb b and g = V e + v a + vb b. What a and b do comes from what moves the state (mg, vg)
-    and from what a sensor shows (md, vd), in shares of their own for each other course.
+    All causes share N_ee and n_e. Over a row e <- A e + m a + mb b and g = V e + v a + vb b. The parts of a and b come
+    from what acts on the state (mg, vg) and on the sensor (md, vd), in other proportions for each other profile.
     """
     rows, n_x, n_y, causes, others = F.shape[0], F.shape[1], H.shape[1], G.shape[2], beta.shape[0]
     step_a, step_b = np.zeros((rows, causes)), np.zeros((rows, causes))
     other_a, other_b = np.zeros((others, rows, causes)), np.zeros((others, rows, causes))
-    one = (1, causes)  # what is one number a cause has two axes, too
+    one = (1, causes)  # scalars of each cause have two axes, too
     N_ee, n_e, N_before, n_before = np.zeros((n_x, n_x)), np.zeros((n_x, 1)), np.zeros((n_x, n_x)), np.zeros((n_x, 1))
     N_ea, N_aa, n_a = np.zeros((n_x, causes)), np.zeros(one), np.zeros(one)
     N_eb = np.zeros((others, n_x, causes))
@@ -283,19 +283,19 @@ def _onsets(
         _mix(m, 1.0, mg, 1.0, md)
         _mix(v, 1.0, vg, 1.0, vd)
         for o in range(others):
-            slope, left = beta[o, k], gamma[o, k]
+            slope, decay = beta[o, k], gamma[o, k]
             _mix(mb, mean[o, k], mg, slope, md)
             _mix(vb, mean[o, k], vg, slope, vd)
-            # What N makes of the column of b: q of e, and of a and of b.
-            _mix(q, slope, N_ea, left, N_eb[o])
-            _mix(of_a, slope, N_aa, left, N_ab[o])
-            _mix(of_b, slope, N_ab[o], left, N_bb[o])
+            # Column b of N: q for e, of_a for a, of_b for b.
+            _mix(q, slope, N_ea, decay, N_eb[o])
+            _mix(of_a, slope, N_aa, decay, N_ab[o])
+            _mix(of_b, slope, N_ab[o], decay, N_bb[o])
             _add(q, N_ee, mb)
             _add_dots(of_a, N_ea, mb)
             _add_dots(of_b, N_eb[o], mb)
             N_ab[o] = of_a
-            _mix(N_bb[o], slope, of_a, left, of_b)
-            _mix(n_b[o], slope, n_a, left, n_b[o])
+            _mix(N_bb[o], slope, of_a, decay, of_b)
+            _mix(n_b[o], slope, n_a, decay, n_b[o])
             N_eb[o] = 0.0
             _add_dots(N_ab[o], m, q)
             _add_dots(N_ab[o], v, vb)

@@ -1,1 +1,1 @@
-"""A diagnosis for people and machines: sentences, an object for JSON, and a page with pictures. All of it is text."""
+"""A diagnosis as text, as an object for JSON, and as a page with figures; pure functions that return text."""

@@ -1,4 +1,4 @@
-"""The balances of a model with causes in them, as MathML in which what the causes bring is marked."""
+"""Balances of a model with causes in them, as MathML with the causes' terms marked."""
 
 import inspect
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from reactorwatch.process.model import ProcessModel
 
 @dataclass(frozen=True)
 class Equation:
-    """One line.
+    """One equation.
 
     Attributes:
-        left: MathML of what it is of.
-        right: MathML of what that is; where it is too long to be read, what it was before, and that it has changed.
-        changed: whether a cause is in it.
+        left: MathML of the left side.
+        right: MathML of the right side; if it is too long, the former one with a remark that it has changed.
+        changed: true if a cause is in it.
     """
 
     left: str
@@ -28,11 +28,11 @@ class Equation:
 
 @dataclass(frozen=True)
 class Meaning:
-    """What a cause is.
+    """Meaning of a cause.
 
     Attributes:
-        symbol: MathML of its size in the equations.
-        text: what it does, in a sentence.
+        symbol: MathML of its magnitude in the equations.
+        text: its effect, in a sentence.
     """
 
     symbol: str
@@ -40,11 +40,11 @@ class Meaning:
 
 
 def balances(model: ProcessModel, effects: Sequence[Effect]) -> list[Equation]:
-    """All balances, and of the outputs those that show something else than before.
+    """All balances, and the output equations that have changed.
 
     Args:
-        model: without the effects.
-        effects: that are put in.
+        model: process model without the effects.
+        effects: effects to add.
     """
     symbols = [ca.SX.sym(symbol) for symbol in _symbols(effects)]
     extended = model
@@ -54,24 +54,24 @@ def balances(model: ProcessModel, effects: Sequence[Effect]) -> list[Equation]:
     brought = [state.symbol for state in extended.states if state.name not in model.state_names]
     new = ca.vertcat(*symbols, *brought)
     before = dict(zip(model.state_names, model.rhs, strict=True))
-    found, hidden = [], 0
+    result, hidden = [], 0
     for state, rate in zip(extended.states, extended.rhs, strict=True):
-        if state.name in before or mathml.readable(rate, mathml.LONGEST_NEW):
-            found.append(_equation(_rate(state.name), rate, before.get(state.name), new))
+        if state.name in before or mathml.is_readable(rate, mathml.LONGEST_NEW):
+            result.append(_equation(_rate(state.name), rate, before.get(state.name), new))
         else:
             hidden += 1
     if hidden:
         text = f"further balances of the cause's own, too long to be read here: {hidden}"
-        found.append(Equation("", mathml.marked(f"<mtext>{text}</mtext>"), changed=True))
+        result.append(Equation("", mathml.mark_added(f"<mtext>{text}</mtext>"), changed=True))
     for now, was in zip(extended.outputs, model.outputs, strict=True):
         if _has(now.expression, new):
             left = f"<msub>{mathml.name(now.name)}<mi>measured</mi></msub>"
-            found.append(_equation(left, now.expression, was.expression, new))
-    return found
+            result.append(_equation(left, now.expression, was.expression, new))
+    return result
 
 
 def meanings(effects: Sequence[Effect]) -> list[Meaning]:
-    """What the sizes in the equations stand for: the first sentences of what an effect says of itself."""
+    """Meaning of each magnitude: the first paragraph of the effect's docstring."""
     return [
         Meaning(mathml.name(symbol), (inspect.getdoc(effect) or effect.label).partition("\n\n")[0].replace("\n", " "))
         for symbol, effect in zip(_symbols(effects), effects, strict=True)
@@ -84,12 +84,12 @@ def _symbols(effects: Sequence[Effect]) -> list[str]:
 
 def _equation(left: str, now: ca.SX, before: ca.SX | None, new: ca.SX) -> Equation:
     if before is None:
-        return Equation(left, mathml.marked(mathml.written(now)), changed=True)
-    if mathml.readable(now):
-        return Equation(left, mathml.written(now, before, new), _has(now, new))
-    was = mathml.written(before) if mathml.readable(before) else "<mtext>what it was</mtext>"
-    said = mathml.marked("<mtext>, changed as said above</mtext>") if _has(now, new) else ""
-    return Equation(left, f"{was}{said}", _has(now, new))
+        return Equation(left, mathml.mark_added(mathml.to_mathml(now)), changed=True)
+    if mathml.is_readable(now):
+        return Equation(left, mathml.to_mathml(now, before, new), _has(now, new))
+    was = mathml.to_mathml(before) if mathml.is_readable(before) else "<mtext>what it was</mtext>"
+    remark = mathml.mark_added("<mtext>, changed as said above</mtext>") if _has(now, new) else ""
+    return Equation(left, f"{was}{remark}", _has(now, new))
 
 
 def _rate(state: str) -> str:

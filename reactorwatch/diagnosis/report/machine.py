@@ -1,4 +1,4 @@
-"""A diagnosis as an object for JSON; what is no finite number is null."""
+"""A diagnosis as an object for JSON; numbers that are not finite are null."""
 
 from math import isfinite
 from typing import Any
@@ -8,13 +8,13 @@ from reactorwatch.diagnosis.result import Cause, Diagnosis, Estimate, Experiment
 
 
 def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None = None) -> dict[str, Any]:
-    """The object that `diagnose --json` prints.
+    """Object that `diagnose --json` prints.
 
     Args:
-        diagnosis: of the file.
-        file: as it was named.
-        seconds: that the diagnosis took.
-        zero: clock time that the minutes count from; None: not known.
+        diagnosis: diagnosis of the file.
+        file: name of the file as given.
+        seconds: duration of the diagnosis.
+        zero: clock time from which the minutes count; None: not known.
     """
     experiment = diagnosis.experiment
     return {
@@ -59,15 +59,15 @@ def _cause(cause: Cause, runs: int) -> dict[str, Any]:
 
 
 def _parameters(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Those that were stated to be uncertain."""
+    """Uncertain parameters."""
     return {
         name: {"nominal": _number(item.nominal), "stated_sd": _number(item.stated_sd), **_estimate(item.estimate)}
         for name, item in diagnosis.parameters.items()
     }
 
 
-def with_differences(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None = None) -> dict[str, Any]:
-    """The same, and where the simulation differs from the record: what report.json holds."""
+def report_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None = None) -> dict[str, Any]:
+    """Content of report.json: `as_object` plus the differences between simulation and record."""
     differences = {name: _difference(item) for name, item in diagnosis.differences.items()}
     return as_object(diagnosis, file, seconds, zero) | {"differences": differences}
 
@@ -88,10 +88,10 @@ def _experiment(experiment: Experiment) -> dict[str, Any]:
                 "delta_bic": _number(item.expected_delta_bic),
                 "probability": _number(item.probability),
             }
-            for item in experiment.apart
+            for item in experiment.separations
         ],
         "predicted": {
-            rival: {name: list(ends) for name, ends in ranges.items()} for rival, ranges in experiment.predicted.items()
+            label: {name: list(ends) for name, ends in ranges.items()} for label, ranges in experiment.predicted.items()
         },
     }
 

@@ -1,18 +1,18 @@
-"""Expressions as MathML, which browsers draw by themselves; what is new in one against another is marked.
+"""Expressions as MathML, which browsers render; new parts are marked.
 
-An expression is a tree, and so are its two versions, without and with a deviation m in it. They are walked together
-from the root. Where the new tree is an operation on all of the old one, only the other operand is new. Where both are
-the same operation, the difference lies further down. Elsewhere the whole of the new part is marked. So in
-K3 (1 + m), put for K3, the product is marked, and in f - m (T - 298), put for f, the term behind f.
+An expression is a tree. Its two versions, with and without a deviation m, are traversed together from the root. Where
+the new tree is an operation on the whole old tree, only the other operand is new. Where both are the same operation,
+the difference is further down. Elsewhere the whole new part is marked. So in K3 (1 + m), put for K3, the product is
+marked, and in f - m (T - 298), put for f, the term after f.
 """
 
 import casadi as ca
 
 ADDED = "added"
-"""Class of what is new."""
+"""Class of new parts."""
 
 LONGEST, LONGEST_NEW = 60, 30
-"""Nodes of a tree that a person would still read; and of one that is all new."""
+"""Maximum number of nodes of a readable tree, and of one that is all new."""
 
 _SUM, _PRODUCT, _SIGN, _ATOM = 1, 2, 3, 4
 _DEPTH = 50
@@ -28,27 +28,27 @@ _WITH_SIGN = {
 _RELATIONS = {ca.OP_LT: "&lt;", ca.OP_LE: "≤", ca.OP_EQ: "=", ca.OP_NE: "≠", ca.OP_AND: "∧", ca.OP_OR: "∨"}
 
 
-def written(expression: ca.SX, before: ca.SX | None = None, new: ca.SX | None = None) -> str:
-    """The MathML of an expression, without the `math` element around it.
+def to_mathml(expression: ca.SX, before: ca.SX | None = None, new: ca.SX | None = None) -> str:
+    """MathML of an expression, without the enclosing `math` element.
 
     Args:
         expression: a scalar.
-        before: the same without what is new; None: there was none, all of it is new.
-        new: symbols of what is new, a column; None: nothing is marked.
+        before: the expression without the new parts; None: everything is new.
+        new: column of the new symbols; None: nothing is marked.
 
     Raises:
-        ValueError: it has an operation without a sign.
+        ValueError: the expression has an operation without a sign.
     """
     return _Writer(ca.SX() if new is None else new).text(expression, before)
 
 
-def readable(expression: ca.SX, longest: int = LONGEST) -> bool:
-    """Whether a scalar can be written out, and a person would read it."""
+def is_readable(expression: ca.SX, longest: int = LONGEST) -> bool:
+    """Return true if a scalar can be written and is short enough to read."""
     return _count(expression, 0, longest) <= longest
 
 
 def name(symbol: str) -> str:
-    """A symbol: its first letter, and the rest as its index, where that is how it is meant: `Tcf`, `k0`, `E_R`.
+    """Symbol with its first letter and, if short, the rest as an index: `Tcf`, `k0`, `E_R`.
 
     >>> name("qc")
     '<msub><mi>q</mi><mi>c</mi></msub>'
@@ -63,8 +63,8 @@ def name(symbol: str) -> str:
     )
 
 
-def marked(text: str) -> str:
-    """As something new."""
+def mark_added(text: str) -> str:
+    """Mark as new."""
     return f'<mrow class="{ADDED}">{text}</mrow>'
 
 
@@ -73,29 +73,29 @@ class _Writer:
         self._new = new
 
     def text(self, now: ca.SX, before: ca.SX | None, binds: int = 0) -> str:
-        """An expression within an operation that binds so tightly."""
+        """Write an expression inside an operation of this precedence."""
         if not self._has_new(now):
             return self._plain(now, (None, None), binds)
         if before is None:
-            return marked(_Writer(ca.SX())._plain(now, (None, None), binds))
+            return mark_added(_Writer(ca.SX())._plain(now, (None, None), binds))
         if now.n_dep() == 2:
             wrapped = [ca.is_equal(now.dep(place), before, _DEPTH) for place in (0, 1)]
             if any(wrapped) and now.op() in (ca.OP_ADD, ca.OP_SUB):
-                return self._wrapped(now, wrapped.index(True), binds)
+                return self._write_sum(now, wrapped.index(True), binds)
         if not before.is_symbolic() and now.op() == before.op() and now.n_dep() == before.n_dep():
             return self._plain(now, tuple(before.dep(place) for place in range(now.n_dep())), binds)
         return self.text(now, None, binds)
 
-    def _wrapped(self, now: ca.SX, old: int, binds: int) -> str:
-        """What was there before, and a new term beside it, marked with its sign."""
+    def _write_sum(self, now: ca.SX, old: int, binds: int) -> str:
+        """Write the old expression with a new term, marked with its sign."""
         sign = "+" if now.op() == ca.OP_ADD else "−"
         kept = self.text(now.dep(old), now.dep(old), _SUM if old == 0 or sign == "+" else _PRODUCT)
         term = _Writer(ca.SX())._plain(now.dep(1 - old), (None, None), _SUM if sign == "+" else _PRODUCT)
         if old == 0:
-            # at the beginning of its row it would be taken for a sign, and drawn without a space
-            new = marked(f'<mo form="infix">{sign}</mo>{term}')
+            # at the start of its row it would be drawn as a sign, without a space
+            new = mark_added(f'<mo form="infix">{sign}</mo>{term}')
             return _within(f"{kept}{new}", _SUM, binds)
-        return _within(f"{marked(term)}<mo>{sign}</mo>{kept}", _SUM, binds)
+        return _within(f"{mark_added(term)}<mo>{sign}</mo>{kept}", _SUM, binds)
 
     def _plain(self, now: ca.SX, before: tuple[ca.SX | None, ...], binds: int) -> str:
         if now.is_constant():
@@ -163,7 +163,7 @@ def _number(value: float, binds: int) -> str:
 
 
 def _count(expression: ca.SX, so_far: int, enough: int) -> int:
-    """Nodes of the tree, counted on; no further than enough, for a tree may be larger than the graph that it is of."""
+    """Count the nodes of the tree up to a limit, because a tree may be larger than its graph."""
     so_far += 1
     if expression.is_symbolic() or expression.is_constant():
         return so_far

@@ -1,4 +1,4 @@
-"""A diagnosis as one page: self-contained, without a script, readable on a light and on a dark ground."""
+"""A diagnosis as one self-contained page without scripts, readable in light and dark mode."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,15 +12,15 @@ from reactorwatch.diagnosis.difference import Difference
 from reactorwatch.diagnosis.report import pictures
 from reactorwatch.diagnosis.report.equations import balances, meanings
 from reactorwatch.diagnosis.report.words import (
-    adjusted_said,
-    causes_said,
-    difference_said,
-    place,
-    place_of,
-    size_said,
-    verdict,
-    when,
-    with_interval,
+    describe_causes,
+    describe_difference,
+    describe_location,
+    describe_parameter,
+    describe_place,
+    describe_size,
+    describe_timing,
+    describe_verdict,
+    format_interval,
 )
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
 from reactorwatch.diagnosis.whiteness import WHITE
@@ -38,7 +38,7 @@ _PAGES = jinja2.Environment(
 
 
 @dataclass(frozen=True)
-class _CauseSaid:
+class _CauseRow:
     name: str
     profile: str
     label: str
@@ -51,7 +51,7 @@ class _CauseSaid:
 
 
 @dataclass(frozen=True)
-class _RivalRow:
+class _AlternativeRow:
     label: str
     place: str
     size: str
@@ -68,45 +68,46 @@ def as_page(
     *,
     on_the_bus: bool = True,
 ) -> str:
-    """The page, as HTML.
+    """Page as HTML.
 
     Args:
-        diagnosis: with its curves.
-        model: that was diagnosed.
+        diagnosis: diagnosis with its curves.
+        model: process model that was diagnosed.
         effects: the catalogue.
-        file: of the record, as it was named.
-        model_file: of the extended model.
-        experiment_file: of the proposed input.
-        on_the_bus: whether there are nodes that could take it.
+        file: name of the record as given.
+        model_file: name of the extended model's file.
+        experiment_file: name of the proposed input's file.
+        on_the_bus: true if there are nodes that could use the model.
 
     Raises:
         ValueError: the diagnosis has no curves.
     """
     catalogue = {effect.name: effect for effect in effects}
-    found = [catalogue[cause.cause] for cause in diagnosis.causes]
-    meant = meanings(found)
+    causing = [catalogue[cause.cause] for cause in diagnosis.causes]
+    meant = meanings(causing)
     return _PAGES.get_template("page.html.j2").render(
         diagnosis=diagnosis,
         file=file,
-        verdict=verdict(diagnosis, effects),
-        place=place(diagnosis) if diagnosis.verdict != NOMINAL else "",
+        verdict=describe_verdict(diagnosis, effects),
+        place=describe_location(diagnosis) if diagnosis.verdict != NOMINAL else "",
         causes=[
-            _said(diagnosis, effects, cause, item.symbol) for cause, item in zip(diagnosis.causes, meant, strict=True)
+            _describe_cause(diagnosis, effects, cause, item.symbol)
+            for cause, item in zip(diagnosis.causes, meant, strict=True)
         ],
-        rivals=_rivals(diagnosis, effects) if diagnosis.verdict == AMBIGUOUS else [],
-        parameters=[(name, adjusted_said(item)) for name, item in diagnosis.parameters.items()],
+        alternatives=_alternatives(diagnosis, effects) if diagnosis.verdict == AMBIGUOUS else [],
+        parameters=[(name, describe_parameter(item)) for name, item in diagnosis.parameters.items()],
         meanings=meant,
-        equations=balances(model, found),
+        equations=balances(model, causing),
         outputs=pictures.outputs(diagnosis, model),
         closer=pictures.closer(diagnosis, model) if diagnosis.causes else [],
         courses=pictures.courses(diagnosis),
         unknown=pictures.unknown_course(diagnosis),
         residuals=pictures.residuals(diagnosis, model),
-        differences=[(difference_said(name, item), _strips(item)) for name, item in diagnosis.differences.items()],
+        differences=[(describe_difference(name, item), _strips(item)) for name, item in diagnosis.differences.items()],
         white=WHITE,
         evidence=_evidence(diagnosis, effects),
         experiment=[] if diagnosis.experiment is None else pictures.experiment(diagnosis.experiment, model),
-        apart=[] if diagnosis.experiment is None else _apart(diagnosis.experiment),
+        separations=[] if diagnosis.experiment is None else _separations(diagnosis.experiment),
         experiment_file=experiment_file,
         experiment_command=_experiment_command(diagnosis.experiment, experiment_file),
         model_file=model_file,
@@ -115,33 +116,38 @@ def as_page(
     )
 
 
-def _rivals(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[list[_RivalRow], str]]:
-    """All explanations that the record does not tell apart, and by how much each is worse than the first."""
+def _alternatives(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[list[_AlternativeRow], str]]:
+    """All explanations that the record does not separate, and the difference of each to the first in BIC."""
     explanations = [(diagnosis.causes, 0.0), *((item.explanation, item.delta_bic) for item in diagnosis.alternatives)]
     return [
         (
-            [_RivalRow(item.label, place_of(item.location), size_said(item, effects), when(item)) for item in causes],
+            [
+                _AlternativeRow(
+                    item.label, describe_place(item.location), describe_size(item, effects), describe_timing(item)
+                )
+                for item in causes
+            ],
             f"{worse:.1f}",
         )
         for causes, worse in explanations
     ]
 
 
-def _said(diagnosis: Diagnosis, effects: Sequence[Effect], cause: Cause, symbol: str) -> _CauseSaid:
+def _describe_cause(diagnosis: Diagnosis, effects: Sequence[Effect], cause: Cause, symbol: str) -> _CauseRow:
     profile = next((item for item in PROFILES if item.name == cause.profile), None)
-    return _CauseSaid(
+    return _CauseRow(
         cause.cause,
         cause.profile,
         cause.label,
-        place_of(cause.location),
-        size_said(cause, effects),
-        when(cause, diagnosis.curves),
+        describe_place(cause.location),
+        describe_size(cause, effects),
+        describe_timing(cause, diagnosis.curves),
         symbol,
         cause.profile if profile is None else profile.meaning,
         tuple(
-            (name.replace("_", " "), f"{size_said(cause, effects)}; m = {with_interval(item)}")
+            (name.replace("_", " "), f"{describe_size(cause, effects)}; m = {format_interval(item)}")
             if name == "size"
-            else (name.replace("_", " "), with_interval(item))
+            else (name.replace("_", " "), format_interval(item))
             for name, item in cause.parameters.items()
             if cause.profile != FREE_NAME or name == "size"  # a curve is better seen than read
         ),
@@ -149,7 +155,7 @@ def _said(diagnosis: Diagnosis, effects: Sequence[Effect], cause: Cause, symbol:
 
 
 def _strips(item: Difference) -> list[tuple[str, list[tuple[str, str, int]]]]:
-    """By axis: each range, the error in it, and how dark it is, from 0 (noise) to 100 (the worst)."""
+    """Ranges by axis, each with its error and a shade from 0 (noise) to 100 (the worst)."""
     ranges = [part for parts in item.along.values() for part in parts]
     most = max((part.rmse for part in ranges), default=0.0) - item.noise_sd
     return [
@@ -171,16 +177,16 @@ def _strips(item: Difference) -> list[tuple[str, list[tuple[str, str, int]]]]:
 def _evidence(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[str, str]]:
     if not diagnosis.causes:
         return [("the simulation as it is", "0")]
-    best = causes_said([(cause.cause, cause.profile) for cause in diagnosis.causes], effects)
+    best = describe_causes([(cause.cause, cause.profile) for cause in diagnosis.causes], effects)
     rows = [(best, "0")]
-    rows += [(causes_said(item.causes, effects), f"{item.delta_bic:.1f}") for item in diagnosis.alternatives]
+    rows += [(describe_causes(item.causes, effects), f"{item.delta_bic:.1f}") for item in diagnosis.alternatives]
     return [*rows, ("the simulation as it was", f"{diagnosis.gain.delta_bic:,.1f}")]
 
 
-def _apart(experiment: Experiment) -> list[tuple[str, str, str]]:
+def _separations(experiment: Experiment) -> list[tuple[str, str, str]]:
     return [
         (" or ".join(item.between), f"{item.expected_delta_bic:.1f}", _percent(item.probability))
-        for item in experiment.apart
+        for item in experiment.separations
     ]
 
 

@@ -1,4 +1,4 @@
-"""The pictures of a diagnosis: what was measured and what either model makes of it, what is left, and the cause."""
+"""Figures of a diagnosis: measurements and simulations, residuals, and the causes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,10 +11,10 @@ from reactorwatch.diagnosis.result import NOMINAL, SD_95, Cause, Curves, Diagnos
 from reactorwatch.process.model import ProcessModel
 
 BEFORE_ROWS, AFTER_ROWS = 100, 200
-"""What is shown of the record about the moment that is looked at closely."""
+"""Rows of the close-up, before and after its centre."""
 
 RESIDUALS_SHOWN = (4.0, 0.99, 1.25)
-"""Of residuals, so many standard deviations to either side at least, else so much more than such a share of them."""
+"""Axis of residuals: at least this many standard deviations, or this factor times this quantile."""
 
 MEASURED = ("measured", "measured")
 BEFORE = ("simulation as it was", "before")
@@ -25,10 +25,10 @@ LIMITS = ("limits", "limit")
 
 @dataclass(frozen=True)
 class Picture:
-    """A plot with its words.
+    """A figure with its title and legend.
 
     Attributes:
-        title: what it is of, with the unit.
+        title: quantity and unit.
         legend: (text, class) of each line.
         drawing: an `svg` element.
     """
@@ -39,39 +39,39 @@ class Picture:
 
 
 def outputs(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
-    """Each output as measured, with the free run of the simulation as it was, and of the extended one."""
+    """Measurements of each output, with the simulation before and with the extended one."""
     curves = _curves(diagnosis)
     moments = _onsets(diagnosis.causes)
-    found = []
+    result = []
     for output in model.outputs:
         if diagnosis.verdict == NOMINAL:
-            lines = [(MEASURED, curves.measured), (RIGHT, curves.free_before)]
+            lines = [(MEASURED, curves.measured), (RIGHT, curves.simulated_before)]
         else:
-            lines = [(MEASURED, curves.measured), (BEFORE, curves.free_before)]
-        found.append(_picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments))
+            lines = [(MEASURED, curves.measured), (BEFORE, curves.simulated_before)]
+        result.append(_picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments))
         if diagnosis.causes:
-            lines[1] = (AFTER, curves.free_after)
-            found.append(_picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments))
-    return found
+            lines[1] = (AFTER, curves.simulated_after)
+            result.append(_picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments))
+    return result
 
 
 def closer(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
-    """Where the two models part: their outputs and the input over a few hundred rows."""
+    """Close-up of the rows where the two models differ: outputs and inputs."""
     curves = _curves(diagnosis)
     rows = _rows_of_interest(curves, diagnosis.causes)
     moments = _onsets(diagnosis.causes)
-    lines = [(MEASURED, curves.measured), (BEFORE, curves.free_before), (AFTER, curves.free_after)]
-    found = [
+    lines = [(MEASURED, curves.measured), (BEFORE, curves.simulated_before), (AFTER, curves.simulated_after)]
+    result = [
         _picture(f"{output.name}, {output.unit}", curves, output.name, lines, moments, rows) for output in model.outputs
     ]
     for item in model.inputs:
         drawing = plot(item.name, curves.time_min[rows], [Line(curves.inputs[item.name][rows], "input", held=True)])
-        found.append(Picture(f"{item.name}, {item.unit}", ((item.meaning, "input"),), drawing))
-    return found
+        result.append(Picture(f"{item.name}, {item.unit}", ((item.meaning, "input"),), drawing))
+    return result
 
 
 def residuals(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
-    """What the next row was missed by, in standard deviations, without and with the cause."""
+    """One-step-ahead residuals in standard deviations, without and with the cause."""
     curves = _curves(diagnosis)
     kinds = [("simulation as it is", "after" if diagnosis.verdict == NOMINAL else "before", curves.residual_before)]
     if diagnosis.causes:
@@ -80,13 +80,13 @@ def residuals(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
             ("with the cause", "after", curves.residual_after),
         ]
     ends = np.full(curves.time_min.size, SD_95)
-    found = []
+    result = []
     for output in model.outputs:
         for text, kind, columns in kinds:
             values = columns[output.name]
             least, share, more = RESIDUALS_SHOWN
-            known = np.abs(values[np.isfinite(values)])
-            reach = max(more * float(np.quantile(known, share)) if known.size else 0.0, least)
+            finite = np.abs(values[np.isfinite(values)])
+            reach = max(more * float(np.quantile(finite, share)) if finite.size else 0.0, least)
             drawing = plot(
                 f"residual of {output.name}, {text}",
                 curves.time_min,
@@ -96,13 +96,13 @@ def residuals(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
                 (-reach, reach),
             )
             legend = ((text, kind), ("95 % of noise", "expected"))
-            found.append(Picture(f"Residual of {output.name}, standard deviations", legend, drawing))
-    return found
+            result.append(Picture(f"Residual of {output.name}, standard deviations", legend, drawing))
+    return result
 
 
 def courses(diagnosis: Diagnosis) -> list[Picture]:
-    """How each cause goes in time, with its 95 % band."""
-    curves, found = _curves(diagnosis), []
+    """Deviation of each cause over time, with its 95 % band."""
+    curves, result = _curves(diagnosis), []
     for cause in diagnosis.causes:
         course = curves.deviation[cause.cause]
         lower, upper = interval(cause, curves)
@@ -115,36 +115,34 @@ def courses(diagnosis: Diagnosis) -> list[Picture]:
             shown=_with_zero(course, lower, upper),
         )
         title = f"Size m of: {cause.label}{'' if unit == '1' else f', {unit}'}"
-        found.append(Picture(title, (("most likely", "after"), ("95 % interval", "certain")), drawing))
-    return found
+        result.append(Picture(title, (("most likely", "after"), ("95 % interval", "certain")), drawing))
+    return result
 
 
 def experiment(proposed: Experiment, model: ProcessModel) -> list[Picture]:
-    """The proposed input, each output as every explanation predicts it, and what they differ by."""
+    """Proposed input, outputs predicted by each explanation, and their differences."""
     curves = proposed.curves
     if curves is None:
         raise ValueError("an experiment without its curves cannot be drawn")
     names = list(curves.outputs)
-    kinds = [f"rival{place}" for place in range(len(names))]
+    kinds = [f"alternative{index}" for index in range(len(names))]
     item = model.inputs[0]
     lines = [Line(curves.level, "input", held=True), *_limits(proposed, item.name, curves.time_min.size)]
     drawing = plot(f"proposed {item.name}", curves.time_min, lines)
-    found = [Picture(f"{item.name}, {item.unit}", ((item.meaning, "input"), LIMITS), drawing)]
+    result = [Picture(f"{item.name}, {item.unit}", ((item.meaning, "input"), LIMITS), drawing)]
     for output in model.outputs:
         values = [curves.outputs[name][output.name] for name in names]
         lines = [Line(column, kind) for column, kind in zip(values, kinds, strict=True)]
         drawing = plot(
-            f"predicted {output.name}",
-            curves.time_min,
-            [*lines, *_limits(proposed, output.name, curves.time_min.size)],
+            f"predicted {output.name}", curves.time_min, [*lines, *_limits(proposed, output.name, curves.time_min.size)]
         )
         legend = tuple(zip(names, kinds, strict=True))
-        found.append(Picture(f"{output.name}, {output.unit}, as predicted under each", (*legend, LIMITS), drawing))
+        result.append(Picture(f"{output.name}, {output.unit}, as predicted under each", (*legend, LIMITS), drawing))
         lines = [Line(column - values[0], kind) for column, kind in zip(values[1:], kinds[1:], strict=True)]
         drawing = plot(f"differences of predicted {output.name}", curves.time_min, lines)
         title = f"{output.name}, {output.unit}, less what is predicted under {names[0]}"
-        found.append(Picture(title, legend[1:], drawing))
-    return found
+        result.append(Picture(title, legend[1:], drawing))
+    return result
 
 
 def _limits(proposed: Experiment, name: str, rows: int) -> list[Line]:
@@ -152,7 +150,7 @@ def _limits(proposed: Experiment, name: str, rows: int) -> list[Line]:
 
 
 def unknown_course(diagnosis: Diagnosis) -> list[Picture]:
-    """How something goes in time that has no name, if that was found."""
+    """Course of an unknown input, if there is one."""
     curves = _curves(diagnosis)
     unknown = curves.unknown
     if unknown is None:
@@ -168,9 +166,9 @@ def unknown_course(diagnosis: Diagnosis) -> list[Picture]:
 
 
 def interval(cause: Cause, curves: Curves) -> tuple[Array, Array]:
-    """The ends of the 95 % interval of a cause's size at each row, each of shape (rows,).
+    """Ends of the 95 % interval of a cause's magnitude, each of shape (rows,).
 
-    At its onset a step is not known to have come yet; but it is none of it or all, and nothing beyond.
+    Near its onset a step may or may not have set in; its interval is within zero and the magnitude's interval.
     """
     course, half = curves.deviation[cause.cause], SD_95 * curves.deviation_sd[cause.cause]
     lower, upper = course - half, course + half
@@ -191,9 +189,9 @@ def _picture(
 ) -> Picture:
     drawn = [Line(columns[output][rows], kind) for (_, kind), columns in lines]
     measured = curves.measured[output][rows]
-    models = np.concatenate([curves.free_before[output][rows], curves.free_after[output][rows], measured])
-    known = models[np.isfinite(models)]
-    shown = (float(known.min()), float(known.max())) if known.size else None  # one scale for before and after
+    models = np.concatenate([curves.simulated_before[output][rows], curves.simulated_after[output][rows], measured])
+    finite = models[np.isfinite(models)]
+    shown = (float(finite.min()), float(finite.max())) if finite.size else None  # one scale for before and after
     drawing = plot(
         f"{title}: {', '.join(text for (text, _), _ in lines)}", curves.time_min[rows], drawn, (), moments_min, shown
     )
@@ -201,14 +199,14 @@ def _picture(
 
 
 def _rows_of_interest(curves: Curves, causes: Sequence[Cause]) -> slice:
-    """About the first onset, or where the two models differ most."""
+    """Rows around the first onset, or where the two models differ most."""
     onsets = _onsets(causes)
     if onsets:
         centre = int(np.searchsorted(curves.time_min, min(onsets)))
     else:
         off = np.zeros(curves.time_min.size)
-        for name, before in curves.free_before.items():
-            difference = np.abs(np.nan_to_num(curves.free_after[name] - before))
+        for name, before in curves.simulated_before.items():
+            difference = np.abs(np.nan_to_num(curves.simulated_after[name] - before))
             off += difference / max(float(difference.max()), 1e-300)
         centre = int(np.argmax(off))
     begin = max(min(centre - BEFORE_ROWS, curves.time_min.size - BEFORE_ROWS - AFTER_ROWS), 0)
@@ -216,13 +214,13 @@ def _rows_of_interest(curves: Curves, causes: Sequence[Cause]) -> slice:
 
 
 def _onsets(causes: Sequence[Cause]) -> list[float]:
-    """When causes set in, as far as that was found and not given."""
-    found = [(cause.parameters["onset"], cause.run_shift_min) for cause in causes if "onset" in cause.parameters]
-    return [item.value + shift_min for item, shift_min in found if item.sd > 0.0]
+    """Onsets that were estimated and not given."""
+    result = [(cause.parameters["onset"], cause.run_shift_min) for cause in causes if "onset" in cause.parameters]
+    return [item.value + shift_min for item, shift_min in result if item.sd > 0.0]
 
 
 def _with_zero(course: Array, lower: Array, upper: Array) -> tuple[float, float]:
-    """From the lowest to the highest, zero included; an interval without end is cut off."""
+    """Range of the axis, zero included; an infinite interval is cut off."""
     most = 3.0 * max(float(np.max(np.abs(course))), 1e-12)
     lowest = float(np.min(lower, initial=0.0, where=np.isfinite(lower)))
     highest = float(np.max(upper, initial=0.0, where=np.isfinite(upper)))

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 
 from reactorwatch.diagnosis.report.words import (
-    adjusted_said,
+    describe_difference,
     describe_explanation,
-    difference_said,
-    error_left,
-    size_said,
-    verdict,
-    when,
+    describe_holdout,
+    describe_parameter,
+    describe_size,
+    describe_timing,
+    describe_verdict,
 )
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Diagnosis
 from reactorwatch.process.effect import Effect
@@ -19,43 +19,40 @@ INDENT = 14
 
 
 def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
-    """What people read: the verdict, the causes with their 95 % intervals, the gain, the rivals, remarks.
+    """Verdict, causes with their 95 % intervals, gain, alternatives and remarks.
 
     Args:
-        diagnosis: of the file.
-        file: as it was named.
+        diagnosis: diagnosis of the file.
+        file: name of the file as given.
         effects: the catalogue.
     """
-    lines = [
-        f"{file}: {diagnosis.samples} rows over {diagnosis.span_min:g} min",
-        verdict(diagnosis, effects),
-    ]
+    lines = [f"{file}: {diagnosis.samples} rows over {diagnosis.span_min:g} min", describe_verdict(diagnosis, effects)]
     ambiguous = diagnosis.verdict == AMBIGUOUS
     if ambiguous:
         lines += [_line("either", f"{describe_explanation(diagnosis.causes, effects)}  (95 %)")]
-        lines += _rivals(diagnosis, effects) + _experiment(diagnosis)
+        lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
     for cause in () if ambiguous else diagnosis.causes:
         lines += [
             _line("cause", f"{cause.label} ({cause.cause}, {cause.profile})"),
-            _line("size", f"{size_said(cause, effects)}  (95 %)"),
-            _line("when", when(cause, diagnosis.curves)),
+            _line("size", f"{describe_size(cause, effects)}  (95 %)"),
+            _line("when", describe_timing(cause, diagnosis.curves)),
         ]
     if diagnosis.verdict != NOMINAL:
         lines.append(_line("evidence", f"{diagnosis.gain.delta_bic:,.1f} in BIC over the simulation as it was"))
-        lines += [_line("differs", difference_said(name, item)) for name, item in diagnosis.differences.items()]
+        lines += [_line("differs", describe_difference(name, item)) for name, item in diagnosis.differences.items()]
     for name, known in diagnosis.parameters.items():
-        lines.append(_line("parameter", f"{name} {adjusted_said(known)}  (95 %)"))
+        lines.append(_line("parameter", f"{name} {describe_parameter(known)}  (95 %)"))
     for name, item in diagnosis.gain.held_out.items():
-        lines.append(_line("held out", error_left(name, item, improved=bool(diagnosis.causes))))
+        lines.append(_line("held out", describe_holdout(name, item, improved=bool(diagnosis.causes))))
     if not ambiguous:
-        lines += _rivals(diagnosis, effects) + _experiment(diagnosis)
+        lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
     if diagnosis.causes and not diagnosis.alternatives:
         lines.append(_line("or", "nothing else in the catalogue comes near"))
     lines += [_line("note", remark) for remark in diagnosis.remarks]
     return printable_lines(lines)
 
 
-def _rivals(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[str]:
+def _alternatives(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[str]:
     return [
         _line("or", f"{describe_explanation(item.explanation, effects)}, worse by {item.delta_bic:.1f} in BIC")
         for item in diagnosis.alternatives
@@ -66,5 +63,5 @@ def _experiment(diagnosis: Diagnosis) -> list[str]:
     return [] if diagnosis.experiment is None else [_line("experiment", diagnosis.experiment.why)]
 
 
-def _line(what: str, said: str) -> str:
-    return f"  {what:<{INDENT - 2}}{said}"
+def _line(key: str, text: str) -> str:
+    return f"  {key:<{INDENT - 2}}{text}"

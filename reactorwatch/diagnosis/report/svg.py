@@ -1,7 +1,7 @@
-"""Plots over time as SVG: small, without a script, in colours that the page's style sheet gives.
+"""Plots over time as SVG: small, without scripts, in the colours of the page's style sheet.
 
-A plot has some hundred columns. Where more rows fall on a column than it can show, the lowest and the highest of them
-are drawn, in the order in which they came, so that no peak is lost and nothing is averaged away.
+A plot has some hundred columns. Where a column has more rows than it can show, its lowest and its highest value are
+drawn, in the order of their times, so that no peak is lost.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ COLUMNS = 600
 LABEL_ROOM = 40
 
 GAP = 10.0
-"""A line is broken where rows are so many times further apart than they mostly are."""
+"""A line is interrupted where the time step exceeds this factor times the median step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +28,8 @@ class Line:
 
     Attributes:
         values: shape (rows,); NaN leaves a gap.
-        kind: its class in the style sheet.
-        held: whether each value holds until the next row.
+        kind: class in the style sheet.
+        held: true if each value holds until the next row.
     """
 
     values: Array
@@ -39,7 +39,7 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """An area between two lines, each of shape (rows,)."""
+    """Area between two lines, each of shape (rows,)."""
 
     lower: Array
     upper: Array
@@ -54,22 +54,22 @@ def plot(
     moments_min: Sequence[float] = (),
     shown: tuple[float, float] | None = None,
 ) -> str:
-    """An `svg` element.
+    """Plot as an `svg` element.
 
     Args:
-        title: for those who cannot see it.
+        title: text alternative.
         time_min: shape (rows,), at least two.
-        lines: drawn in their order, above the bands.
+        lines: lines in drawing order, above the bands.
         bands: areas.
-        moments_min: vertical lines.
-        shown: lowest and highest value of the axis; None: all that is drawn.
+        moments_min: times of vertical lines.
+        shown: lowest and highest value of the axis; None: those of the data.
     """
     values = np.concatenate(
         [*(line.values for line in lines), *(part for band in bands for part in (band.lower, band.upper))]
     )
-    known = values[np.isfinite(values)]
+    finite = values[np.isfinite(values)]
     across = _Time(float(time_min[0]), float(time_min[-1]))
-    low, high = shown or (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    low, high = shown or (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     up = axis(low, high, 4)
     area = f'x="{LEFT}" y="{TOP}" width="{WIDTH - LEFT - RIGHT}" height="{HEIGHT - TOP - BOTTOM}"'
     parts = [
@@ -86,13 +86,13 @@ def plot(
     return "".join(parts)
 
 
-def decimated(time_min: Array, values: Array, columns: int = COLUMNS) -> tuple[Array, Array]:
-    """At most two rows a column, its lowest and its highest; a column without any value is one gap.
+def decimate(time_min: Array, values: Array, columns: int = COLUMNS) -> tuple[Array, Array]:
+    """Reduce to the lowest and the highest row of each column; a column without values becomes one gap.
 
     Args:
         time_min: shape (rows,), increasing.
         values: shape (rows,).
-        columns: between the first time and the last.
+        columns: number of columns between the first time and the last.
     """
     if time_min.size <= 2 * columns:
         return time_min, values
@@ -104,8 +104,8 @@ def decimated(time_min: Array, values: Array, columns: int = COLUMNS) -> tuple[A
     counts = np.diff(np.append(begin, time_min.size))
     ends = []
     for extreme in (lowest, highest):
-        found = values == np.repeat(extreme, counts)
-        ends.append(np.minimum.reduceat(np.where(found, place, time_min.size), begin))
+        result = values == np.repeat(extreme, counts)
+        ends.append(np.minimum.reduceat(np.where(result, place, time_min.size), begin))
     first = np.where(np.isfinite(lowest), ends[0], begin)
     second = np.where(np.isfinite(lowest), ends[1], begin)
     kept = np.unique(np.concatenate([first, second]))
@@ -122,16 +122,16 @@ class _Time:
         return LEFT + share * (WIDTH - LEFT - RIGHT)
 
     def ticks(self) -> list[tuple[float, str]]:
-        found = axis(self.first, self.last, 8)
+        result = axis(self.first, self.last, 8)
         return [
             (self.place(float(tick)), label)
-            for tick, label in zip(found.ticks, found.labels, strict=True)
+            for tick, label in zip(result.ticks, result.labels, strict=True)
             if self.first <= tick <= self.last
         ]
 
 
 def _line(line: Line, time_min: Array, across: _Time, up: Axis) -> str:
-    times, values = decimated(time_min, line.values)
+    times, values = decimate(time_min, line.values)
     x = LEFT + (times - across.first) / (across.last - across.first) * (WIDTH - LEFT - RIGHT)
     y = TOP + (1.0 - up.share(values)) * (HEIGHT - TOP - BOTTOM)
     step = np.diff(times, prepend=times[0])
@@ -148,7 +148,7 @@ def _band(band: Band, time_min: Array, across: _Time, up: Axis) -> str:
     columns = COLUMNS // 2
     edges = []
     for values in (band.lower, band.upper):
-        times, kept = decimated(time_min, values, columns)
+        times, kept = decimate(time_min, values, columns)
         x = LEFT + (times - across.first) / (across.last - across.first) * (WIDTH - LEFT - RIGHT)
         y = TOP + (1.0 - up.share(kept)) * (HEIGHT - TOP - BOTTOM)
         there = np.isfinite(y)

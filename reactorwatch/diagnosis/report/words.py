@@ -1,4 +1,4 @@
-"""What a diagnosis says, in words."""
+"""A diagnosis in sentences."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from reactorwatch.diagnosis.result import (
     NAMED,
     NOMINAL,
     SD_95,
-    Adjusted,
+    AdjustedParameter,
     Cause,
     Curves,
     Diagnosis,
@@ -22,7 +22,7 @@ from reactorwatch.diagnosis.result import (
 from reactorwatch.process.effect import Effect
 
 MOSTLY_NOISE, WORSE = 0.9, 1.2
-"""Of the mean square error: nothing worth locating is left. Times the error of all rows: a range is told as worse."""
+"""Noise share above which no range is named; error of a range, relative to all rows, above which it is named."""
 
 PLACES = {
     "mass_balance": "in the mass balance",
@@ -34,12 +34,12 @@ PLACES = {
     "concentration_sensor": "in the measurement of the concentration",
     "timing": "in the times of the record",
 }
-"""Of causes, by their location, where it takes more words than the name of the location."""
+"""Phrases of locations whose name is not enough."""
 
 
-def verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
-    """The answer, in a sentence or two."""
-    off = [name for name, item in diagnosis.parameters.items() if item.off]
+def describe_verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
+    """Verdict in a sentence or two."""
+    off = [name for name, item in diagnosis.parameters.items() if item.differs]
     if diagnosis.verdict == NOMINAL and off:
         return (
             f"The simulation is right within what was stated of its parameters: {' and '.join(off)} "
@@ -47,51 +47,48 @@ def verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
         )
     if diagnosis.verdict == NOMINAL:
         return "The simulation is right: what the record shows beyond it is noise."
+    matters = describe_significance(diagnosis)
     if diagnosis.verdict == AMBIGUOUS:
         explanations = [diagnosis.causes, *(item.explanation for item in diagnosis.alternatives)]
-        names = [" with ".join(f"{item.label} ({when(item)})" for item in causes) for causes in explanations]
-        return (
-            f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {in_practice(diagnosis)}"
-        )
+        names = [" with ".join(f"{item.label} ({describe_timing(item)})" for item in causes) for causes in explanations]
+        return f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {matters}"
     if diagnosis.verdict == NAMED:
-        causes = [f"{cause.label}, {when(cause, diagnosis.curves)}" for cause in diagnosis.causes]
-        return f"The simulation is wrong: {'; and '.join(causes)}. {in_practice(diagnosis)}"
-    return (
-        f"The simulation is wrong, and no known cause explains it; it acts {place(diagnosis)}. {in_practice(diagnosis)}"
-    )
+        causes = [f"{cause.label}, {describe_timing(cause, diagnosis.curves)}" for cause in diagnosis.causes]
+        return f"The simulation is wrong: {'; and '.join(causes)}. {matters}"
+    return f"The simulation is wrong, and no known cause explains it; it acts {describe_location(diagnosis)}. {matters}"
 
 
-def in_practice(diagnosis: Diagnosis) -> str:
-    """Whether it matters."""
+def describe_significance(diagnosis: Diagnosis) -> str:
+    """Practical significance."""
     return "It matters in practice." if diagnosis.practical else "In practice the difference is too small to matter."
 
 
-def place(diagnosis: Diagnosis) -> str:
-    """Where it acts."""
+def describe_location(diagnosis: Diagnosis) -> str:
+    """Location of the deviation."""
     if not diagnosis.location:
         return "where this record does not tell"
-    return place_of(diagnosis.location)
+    return describe_place(diagnosis.location)
 
 
-def place_of(location: str) -> str:
-    """Where that is.
+def describe_place(location: str) -> str:
+    """Phrase of a location.
 
-    >>> place_of("upper_tank")
+    >>> describe_place("upper_tank")
     'in the upper tank'
     """
     return PLACES.get(location, f"in the {location.replace('_', ' ')}")
 
 
-def when(cause: Cause, curves: Curves | None = None) -> str:
-    """Since when, or how it goes in time."""
+def describe_timing(cause: Cause, curves: Curves | None = None) -> str:
+    """Onset of a cause, or its profile in time."""
     if cause.profile == "constant":
         return "all the time"
     if cause.profile == "sine":
-        return f"swinging with a period of {with_interval(cause.parameters['period'])}"
+        return f"swinging with a period of {format_interval(cause.parameters['period'])}"
     if cause.profile == "free":
         largest = "" if curves is None else f", largest at {_largest_min(cause, curves):.4g} min"
         return f"changing over the record{largest}"
-    since = f"since {with_interval(cause.parameters['onset'])}"
+    since = f"since {format_interval(cause.parameters['onset'])}"
     if cause.run > 1:
         since += f" of run {cause.run}"
     if cause.profile == "ramp":
@@ -99,21 +96,22 @@ def when(cause: Cause, curves: Curves | None = None) -> str:
     return f"settling {since}" if cause.profile == "decay" else since
 
 
-def size_said(cause: Cause, effects: Sequence[Effect]) -> str:
+def describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
     """Size of a cause in its unit and meaning with its 95 % interval, and the part of the profile it belongs to.
 
     Args:
-        cause: of an explanation.
-        effects: the catalogue, where it has its meaning.
+        cause: cause of an explanation.
+        effects: the catalogue, which has its meaning.
     """
     of_what = {"ramp": " at the end", "decay": " in the end", "sine": " to either side", "free": " at its largest"}
     return _describe_size(cause, effects) + of_what.get(cause.profile, "")
 
 
 def describe_explanation(causes: Sequence[Cause], effects: Sequence[Effect]) -> str:
-    """Causes that explain a record together, each with its size and since when."""
+    """Causes of an explanation, each with its size and onset."""
     return " with ".join(
-        f"{item.label} ({item.cause}, {item.profile}): {size_said(item, effects)}, {when(item)}" for item in causes
+        f"{item.label} ({item.cause}, {item.profile}): {describe_size(item, effects)}, {describe_timing(item)}"
+        for item in causes
     )
 
 
@@ -121,11 +119,11 @@ def _describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
     size = cause.parameters["size"]
     effect = next((item for item in effects if item.name == cause.cause), None)
     if effect is None or not effect.larger:
-        return with_interval(size)
+        return format_interval(size)
     share = "{} %" in effect.larger
     amount = replace(size, value=100.0 * size.value, sd=100.0 * size.sd, unit="%") if share else size
-    if cause.profile == "sine":  # whose sign says nothing
-        return with_interval(amount)
+    if cause.profile == "sine":  # its sign has no meaning
+        return format_interval(amount)
     text = effect.larger
     if amount.value < 0.0 and effect.smaller:
         text, amount = effect.smaller, replace(amount, value=-amount.value)
@@ -134,8 +132,8 @@ def _describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
     return text.format(value) + (f" (± {half}{unit})" if half else "")
 
 
-def causes_said(causes: Sequence[tuple[str, str]], effects: Sequence[Effect]) -> str:
-    """Causes that explain a record together, as people call them.
+def describe_causes(causes: Sequence[tuple[str, str]], effects: Sequence[Effect]) -> str:
+    """Causes of an explanation by their labels.
 
     Args:
         causes: (cause, profile) of each.
@@ -150,12 +148,12 @@ def causes_said(causes: Sequence[tuple[str, str]], effects: Sequence[Effect]) ->
     return " with ".join(labels)
 
 
-def with_interval(estimate: Estimate) -> str:
-    """A number and half the width of its 95 % interval, with its unit.
+def format_interval(estimate: Estimate) -> str:
+    """Estimate and half width of its 95 % interval, with the unit.
 
-    >>> with_interval(Estimate(-0.0499634, 8.5e-5, "1"))
+    >>> format_interval(Estimate(-0.0499634, 8.5e-5, "1"))
     '-0.04996 ± 0.00017'
-    >>> with_interval(Estimate(299.9, 0.0, "min"))
+    >>> format_interval(Estimate(299.9, 0.0, "min"))
     '299.9 min'
     """
     unit = "" if estimate.unit == "1" else f" {estimate.unit}"
@@ -164,7 +162,7 @@ def with_interval(estimate: Estimate) -> str:
 
 
 def round_estimate(estimate: Estimate) -> tuple[str, str]:
-    """A number and half the width of its 95 % interval with as many decimals; the latter empty if it is not known.
+    """Estimate and half width of its 95 % interval with equal decimals; the latter empty if it is not known.
 
     The interval has one digit, or two if it begins with a 1.
 
@@ -181,36 +179,36 @@ def round_estimate(estimate: Estimate) -> tuple[str, str]:
     return f"{estimate.value:.{decimals}f}", f"{half:.{decimals}f}"
 
 
-def adjusted_said(item: Adjusted) -> str:
-    """An uncertain parameter as the record has it, beside what was stated."""
+def describe_parameter(item: AdjustedParameter) -> str:
+    """Estimate of an uncertain parameter, with its prior."""
     stated = Estimate(item.nominal, item.stated_sd, item.estimate.unit)
-    return f"{with_interval(item.estimate)}; stated: {with_interval(stated)}"
+    return f"{format_interval(item.estimate)}; stated: {format_interval(stated)}"
 
 
-def error_said(value: float, unit: str) -> str:
-    """A root mean square error; a free run that came to an end has none."""
+def format_error(value: float, unit: str) -> str:
+    """Root mean square error; none if the simulation diverged."""
     return f"{value:.3g} {unit}" if isfinite(value) else "none, it ran away"
 
 
-def error_left(name: str, item: HeldOut, *, improved: bool) -> str:
-    """The error of the free run on rows that the fit did not see, in one line."""
-    before = f", before {error_said(item.rmse_before, item.unit)}" if improved else ""
-    return f"{name} off by {error_said(item.rmse_after, item.unit)}{before}; noise {item.noise_sd:.3g} {item.unit}"
+def describe_holdout(name: str, item: HeldOut, *, improved: bool) -> str:
+    """Error of the simulation on held-out rows, in one line."""
+    before = f", before {format_error(item.rmse_before, item.unit)}" if improved else ""
+    return f"{name} off by {format_error(item.rmse_after, item.unit)}{before}; noise {item.noise_sd:.3g} {item.unit}"
 
 
-def difference_said(name: str, item: Difference) -> str:
-    """By how much the simulation errs, where most, and how much of it is noise, in a sentence."""
+def describe_difference(name: str, item: Difference) -> str:
+    """Error of the simulation, its share of noise, and the ranges where it is largest, in a sentence."""
     if not isfinite(item.rmse):
         return f"{name}: the simulation ran away from the record."
-    said = f"{name}: the simulation errs by {item.rmse:.3g} {item.unit}, {_percent(item.noise_share)} of it noise"
+    text = f"{name}: the simulation errs by {item.rmse:.3g} {item.unit}, {_percent(item.noise_share)} of it noise"
     if item.noise_share > MOSTLY_NOISE:
-        return f"{said}."
+        return f"{text}."
     places = [
         f"{'from' if axis == TIME else f'at {axis}'} {part.lower:.4g} to {part.upper:.4g} {unit} ({part.rmse:.3g})"
         for axis, unit in item.units.items()
         if (part := item.worst(axis)) is not None and part.rmse > WORSE * item.rmse
     ]
-    return f"{said}; most {', '.join(places)}." if places else f"{said}; everywhere alike."
+    return f"{text}; most {', '.join(places)}." if places else f"{text}; everywhere alike."
 
 
 def _percent(share: float) -> str:

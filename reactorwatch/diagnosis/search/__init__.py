@@ -1,1 +1,1 @@
-"""Search for the explanation that fits a record best."""
+"""Search for the hypothesis that fits a record best."""

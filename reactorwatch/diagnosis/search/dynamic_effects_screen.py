@@ -1,8 +1,8 @@
-"""Leads among the effects that bring memory of their own: lags, a valve that sticks, a delay.
+"""Screen for effects with internal states: lags, valve stiction, delays.
 
-They have no infinitesimal deviation, so each is tried at a few sizes of the usual magnitude. What the innovations lose
-by a size is its signature; since such memory is short beside the courses, that signature times a course is taken for
-that of the course.
+They have no infinitesimal deviation, so each is evaluated at a few typical magnitudes. Its signature is the reduction
+of the innovations by a magnitude. The internal dynamics are fast beside the profiles, so the signature of a profile is
+taken for the signature times the profile.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,22 +12,22 @@ from typing import TypeAlias
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.fault_filter import Followed, clipped
+from reactorwatch.diagnosis.fitting.fault_filter import FilterResult, huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
-from reactorwatch.diagnosis.fitting.profiles import Constant, Course, Decay, Free, Ramp, Signal, Step
+from reactorwatch.diagnosis.fitting.profiles import Constant, Decay, FittedProfile, PiecewiseLinear, Ramp, Signal, Step
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.screen import DECAYS, EDGE_ROWS, KNOTS, Lead
+from reactorwatch.diagnosis.search.screen import DECAYS, EDGE_ROWS, KNOTS, Candidate
 from reactorwatch.process.effect import Effect
 
-Follow: TypeAlias = Callable[[Effect, Sequence[Signal]], Sequence[Followed]]
-"""From some deviations of an effect to what filters that know of them make of the run."""
+Evaluate: TypeAlias = Callable[[Effect, Sequence[Signal]], Sequence[FilterResult]]
+"""From deviations of an effect to the filter results with them."""
 
 
-class MemoryScreen:
-    """Tries the effects with memory on one run.
+class DynamicEffectsScreen:
+    """Screens one run for effects with internal states.
 
     Args:
-        effects: those that bring states of their own.
+        effects: effects with internal states.
         run: the record.
     """
 
@@ -35,103 +35,107 @@ class MemoryScreen:
         self._effects, self._run = tuple(effects), run
         t = run.time_min
         self._constant, self._step, self._ramp, self._decay = Constant(t), Step(t), Ramp(t), Decay(t)
-        self._free = Free(t, KNOTS)
+        self._free = PiecewiseLinear(t, KNOTS)
 
-    def leads(
-        self, without: Fit, follow: Follow, of: Sequence[Effect] | None = None, least_score: float = 0.0
-    ) -> list[Lead]:
-        """The best size of each effect as a constant, and from there a step, a ramp, decays and a free curve.
+    def candidates(
+        self, baseline: Fit, evaluate: Evaluate, of: Sequence[Effect] | None = None, least_score: float = 0.0
+    ) -> list[Candidate]:
+        """Best magnitude of each effect as a constant and, scaled from there, a step, a ramp, decays and a curve.
 
         Args:
-            without: a fit without any of the effects.
-            follow: what filters make of the run that know of the same, and of a deviation of one effect.
-            of: these effects alone; None: all.
-            least_score: promises of less, in BIC, are not held against a run of the filter.
+            baseline: fit without any of these effects.
+            evaluate: runs the filter of the same hypothesis plus deviations of one effect.
+            of: effects to screen; None: all.
+            least_score: predicted gains below this, in BIC, are not confirmed by a filter run.
         """
-        found = []
+        result = []
         for effect in self._effects if of is None else of:
             starts = effect.start_values or (effect.typical,)
-            followed = follow(effect, [self._constant.signal(np.array([start])) for start in starts])
-            tried = [
-                (2.0 * (without.loss - item.loss), start, item.w) for start, item in zip(starts, followed, strict=True)
-            ]
-            gain, start, _ = max(tried, key=lambda item: item[0])
-            if gain > 0.0:
-                found.append(Lead(effect, self._constant, np.array([start]), gain))
-            before = clipped(without.w)
-            scaled = [self.scaled(effect, before, (before - clipped(w)) / start) for _, start, w in tried]
-            for leads, kept in zip(scaled, self._kept(without, follow, scaled, least_score), strict=True):
-                # What acts in jumps does not scale: a fit has to scan its size, and can do so for one alone.
-                found += [
-                    replace(item, gain=kept * item.gain)
-                    for item in leads
-                    if kept > 0.0 and (not effect.is_discontinuous or item.course.name in ("constant", "step"))
+            results = evaluate(effect, [self._constant.signal(np.array([start])) for start in starts])
+            gains = [2.0 * (baseline.loss - item.loss) for item in results]
+            best = int(np.argmax(gains))
+            if gains[best] > 0.0:
+                result.append(Candidate(effect, self._constant, np.array([starts[best]]), gains[best]))
+            w = huber_clip(baseline.w)
+            reductions = [(w - huber_clip(item.w)) / start for start, item in zip(starts, results, strict=True)]
+            scaled = [self.scale_signature(effect, w, g) for g in reductions]
+            confirmations = self._confirmations(baseline, evaluate, scaled, least_score)
+            for candidates, confirmed in zip(scaled, confirmations, strict=True):
+                # A discontinuous effect does not scale: a fit has to scan its size, and can scan only one.
+                result += [
+                    replace(item, gain=confirmed * item.gain)
+                    for item in candidates
+                    if confirmed > 0.0 and (not effect.is_discontinuous or item.profile.name in ("constant", "step"))
                 ]
-        return found
+        return result
 
-    def _kept(self, without: Fit, follow: Follow, scaled: Sequence[Sequence[Lead]], least_score: float) -> list[float]:
-        """How much of the gain that each scaling promises a run with that constant size keeps, at most all of it.
+    def _confirmations(
+        self, baseline: Fit, evaluate: Evaluate, scaled: Sequence[Sequence[Candidate]], least_score: float
+    ) -> list[float]:
+        """Fraction of the predicted gain that a filter run at that constant magnitude confirms, at most 1.
 
-        A scaling that promises little, or is of an effect that acts in jumps, is believed without a run.
+        Small predictions and discontinuous effects are taken without a run.
         """
-        kept, asked = [1.0] * len(scaled), []
-        for number, leads in enumerate(scaled):
-            constant = leads[0]
-            if constant.effect.is_discontinuous or max(item.score(self._run.values) for item in leads) <= least_score:
+        confirmed, to_confirm = [1.0] * len(scaled), []
+        for number, candidates in enumerate(scaled):
+            constant = candidates[0]
+            if constant.effect.is_discontinuous or max(item.score(self._run.values) for item in candidates) <= least_score:
                 continue
             if constant.gain > 0.0:
-                asked.append(number)
+                to_confirm.append(number)
             elif constant.gain < 0.0:
-                kept[number] = 0.0
-        if asked:
-            signals = [self._constant.signal(scaled[number][0].theta) for number in asked]
-            for number, item in zip(asked, follow(scaled[0][0].effect, signals), strict=True):
-                kept[number] = min(2.0 * (without.loss - item.loss) / scaled[number][0].gain, 1.0)
-        return kept
+                confirmed[number] = 0.0
+        if to_confirm:
+            signals = [self._constant.signal(scaled[number][0].parameters) for number in to_confirm]
+            for number, item in zip(to_confirm, evaluate(scaled[0][0].effect, signals), strict=True):
+                confirmed[number] = min(2.0 * (baseline.loss - item.loss) / scaled[number][0].gain, 1.0)
+        return confirmed
 
-    def scaled(self, effect: Effect, w: Array, g: Array) -> list[Lead]:
-        """From the signature of a size of 1 in every row.
+    def scale_signature(self, effect: Effect, w: Array, g: Array) -> list[Candidate]:
+        """Candidates from the signature of a unit magnitude in every row.
 
         Args:
-            effect: whose.
-            w: what there is to explain, shape (rows, n_y).
-            g: the signature, likewise.
+            effect: the effect.
+            w: normalised innovations to explain, shape (rows, n_y).
+            g: the signature, shape (rows, n_y).
         """
         a, b = np.sum(w * g, axis=1), np.sum(g * g, axis=1)
         t = self._run.time_min
-        leads = [_lead(effect, self._constant, a.sum(), b.sum(), ())]
-        later_a, later_b = _later(a), _later(b)
-        place = _best(later_a, later_b, effect)
-        leads.append(_lead(effect, self._step, later_a[place], later_b[place], (t[place],)))
-        moments = [_later(item * t**power) for item in (a, b) for power in (0, 1, 2)]
+        candidates = [_candidate(effect, self._constant, a.sum(), b.sum(), ())]
+        later_a, later_b = _sums_to_end(a), _sums_to_end(b)
+        index = _best(later_a, later_b, effect)
+        candidates.append(_candidate(effect, self._step, later_a[index], later_b[index], (t[index],)))
+        moments = [_sums_to_end(item * t**power) for item in (a, b) for power in (0, 1, 2)]
         span = np.maximum(t[-1] - t, self._ramp.period_min)
         grown_a = (moments[1] - t * moments[0]) / span
         grown_b = np.maximum(moments[5] - 2 * t * moments[4] + t**2 * moments[3], 0.0) / span**2
-        place = _best(grown_a, grown_b, effect)
-        leads.append(_lead(effect, self._ramp, grown_a[place], grown_b[place], (t[place],)))
+        index = _best(grown_a, grown_b, effect)
+        candidates.append(_candidate(effect, self._ramp, grown_a[index], grown_b[index], (t[index],)))
         for share in DECAYS:
             constant = share * self._run.span_min
-            left = np.exp((t[-1] - t) / constant)  # of the way, seen from the end
-            short_a, short_b, shorter_b = (_later(item * w) / w for item, w in ((a, left), (b, left), (b, left**2)))
+            remaining = np.exp((t[-1] - t) / constant)  # backwards from the end
+            short_a, short_b, shorter_b = (
+                _sums_to_end(item * w) / w for item, w in ((a, remaining), (b, remaining), (b, remaining**2))
+            )
             grown_a, grown_b = later_a - short_a, np.maximum(later_b - 2.0 * short_b + shorter_b, 0.0)
-            place = _best(grown_a, grown_b, effect)
-            leads.append(_lead(effect, self._decay, grown_a[place], grown_b[place], (t[place], constant)))
-        hats = self._free.functions(np.empty(0))[0]
+            index = _best(grown_a, grown_b, effect)
+            candidates.append(_candidate(effect, self._decay, grown_a[index], grown_b[index], (t[index], constant)))
+        hats = self._free.basis_functions(np.empty(0))[0]
         A, B = hats.T @ a, hats.T @ (hats * b[:, None])
         by = np.clip(np.asarray(np.linalg.lstsq(B, A, rcond=1e-9)[0]), effect.lower, effect.upper)
-        leads.append(Lead(effect, self._free, by, float(by @ (2.0 * A - B @ by))))
-        return leads
+        candidates.append(Candidate(effect, self._free, by, float(by @ (2.0 * A - B @ by))))
+        return candidates
 
 
-def _later(values: Array) -> Array:
+def _sums_to_end(values: Array) -> Array:
     """Sums from each row to the last."""
     return np.asarray(np.cumsum(values[::-1])[::-1])
 
 
-def _lead(effect: Effect, course: Course, a: float, b: float, shape: tuple[float, ...]) -> Lead:
-    """At the nearest possible size, with the gain of just that: a run with it is held against this gain."""
+def _candidate(effect: Effect, profile: FittedProfile, a: float, b: float, shape: tuple[float, ...]) -> Candidate:
+    """Candidate at the nearest possible magnitude, with the gain there, because a filter run is compared with it."""
     size = float(np.clip(a / max(b, 1e-300), effect.lower, effect.upper))
-    return Lead(effect, course, np.array([size, *shape]), size * (2.0 * float(a) - size * float(b)))
+    return Candidate(effect, profile, np.array([size, *shape]), size * (2.0 * float(a) - size * float(b)))
 
 
 def _best(a: Array, b: Array, effect: Effect) -> int:

@@ -1,8 +1,8 @@
-"""Explanations that another one's noise hides.
+"""Hypotheses that another one's noise levels mask.
 
-All hypotheses are compared with the noise of the best. If that is a wrong one, its process seems so noisy that the
-filter is carried along by what is measured, and under such a noise the right one shows little. So if the best leaves
-what is not white, others are asked anew, each with the noise that it needs itself.
+All hypotheses are compared with the noise levels of the best. If that is a wrong one, its process noise is so large
+that the filter follows the measurements, and the right hypothesis gains little. So if the best leaves innovations that
+are not white, others are fitted again, each with noise levels of its own.
 """
 
 import numpy as np
@@ -11,86 +11,87 @@ from msgspec.structs import replace
 from reactorwatch.diagnosis.fitting import grid_search
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, Step
-from reactorwatch.diagnosis.search.search import FAR_OUT, SETTLED_NOISE, Explained, Found, Search
+from reactorwatch.diagnosis.search.search import CONVERGED_NOISE, FAR_OUT, FittedHypothesis, Search, SearchResult
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
 from reactorwatch.process.effect import Effect
 
 OTHERS, ROUNDS = 2, 2
 
 QUIET_SHARE = 0.003
-"""Of a state's scale per square root of a minute: noise that hides no valve that sticks."""
+"""Fraction of a state's scale per square root of a minute: process noise that does not mask valve stiction."""
 
 
-def explained_by_one(search: Search) -> Found:
-    """What one effect explains best, and its rivals, with the noise of the best."""
-    found = search.found()
-    hidden = _uncovered(search, found)
-    return found if hidden is None else search.about(hidden, found)
+def search_single_cause(search: Search) -> SearchResult:
+    """Search for the best single effect and its alternatives, with the noise levels of the best."""
+    better = search.search_single_causes()
+    hidden = _search_masked(search, better)
+    return better if hidden is None else search.search_from(hidden, better)
 
 
-def _uncovered(search: Search, known: Found) -> Explained | None:
-    """A better explanation, whose noise then is that of the search; None if there is none, or nothing calls for one.
+def _search_masked(search: Search, result: SearchResult) -> FittedHypothesis | None:
+    """Find a better hypothesis and adopt its noise levels; None if there is none or the innovations are white.
 
-    Those that act in jumps are asked too, though they promise little or nothing: with a noise that carries the filter
-    along a valve that sticks does not show, and at the wrong size it explains nothing.
+    Discontinuous effects are tried even if they predict no gain: process noise masks stiction, and at a wrong magnitude
+    it explains nothing.
     """
-    best = known.best
+    best = result.best
     if not np.any(minus_log10_p(best.fit.w, search.run.inputs) > DOUBTFUL):
         return None
-    others = {item.hypothesis.causes: item for item in reversed(known.explained)}
-    if not _jumps(best):
+    others = {item.hypothesis.causes: item for item in reversed(result.hypotheses)}
+    if not _is_discontinuous(best):
         others.pop(best.hypothesis.causes, None)
     by_bic = sorted(others.values(), key=lambda item: item.bic)
-    asked = by_bic[:OTHERS] + [item for item in by_bic[OTHERS:] if _jumps(item)]
-    leads = {lead.effect: lead for lead in known.remembering}
-    for effect in search.screen.with_memory:
+    to_fit = by_bic[:OTHERS] + [item for item in by_bic[OTHERS:] if _is_discontinuous(item)]
+    candidates = {candidate.effect: candidate for candidate in result.dynamic_candidates}
+    for effect in search.screen.dynamic_effects:
         if effect.is_discontinuous and (effect.name,) not in (best.hypothesis.causes, *others):
-            if effect in leads:
-                asked.append(search.fitted(leads[effect]))
-            elif not best.key:  # nothing explains anything
-                asked.append(_as_usual(search, effect))
-    held, found = search.noise, best
-    for item in asked:
-        search.settle(item)
-        item = _set_in(search, item, best) if _jumps(item) else search.refitted(item)
-        if item.bic < found.bic:
-            held, found = search.noise, item
-    search.noise = held
-    return None if found is best else found
+            if effect in candidates:
+                to_fit.append(search.fit_candidate(candidates[effect]))
+            elif not best.label:  # no effect explains anything
+                to_fit.append(_fit_typical(search, effect))
+    noise, better = search.noise, best
+    for item in to_fit:
+        search.update_noise(item)
+        item = _scan_effect(search, item, best) if _is_discontinuous(item) else search.refit(item)
+        if item.bic < better.bic:
+            noise, better = search.noise, item
+    search.noise = noise
+    return None if better is best else better
 
 
-def _jumps(item: Explained) -> bool:
-    return any(effect.is_discontinuous for effect in item.hypothesis.sized.effects)
+def _is_discontinuous(item: FittedHypothesis) -> bool:
+    return any(effect.is_discontinuous for effect in item.hypothesis.filter.effects)
 
 
-def _as_usual(search: Search, effect: Effect) -> Explained:
-    constant = Hypothesis(search.sized((effect,)), (Constant(search.run.time_min),))
-    return search.explained(constant, (np.array([effect.typical]),))
+def _fit_typical(search: Search, effect: Effect) -> FittedHypothesis:
+    constant = Hypothesis(search.filter((effect,)), (Constant(search.run.time_min),))
+    return search.evaluate(constant, (np.array([effect.typical]),))
 
 
-def _set_in(search: Search, item: Explained, best: Explained) -> Explained:
-    """An effect that acts in jumps, set in when that explains most, with the noise that it needs itself.
+def _scan_effect(search: Search, item: FittedHypothesis, best: FittedHypothesis) -> FittedHypothesis:
+    """Fit the magnitude and onset of a discontinuous effect, with its own noise levels.
 
-    It begins with little noise: a process that is noisy enough for the wrong size hides how far off that is. Where it
-    is far from the best even so, it is not looked at more closely.
+    It starts with little process noise, because noise that suits a wrong magnitude hides the error of the magnitude. An
+    effect that is still far from the best is not refined.
     """
-    sized, run = item.hypothesis.sized, search.run
-    quiet = (QUIET_SHARE * state.scale for state in sized.model.states)
+    ekf, run = item.hypothesis.filter, search.run
+    quiet = (QUIET_SHARE * state.scale for state in ekf.model.states)
     process_sd = tuple(min(sd, least) for sd, least in zip(search.noise.process_sd, quiet, strict=False))
     search.noise = replace(search.noise, process_sd=process_sd)
-    item = search.refitted(item)
-    courses = [Hypothesis(sized, (course,)) for course in (Constant(run.time_min), Step(run.time_min))]
+    item = search.refit(item)
+    profiles = [Hypothesis(ekf, (profile,)) for profile in (Constant(run.time_min), Step(run.time_min))]
     for closely in range(1 + ROUNDS):
         before = item.bic
-        for hypothesis in courses:
-            if closely and hypothesis.courses[0].name == item.hypothesis.courses[0].name:
-                fit = grid_search.finely(run, hypothesis, item.fit)
+        for hypothesis in profiles:
+            if closely and hypothesis.profiles[0].name == item.hypothesis.profiles[0].name:
+                fit = grid_search.search_fine(run, hypothesis, item.fit)
             else:
-                numbers = [item.fit.theta[0][0], *(number.lower for number in hypothesis.courses[0].numbers)]
-                fit = grid_search.roughly(run, hypothesis, hypothesis.at(run, (np.array(numbers),)))
-            item = min(item, search.judged(hypothesis, fit), key=lambda each: each.bic)
-        search.settle(item)
-        item = search.refitted(item)
-        if item.bic > (before - SETTLED_NOISE if closely else best.bic + FAR_OUT):
+                lowest = (parameter.lower for parameter in hypothesis.profiles[0].nonlinear_parameters)
+                values = [item.fit.parameters[0][0], *lowest]
+                fit = grid_search.search_coarse(run, hypothesis, hypothesis.evaluate(run, (np.array(values),)))
+            item = min(item, search.score_fit(hypothesis, fit), key=lambda each: each.bic)
+        search.update_noise(item)
+        item = search.refit(item)
+        if item.bic > (before - CONVERGED_NOISE if closely else best.bic + FAR_OUT):
             break
     return item

@@ -1,16 +1,15 @@
-"""Which two causes come into question together: all pairs at once, linearised about a run of the filter.
+"""Screen for pairs of causes: all pairs at once, linearised about a filter run.
 
-What two deviations do together is, to first order, the sum of what each does. So every cause gets a few columns: what
-it does to the innovations as a constant, as a curve through some knots, and as the sines that stand out. The products
-of all columns with each other and with what there is to explain are taken once; the gain of any pair then is that of a
-small system of linear equations, and of thousands of pairs the best can be had (forward selection, which sees one cause
-at a time, would begin with a third cause that looks like both).
+To first order the signature of two deviations is the sum of theirs. So every cause gets a few columns: its signatures
+as a constant, as a piecewise-linear curve, and as the sines that stand out. The gram matrix of all columns is computed
+once; the gain of any pair is then the solution of a small linear system, so that the best of thousands of pairs can be
+found. (Forward selection sees one cause at a time, and would start with a third cause that resembles both.)
 
-Effects with memory are tried at a few sizes, as in `dynamic_effects_screen`.
+Effects with internal states are evaluated at a few magnitudes, as in `dynamic_effects_screen`.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf, log
 
 import numpy as np
@@ -18,171 +17,173 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
-from reactorwatch.diagnosis.fitting.bounded_least_squares import within
-from reactorwatch.diagnosis.fitting.profiles import Constant, Course, Free, Sine
+from reactorwatch.diagnosis.fitting.bounded_least_squares import solve_bounded
+from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, PiecewiseLinear, Sine
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.screen import KNOTS, Screen, usable
+from reactorwatch.diagnosis.search.screen import KNOTS, Screen, all_finite
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect
 
-TAKEN_AWAY, SINES_SHARE = 2, 0.3
-"""How many causes are taken away in turn to see sines below, and what share of the best one's gain a sine must have."""
+REMOVED_CAUSES, SINES_SHARE = 2, 0.3
+"""Number of causes that are removed in turn to see sines beneath them, and minimum gain of a sine as a fraction of the
+best."""
 
 BLOCK, NEGLIGIBLE = 512, 1e-9
-"""Values whose products are summed at once, and the share of a column's largest that is taken for nothing."""
+"""Rows of columns that are multiplied at once, and the fraction of a column's maximum below which it counts as 0."""
 
 _RIDGE = 1e-9
 _MOST_SIZES = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class PairLead:
-    """Two causes, each with a course, that may explain what is left.
+class CandidatePair:
+    """Two causes with profiles that may explain the innovations.
 
     Attributes:
-        parts: of each the cause, its course, and where a fit may begin.
-        score: the gain in BIC that the linear model promises.
+        parts: for each the effect, its profile and initial parameters.
+        score: predicted gain in BIC.
     """
 
-    parts: tuple[tuple[Effect, Course, Array], ...]
+    parts: tuple[tuple[Effect, FittedProfile, Array], ...]
     score: float
 
     @property
     def causes(self) -> frozenset[str]:
-        """Their names."""
+        """Names of the causes."""
         return frozenset(effect.name for effect, _, _ in self.parts)
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One cause with one kind of course.
+    """Columns of one cause with one kind of profile.
 
     Attributes:
         effect: the cause.
-        course: its course.
-        shape: the course's numbers.
-        size: that a coefficient of 1 stands for, of an effect with memory; None: 1.
-        columns: what each function of the course does to the innovations, shape (values, coefficients).
+        profile: its profile.
+        shape: nonlinear parameters of the profile.
+        size: magnitude at a coefficient of 1, of an effect with internal states; None: 1.
+        columns: signature of each basis function, shape (values, n_linear).
     """
 
     effect: Effect
-    course: Course
+    profile: FittedProfile
     shape: Array
     size: float | None
     columns: Array
 
 
 class PairScreen:
-    """Looks for pairs in a run.
+    """Screens a run for pairs.
 
     Args:
-        screen: of the run.
+        screen: screen for single causes of the run.
         run: the record.
     """
 
     def __init__(self, screen: Screen, run: Run) -> None:
         self._screen, self._run = screen, run
         t = run.time_min
-        self._constant, self._free, self._sine = Constant(t), Free(t, KNOTS), Sine(t)
+        self._constant, self._free, self._sine = Constant(t), PiecewiseLinear(t, KNOTS), Sine(t)
 
-    def leads(self, ways: ErrorDynamics, memory: Sequence["Remembered"], count: int) -> list[PairLead]:
-        """The best of each two causes, the most promising first.
+    def candidates(self, dynamics: ErrorDynamics, dynamic: Sequence["DynamicSignature"], count: int) -> list[CandidatePair]:
+        """Best candidate of each pair of causes, the most promising first.
 
         Args:
-            ways: of all direct effects, with what there is to explain.
-            memory: what effects with memory do at some sizes.
-            count: how many.
+            dynamics: error equations of all static effects, with the innovations to explain.
+            dynamic: signatures of the effects with internal states.
+            count: number of candidates.
         """
-        if not usable(ways):
+        if not all_finite(dynamics):
             return []
-        w = ways.w.ravel()
-        blocks = [*self._slow(ways), *self._remembered(memory, w)]
-        blocks += self._swinging(ways, blocks, w)
+        w = dynamics.w.ravel()
+        blocks = [*self._static_blocks(dynamics), *self._dynamic_blocks(dynamic, w)]
+        blocks += self._sine_blocks(dynamics, blocks, w)
         if not blocks:
             return []
-        return self._ranked(blocks, w, count)
+        return self._rank(blocks, w, count)
 
-    def _slow(self, ways: ErrorDynamics) -> Iterator[Block]:
-        """Every direct effect as a constant and as a curve."""
-        over_row, at_row = self._free.basis(np.empty(0))
-        for cause, effect in enumerate(self._screen.direct):
-            g = signatures.shown(ways, cause, over_row[1:-1], at_row[2:]).reshape(-1, KNOTS)
-            yield from self._both(effect, None, g)
+    def _static_blocks(self, dynamics: ErrorDynamics) -> Iterator[Block]:
+        """Every static effect as a constant and as a curve."""
+        interval_mean, sample_value = self._free.basis_signals(np.empty(0))
+        for cause, effect in enumerate(self._screen.static_effects):
+            g = signatures.forward_signatures(dynamics, cause, interval_mean[1:-1], sample_value[2:]).reshape(-1, KNOTS)
+            yield from self._blocks_of(effect, None, g)
 
-    def _remembered(self, memory: Sequence["Remembered"], w: Array) -> Iterator[Block]:
-        """Every effect with memory as a constant about each of its sizes, and as a curve about the best of these."""
-        hats = self._free.functions(np.empty(0))[0][2:]
-        for effect in dict.fromkeys(item.effect for item in memory):
-            tried = []
-            for item in memory:
+    def _dynamic_blocks(self, dynamic: Sequence["DynamicSignature"], w: Array) -> Iterator[Block]:
+        """Every effect with internal states as a constant at each magnitude, and as a curve at the best of them."""
+        hats = self._free.basis_functions(np.empty(0))[0][2:]
+        for effect in dict.fromkeys(item.effect for item in dynamic):
+            evaluated = []
+            for item in dynamic:
                 g = (item.g[2:, :, None] * hats[:, None, :]).reshape(-1, KNOTS)
                 if item.effect is effect and np.all(np.isfinite(g)):
-                    tried.append((_gain(g, w)[0], list(self._both(effect, item.size, g))))
-            best = max((gain for gain, _ in tried), default=0.0)
-            for gain, (constant, curve) in tried:
+                    evaluated.append((_gain(g, w)[0], list(self._blocks_of(effect, item.size, g))))
+            best = max((gain for gain, _ in evaluated), default=0.0)
+            for gain, (constant, curve) in evaluated:
                 yield constant
                 if gain == best:
                     yield curve
 
-    def _both(self, effect: Effect, size: float | None, g: Array) -> Iterator[Block]:
+    def _blocks_of(self, effect: Effect, size: float | None, g: Array) -> Iterator[Block]:
         if np.all(np.isfinite(g)):
             yield Block(effect, self._constant, np.empty(0), size, g.sum(axis=1, keepdims=True))
             yield Block(effect, self._free, np.empty(0), size, g)
 
-    def _swinging(self, ways: ErrorDynamics, blocks: Sequence[Block], w: Array) -> Iterator[Block]:
-        """The sines that stand out, and those that do once the best other cause is taken away."""
-        found: dict[tuple[str, float], Block] = {}
-        curves = [block for block in blocks if block.course is self._free]
+    def _sine_blocks(self, dynamics: ErrorDynamics, blocks: Sequence[Block], w: Array) -> Iterator[Block]:
+        """Sines that stand out, also once the best other cause is removed."""
+        result: dict[tuple[str, float], Block] = {}
+        curves = [block for block in blocks if block.profile is self._free]
         by_gain = sorted(curves, key=lambda block: -_gain(block.columns, w)[0])
-        strongest = _of_different_causes(by_gain)[:TAKEN_AWAY]
-        for rest in [w, *(w - block.columns @ _gain(block.columns, w)[1] for block in strongest)]:
-            about = ErrorDynamics(ways.F, ways.G, ways.H, ways.D, ways.K, ways.whitening, rest.reshape(ways.w.shape))
-            leads = [item for item in self._screen.swinging(about, self._screen.direct) if np.isfinite(item.gain)]
-            least = max([0.0, *(SINES_SHARE * item.score(self._run.values) for item in leads)])
-            for lead in leads:
-                period = lead.theta[2:]
-                key = (lead.effect.name, round(log(float(period[0])), 2))
-                if lead.score(self._run.values) > least and key not in found:
-                    over_row, at_row = self._sine.basis(period)
-                    cause = self._screen.direct.index(lead.effect)
-                    g = signatures.shown(about, cause, over_row[1:-1], at_row[2:])
-                    found[key] = Block(lead.effect, self._sine, period, None, g.reshape(-1, 2))
-        yield from found.values()
+        strongest = _of_different_causes(by_gain)[:REMOVED_CAUSES]
+        for residual in [w, *(w - block.columns @ _gain(block.columns, w)[1] for block in strongest)]:
+            about = replace(dynamics, w=residual.reshape(dynamics.w.shape))
+            candidates = self._screen.sine_candidates(about, self._screen.static_effects)
+            candidates = [item for item in candidates if np.isfinite(item.gain)]
+            least = max([0.0, *(SINES_SHARE * item.score(self._run.values) for item in candidates)])
+            for candidate in candidates:
+                period = candidate.parameters[2:]
+                key = (candidate.effect.name, round(log(float(period[0])), 2))
+                if candidate.score(self._run.values) > least and key not in result:
+                    interval_mean, sample_value = self._sine.basis_signals(period)
+                    cause = self._screen.static_effects.index(candidate.effect)
+                    g = signatures.forward_signatures(about, cause, interval_mean[1:-1], sample_value[2:])
+                    result[key] = Block(candidate.effect, self._sine, period, None, g.reshape(-1, 2))
+        yield from result.values()
 
-    def _ranked(self, blocks: Sequence[Block], w: Array, count: int) -> list[PairLead]:
-        """The best of as many sets of two causes.
+    def _rank(self, blocks: Sequence[Block], w: Array, count: int) -> list[CandidatePair]:
+        """Best candidate of each pair of causes.
 
-        What is possible gains at most as much as what is not, so the possible gain is taken of the most promising
-        alone, until those that are left promise less.
+        Bounds only reduce a gain, so the bounded gain is computed for the most promising pairs alone, until the others
+        predict less.
         """
         columns = np.concatenate([block.columns for block in blocks], axis=1)
-        gram, by = _products(columns), columns.T @ w
+        gram, by = _gram(columns), columns.T @ w
         ends = np.cumsum([block.columns.shape[1] for block in blocks])
         places = [np.arange(end - block.columns.shape[1], end) for end, block in zip(ends, blocks, strict=True)]
         price = log(self._run.values)
         best: dict[frozenset[str], tuple[float, int, int, Array]] = {}
-        for promised, i, j in self._promised(blocks, places, gram, by):
+        for promised, i, j in self._bound_gains(blocks, places, gram, by):
             if len(best) >= count and sorted((item[0] for item in best.values()), reverse=True)[count - 1] > promised:
                 break
             first, second = blocks[i], blocks[j]
             both = np.concatenate([places[i], places[j]])
             lowest, highest = (np.concatenate(ends) for ends in zip(_range(first), _range(second), strict=True))
-            gain, theta = within(gram[np.ix_(both, both)], by[both], lowest, highest)
-            score = gain - price * (first.course.freedom + second.course.freedom)
+            gain, parameters = solve_bounded(gram[np.ix_(both, both)], by[both], lowest, highest)
+            score = gain - price * (first.profile.n_parameters + second.profile.n_parameters)
             key = frozenset((first.effect.name, second.effect.name))
             if score > best.get(key, (-inf,))[0]:
-                best[key] = (score, i, j, theta)
-        found = []
-        for score, i, j, theta in best.values():
+                best[key] = (score, i, j, parameters)
+        result = []
+        for score, i, j, parameters in best.values():
             middle = places[i].size
-            parts = (_part(blocks[i], theta[:middle]), _part(blocks[j], theta[middle:]))
-            found.append(PairLead(parts, score))
-        return sorted(found, key=lambda item: -item.score)[:count]
+            parts = (_part(blocks[i], parameters[:middle]), _part(blocks[j], parameters[middle:]))
+            result.append(CandidatePair(parts, score))
+        return sorted(result, key=lambda item: -item.score)[:count]
 
-    def _promised(
+    def _bound_gains(
         self, blocks: Sequence[Block], places: Sequence[NDArray[np.int64]], gram: Array, by: Array
     ) -> list[tuple[float, int, int]]:
-        """The gain in BIC of any two blocks if any sizes were possible, the largest first."""
+        """Gain in BIC of any two blocks without bounds, the largest first."""
         of_size: dict[tuple[int, int], list[tuple[int, int]]] = {}
         for i, first in enumerate(blocks):
             for j in range(i + 1, len(blocks)):
@@ -191,7 +192,7 @@ class PairScreen:
         price, scale = log(self._run.values), np.sqrt(np.maximum(np.diag(gram), 1e-300))
         scaled, scaled_by = gram / np.outer(scale, scale), by / scale
         scaled[np.diag_indices_from(scaled)] += _RIDGE
-        found = []
+        result = []
         for pairs in of_size.values():
             both = np.array([np.concatenate([places[i], places[j]]) for i, j in pairs])
             a = scaled_by[both]
@@ -199,18 +200,18 @@ class PairScreen:
                 "ni,ni->n", a, np.linalg.solve(scaled[both[:, :, None], both[:, None, :]], a[..., None])[..., 0]
             )
             for gain, (i, j) in zip(gains.tolist(), pairs, strict=True):
-                found.append((gain - price * (blocks[i].course.freedom + blocks[j].course.freedom), i, j))
-        return sorted(found, reverse=True)
+                result.append((gain - price * (blocks[i].profile.n_parameters + blocks[j].profile.n_parameters), i, j))
+        return sorted(result, reverse=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Remembered:
-    """What an effect with memory does at a constant size.
+class DynamicSignature:
+    """Signature of an effect with internal states at a constant magnitude.
 
     Attributes:
-        effect: it.
-        size: of it.
-        g: what the innovations lose, shape (rows, n_y).
+        effect: the effect.
+        size: its magnitude.
+        g: reduction of the innovations, shape (rows, n_y).
     """
 
     effect: Effect
@@ -218,39 +219,39 @@ class Remembered:
     g: Array
 
 
-def _part(block: Block, by: Array) -> tuple[Effect, Course, Array]:
-    theta = np.concatenate([by * (1.0 if block.size is None else block.size), block.shape])
-    return block.effect, block.course, block.course.limited(theta, block.effect.lower, block.effect.upper)
+def _part(block: Block, by: Array) -> tuple[Effect, FittedProfile, Array]:
+    parameters = np.concatenate([by * (1.0 if block.size is None else block.size), block.shape])
+    return block.effect, block.profile, block.profile.clip(parameters, block.effect.lower, block.effect.upper)
 
 
 def _range(block: Block) -> tuple[Array, Array]:
-    """What the coefficients can be at least and at most. Far beyond a size that was tried memory is not linear."""
+    """Bounds of the coefficients. Internal states are not linear far beyond a magnitude that was evaluated."""
     effect, count = block.effect, block.columns.shape[1]
-    lower, upper = (effect.lower, effect.upper) if not isinstance(block.course, Sine) else (-inf, inf)
+    lower, upper = (effect.lower, effect.upper) if not isinstance(block.profile, Sine) else (-inf, inf)
     if block.size is not None:
         lower, upper = lower / block.size, min(upper / block.size, _MOST_SIZES)
     return np.full(count, lower), np.full(count, upper)
 
 
-def _products(columns: Array) -> Array:
-    """Of all columns with each other. A knot of a curve shows for a while only, and outside of it costs nothing."""
+def _gram(columns: Array) -> Array:
+    """Gram matrix of all columns. Most of a hat function's column is 0 and costs nothing."""
     sizes, products = np.abs(columns), np.zeros((columns.shape[1],) * 2)
     least = NEGLIGIBLE * np.max(sizes, axis=0)
     for begin in range(0, len(columns), BLOCK):
         part = slice(begin, begin + BLOCK)
-        there = np.flatnonzero(np.max(sizes[part], axis=0) > least)
-        shown = columns[part, there]
-        products[np.ix_(there, there)] += shown.T @ shown
+        present = np.flatnonzero(np.max(sizes[part], axis=0) > least)
+        shown = columns[part, present]
+        products[np.ix_(present, present)] += shown.T @ shown
     return products
 
 
 def _gain(columns: Array, w: Array) -> tuple[float, Array]:
     unbounded = np.full(columns.shape[1], inf)
-    return within(columns.T @ columns, columns.T @ w, -unbounded, unbounded)
+    return solve_bounded(columns.T @ columns, columns.T @ w, -unbounded, unbounded)
 
 
 def _of_different_causes(blocks: Sequence[Block]) -> list[Block]:
-    found: dict[str, Block] = {}
+    result: dict[str, Block] = {}
     for block in blocks:
-        found.setdefault(block.effect.name, block)
-    return list(found.values())
+        result.setdefault(block.effect.name, block)
+    return list(result.values())

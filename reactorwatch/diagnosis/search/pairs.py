@@ -1,29 +1,30 @@
-"""Two causes at once.
+"""Search for two simultaneous causes.
 
-Two deviations that are there together can look like a third one, and then the best single cause is neither of them. So
-all pairs are screened together (`pair_screen`), about the run of the best single cause, and the best are fitted
-roughly, with curves that can be anything. Of the best of these each cause takes the simplest course that does, and
-about its run, where linear equations hold, all pairs are screened again.
+Two deviations together can look like a third one, so that the best single cause is neither of them. So all pairs are
+screened together (`pair_screen`) about the run of the best single cause, and the best are fitted roughly, with curves
+of any shape. In the best of these each cause then gets its simplest adequate profile, and all pairs are screened again
+about its run, where the linearisation holds.
 
-A curve can take what belongs to the other cause. So if one is left, a pair is grown without curves too, from the best
-single cause of a simple course, and the likelier of the two goes on. In the end each of the two is exchanged, the other
-held, for whatever explains the rest better, until nothing does. A pair is a strong claim and takes a gain of
+A curve can take what belongs to the other cause. So if a curve remains, a pair is also grown without curves, from the
+best single cause with a simple profile, and the better of the two is kept. Finally each of the two causes is exchanged
+for whatever explains the remainder better, until nothing does. A pair is a strong claim: it needs a gain of
 `LEAST_PAIR_GAIN`.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.fault_filter import Followed, clipped
+from reactorwatch.diagnosis.fitting.fault_filter import FilterResult, huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
-from reactorwatch.diagnosis.fitting.profiles import Constant, Course, Free, Signal
-from reactorwatch.diagnosis.search.pair_screen import PairLead, PairScreen, Remembered
-from reactorwatch.diagnosis.search.screen import KNOTS, Lead
-from reactorwatch.diagnosis.search.search import IN_QUESTION, Explained, Found, Key, Search, keep
+from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, PiecewiseLinear, Signal
+from reactorwatch.diagnosis.search.pair_screen import CandidatePair, DynamicSignature, PairScreen
+from reactorwatch.diagnosis.search.screen import KNOTS, Candidate
+from reactorwatch.diagnosis.search.search import IN_QUESTION, FittedHypothesis, Label, Search, SearchResult, keep_best
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
 from reactorwatch.process.effect import Effect
 
@@ -31,17 +32,17 @@ LEAST_PAIR_GAIN = 40.0
 """In BIC, of a pair over the best single cause."""
 
 SHORTLIST, AGAIN, REFINED = 6, 3, 2
-"""How many pairs of a screen are fitted, how many of these again with the noise of the best, and how many well."""
+"""Pairs fitted after a screen; pairs fitted again with the noise of the best; pairs refined."""
 
-COURSES, EXCHANGED = 2, 4
-"""How many courses of one cause are fitted, and how many leads in an exchange."""
+MOST_PROFILES, EXCHANGED = 2, 4
+"""Profiles fitted for one cause, and candidates fitted in an exchange."""
 
 NEAR_BEST = 20.0
-"""In BIC: what is exchanged and fits worse, roughly, is not fitted to the end."""
+"""In BIC: an exchanged pair whose rough fit is worse by more is not fitted fully."""
 
 ROUNDS, EXCHANGES = 3, 3
 ROUGH_STEPS, EXCHANGE_STEPS = 3, 6
-_NEAR = 0.05  # of what a pair gains: what a rough fit may fall short
+_NEAR = 0.05  # fraction of a pair's gain that a rough fit may lack
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,292 +50,304 @@ class Part:
     """One cause of a pair."""
 
     effect: Effect
-    course: Course
-    theta: Array
+    profile: FittedProfile
+    parameters: Array
 
 
-def with_pairs(search: Search, found: Found) -> Found:
-    """What was found, and pairs if the best single cause leaves so much that a second one explains.
+def search_pairs(search: Search, result: SearchResult) -> SearchResult:
+    """Search for pairs if the best single cause leaves enough for a second one.
 
     Args:
-        search: that found it.
-        found: single causes.
+        search: search of the run.
+        result: result for single causes.
     """
-    single = found.best
-    if not _inadequate(search, single):
-        return found
-    pairs = PairSearch(search, found)
-    best, known = pairs.found()
+    single = result.best
+    if not _may_have_second_cause(search, single):
+        return result
+    pairs = PairSearch(search, result)
+    best, by_label = pairs.search()
     if best is not None and pairs.gain(best) >= LEAST_PAIR_GAIN:
-        return Found(search.noise, found.own_noise, found.nominal, sorted(known.values(), key=_bic))
-    if pairs.single.key == single.key:
-        search.noise = found.noise
-        return found
-    # One of a pair, alone, in a course that was not tried before.
-    search.settle(pairs.single)
-    rivals = [item for item in found.explained if item.bic < single.bic + IN_QUESTION]
-    explained = sorted((search.refitted(item) for item in (pairs.single, *rivals)), key=_bic)
-    return Found(search.noise, found.own_noise, found.nominal, explained)
+        return SearchResult(search.noise, result.nominal_noise, result.nominal, sorted(by_label.values(), key=_bic))
+    if pairs.single.label == single.label:
+        search.noise = result.noise
+        return result
+    # One cause of a pair alone, with a profile that was not tried before.
+    search.update_noise(pairs.single)
+    alternatives = [item for item in result.hypotheses if item.bic < single.bic + IN_QUESTION]
+    fitted = sorted((search.refit(item) for item in (pairs.single, *alternatives)), key=_bic)
+    return SearchResult(search.noise, result.nominal_noise, result.nominal, fitted)
 
 
-def _inadequate(search: Search, single: Explained) -> bool:
-    """Whether a single cause leaves so much that there may be a second."""
+def _may_have_second_cause(search: Search, single: FittedHypothesis) -> bool:
+    """Return true if the residual of a single cause leaves room for a second one."""
     if np.any(minus_log10_p(single.fit.w, search.run.inputs) > DOUBTFUL):
         return True
-    leads = search.screen.leads(single.hypothesis, single.fit) if single.key else []
-    return any(lead.score(search.run.values) > LEAST_PAIR_GAIN for lead in leads)
+    candidates = search.screen.candidates(single.hypothesis, single.fit) if single.label else []
+    return any(candidate.score(search.run.values) > LEAST_PAIR_GAIN for candidate in candidates)
 
 
 class PairSearch:
     """Searches one run for two causes.
 
     Args:
-        search: of the run.
-        found: single causes.
+        search: search of the run.
+        result: result for single causes.
 
     Attributes:
-        single: the best single cause.
+        single: best single cause.
     """
 
-    def __init__(self, search: Search, found: Found) -> None:
-        self._search, self._run, self._found = search, search.run, found
+    def __init__(self, search: Search, result: SearchResult) -> None:
+        self._search, self._run, self._result = search, search.run, result
         self._pair_screen = PairScreen(search.screen, search.run)
-        self._order = {effect.name: place for place, effect in enumerate(search.screen.effects)}
+        self._order = {effect.name: index for index, effect in enumerate(search.screen.effects)}
         self._constant = Constant(search.run.time_min)
         self._tried: set[frozenset[str]] = set()
-        self.single = found.best
+        self.single = result.best
 
-    def found(self) -> tuple[Explained | None, dict[Key, Explained]]:
-        """The best pair, and all that were fitted well under the same noise."""
-        best = self._curved()
-        if best is None or _curves(best):
-            best = min((item for item in (best, self._grown()) if item is not None), key=_bic, default=None)
+    def search(self) -> tuple[FittedHypothesis | None, dict[Label, FittedHypothesis]]:
+        """Find the best pair, and all that were fitted fully under the same noise levels."""
+        best = self._search_curves()
+        if best is None or _has_curve(best):
+            best = min((item for item in (best, self._grow_from_single()) if item is not None), key=_bic, default=None)
         if best is None:
             return None, {}
-        self._search.settle(best)
-        return self._exchanged(self._fitted(_parts(best)))
+        self._search.update_noise(best)
+        return self._exchange(self._fit(_parts(best)))
 
-    def _curved(self) -> Explained | None:
-        """The best that is found with curves, of which each then takes the simplest course that does."""
-        search, nominal = self._search, self._found.nominal
-        best: Explained | None = None
-        leads = self._screened(self._found.best)
+    def _search_curves(self) -> FittedHypothesis | None:
+        """Find the best pair with curves, and give each cause its simplest adequate profile."""
+        search, nominal = self._search, self._result.nominal
+        best: FittedHypothesis | None = None
+        candidates = self._screen_pairs(self._result.best)
         for _ in range(ROUNDS):
-            rough = sorted((self._fitted(_parts_of(lead), ROUGH_STEPS) for lead in self._fresh(leads, best)), key=_bic)
+            untried = self._skip_tried(candidates, best)
+            rough = sorted((self._fit(_parts_of(item), ROUGH_STEPS) for item in untried), key=_bic)
             if not rough:
                 break
             if best is None:
-                search.settle(rough[0])
-                rough = sorted((self._fitted(_parts(item), ROUGH_STEPS) for item in rough[:AGAIN]), key=_bic)
+                search.update_noise(rough[0])
+                rough = sorted((self._fit(_parts(item), ROUGH_STEPS) for item in rough[:AGAIN]), key=_bic)
             before, near = best, min(item.bic for item in (*rough, best) if item is not None)
             near += _NEAR * max(nominal.bic - near, 0.0)
-            refined = [self._refined(item) for item in rough[:REFINED] if item.bic <= near]
+            refined = [self._refine(item) for item in rough[:REFINED] if item.bic <= near]
             best = min((item for item in (best, *refined) if item is not None), key=_bic)
             if best is before:
                 break
-            search.settle(best)
-            best = self._fitted(_parts(best))
+            search.update_noise(best)
+            best = self._fit(_parts(best))
             if self.gain(best) < LEAST_PAIR_GAIN:
                 return None
             if not np.any(minus_log10_p(best.fit.w, self._run.inputs) > DOUBTFUL):
                 break
-            leads = self._screened(best)
+            candidates = self._screen_pairs(best)
         return best
 
-    def _grown(self) -> Explained | None:
-        """From the best single cause whose course has few numbers: a curve takes what belongs to a second one."""
+    def _grow_from_single(self) -> FittedHypothesis | None:
+        """Grow a pair from the best single cause with a simple profile; a curve takes what belongs to others."""
         search = self._search
-        simple = [item for item in self._found.explained if not _curves(item)]
+        simple = [item for item in self._result.hypotheses if not _has_curve(item)]
         if not simple:
-            search.noise = self._found.own_noise
-            nominal = self._found.nominal
-            leads = self._simple(search.screen.leads(nominal.hypothesis, nominal.fit))
-            simple = [self._fitted([_part_of(lead)], EXCHANGE_STEPS) for lead in leads]
+            search.noise = self._result.nominal_noise
+            nominal = self._result.nominal
+            candidates = self._select_simple(search.screen.candidates(nominal.hypothesis, nominal.fit))
+            simple = [self._fit([_part_of(candidate)], EXCHANGE_STEPS) for candidate in candidates]
         if not simple:
             return None
         first = min(simple, key=_bic)
-        search.settle(first)
-        first = search.refitted(first)
+        search.update_noise(first)
+        first = search.refit(first)
         (part,) = _parts(first)
-        leads = search.screen.leads(first.hypothesis, first.fit)
-        others = [effect for effect in search.screen.with_memory if effect is not part.effect]
-        leads += search.memory.leads(first.fit, lambda item, signals: self._followed([part], item, signals), others)
-        leads = self._simple([lead for lead in leads if lead.effect is not part.effect])
-        pairs = [self._fitted([part, _part_of(lead)], EXCHANGE_STEPS) for lead in leads]
+        candidates = search.screen.candidates(first.hypothesis, first.fit)
+        others = [effect for effect in search.screen.dynamic_effects if effect is not part.effect]
+        candidates += search.dynamic_screen.candidates(first.fit, partial(self._evaluate_with, [part]), others)
+        candidates = self._select_simple([item for item in candidates if item.effect is not part.effect])
+        pairs = [self._fit([part, _part_of(candidate)], EXCHANGE_STEPS) for candidate in candidates]
         if not pairs:
             return None
         best = min(pairs, key=_bic)
-        search.settle(best)
-        best = self._exchanged(self._fitted(_parts(best)), curves=False)[0]
-        search.settle(best)
-        return self._fitted(_parts(best))
+        search.update_noise(best)
+        best = self._exchange(self._fit(_parts(best)), curves=False)[0]
+        search.update_noise(best)
+        return self._fit(_parts(best))
 
-    def _simple(self, leads: Sequence[Lead]) -> list[Lead]:
-        """The most promising of different causes that are no curves."""
-        leads = [lead for lead in leads if not isinstance(lead.course, Free)]
-        leads.sort(key=lambda item: -item.score(self._run.values))
-        return self._search.chosen(leads, EXCHANGED, -inf, of_a_cause=1)
+    def _select_simple(self, candidates: Sequence[Candidate]) -> list[Candidate]:
+        """Select the best candidates of different causes that are not curves."""
+        candidates = [item for item in candidates if not isinstance(item.profile, PiecewiseLinear)]
+        candidates.sort(key=lambda item: -item.score(self._run.values))
+        return self._search.select(candidates, EXCHANGED, -inf, of_a_cause=1)
 
-    def gain(self, pair: Explained) -> float:
-        """In BIC, of a pair over the best single cause, with the noise that holds now; either of the two, too."""
-        singles = [self._search.refitted(self.single)] if self.single.key else [self._search.nominal()]
-        singles += [self._fitted([part]) for part in _parts(pair)]
+    def gain(self, pair: FittedHypothesis) -> float:
+        """Gain of a pair in BIC over the best single cause, either of the two included, at the present noise levels."""
+        singles = [self._search.refit(self.single)] if self.single.label else [self._search.fit_nominal()]
+        singles += [self._fit([part]) for part in _parts(pair)]
         self.single = min(singles, key=_bic)
         return self.single.bic - pair.bic
 
-    def _fresh(self, leads: Sequence[PairLead], best: Explained | None) -> list[PairLead]:
-        """Those that were not fitted yet and promise more than the best pair itself, which has been fitted."""
-        found = []
-        for lead in leads:
-            if best is not None and lead.causes == set(best.hypothesis.causes):
+    def _skip_tried(self, candidates: Sequence[CandidatePair], best: FittedHypothesis | None) -> list[CandidatePair]:
+        """Select pairs that were not fitted and predict more than the best pair itself."""
+        result = []
+        for candidate in candidates:
+            if best is not None and candidate.causes == set(best.hypothesis.causes):
                 break
-            if lead.causes not in self._tried:
-                self._tried.add(lead.causes)
-                found.append(lead)
-        return found
+            if candidate.causes not in self._tried:
+                self._tried.add(candidate.causes)
+                result.append(candidate)
+        return result
 
-    def _exchanged(self, best: Explained, curves: bool = True) -> tuple[Explained, dict[Key, Explained]]:
-        """Each of the two exchanged for whatever is better, with curves or without them, until nothing is."""
+    def _exchange(
+        self, best: FittedHypothesis, curves: bool = True
+    ) -> tuple[FittedHypothesis, dict[Label, FittedHypothesis]]:
+        """Exchange each cause for a better one, with or without curves, until nothing is better."""
         search = self._search
-        known: dict[Key, Explained] = {best.key: best}
+        by_label: dict[Label, FittedHypothesis] = {best.label: best}
         for turn in range(EXCHANGES):
             if turn:
-                search.settle(best)
-                best = self._fitted(_parts(best))
-            best = search.resolved(best, EXCHANGE_STEPS)
-            known, again = {best.key: best}, best
-            for place in (0, 1):
-                leads = self._new(self._leads(best, place), best)
-                leads = [lead for lead in leads if curves or not isinstance(lead.course, Free)]
-                least = max((item.score(self._run.values) for item in leads), default=0.0) - IN_QUESTION
-                for lead in search.chosen(leads, EXCHANGED, least):
-                    knots = best.hypothesis.courses[place].coefficients
-                    item = self._fitted(_with(best, place, lead, knots), EXCHANGE_STEPS)
-                    if isinstance(lead.course, Free) and item.bic < best.bic + IN_QUESTION:
-                        item = search.resolved(item, EXCHANGE_STEPS)
+                search.update_noise(best)
+                best = self._fit(_parts(best))
+            best = search.with_selected_knots(best, EXCHANGE_STEPS)
+            by_label, unchanged = {best.label: best}, best
+            for index in (0, 1):
+                candidates = self._select_new(self._candidates(best, index), best)
+                candidates = [item for item in candidates if curves or not isinstance(item.profile, PiecewiseLinear)]
+                least = max((item.score(self._run.values) for item in candidates), default=0.0) - IN_QUESTION
+                for candidate in search.select(candidates, EXCHANGED, least):
+                    knots = best.hypothesis.profiles[index].n_linear
+                    item = self._fit(_replace_part(best, index, candidate, knots), EXCHANGE_STEPS)
+                    if isinstance(candidate.profile, PiecewiseLinear) and item.bic < best.bic + IN_QUESTION:
+                        item = search.with_selected_knots(item, EXCHANGE_STEPS)
                     if item.bic < best.bic + NEAR_BEST:
-                        keep(known, self._fitted(_parts(item), scan=lead.effect.is_discontinuous))
-            best = min(known.values(), key=_bic)
-            if best.key == again.key:
+                        keep_best(by_label, self._fit(_parts(item), scan=candidate.effect.is_discontinuous))
+            best = min(by_label.values(), key=_bic)
+            if best.label == unchanged.label:
                 break
-        return best, known
+        return best, by_label
 
-    def _refined(self, pair: Explained) -> Explained:
-        """Each cause with the best of its courses. What acts in jumps had a curve only until a course is found."""
+    def _refine(self, pair: FittedHypothesis) -> FittedHypothesis:
+        """Give each cause the best of its profiles.
+
+        A discontinuous effect keeps its curve only until a profile is fitted.
+        """
         best = pair
-        for place in (0, 1):
-            about, jumps = best, best.hypothesis.sized.effects[place].is_discontinuous
-            provisional = jumps and isinstance(about.hypothesis.courses[place], Free)
-            leads = self._leads(about, place, own=True)
-            leads = leads if jumps else self._new(leads, about)  # its size has not been looked for yet
+        for index in (0, 1):
+            about, jumps = best, best.hypothesis.filter.effects[index].is_discontinuous
+            provisional = jumps and isinstance(about.hypothesis.profiles[index], PiecewiseLinear)
+            candidates = self._candidates(about, index, own=True)
+            # The size of a discontinuous effect has not been scanned yet.
+            candidates = candidates if jumps else self._select_new(candidates, about)
             items = [
-                self._fitted(_with(about, place, lead), EXCHANGE_STEPS, scan=jumps)
-                for lead in self._search.chosen(leads, COURSES, -inf, of_a_cause=COURSES)
+                self._fit(_replace_part(about, index, candidate), EXCHANGE_STEPS, scan=jumps)
+                for candidate in self._search.select(candidates, MOST_PROFILES, -inf, of_a_cause=MOST_PROFILES)
             ]
             best = min(items if provisional and items else [*items, about], key=_bic)
-        return self._fitted(_parts(best))
+        return self._fit(_parts(best))
 
-    def _new(self, leads: Sequence[Lead], pair: Explained) -> list[Lead]:
-        """Those that are no part of a pair with the same course already, unless there may be another optimum."""
-        there = {(part.effect.name, part.course.name) for part in _parts(pair) if not part.course.numbers}
-        return [lead for lead in leads if (lead.effect.name, lead.course.name) not in there]
+    def _select_new(self, candidates: Sequence[Candidate], pair: FittedHypothesis) -> list[Candidate]:
+        """Select candidates that differ from the pair's parts.
 
-    def _leads(self, pair: Explained, place: int, own: bool = False) -> list[Lead]:
-        """What may take the place of one of the two.
+        With nonlinear parameters the same profile may have another optimum.
+        """
+        fixed = [item for item in _parts(pair) if not item.profile.nonlinear_parameters]
+        kinds = {(item.effect.name, item.profile.name) for item in fixed}
+        return [item for item in candidates if (item.effect.name, item.profile.name) not in kinds]
+
+    def _candidates(self, pair: FittedHypothesis, index: int, own: bool = False) -> list[Candidate]:
+        """Candidates to replace one cause of a pair.
 
         Args:
-            pair: the two.
-            place: of the one.
-            own: its own cause alone, in any course.
+            pair: the pair.
+            index: index of the cause to replace.
+            own: only that cause itself, with any profile.
         """
         search, parts = self._search, _parts(pair)
-        effect, other = parts[place].effect, parts[1 - place]
-        leads: list[Lead] = []
-        if not own or effect in search.screen.direct:
-            leads += search.screen.leads(pair.hypothesis, pair.fit, (place,), (effect,) if own else None)
-        if effect in search.screen.with_memory:
-            alone = search.explained(Hypothesis(search.sized((other.effect,)), (other.course,)), (other.theta,))
-            of = [
-                item for item in search.screen.with_memory if item is not other.effect and (item is effect or not own)
-            ]
-            leads += search.memory.leads(alone.fit, lambda item, signals: self._followed([other], item, signals), of)
-        leads = [lead for lead in leads if lead.effect is not other.effect]
-        return sorted(leads, key=lambda item: -item.score(self._run.values))
+        effect, other = parts[index].effect, parts[1 - index]
+        candidates: list[Candidate] = []
+        if not own or effect in search.screen.static_effects:
+            candidates += search.screen.candidates(pair.hypothesis, pair.fit, (index,), (effect,) if own else None)
+        if effect in search.screen.dynamic_effects:
+            reduced = search.evaluate(Hypothesis(search.filter((other.effect,)), (other.profile,)), (other.parameters,))
+            of = [effect] if own else [item for item in search.screen.dynamic_effects if item is not other.effect]
+            candidates += search.dynamic_screen.candidates(reduced.fit, partial(self._evaluate_with, [other]), of)
+        candidates = [item for item in candidates if item.effect is not other.effect]
+        return sorted(candidates, key=lambda item: -item.score(self._run.values))
 
-    def _followed(self, beside: Sequence[Part], effect: Effect, signals: Sequence[Signal]) -> list[Followed]:
-        """What filters make of the run with one more deviation, of several."""
-        others = {part.effect.name: part.course.signal(part.theta) for part in beside}
-        effects = self._sorted([*(part.effect for part in beside), effect])
+    def _evaluate_with(self, beside: Sequence[Part], effect: Effect, signals: Sequence[Signal]) -> list[FilterResult]:
+        """Run filters with one more deviation, for several such deviations."""
+        others = {part.effect.name: part.profile.signal(part.parameters) for part in beside}
+        effects = self._order_effects([*(part.effect for part in beside), effect])
         several = [[(others | {effect.name: signal})[item.name] for item in effects] for signal in signals]
-        return self._search.sized(effects).follow_all(self._run, several)
+        return self._search.filter(effects).evaluate_all(self._run, several)
 
-    def _screened(self, about: Explained) -> list[PairLead]:
-        """Pairs that may explain all that there is to explain, linearised about a run."""
+    def _screen_pairs(self, about: FittedHypothesis) -> list[CandidatePair]:
+        """Screen for pairs that explain everything, linearised about a run."""
         search = self._search
         hypothesis, fit = about.hypothesis, about.fit
         with np.errstate(over="ignore", invalid="ignore"):
-            ways = search.screen.ways_of_all(hypothesis, fit, range(len(hypothesis.courses)))
-            return self._pair_screen.leads(ways, self._remembered(about), SHORTLIST)
+            dynamics = search.screen.dynamics_of_all(hypothesis, fit, range(len(hypothesis.profiles)))
+            return self._pair_screen.candidates(dynamics, self._dynamic_signatures(about), SHORTLIST)
 
-    def _remembered(self, about: Explained) -> list[Remembered]:
-        found = []
+    def _dynamic_signatures(self, about: FittedHypothesis) -> list[DynamicSignature]:
+        result = []
         parts = _parts(about)
-        own = {part.effect.name: place for place, part in enumerate(parts)}
-        for effect in self._search.screen.with_memory:
+        own = {part.effect.name: index for index, part in enumerate(parts)}
+        for effect in self._search.screen.dynamic_effects:
             starts = effect.start_values or (effect.typical,)
             beside, before = parts, about.fit.w
             if effect.name in own:
                 part = parts[own[effect.name]]
-                starts = (max(float(np.mean(np.abs(part.course.signal(part.theta).at_row))), 0.1 * effect.typical),)
+                mean = float(np.mean(np.abs(part.profile.signal(part.parameters).sample_value)))
+                starts = (max(mean, 0.1 * effect.typical),)
                 beside = [item for item in parts if item is not part]
-                before = about.hypothesis.without(self._run, about.fit, own[effect.name])
-            followed = self._followed(beside, effect, [self._constant.signal(np.array([start])) for start in starts])
-            for start, item in zip(starts, followed, strict=True):
-                found.append(Remembered(effect, start, clipped(before) - clipped(item.w)))
-        return found
+                before = about.hypothesis.innovations_without(self._run, about.fit, own[effect.name])
+            signals = [self._constant.signal(np.array([start])) for start in starts]
+            for start, item in zip(starts, self._evaluate_with(beside, effect, signals), strict=True):
+                result.append(DynamicSignature(effect, start, huber_clip(before) - huber_clip(item.w)))
+        return result
 
-    def _fitted(self, parts: Sequence[Part], steps: int = MOST_STEPS, scan: bool = False) -> Explained:
+    def _fit(self, parts: Sequence[Part], steps: int = MOST_STEPS, scan: bool = False) -> FittedHypothesis:
         search = self._search
         parts = sorted(parts, key=lambda part: self._order[part.effect.name])
-        hypothesis = Hypothesis(search.sized(tuple(part.effect for part in parts)), [part.course for part in parts])
-        return search.fit(hypothesis, [part.theta for part in parts], steps, scan)
+        hypothesis = Hypothesis(search.filter(tuple(part.effect for part in parts)), [part.profile for part in parts])
+        return search.fit(hypothesis, [part.parameters for part in parts], steps, scan)
 
-    def _sorted(self, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+    def _order_effects(self, effects: Sequence[Effect]) -> tuple[Effect, ...]:
         return tuple(sorted(effects, key=lambda effect: self._order[effect.name]))
 
 
-def _parts_of(lead: PairLead) -> list[Part]:
-    return [Part(*part) for part in lead.parts]
+def _parts_of(candidate: CandidatePair) -> list[Part]:
+    return [Part(*part) for part in candidate.parts]
 
 
-def _parts(explained: Explained) -> list[Part]:
-    hypothesis = explained.hypothesis
-    whole = zip(hypothesis.sized.effects, hypothesis.courses, explained.fit.theta, strict=True)
+def _parts(fitted: FittedHypothesis) -> list[Part]:
+    hypothesis = fitted.hypothesis
+    whole = zip(hypothesis.filter.effects, hypothesis.profiles, fitted.fit.parameters, strict=True)
     return [Part(*item) for item in whole]
 
 
-def _part_of(lead: Lead) -> Part:
-    return Part(lead.effect, lead.course, lead.theta)
+def _part_of(candidate: Candidate) -> Part:
+    return Part(candidate.effect, candidate.profile, candidate.parameters)
 
 
-def _with(explained: Explained, place: int, lead: Lead, knots: int = KNOTS) -> list[Part]:
-    """One of the two exchanged; a curve with at least so many knots."""
-    parts, part = _parts(explained), _part_of(lead)
-    parts[place] = _with_knots(part, knots) if isinstance(lead.course, Free) and knots > KNOTS else part
+def _replace_part(fitted: FittedHypothesis, index: int, candidate: Candidate, knots: int = KNOTS) -> list[Part]:
+    """Replace one of the two; a curve gets at least this many knots."""
+    parts, part = _parts(fitted), _part_of(candidate)
+    parts[index] = (
+        _refine_knots(part, knots) if isinstance(candidate.profile, PiecewiseLinear) and knots > KNOTS else part
+    )
     return parts
 
 
-def _with_knots(part: Part, knots: int) -> Part:
-    """The same curve with more knots."""
-    finer = Free(part.course.time_min, knots)
-    values = part.course.functions(np.empty(0))[0] @ part.theta
-    return Part(part.effect, finer, np.interp(finer.knots_min, part.course.time_min, values))
+def _refine_knots(part: Part, knots: int) -> Part:
+    """Interpolate the curve on more knots."""
+    finer = PiecewiseLinear(part.profile.time_min, knots)
+    values = part.profile.basis_functions(np.empty(0))[0] @ part.parameters
+    return Part(part.effect, finer, np.interp(finer.knots_min, part.profile.time_min, values))
 
 
-def _curves(explained: Explained) -> bool:
-    """Whether one of its courses is a curve."""
-    return any(isinstance(course, Free) for course in explained.hypothesis.courses)
+def _has_curve(fitted: FittedHypothesis) -> bool:
+    """Return true if one of the profiles is a curve."""
+    return any(isinstance(profile, PiecewiseLinear) for profile in fitted.hypothesis.profiles)
 
 
-def _bic(explained: Explained) -> float:
-    return explained.bic
+def _bic(fitted: FittedHypothesis) -> float:
+    return fitted.bic

@@ -1,1 +1,1 @@
-"""Localisation of a deviation that no known effect explains."""
+"""Localisation of a deviation that no effect of the catalogue explains."""

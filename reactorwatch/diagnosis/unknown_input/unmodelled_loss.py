@@ -1,7 +1,7 @@
-"""What leaves a balance unnoticed: a share of what it holds, as whatever flows out of a mixed vessel takes with it.
+"""Unmodelled losses: a fraction of a balance's content leaves it, as with any outflow from a mixed vessel.
 
-It stands for all that may act on a balance as such, where no effect of the catalogue does. What is brought into a
-balance instead is brought by something, and that has a place of its own.
+A loss represents any deviation of the balance itself, for which the catalogue has no effect. Anything that enters a
+balance comes from a location of its own.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from reactorwatch.process.model import ProcessModel, Variable
 
 
 def balance_losses(model: ProcessModel) -> Sequence[Effect]:
-    """One for each state that has a balance, located there."""
+    """One loss for each state that has a balance, located there."""
     return tuple(_loss(state) for state in model.states if state.balance)
 
 

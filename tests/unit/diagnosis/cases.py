@@ -6,11 +6,10 @@ from math import nan
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.difference import difference
+from reactorwatch.diagnosis.difference import compute_difference
 from reactorwatch.diagnosis.result import (
-    Adjusted,
+    AdjustedParameter,
     Alternative,
-    Apart,
     Cause,
     Curves,
     Diagnosis,
@@ -19,6 +18,7 @@ from reactorwatch.diagnosis.result import (
     ExperimentCurves,
     Gain,
     HeldOut,
+    Separation,
 )
 
 ROWS = 2000
@@ -59,7 +59,7 @@ EXPERIMENT = Experiment(
     signal="qc",
     span_min=20.0,
     limits={"qc": (85.0, 115.0), "C": (0.05, 0.2), "T": (425.0, 455.0)},
-    apart=(Apart(("coolant_flow", "feed_temperature"), 42.0, 0.994),),
+    separations=(Separation(("coolant_flow", "feed_temperature"), 42.0, 0.994),),
     predicted={
         "coolant_flow": {"C": (0.06, 0.1), "T": (438.5, 448.7)},
         "feed_temperature": {"C": (0.06, 0.11), "T": (438.4, 448.8)},
@@ -106,7 +106,7 @@ def diagnosis_of(
     experiment: Experiment | None = None,
     remarks: tuple[str, ...] = (),
     ran_away: bool = False,
-    parameters: dict[str, Adjusted] | None = None,
+    parameters: dict[str, AdjustedParameter] | None = None,
 ) -> Diagnosis:
     """A diagnosis of 2,000 rows."""
     before = nan if ran_away else 3.2
@@ -115,12 +115,12 @@ def diagnosis_of(
         "T": HeldOut(before, 0.292, 3.2, 0.292, 0.303, "K"),
     }
     drawn = curves(causes)
-    signals = {"qc": (drawn.inputs["qc"], "l/min"), "C": (drawn.free_before["C"], "mol/l")}
+    signals = {"qc": (drawn.inputs["qc"], "l/min"), "C": (drawn.simulated_before["C"], "mol/l")}
     differences = {
-        name: difference(
+        name: compute_difference(
             drawn.measured[name] - run, drawn.residual_before[name], item.noise_sd, item.unit, drawn.time_min, signals
         )
-        for (name, run), item in zip(drawn.free_before.items(), held_out.values(), strict=True)
+        for (name, run), item in zip(drawn.simulated_before.items(), held_out.values(), strict=True)
     }
     return Diagnosis(
         samples=ROWS,
@@ -163,8 +163,8 @@ CASES = {
     "unknown": diagnosis_of("unknown", location="energy_balance"),
 }
 ROUGHLY = {
-    "K3": Adjusted(700.0, 14.0, Estimate(711.2, 1.5, "l/min")),
-    "Tf": Adjusted(350.0, 0.5, Estimate(350.0, 0.1, "K")),
+    "K3": AdjustedParameter(700.0, 14.0, Estimate(711.2, 1.5, "l/min")),
+    "Tf": AdjustedParameter(350.0, 0.5, Estimate(350.0, 0.1, "K")),
 }
 ADJUSTED = diagnosis_of("nominal", parameters=ROUGHLY)
 """Where parameters were stated to be uncertain."""

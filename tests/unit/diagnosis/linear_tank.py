@@ -7,11 +7,11 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.search import Explained
+from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.process.effect import Effect, ParameterEffect, ParameterShift
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
 
@@ -47,14 +47,14 @@ class Shift(ParameterShift):
     parameter = "shift"
 
 
-def explained(effect: Effect, size: float, run: Run) -> Explained:
+def explained(effect: Effect, size: float, run: Run) -> FittedHypothesis:
     """A hypothesis of one effect that is there all the time."""
-    hypothesis = Hypothesis(Sized(tank(), (effect,), NOISE), (Constant(run.time_min),))
-    return Explained(hypothesis, hypothesis.at(run, [np.array([size])]), 0.0)
+    hypothesis = Hypothesis(FaultFilter(tank(), (effect,), NOISE), (Constant(run.time_min),))
+    return FittedHypothesis(hypothesis, hypothesis.evaluate(run, [np.array([size])]), 0.0)
 
 
 def record(u: Array) -> Run:
-    """What a tank without fault shows, without noise."""
+    """Noise-free record of a tank without fault."""
     return Run(PERIOD_MIN * np.arange(u.size, dtype=np.float64), u[:, None], follows(u, u[0])[:, None])
 
 

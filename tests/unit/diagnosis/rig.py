@@ -18,16 +18,7 @@ NOISE_V = 0.01
 
 @dataclass(frozen=True)
 class Rig:
-    """What is wrong with a rig, from the onset on.
-
-    Attributes:
-        overflow_per_min: flow over the brim for each volt above it; half of it goes into the lower tank.
-        pump: share by which the pump gives more.
-        leak: of the upper tank, V^0.5/min.
-        clogging: share of the upper outlet that is closed.
-        bias: of the level sensor, V.
-        onset_min: when all that begins.
-    """
+    """Faults of a rig, from the onset on."""
 
     overflow_per_min: float = 0.0
     pump: float = 0.0
@@ -51,11 +42,11 @@ def record_of(rig: Rig, seed: int, rows: int = 1500) -> Record:
     return Record(time_min, {"u": u, "x2": shown}, "tanks")
 
 
-def _next(rig: Rig, begin_min: float, levels: Array, u: float) -> Array:
-    on = begin_min >= rig.onset_min - 1e-9
+def _next(rig: Rig, start_min: float, levels: Array, u: float) -> Array:
+    on = start_min >= rig.onset_min - 1e-9
     pump, outlet = 3 * u * (1 + on * rig.pump), 3 * (1 - on * rig.clogging)
     leak, spill = on * rig.leak, on * rig.overflow_per_min
-    now, end, x, over = begin_min, begin_min + PERIOD_MIN, levels, bool(levels[0] > BRIM_V)
+    now, end, x, over = start_min, start_min + PERIOD_MIN, levels, bool(levels[0] > BRIM_V)
     while now < end:
 
         def rates(_: float, x: Array, over: bool = over) -> list[float]:

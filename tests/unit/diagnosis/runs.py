@@ -9,11 +9,11 @@ from reactorwatch.records.record import Record
 
 
 def record_of(*faults: str, seed: int = 1, rows: int = 3000) -> Record:
-    """What a plant publishes, its input stepping every minute."""
+    """Record of a plant whose input steps every minute."""
     return simulate_record(PlantConfig(seed=seed, faults=faults), rows)
 
 
-def run_of(*faults: str, seed: int = 1, rows: int = 3000) -> Run:
+def make_run(*faults: str, seed: int = 1, rows: int = 3000) -> Run:
     """The same as a run."""
     record = record_of(*faults, seed=seed, rows=rows)
     measured = np.stack([record.columns["C"], record.columns["T"]], axis=1)

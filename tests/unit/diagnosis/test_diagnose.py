@@ -1,4 +1,4 @@
-"""What is said of records with one thing wrong, two, nothing, or something that no catalogue has."""
+"""Diagnoses of records with one fault, with two, without any, or with one that no catalogue has."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +9,7 @@ import pytest
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.result import NAMED, NOMINAL, UNKNOWN
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
@@ -31,7 +31,7 @@ def test_it_tells_which_values_its_errors_are_of() -> None:
     assert found.curves is not None
     for name, gain in found.gain.held_out.items():
         values = found.curves.held_out[name]
-        off = (record.columns[name] - found.curves.free_before[name])[values]
+        off = (record.columns[name] - found.curves.simulated_before[name])[values]
         assert off.size >= 300
         assert gain.rmse_before == pytest.approx(np.sqrt(np.mean(off**2)), rel=1e-12)
 
@@ -143,7 +143,7 @@ def test_another_unit_is_said_with_its_cure(spoil: Callable[[Record], Record], s
     ],
 )
 def test_a_gross_cause_is_not_taken_for_a_wrong_unit(fault: str) -> None:
-    run_of(record_of(fault, rows=400), cstr())
+    make_run(record_of(fault, rows=400), cstr())
 
 
 def test_a_short_record_has_rows_held_out_too() -> None:

@@ -1,11 +1,11 @@
-"""Where a simulation differs is found along time and along every signal, and noise is told from it."""
+"""Differences between a simulation and a record are located in time and along every signal, apart from noise."""
 
 import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.difference import BINS, TIME, Difference, difference
-from reactorwatch.diagnosis.report.words import difference_said
+from reactorwatch.diagnosis.difference import BINS, TIME, Difference, compute_difference
+from reactorwatch.diagnosis.report.words import describe_difference
 
 ROWS, NOISE = 8000, 0.3
 T_MIN: Array = np.linspace(0.0, 800.0, ROWS)
@@ -15,15 +15,15 @@ def of(error: Array, qc: Array | None = None) -> Difference:
     rng = np.random.default_rng(2)
     noise = NOISE * rng.standard_normal(ROWS)
     flow = rng.permutation(np.linspace(90.0, 110.0, ROWS)) if qc is None else qc
-    return difference(error + noise, noise / NOISE, NOISE, "K", T_MIN, {"qc": (flow, "l/min")})
+    return compute_difference(error + noise, noise / NOISE, NOISE, "K", T_MIN, {"qc": (flow, "l/min")})
 
 
 def test_noise_alone_is_told_as_noise() -> None:
-    """Of 8,000 rows a root mean square has a standard error of 0.8 %."""
+    """The root mean square of 8,000 rows has a standard error of 0.8 %."""
     found = of(np.zeros(ROWS))
     assert found.rmse == pytest.approx(NOISE, rel=0.04)
     assert found.noise_share > 0.9
-    assert difference_said("T", found).endswith("of it noise.")
+    assert describe_difference("T", found).endswith("of it noise.")
 
 
 def test_the_share_of_noise_is_that_of_its_variance() -> None:
@@ -41,7 +41,7 @@ def test_the_worst_stretch_of_time_and_the_worst_operating_points_are_found() ->
     assert (when.lower, when.upper) == pytest.approx((400.0, 500.0), abs=0.2)
     assert (where.lower, where.upper) == pytest.approx((107.5, 110.0), abs=0.01)
     assert where.mean < -1.0
-    said = difference_said("T", found)
+    said = describe_difference("T", found)
     assert "from 400 to 500 min" in said
     assert "at qc 107.5 to 110 l/min" in said
 
@@ -55,9 +55,9 @@ def test_all_rows_lie_in_some_range() -> None:
 
 def test_a_run_that_ran_away_has_no_ranges_and_says_so() -> None:
     nothing = np.full(ROWS, np.nan)
-    found = difference(nothing, nothing, NOISE, "K", T_MIN, {"T": (nothing, "K")})
+    found = compute_difference(nothing, nothing, NOISE, "K", T_MIN, {"T": (nothing, "K")})
     assert found.worst("T") is None
-    assert "ran away" in difference_said("T", found)
+    assert "ran away" in describe_difference("T", found)
 
 
 def test_an_input_that_takes_two_values_has_two_ranges_at_most() -> None:

@@ -7,17 +7,17 @@ import pytest
 
 from plant_node.config import NoiseSd, PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.diagnosis.experiment.alternatives import Rivals
-from reactorwatch.diagnosis.experiment.constraints import checked_limits, limits_of
-from reactorwatch.diagnosis.experiment.design import FEWEST, PATTERN_ROWS, proposed
-from reactorwatch.diagnosis.experiment.input_sequence import HOLDS_ROWS, QUIET_ROWS, Ends, families
+from reactorwatch.diagnosis.experiment.alternatives import Predictions
+from reactorwatch.diagnosis.experiment.constraints import check_limits, limits_of
+from reactorwatch.diagnosis.experiment.design import FEWEST, PATTERN_ROWS, propose_experiment
+from reactorwatch.diagnosis.experiment.input_sequence import HOLDS_ROWS, QUIET_ROWS, InputRange, initial_sequences
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
 from reactorwatch.diagnosis.result import Experiment
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.search import Explained
+from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
@@ -38,17 +38,17 @@ def run() -> Run:
     return Run(found.time_min, found.columns["qc"][:, None], measured)
 
 
-def rival(run: Run, **sizes: float) -> Explained:
+def alternative(run: Run, **sizes: float) -> FittedHypothesis:
     """Some causes that are there all the time."""
     effects = tuple(NAMED[name] for name in sizes)
-    hypothesis = Hypothesis(Sized(cstr(), effects, SENSORS), [Constant(run.time_min)] * len(effects))
-    return Explained(hypothesis, hypothesis.at(run, [np.array([size]) for size in sizes.values()]), 0.0)
+    hypothesis = Hypothesis(FaultFilter(cstr(), effects, SENSORS), [Constant(run.time_min)] * len(effects))
+    return FittedHypothesis(hypothesis, hypothesis.evaluate(run, [np.array([size]) for size in sizes.values()]), 0.0)
 
 
 @pytest.fixture(scope="module")
 def experiment(run: Run) -> Experiment:
-    both = [rival(run, coolant_flow=-0.02), rival(run, feed_temperature=1.8)]
-    found = proposed(both, run, cstr(), SENSORS, LIMITS)
+    both = [alternative(run, coolant_flow=-0.02), alternative(run, feed_temperature=1.8)]
+    found = propose_experiment(both, run, cstr(), SENSORS, LIMITS)
     assert isinstance(found, Experiment)
     return found
 
@@ -90,14 +90,14 @@ def test_the_plant_does_under_each_rival_what_was_predicted_and_what_its_sensors
 def test_the_proposed_input_tells_more_than_the_same_time_of_random_steps_within_the_limits(
     run: Run, experiment: Experiment
 ) -> None:
-    both = [rival(run, coolant_flow=-0.02), rival(run, feed_temperature=1.8)]
-    rivals = Rivals(both, run, cstr(), SENSORS, LIMITS, PATTERN_ROWS)
+    both = [alternative(run, coolant_flow=-0.02), alternative(run, feed_temperature=1.8)]
+    alternatives = Predictions(both, run, cstr(), SENSORS, LIMITS, PATTERN_ROWS)
     found = []
     for seed in range(12):
         levels = np.repeat(np.random.default_rng(seed).uniform(97.0, 110.0, 120), 10)
-        runs = rivals.runs(levels)
+        runs = alternatives.runs(levels)
         if runs is not None:
-            found.append(rivals.unexplained((0, 1), runs))
+            found.append(alternatives.noncentrality((0, 1), runs))
     assert len(found) >= 6
     assert experiment.expected_delta_bic * 120.0 / experiment.span_min > 1.5 * max(found)
 
@@ -106,10 +106,10 @@ def test_twins_are_said_to_be_such(run: Run) -> None:
     """C measured (1 + m) C is what a feed richer by the factor 1 + m gives, if as much less heat comes of it."""
     m = 0.03
     both = [
-        rival(run, concentration_gain=m),
-        rival(run, feed_concentration=m * 1.0, reaction_heat=1.0 / (1.0 + m) - 1.0),
+        alternative(run, concentration_gain=m),
+        alternative(run, feed_concentration=m * 1.0, reaction_heat=1.0 / (1.0 + m) - 1.0),
     ]
-    found = proposed(both, run, cstr(), SENSORS, {"qc": (85.0, 112.0), "T": (425.0, 460.0)})
+    found = propose_experiment(both, run, cstr(), SENSORS, {"qc": (85.0, 112.0), "T": (425.0, 460.0)})
     assert isinstance(found, str)
     assert found.startswith("No experiment with qc can tell wrong gain of the analyser and wrong feed concentration")
     assert "not even in 480 min" in found
@@ -118,20 +118,20 @@ def test_twins_are_said_to_be_such(run: Run) -> None:
 def test_a_twin_among_others_does_not_keep_these_from_being_told_apart(run: Run) -> None:
     m = 0.03
     three = [
-        rival(run, concentration_gain=m),
-        rival(run, feed_concentration=m * 1.0, reaction_heat=1.0 / (1.0 + m) - 1.0),
-        rival(run, concentration_bias=m * 0.1),
+        alternative(run, concentration_gain=m),
+        alternative(run, feed_concentration=m * 1.0, reaction_heat=1.0 / (1.0 + m) - 1.0),
+        alternative(run, concentration_bias=m * 0.1),
     ]
-    found = proposed(three, run, cstr(), SENSORS, LIMITS)
+    found = propose_experiment(three, run, cstr(), SENSORS, LIMITS)
     assert isinstance(found, Experiment)
     assert set(found.separates) == {"concentration_gain", "feed_concentration+reaction_heat", "concentration_bias"}
     assert "(but not between wrong gain of the analyser and wrong feed concentration with" in found.why
-    assert [item.probability > 0.9 for item in found.apart] == [False, True, True]
+    assert [item.probability > 0.9 for item in found.separations] == [False, True, True]
 
 
 def test_limits_that_leave_no_room_are_said_to_be_such(run: Run) -> None:
-    both = [rival(run, coolant_flow=-0.02), rival(run, feed_temperature=1.8)]
-    found = proposed(both, run, cstr(), SENSORS, {"T": (440.0, 441.0)})
+    both = [alternative(run, coolant_flow=-0.02), alternative(run, feed_temperature=1.8)]
+    found = propose_experiment(both, run, cstr(), SENSORS, {"T": (440.0, 441.0)})
     assert isinstance(found, str)
     assert "leave qc no room to move" in found
 
@@ -139,7 +139,7 @@ def test_limits_that_leave_no_room_are_said_to_be_such(run: Run) -> None:
 def test_nothing_in_it_knows_the_reactor() -> None:
     record = tank_record(np.repeat(5.0 + np.random.default_rng(1).uniform(-1.0, 1.0, 60), 10))
     both = [explained(Gain(), 0.02, record), explained(Shift(), 0.1, record)]
-    found = proposed(both, record, tank(), NOISE, {"u": (1.0, 9.0), "h": (0.0, 10.0)})
+    found = propose_experiment(both, record, tank(), NOISE, {"u": (1.0, 9.0), "h": (0.0, 10.0)})
     assert isinstance(found, Experiment)
     assert found.signal == "u"
     levels = np.array(found.input)[:, 1]
@@ -158,7 +158,7 @@ def test_nothing_in_it_knows_the_reactor() -> None:
 )
 def test_limits_that_cannot_be_meant_are_refused_in_a_line(limits: dict[str, tuple[float, float]], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        checked_limits(cstr(), limits)
+        check_limits(cstr(), limits)
 
 
 def test_without_limits_the_record_says_them_with_some_room_but_never_beyond_the_model(run: Run) -> None:
@@ -174,11 +174,11 @@ def test_without_limits_the_record_says_them_with_some_room_but_never_beyond_the
 
 
 def test_levels_are_short_numbers_within_the_ends() -> None:
-    ends = Ends(97.43, 109.41, 103.42)
+    ends = InputRange(97.43, 109.41, 103.42)
     levels = ends.levels(np.linspace(-1.0, 1.0, 201))
     assert np.all(levels == np.round(levels, 1))
     assert (levels[0], levels[100], levels[-1]) == (97.5, 103.4, 109.4)
-    tried = list(families(PATTERN_ROWS))
+    tried = list(initial_sequences(PATTERN_ROWS))
     assert len(tried) == 2 * len(HOLDS_ROWS)
     for sequence in tried:
         column = sequence.levels(ends, PATTERN_ROWS)

@@ -1,4 +1,4 @@
-"""What one record leaves open, the proposed experiment decides when it is run on the plant node."""
+"""The proposed experiment, run on the plant node, decides between the alternatives of one record."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ NARROW = {"kind": "random-steps", "low": 102.41, "high": 104.41}
 
 
 @pytest.mark.parametrize(
-    ("cause", "size", "rival", "seed"),
+    ("cause", "size", "alternative", "seed"),
     [
         ("coolant_flow", -0.02, "feed_temperature", 2),
         ("feed_temperature", 1.5, "coolant_flow", 2),
@@ -23,14 +23,14 @@ NARROW = {"kind": "random-steps", "low": 102.41, "high": 104.41}
         ("reaction_heat", -0.01, "heat_loss", 2),
     ],
 )
-def test_the_experiment_decides(cause: str, size: float, rival: str, seed: int) -> None:
+def test_the_experiment_decides(cause: str, size: float, alternative: str, seed: int) -> None:
     config = PlantConfig(seed=seed, faults=(f"{cause}:step:{size}@60min",), scenario=NARROW)
     open_ = diagnose(simulate_record(config, 1500), cstr(), limits=LIMITS)
     listed = {item.cause for item in open_.causes} | {name for item in open_.alternatives for name, _ in item.causes}
-    assert {cause, rival} <= listed
+    assert {cause, alternative} <= listed
     experiment = open_.experiment
     assert experiment is not None
-    assert {cause, rival} <= set(experiment.separates)
+    assert {cause, alternative} <= set(experiment.separates)
     assert experiment.probability >= 0.9
     assert experiment.expected_delta_bic >= 10.0
 

@@ -1,4 +1,4 @@
-"""From causes to the model that has them in it."""
+"""The extended model contains the diagnosed causes."""
 
 import json
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.extended import extended_model
-from reactorwatch.diagnosis.fitting.profiles import Course, Decay, Free, Ramp, Sine, Step
+from reactorwatch.diagnosis.fitting.profiles import Decay, FittedProfile, PiecewiseLinear, Ramp, Sine, Step
 from reactorwatch.diagnosis.result import Cause, Estimate
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr.effects import EFFECTS
@@ -16,9 +16,9 @@ from reactorwatch.process.model import ProcessModel
 TIMES_MIN = np.arange(0.0, 100.05, 0.1)
 
 
-def cause_of(name: str, course: Course, theta: list[float]) -> Cause:
-    parameters = {key: Estimate(value, 0.0, "1") for key, value in course.parameters(np.array(theta)).items()}
-    return Cause(name, course.name, name, "coolant", parameters)
+def cause_of(name: str, profile: FittedProfile, fitted: list[float]) -> Cause:
+    parameters = {key: Estimate(value, 0.0, "1") for key, value in profile.profile_values(np.array(fitted)).items()}
+    return Cause(name, profile.name, name, "coolant", parameters)
 
 
 def deviation(model: ProcessModel, times_min: list[float]) -> list[float]:
@@ -32,26 +32,28 @@ def deviation(model: ProcessModel, times_min: list[float]) -> list[float]:
 
 
 @pytest.mark.parametrize(
-    ("course", "theta"),
+    ("profile", "fitted"),
     [
         (Step(TIMES_MIN), [1.5, 33.33]),
         (Ramp(TIMES_MIN), [-2.0, 20.0]),
         (Decay(TIMES_MIN), [3.0, 10.0, 25.0]),
         (Sine(TIMES_MIN), [0.6, -0.8, 17.0]),
-        (Free(TIMES_MIN, 5), [0.0, 1.0, -3.0, 0.5, 2.0]),
-        (Free(TIMES_MIN, 4), [0.0, 0.0, 0.0, 0.0]),
+        (PiecewiseLinear(TIMES_MIN, 5), [0.0, 1.0, -3.0, 0.5, 2.0]),
+        (PiecewiseLinear(TIMES_MIN, 4), [0.0, 0.0, 0.0, 0.0]),
     ],
 )
-def test_the_written_profile_is_the_fitted_course(course: Course, theta: list[float]) -> None:
-    written = extended_model(cstr(), EFFECTS, [cause_of("temperature_bias", course, theta)])
+def test_the_written_profile_is_the_fitted_course(profile: FittedProfile, fitted: list[float]) -> None:
+    written = extended_model(cstr(), EFFECTS, [cause_of("temperature_bias", profile, fitted)])
     model = parse_extended_model(json.dumps(written)).build()
-    expected = course.signal(np.array(theta)).at_row
+    expected = profile.signal(np.array(fitted)).sample_value
     places = [0, 150, 333, 334, 600, 1000]
     np.testing.assert_allclose(deviation(model, TIMES_MIN[places].tolist()), expected[places], atol=1e-9)
 
 
 def test_a_curve_at_the_bounds_of_its_effect_can_be_read_again() -> None:
-    written = extended_model(cstr(), EFFECTS, [cause_of("coolant_flow", Free(TIMES_MIN, 3), [-0.99, 0.3, 4.0])])
+    written = extended_model(
+        cstr(), EFFECTS, [cause_of("coolant_flow", PiecewiseLinear(TIMES_MIN, 3), [-0.99, 0.3, 4.0])]
+    )
     values = parse_extended_model(json.dumps(written)).effects[0].values
     assert [values["size"] * values[f"value_{number}"] for number in (1, 2, 3)] == pytest.approx([-0.99, 0.3, 4.0])
 

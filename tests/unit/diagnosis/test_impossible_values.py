@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from reactorwatch.cli.diagnosis import DiagnosisOptions, load_case
 from reactorwatch.cli.simulation import simulate_along
-from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.cstr.model import cstr
@@ -51,7 +51,7 @@ def test_any_value_outside_a_signals_bounds_is_named_in_any_rows(signal: str, va
     assume(not lower <= value <= upper)
     record = spoiled(sound(signal), signal, sorted(rows), value)
     with pytest.raises(InputError) as told:
-        run_of(record, MODELS[signal])
+        make_run(record, MODELS[signal])
     said, place = str(told.value), f"at {record.time_min[min(rows)]:g} min, column '{signal}'"
     assert f"{record.name}, {place}: must be in [{lower:g}, {upper:g}]" in said
     assert f"got {value:g}" in said
@@ -74,7 +74,7 @@ def test_of_a_file_the_row_is_its_line(signal: str, rows: list[int], tmp_path: P
 @pytest.mark.parametrize("signal", sorted(MODELS))
 def test_values_at_the_bounds_are_no_sentinels(signal: str) -> None:
     record = spoiled(spoiled(sound(signal), signal, [7], BOUNDS[signal][0]), signal, [9], BOUNDS[signal][1])
-    run_of(record, MODELS[signal])
+    make_run(record, MODELS[signal])
 
 
 def test_where_lines_are_no_rows_the_time_is_told_alone(tmp_path: Path) -> None:

@@ -22,14 +22,14 @@ LEVELS = np.repeat([4.0, 7.0, 3.0, 6.0, 2.0, 8.0, 5.0, 4.0, 6.0, 3.0], 60)
 
 
 def tank_record(gain: float) -> Record:
-    """What the level shows of a tank whose input acts with another gain."""
+    """Level of a tank whose input has another gain."""
     level = follows(gain * LEVELS, gain * LEVELS[0])
     noise = NOISE_SD * np.random.default_rng(1).standard_normal(level.size)
     return Record(PERIOD_MIN * np.arange(level.size, dtype=np.float64), {"u": LEVELS, "h": level + noise}, "tank")
 
 
 def named(*names: str) -> tuple[Effect, ...]:
-    """Those effects of the reactor."""
+    """Effects of the reactor with these names."""
     return tuple(effect for effect in EFFECTS if effect.name in names)
 
 

@@ -13,8 +13,8 @@ import pytest
 from reactorwatch.diagnosis.report import mathml
 from reactorwatch.diagnosis.report.equations import balances
 from reactorwatch.diagnosis.report.page import as_page
-from reactorwatch.diagnosis.report.svg import COLUMNS, decimated
-from reactorwatch.diagnosis.result import UnknownCourse
+from reactorwatch.diagnosis.report.svg import COLUMNS, decimate
+from reactorwatch.diagnosis.result import UnknownInputCurve
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
@@ -129,7 +129,9 @@ def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> Non
     curves = CASES["unknown"].curves
     assert curves is not None
     assert "What acts there" not in page("unknown")
-    told = replace(curves, unknown=UnknownCourse("heat loss", "1/min", np.linspace(0.0, 0.01, curves.time_min.size)))
+    told = replace(
+        curves, unknown=UnknownInputCurve("heat loss", "1/min", np.linspace(0.0, 0.01, curves.time_min.size))
+    )
     text = as_page(replace(CASES["unknown"], curves=told), cstr(), EFFECTS, "a.csv", "extended.json")
     assert "What acts there, over time" in text
     assert "Told as the size of: heat loss, 1/min" in text
@@ -156,8 +158,8 @@ def test_a_free_run_that_ran_away_and_a_size_of_unknown_spread_are_drawn_as_far_
     assert curves is not None
     nothing = np.full(curves.time_min.size, np.nan)
     for broken in (
-        replace(curves, free_before={"C": nothing, "T": nothing}),
-        replace(curves, free_before={"C": nothing, "T": nothing}, free_after={"C": nothing, "T": nothing}),
+        replace(curves, simulated_before={"C": nothing, "T": nothing}),
+        replace(curves, simulated_before={"C": nothing, "T": nothing}, simulated_after={"C": nothing, "T": nothing}),
         replace(curves, deviation_sd={"coolant_flow": nothing}),
         replace(curves, deviation_sd={"coolant_flow": np.full(nothing.size, np.inf)}),
         replace(curves, residual_before={"C": nothing, "T": nothing}),
@@ -173,7 +175,7 @@ def test_a_page_of_many_rows_stays_small() -> None:
     assert curves is not None
     assert len(page("named")) < 600_000
     long = np.linspace(0.0, 750.0, 7500)
-    assert decimated(long, np.sin(long))[0].size <= 2 * (COLUMNS + 1)
+    assert decimate(long, np.sin(long))[0].size <= 2 * (COLUMNS + 1)
 
 
 def test_no_peak_is_lost_where_rows_outnumber_columns() -> None:
@@ -181,7 +183,7 @@ def test_no_peak_is_lost_where_rows_outnumber_columns() -> None:
     time_min = np.cumsum(random.uniform(0.05, 0.2, 20_000))
     values = random.standard_normal(time_min.size)
     values[random.integers(0, time_min.size, 500)] = np.nan
-    times, kept = decimated(time_min, values, 50)
+    times, kept = decimate(time_min, values, 50)
     column = np.floor((time_min - time_min[0]) / (time_min[-1] - time_min[0]) * 50)
     column_kept = np.floor((times - time_min[0]) / (time_min[-1] - time_min[0]) * 50)
     for number in np.unique(column):
@@ -198,7 +200,7 @@ def test_a_column_without_values_is_a_gap() -> None:
     time_min = np.arange(10_000.0)
     values = np.ones(time_min.size)
     values[4000:6000] = np.nan
-    times, kept = decimated(time_min, values, 100)
+    times, kept = decimate(time_min, values, 100)
     assert np.all(np.isnan(kept[(times > 4100) & (times < 5900)]))
     assert np.all(np.isfinite(kept[(times < 3900) | (times > 6100)]))
 
@@ -233,8 +235,8 @@ def test_what_is_marked_is_what_is_new() -> None:
         (m * before, ["m(kx−e−x)"]),
     ]
     for now, expected in cases:
-        assert marked(mathml.written(now, before, m)) == expected
-    assert marked(mathml.written(before, before, m)) == []
+        assert marked(mathml.to_mathml(now, before, m)) == expected
+    assert marked(mathml.to_mathml(before, before, m)) == []
 
 
 @pytest.mark.parametrize(
@@ -252,7 +254,7 @@ def test_what_is_marked_is_what_is_new() -> None:
 def test_brackets_stand_where_they_are_needed(expression: object, expected: str) -> None:
     assert callable(expression)
     x, y = ca.SX.sym("x"), ca.SX.sym("y")
-    root = ElementTree.fromstring(f"<math>{mathml.written(expression(x, y))}</math>")
+    root = ElementTree.fromstring(f"<math>{mathml.to_mathml(expression(x, y))}</math>")
     assert "".join(root.itertext()) == expected
 
 
@@ -261,9 +263,9 @@ def test_what_is_long_or_has_no_sign_is_not_written_out() -> None:
     long = x
     for _ in range(40):
         long = long * (1 + long)
-    assert not mathml.readable(long)
-    assert not mathml.readable(ca.hypot(x, 1 + x))  # which has no sign here
-    assert mathml.readable(x * (1 + x))
+    assert not mathml.is_readable(long)
+    assert not mathml.is_readable(ca.hypot(x, 1 + x))  # which has no sign here
+    assert mathml.is_readable(x * (1 + x))
 
 
 class Timing(Effect):

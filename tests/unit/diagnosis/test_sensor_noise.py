@@ -1,4 +1,4 @@
-"""What a model errs is not taken for noise of its sensors, and so it can matter in practice."""
+"""Model error is not taken for sensor noise, so that it can matter in practice."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,9 +10,9 @@ from scipy.signal import lfilter
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.fitting.colored_noise import Noise, Wandering
+from reactorwatch.diagnosis.fitting.colored_noise import ColoredNoise, Noise
 from reactorwatch.diagnosis.result import UNKNOWN
-from reactorwatch.diagnosis.sensor_noise import sensor_noise
+from reactorwatch.diagnosis.sensor_noise import estimate_sensor_noise
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
@@ -27,19 +27,19 @@ def white(seed: int) -> Array:
 
 
 def autoregressive(kept: float, seed: int) -> Array:
-    """Of unit variance."""
+    """First-order autoregression of unit variance."""
     return np.asarray(lfilter([sqrt(1.0 - kept**2)], [1.0, -kept], white(seed)))
 
 
 def plant_like(seed: int) -> Array:
-    """Of unit variance: what follows moves of an input with a time constant of ten rows."""
+    """Unit variance: the response to an input's moves with a time constant of ten rows."""
     moves = np.repeat(np.random.default_rng(seed).standard_normal(ROWS // 20), 20)
-    followed = lfilter([0.1], [1.0, -0.9], lfilter([0.1], [1.0, -0.9], moves))
-    return np.asarray(followed / np.std(followed))
+    results = lfilter([0.1], [1.0, -0.9], lfilter([0.1], [1.0, -0.9], moves))
+    return np.asarray(results / np.std(results))
 
 
 def estimated(residual: Array, noise: Noise) -> float:
-    return float(sensor_noise(noise, ("y",), residual[:, None], residual[:, None], PERIOD_MIN)[0])
+    return float(estimate_sensor_noise(noise, ("y",), residual[:, None], residual[:, None], PERIOD_MIN)[0])
 
 
 @pytest.mark.parametrize("error", [0.0, 0.5, 3.0, 10.0])
@@ -54,7 +54,7 @@ def test_white_noise_is_found_beside_an_error_of_any_size(error: float) -> None:
 def test_noise_with_memory_counts_and_an_error_that_passes_for_it_does_not(kept: float, error: float) -> None:
     residual = white(3) + 2.0 * autoregressive(kept, 4) + error * plant_like(5)
     time_min = -PERIOD_MIN / np.log(kept)
-    memory = Wandering("y", float(np.hypot(2.0, error)), time_min, 1.0, 1.0)
+    memory = ColoredNoise("y", float(np.hypot(2.0, error)), time_min, 1.0, 1.0)
     assert estimated(residual, Noise((1.0,), (0.0,), (memory,))) == pytest.approx(sqrt(5.0), rel=0.2)
 
 
@@ -62,7 +62,7 @@ def test_the_noise_is_never_larger_than_the_filters_and_rounding_is_part_of_it()
     assert estimated(white(6), Noise((0.5,), (0.0,))) == 0.5
     slow = 0.01 * np.arange(ROWS, dtype=np.float64)
     rounded = np.round(slow)[:, None]
-    found = sensor_noise(Noise((9.0,), (0.0,)), ("y",), rounded - slow[:, None], rounded, PERIOD_MIN)
+    found = estimate_sensor_noise(Noise((9.0,), (0.0,)), ("y",), rounded - slow[:, None], rounded, PERIOD_MIN)
     assert found[0] == pytest.approx(1.0 / sqrt(12.0), rel=0.3)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.holdout import OBSERVED_ROWS, held_out_rows
-from reactorwatch.diagnosis.record_checks import run_of
+from reactorwatch.diagnosis.holdout import OBSERVED_ROWS, holdout_rows
+from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.errors import InputError
@@ -75,7 +75,7 @@ def test_a_fault_is_found_at_the_minute_that_the_clock_showed(leaking: Record, b
 
 @pytest.mark.parametrize("lengths", [(1, 1, 2, 3), (20, 1, 150), (2, 500, 1)])
 def test_runs_of_a_few_rows_hide_no_fault(leaking: Record, lengths: tuple[int, ...]) -> None:
-    """With values missing in their first rows, too."""
+    """Values are also missing in their first rows."""
     ends = 300 + np.cumsum(lengths)
     runs = 1 + np.searchsorted([300, *ends], np.arange(ROWS), side="right")
     columns = {name: values.copy() for name, values in leaking.columns.items()}
@@ -88,10 +88,10 @@ def test_runs_of_a_few_rows_hide_no_fault(leaking: Record, lengths: tuple[int, .
 
 def test_nothing_is_judged_where_the_free_run_is_still_looking_for_the_state() -> None:
     record = sessions(1, 2)
-    run = run_of(record, cstr())
+    run = make_run(record, cstr())
     assert run.starts == (700,)
     assert 700 in run.breaks
-    held_out = held_out_rows(run)
+    held_out = holdout_rows(run)
     assert not held_out[700 : 700 + OBSERVED_ROWS].any()
     assert held_out[700:].any()
 
@@ -100,4 +100,4 @@ def test_an_input_is_not_carried_over_from_one_run_to_the_next() -> None:
     record = sessions(1, 2)
     record.columns["qc"][700] = np.nan
     with pytest.raises(InputError, match="qc must be there in the first row of each run"):
-        run_of(record, cstr())
+        make_run(record, cstr())

@@ -1,4 +1,4 @@
-"""What a diagnosis says to people and to machines."""
+"""Text and JSON of a diagnosis."""
 
 import json
 import re
@@ -6,9 +6,9 @@ import re
 import msgspec
 import pytest
 
-from reactorwatch.diagnosis.report.machine import as_object, with_differences
+from reactorwatch.diagnosis.report.machine import as_object, report_object
 from reactorwatch.diagnosis.report.plain import as_text
-from reactorwatch.diagnosis.report.words import size_said, verdict, with_interval
+from reactorwatch.diagnosis.report.words import describe_size, describe_verdict, format_interval
 from reactorwatch.diagnosis.result import Cause, Diagnosis, Estimate
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
@@ -44,7 +44,7 @@ from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
     ],
 )
 def test_the_verdict_is_a_sentence(case: str, expected: str) -> None:
-    assert verdict(CASES[case], EFFECTS) == expected
+    assert describe_verdict(CASES[case], EFFECTS) == expected
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_the_verdict_is_a_sentence(case: str, expected: str) -> None:
     ],
 )
 def test_a_number_has_the_digits_that_its_95_percent_interval_allows(estimate: Estimate, expected: str) -> None:
-    assert with_interval(estimate) == expected
+    assert format_interval(estimate) == expected
 
 
 @pytest.mark.parametrize("effect", [*EFFECTS, *TANK_EFFECTS], ids=lambda effect: effect.name)
@@ -68,7 +68,7 @@ def test_the_size_of_every_cause_is_said_in_its_unit_and_meaning(effect: Effect,
     for sign in (1.0, -1.0) if effect.lower < 0.0 else (1.0,):
         size = Estimate(sign * abs(effect.typical), 0.01 * abs(effect.typical), effect.unit)
         cause = Cause(effect.name, profile, effect.label, effect.location, {"size": size})
-        said = size_said(cause, (effect,))
+        said = describe_size(cause, (effect,))
         unit = "%" if "%" in effect.larger else effect.unit
         value = abs(size.value) * (100.0 if unit == "%" else 1.0)
         number = re.search(r"-?\d[\d.]*", said)
@@ -129,10 +129,10 @@ def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -
 def test_the_object_holds_what_was_found() -> None:
     said = as_object(CASES["ambiguous"], "run.csv", 1.0)
     assert said["causes"][0]["parameters"]["onset"] == {"value": 150.3349, "sd": 0.0122, "unit": "min"}
-    (rival,) = said["alternatives"]
-    assert rival["delta_bic"] == 3.21
-    assert rival["causes"][0]["cause"] == "feed_temperature"
-    assert rival["causes"][0]["parameters"]["size"] == {"value": 1.234, "sd": 0.05, "unit": "K"}
+    (alternative,) = said["alternatives"]
+    assert alternative["delta_bic"] == 3.21
+    assert alternative["causes"][0]["cause"] == "feed_temperature"
+    assert alternative["causes"][0]["parameters"]["size"] == {"value": 1.234, "sd": 0.05, "unit": "K"}
     assert said["experiment"] == {
         "why": "Wider steps of qc tell both apart.",
         "input": [[0.0, 103.4], [10.0, 90.0]],
@@ -152,7 +152,7 @@ def test_the_object_holds_what_was_found() -> None:
 
 
 def test_what_was_stated_to_be_uncertain_is_told_as_it_is_known_now() -> None:
-    assert verdict(ADJUSTED, EFFECTS) == (
+    assert describe_verdict(ADJUSTED, EFFECTS) == (
         "The simulation is right within what was stated of its parameters: K3 is a little off, "
         "and what the record shows beyond that is noise."
     )
@@ -170,7 +170,7 @@ def test_what_is_no_finite_number_is_null() -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_report_for_machines_adds_where_the_simulation_differs(case: str) -> None:
-    said = json.loads(msgspec.json.encode(with_differences(CASES[case], "run.csv", 1.0)))
+    said = json.loads(msgspec.json.encode(report_object(CASES[case], "run.csv", 1.0)))
     assert said.keys() - as_object(CASES[case], "run.csv", 1.0).keys() == {"differences"}
     for name, item in said["differences"].items():
         assert item["unit"] == CASES[case].gain.held_out[name].unit

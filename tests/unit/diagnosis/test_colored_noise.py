@@ -7,8 +7,8 @@ import pytest
 from scipy.signal import lfilter
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.colored_noise import Noise, suspected
-from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.colored_noise import Noise, detect_colored_noise
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
 from reactorwatch.process.simulate import Simulator
@@ -25,7 +25,7 @@ def autoregressive(kept: float, rows: int, seed: int) -> Array:
 
 
 def wandering_in(residual: Array) -> list[str]:
-    return [item.output for item in suspected(WHITE, NAMES, residual, 0.1)]
+    return [item.output for item in detect_colored_noise(WHITE, NAMES, residual, 0.1)]
 
 
 @pytest.mark.parametrize(("rows", "kept"), [(1500, 0.5), (1500, 0.8), (7500, 0.35)])
@@ -60,19 +60,19 @@ def coloured(kept: float, rows: int, seed: int) -> Run:
 def test_its_size_and_memory_are_learned_and_what_is_left_is_white(kept: float) -> None:
     rows = 2000
     run = coloured(kept, rows, seed=4)
-    begin = suspected(WHITE, NAMES, Sized(cstr(), (), WHITE).follow(run, ())[2].residual, 0.1)
-    sized = Sized(cstr(), (), Noise(WHITE.measurement_sd, WHITE.process_sd, begin))
-    sized.noise = noise = sized.tuned(run, (), SMALLEST)
-    (thermometer,) = noise.wandering
+    begin = detect_colored_noise(WHITE, NAMES, FaultFilter(cstr(), (), WHITE).evaluate(run, ())[2].residual, 0.1)
+    ekf = FaultFilter(cstr(), (), Noise(WHITE.measurement_sd, WHITE.process_sd, begin))
+    ekf.noise = noise = ekf.estimate_noise(run, (), SMALLEST)
+    (thermometer,) = noise.colored
     assert noise.process_sd == (0.0, 0.0)
     # of an autoregression the coefficient is known to sqrt((1 - kept^2) / rows), its variance to less
     found = exp(-0.1 / thermometer.time_min) * thermometer.sd**2 / noise.sensor_sd(NAMES)[1] ** 2
     assert found == pytest.approx(kept, abs=5.0 * sqrt((1.0 - kept**2) / rows))
     inflated = sqrt((1.0 + kept) / (1.0 - kept) / (2.0 * rows))
     assert log(noise.sensor_sd(NAMES)[1] / 0.3) == pytest.approx(0.0, abs=4.0 * inflated)
-    w = sized.follow(run, ())[1][100:, 1]
+    w = ekf.evaluate(run, ())[1][100:, 1]
     assert abs(float(np.corrcoef(w[1:], w[:-1])[0, 1])) < 4.0 / sqrt(rows)
 
 
 def test_white_sensors_cost_the_filter_no_state() -> None:
-    assert Sized(cstr(), (), WHITE).model.state_names == NAMES
+    assert FaultFilter(cstr(), (), WHITE).model.state_names == NAMES

@@ -5,13 +5,13 @@ import pytest
 
 from reactorwatch.diagnosis.fitting import grid_search
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, Step
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
 
-from .runs import run_of
+from .runs import make_run
 
 STICKS = next(effect for effect in EFFECTS if effect.name == "valve_stiction")
 NOISE = Noise((0.002, 0.3), (0.0, 0.0))
@@ -19,33 +19,33 @@ NOISE = Noise((0.002, 0.3), (0.0, 0.0))
 
 @pytest.mark.parametrize(("size", "onset_min"), [(6.0, 150.23), (5.3, 212.07), (3.65, 211.78), (7.33, 175.97)])
 def test_an_onset_that_no_slope_leads_to_is_found(size: float, onset_min: float) -> None:
-    run = run_of(f"valve_stiction:step:{size}@{onset_min}min", rows=3000)
-    hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
-    truth = hypothesis.at(run, (np.array([size, onset_min]),))
-    roughly = grid_search.roughly(run, hypothesis, hypothesis.at(run, (np.array([6.3, 40.0]),)))
-    found = grid_search.finely(run, hypothesis, roughly)
+    run = make_run(f"valve_stiction:step:{size}@{onset_min}min", rows=3000)
+    hypothesis = Hypothesis(FaultFilter(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
+    truth = hypothesis.evaluate(run, (np.array([size, onset_min]),))
+    search_coarse = grid_search.search_coarse(run, hypothesis, hypothesis.evaluate(run, (np.array([6.3, 40.0]),)))
+    found = grid_search.search_fine(run, hypothesis, search_coarse)
     assert found.loss <= truth.loss + 1e-6
     # When it began to stick shows only in where it stands from the next move on that it does not follow.
     after = slice(int(10.0 * onset_min) + 100, None)
-    np.testing.assert_allclose(found.found.x[after, 2], truth.found.x[after, 2], atol=0.01)
+    np.testing.assert_allclose(found.innovations.x[after, 2], truth.innovations.x[after, 2], atol=0.01)
 
 
 def test_a_size_is_found_between_the_two_moves_that_it_lies_between() -> None:
-    run = run_of("valve_stiction:constant:4.0", rows=1500)
-    hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Constant(run.time_min),))
-    truth = hypothesis.at(run, (np.array([4.0]),))
-    found = grid_search.fitted(run, hypothesis, (np.array([1.5]),))
+    run = make_run("valve_stiction:constant:4.0", rows=1500)
+    hypothesis = Hypothesis(FaultFilter(cstr(), (STICKS,), NOISE), (Constant(run.time_min),))
+    truth = hypothesis.evaluate(run, (np.array([4.0]),))
+    found = grid_search.fit_hypothesis(run, hypothesis, (np.array([1.5]),))
     assert found.loss <= truth.loss + 1e-6
-    assert found.theta[0][0] == pytest.approx(4.0, abs=0.5)
+    assert found.parameters[0][0] == pytest.approx(4.0, abs=0.5)
 
 
 @pytest.mark.parametrize("onset_min", [0.0, 12.34, 99.95, 149.9])
 def test_a_filter_that_goes_on_where_a_later_onset_makes_no_difference_says_the_same(onset_min: float) -> None:
-    run = run_of("valve_stiction:step:6.0@50.23min", rows=1500)
-    hypothesis = Hypothesis(Sized(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
-    later = hypothesis.at(run, (np.array([6.0, 149.9]),))
+    run = make_run("valve_stiction:step:6.0@50.23min", rows=1500)
+    hypothesis = Hypothesis(FaultFilter(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
+    later = hypothesis.evaluate(run, (np.array([6.0, 149.9]),))
     numbers = (np.array([6.0, onset_min]),)
-    whole, rest = hypothesis.at(run, numbers), hypothesis.at(run, numbers, later)
+    whole, rest = hypothesis.evaluate(run, numbers), hypothesis.evaluate(run, numbers, later)
     assert rest.loss == whole.loss
-    for one, other in zip((rest.w, *rest.found), (whole.w, *whole.found), strict=True):
+    for one, other in zip((rest.w, *rest.innovations), (whole.w, *whole.innovations), strict=True):
         np.testing.assert_array_equal(one, other)

@@ -1,4 +1,4 @@
-"""What an input is expected to tell of rivals, against closed forms and against records with noise."""
+"""The expected evidence of an input, against closed forms and against records with noise."""
 
 from math import exp
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.experiment.alternative import Rival, going_on, probability
+from reactorwatch.diagnosis.experiment.alternative import Prediction, extrapolate, probability_decided
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import Sized
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
-from reactorwatch.diagnosis.fitting.profiles import Constant, Free, Ramp, Sine
+from reactorwatch.diagnosis.fitting.profiles import Constant, PiecewiseLinear, Ramp, Sine
 from reactorwatch.diagnosis.run import Run
 from tests.unit.diagnosis.linear_tank import NOISE, NOISE_SD, PERIOD_MIN, RATE, Gain, Shift, explained, follows, tank
 from tests.unit.diagnosis.linear_tank import record as tank_record
@@ -24,23 +24,23 @@ def steps(reach: float, rows: int = ROWS, seed: int = 3) -> Array:
     return np.repeat(5.0 + reach * np.random.default_rng(seed).uniform(-1.0, 1.0, rows // 10), 10)
 
 
-def rivals(reach: float) -> tuple[Rival, Rival, Run]:
+def alternatives(reach: float) -> tuple[Prediction, Prediction, Run]:
     """The two, and what the first predicts."""
     record = tank_record(steps(1.0))
     resting = np.array([5.0])
     gain, shift = (
-        Rival(item.hypothesis, item.fit, record, resting, 300, 30.0)
+        Prediction(item.hypothesis, item.fit, record, resting, 300, 30.0)
         for item in (explained(Gain(), SIZES[0], record), explained(Shift(), SIZES[1], record))
     )
-    time_min = gain.begin_min + PERIOD_MIN * np.arange(ROWS, dtype=np.float64)
+    time_min = gain.start_min + PERIOD_MIN * np.arange(ROWS, dtype=np.float64)
     u = steps(reach)[:, None]
-    outputs = gain.outputs(time_min, u)
+    outputs = gain.predict_outputs(time_min, u)
     assert outputs is not None
     return gain, shift, Run(time_min, u, outputs)
 
 
 def closed_form(u: Array) -> float:
-    """What a shift, from any start, cannot imitate of a gain, by least squares over all rows, in units of the noise."""
+    """Part of a gain that a shift from any start cannot imitate, by least squares, in units of the noise."""
     truth = follows((1.0 + SIZES[0]) * u, 5.0 * (1.0 + SIZES[0]))
     base = follows(u, 0.0)
     of_start = exp(-RATE * PERIOD_MIN) ** np.arange(u.size)
@@ -52,21 +52,21 @@ def closed_form(u: Array) -> float:
 
 @pytest.mark.parametrize("reach", [1.0, 4.0])
 def test_of_a_linear_plant_the_expected_evidence_is_the_noncentrality_of_the_likelihood_ratio(reach: float) -> None:
-    gain, shift, truth = rivals(reach)
+    gain, shift, truth = alternatives(reach)
     np.testing.assert_allclose(
         truth.measured[:, 0], follows((1.0 + SIZES[0]) * truth.inputs[:, 0], 5.0 * (1.0 + SIZES[0])), atol=1e-6
     )
     expected = closed_form(truth.inputs[:, 0])
-    assert shift.unexplained(truth) == pytest.approx(expected, rel=0.02)  # which leaves out the second row
+    assert shift.noncentrality(truth) == pytest.approx(expected, rel=0.02)  # which leaves out the second row
     assert 2.0 * (shift.loss(truth) - gain.own_loss(truth)) == pytest.approx(expected, rel=0.02)
-    assert gain.unexplained(truth) == pytest.approx(0.0, abs=1e-6)
+    assert gain.noncentrality(truth) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_with_noise_the_evidence_scatters_about_what_is_expected_as_the_probability_says() -> None:
-    gain, shift, truth = rivals(4.0)
+    gain, shift, truth = alternatives(4.0)
     expected = 2.0 * (shift.loss(truth) - gain.own_loss(truth))
-    courses = (Constant(truth.time_min),)
-    both = [Hypothesis(Sized(tank(), (effect,), NOISE), courses) for effect in (Gain(), Shift())]
+    profiles = (Constant(truth.time_min),)
+    both = [Hypothesis(FaultFilter(tank(), (effect,), NOISE), profiles) for effect in (Gain(), Shift())]
     random, found = np.random.default_rng(8), []
     for _ in range(150):
         noisy = Run(truth.time_min, truth.inputs, truth.measured + NOISE_SD * random.standard_normal((ROWS, 1)))
@@ -75,30 +75,30 @@ def test_with_noise_the_evidence_scatters_about_what_is_expected_as_the_probabil
     error = np.std(found) / np.sqrt(len(found))
     assert np.mean(found) == pytest.approx(expected, abs=3.5 * error)
     assert np.std(found) == pytest.approx(2.0 * np.sqrt(expected), rel=3.5 / np.sqrt(2 * len(found)))
-    decided, share = np.mean(np.array(found) > 10.0), probability(expected, expected)
+    decided, share = np.mean(np.array(found) > 10.0), probability_decided(expected, expected)
     assert decided == pytest.approx(share, abs=3.5 * np.sqrt(share * (1.0 - share) / len(found)))
 
 
 def test_evidence_that_noise_of_the_process_would_hide_does_not_count() -> None:
-    _, shift, truth = rivals(4.0)
+    _, shift, truth = alternatives(4.0)
     disturbed = explained(Shift(), SIZES[1], truth)
-    disturbed.hypothesis.sized.noise = Noise(NOISE.measurement_sd, (0.1,))
-    other = Rival(disturbed.hypothesis, disturbed.fit, truth, np.array([5.0]), 300, 30.0)
-    assert 0.0 < other.unexplained(truth) < 0.7 * shift.unexplained(truth)
+    disturbed.hypothesis.filter.noise = Noise(NOISE.measurement_sd, (0.1,))
+    other = Prediction(disturbed.hypothesis, disturbed.fit, truth, np.array([5.0]), 300, 30.0)
+    assert 0.0 < other.noncentrality(truth) < 0.7 * shift.noncentrality(truth)
 
 
-@pytest.mark.parametrize(("course", "theta"), [(Ramp, [2.0, 10.0]), (Free, [0.0, 1.0, 2.0])])
+@pytest.mark.parametrize(("profile", "parameters"), [(Ramp, [2.0, 10.0]), (PiecewiseLinear, [0.0, 1.0, 2.0])])
 def test_what_has_set_in_stays_as_large_as_it_was_at_the_end(
-    course: type[Ramp] | type[Free], theta: list[float]
+    profile: type[Ramp] | type[PiecewiseLinear], parameters: list[float]
 ) -> None:
     record_min = np.arange(0.0, 50.0, 0.1)
-    there = Ramp(record_min) if course is Ramp else Free(record_min, 3)
-    later, numbers = going_on(there, np.array(theta), np.arange(60.0, 70.0, 0.1), 60.0)
-    np.testing.assert_allclose(later.signal(numbers).at_row, 2.0)
+    there = Ramp(record_min) if profile is Ramp else PiecewiseLinear(record_min, 3)
+    later, numbers = extrapolate(there, np.array(parameters), np.arange(60.0, 70.0, 0.1), 60.0)
+    np.testing.assert_allclose(later.signal(numbers).sample_value, 2.0)
 
 
 def test_what_swings_goes_on_swinging() -> None:
-    theta, later_min = np.array([0.6, -0.8, 7.0]), np.arange(81.3, 95.0, 0.1)
-    later, numbers = going_on(Sine(np.arange(2.0, 50.0, 0.1)), theta, later_min, 60.0)
+    parameters, later_min = np.array([0.6, -0.8, 7.0]), np.arange(81.3, 95.0, 0.1)
+    later, numbers = extrapolate(Sine(np.arange(2.0, 50.0, 0.1)), parameters, later_min, 60.0)
     angle = 2.0 * np.pi * (later_min - 2.0) / 7.0
-    np.testing.assert_allclose(later.signal(numbers).at_row, 0.6 * np.sin(angle) - 0.8 * np.cos(angle), atol=1e-9)
+    np.testing.assert_allclose(later.signal(numbers).sample_value, 0.6 * np.sin(angle) - 0.8 * np.cos(angle), atol=1e-9)

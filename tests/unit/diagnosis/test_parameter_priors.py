@@ -8,31 +8,31 @@ import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.fault_filter import Sized
-from reactorwatch.diagnosis.parameter_priors import offsets, stated, with_uncertain
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
+from reactorwatch.diagnosis.parameter_priors import add_priors, offsets, parse_priors
 from reactorwatch.diagnosis.result import NAMED, NOMINAL
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr.model import cstr
-from tests.unit.diagnosis.runs import record_of, run_of
+from tests.unit.diagnosis.runs import make_run, record_of
 
 SENSORS = Noise((0.002, 0.3), (0.0, 0.0))
 WARMER = "feed_temperature:constant:0.5"
 
 
-def followed(run: Run, sds: dict[str, float]) -> tuple[float, float]:
+def estimate_offset(run: Run, sds: dict[str, float]) -> tuple[float, float]:
     """Offset of the feed's temperature in the end, and its standard deviation."""
     noise = Noise(SENSORS.measurement_sd, (0.0,) * (2 + len(sds)))
-    _, _, found = Sized(with_uncertain(cstr(), sds), (), noise).follow(run, ())
+    _, _, found = FaultFilter(add_priors(cstr(), sds), (), noise).evaluate(run, ())
     return float(found.x[-1, 2]), float(np.sqrt(found.P[-1, 2, 2]))
 
 
 def test_the_likelihood_is_that_of_all_offsets_weighed_by_what_was_stated() -> None:
-    run, sd = run_of(WARMER, rows=400), 0.5
+    run, sd = make_run(WARMER, rows=400), 0.5
     noise = Noise(SENSORS.measurement_sd, (0.0, 0.0, 0.0))
-    uncertain = Filter(with_uncertain(cstr(), {"Tf": sd}), noise).run(run.time_min, run.inputs, run.measured)
+    uncertain = Filter(add_priors(cstr(), {"Tf": sd}), noise).run(run.time_min, run.inputs, run.measured)
     grid = np.linspace(0.0, 1.0, 101)
     given = []
     for offset in grid:
@@ -47,8 +47,8 @@ def test_the_likelihood_is_that_of_all_offsets_weighed_by_what_was_stated() -> N
 
 
 def test_what_was_learned_of_a_parameter_outlasts_a_break_in_the_record() -> None:
-    run = run_of(WARMER, rows=1000)
-    whole, broken = followed(run, {"Tf": 0.5}), followed(replace(run, breaks=(500, 980)), {"Tf": 0.5})
+    run = make_run(WARMER, rows=1000)
+    whole, broken = estimate_offset(run, {"Tf": 0.5}), estimate_offset(replace(run, breaks=(500, 980)), {"Tf": 0.5})
     assert whole[0] == pytest.approx(0.5, abs=4 * whole[1])
     assert broken[0] == pytest.approx(whole[0], abs=2 * whole[1])
     assert broken[1] < 1.2 * whole[1]
@@ -60,7 +60,7 @@ def test_a_parameter_off_by_as_much_as_stated_is_no_finding_and_without_the_stat
     assert exact.verdict != NOMINAL
     assert (rough.verdict, rough.significant, rough.practical, rough.causes) == (NOMINAL, False, False, ())
     said = rough.parameters["Tf"]
-    assert said.off
+    assert said.differs
     assert abs(said.estimate.value - 350.5) < 4 * said.estimate.sd
     assert said.estimate.sd < 0.2 * said.stated_sd
     assert rough.gain.held_out["T"].rmse_before < 1.1 * 0.3
@@ -93,15 +93,15 @@ def test_the_uncertain_parameter_itself_is_a_cause_only_if_it_is_far_from_what_w
 
 
 def test_no_parameter_costs_the_filter_a_state_unless_it_is_uncertain() -> None:
-    assert with_uncertain(cstr(), {}) is cstr()
-    assert offsets(with_uncertain(cstr(), {"V": 1.0, "q": 2.0}), np.array([0.1, 440.0, 3.0, 4.0])) == {
+    assert add_priors(cstr(), {}) is cstr()
+    assert offsets(add_priors(cstr(), {"V": 1.0, "q": 2.0}), np.array([0.1, 440.0, 3.0, 4.0])) == {
         "V": 3.0,
         "q": 4.0,
     }
 
 
 def test_tolerances_are_shares_or_numbers_with_the_unit_of_the_parameter() -> None:
-    assert stated("K3=2%, Tf = 0.5K,V=1.5e0 l", cstr()) == pytest.approx({"K3": 14.0, "Tf": 0.5, "V": 1.5})
+    assert parse_priors("K3=2%, Tf = 0.5K,V=1.5e0 l", cstr()) == pytest.approx({"K3": 14.0, "Tf": 0.5, "V": 1.5})
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_tolerances_are_shares_or_numbers_with_the_unit_of_the_parameter() -> No
 )
 def test_what_cannot_be_stated_is_said_in_a_line(text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        stated(text, cstr())
+        parse_priors(text, cstr())
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,12 @@
-"""Where the likelihood is rough in a number, its interval follows what the record can tell of it."""
+"""The interval of a parameter with a rough likelihood covers what the record leaves open."""
 
 import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Step
-from reactorwatch.diagnosis.profile_likelihood import WITHIN_ROW, settled
-from reactorwatch.diagnosis.record_checks import run_of as of_record
+from reactorwatch.diagnosis.profile_likelihood import WITHIN_ROW, refine
+from reactorwatch.diagnosis.record_checks import make_run as of_record
 from reactorwatch.diagnosis.result import Estimate
 from reactorwatch.diagnosis.search.search import Search
 from reactorwatch.process.library.cstr.effects import EFFECTS
@@ -14,23 +14,23 @@ from reactorwatch.process.library.cstr.model import cstr
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES
-from tests.unit.diagnosis.runs import run_of
+from tests.unit.diagnosis.runs import make_run
 
 PERIOD_MIN = 0.1
 
 
 def step_of(cause: str, size: float, onset_min: float, begun_min: float) -> tuple[Estimate, Estimate, float]:
     """Onset and size of a step in a plant, fitted from another onset; and the onset's standard deviation by the fit."""
-    run = run_of(f"{cause}:step:{size}@{onset_min}min", rows=600)
+    run = make_run(f"{cause}:step:{size}@{onset_min}min", rows=600)
     search = Search(cstr(), EFFECTS, run, (1e-4, 1e-2))
     effect = next(item for item in EFFECTS if item.name == cause)
-    hypothesis = Hypothesis(search.sized((effect,)), (Step(run.time_min),))
+    hypothesis = Hypothesis(search.filter((effect,)), (Step(run.time_min),))
     fitted = search.fit(hypothesis, (np.array([size, begun_min]),))
-    search.settle(fitted)
-    fitted = search.refitted(fitted)
+    search.update_noise(fitted)
+    fitted = search.refit(fitted)
     by_fit = np.sqrt(np.diag(hypothesis.covariance(run, fitted.fit)))
-    best, (sds,) = settled(search, fitted, [by_fit])
-    size_of, onset = best.fit.theta[0].tolist()
+    best, (sds,) = refine(search, fitted, [by_fit])
+    size_of, onset = best.fit.parameters[0].tolist()
     return (
         Estimate(onset, sds[1], "min"),
         Estimate(size_of, sds.get(0, float(by_fit[0])), effect.unit),
@@ -40,7 +40,7 @@ def step_of(cause: str, size: float, onset_min: float, begun_min: float) -> tupl
 
 @pytest.mark.parametrize("onset_min", [30.005, 30.05, 30.095])
 def test_a_sensor_tells_between_which_rows_it_went_wrong_and_no_more(onset_min: float) -> None:
-    """Of a time that may lie anywhere in an interval, the standard deviation is its length over the root of 12."""
+    """A time that is uniform in an interval has the interval's length over the root of 12 as its standard deviation."""
     onset, _, _ = step_of("temperature_bias", 4.0, onset_min, 30.3)
     assert onset.value == pytest.approx(30.05, abs=0.02)
     assert onset.sd == pytest.approx(PERIOD_MIN / np.sqrt(12.0), rel=0.2)
@@ -54,7 +54,7 @@ def test_a_lag_tells_between_which_moves_of_the_input_it_began() -> None:
 
 
 def test_a_lag_is_found_from_an_onset_that_is_far_off() -> None:
-    """From a hollow of the likelihood ten minutes away."""
+    """The start is a local optimum ten minutes away."""
     onset, _, _ = step_of("valve_lag", 0.2, 30.35, 20.35)
     assert onset.value == pytest.approx(30.5, abs=0.15)
 
@@ -73,15 +73,15 @@ def test_an_onset_of_which_the_likelihood_has_two_humps_may_be_at_either() -> No
     size, onset_min = hidden.courses[0].size, hidden.courses[0].onset_min
     run = of_record(hidden.record, cstr())
     search = Search(cstr(), EFFECTS, run, (1e-4, 1e-2))
-    sized = search.sized(tuple(item for item in EFFECTS if item.name == effect.name))
-    hypothesis = Hypothesis(sized, (Step(run.time_min),))
+    ekf = search.filter(tuple(item for item in EFFECTS if item.name == effect.name))
+    hypothesis = Hypothesis(ekf, (Step(run.time_min),))
     fitted = search.fit(hypothesis, (np.array([size, onset_min + 0.4]),))
-    search.settle(fitted)
-    fitted = search.refitted(fitted)
-    best, (sds,) = settled(search, fitted, [np.sqrt(np.diag(hypothesis.covariance(run, fitted.fit)))])
-    sd, (found, estimate) = sds[1], best.fit.theta[0]
+    search.update_noise(fitted)
+    fitted = search.refit(fitted)
+    best, (sds,) = refine(search, fitted, [np.sqrt(np.diag(hypothesis.covariance(run, fitted.fit)))])
+    sd, (found, estimate) = sds[1], best.fit.parameters[0]
     grid = np.arange(estimate - 1.0, estimate + 1.0, 0.02)
-    losses = np.array([hypothesis.at(run, (np.array([found, onset]),)).loss for onset in grid])
+    losses = np.array([hypothesis.evaluate(run, (np.array([found, onset]),)).loss for onset in grid])
     likelihood = np.exp(losses.min() - losses)
     spread = np.sqrt(np.sum(likelihood * (grid - estimate) ** 2) / np.sum(likelihood))
     assert sd == pytest.approx(spread, rel=0.15)
