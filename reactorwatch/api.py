@@ -26,8 +26,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
 from reactorwatch.diagnosis.diagnose import diagnose as find_causes
-from reactorwatch.diagnosis.record_checks import run_of
-from reactorwatch.diagnosis.report.machine import with_differences
+from reactorwatch.diagnosis.record_checks import make_run
+from reactorwatch.diagnosis.report.machine import report_object
 from reactorwatch.diagnosis.result import Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import Identification
@@ -173,7 +173,7 @@ class DiagnosisResult(Diagnosis):
 
     def to_dict(self) -> dict[str, Any]:
         """The object that `reactorwatch diagnose --json` prints, and the differences of the simulation."""
-        return with_differences(self, self.record.name, 0.0, self.record.zero)
+        return report_object(self, self.record.name, 0.0, self.record.zero)
 
     def to_html(self, file: str | Path) -> None:
         """Write the report as one page.
@@ -212,7 +212,7 @@ def diagnose(
         InputError: the record cannot be diagnosed, or an argument is outside its range.
     """
     model = _model_of(process, record)
-    run_of(record, model)
+    make_run(record, model)
     found = find_causes(
         record, model, effects, dict(tolerance or {}) or None, dict(uncertain or {}), dict(limits or {}) or None
     )

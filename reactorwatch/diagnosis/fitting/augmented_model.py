@@ -40,7 +40,7 @@ class AugmentedModel:
     def errors(self) -> ErrorLinearization:
         """Equations of the filter's estimation errors with respect to the magnitudes, without noise levels."""
         unknown = NoiseLevels((1.0,) * len(self.model.outputs), (0.0,) * len(self.model.states))
-        return FilterErrors(self.model, unknown, self.interval_inputs, self.sample_inputs)
+        return ErrorLinearization(self.model, unknown, self.interval_inputs, self.sample_inputs)
 
     def inputs(self, time_min: Array, inputs: Array, signals: Sequence[Signal]) -> Array:
         """Stack the record's inputs and the magnitudes, shape (rows, n_u + 2 effects)."""

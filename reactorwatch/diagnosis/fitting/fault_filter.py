@@ -54,7 +54,7 @@ class SharedPrefix(NamedTuple):
     rows: int
 
 
-class FilterResult(NamedTuple):
+class FilterEvaluation(NamedTuple):
     """Innovations and loss of a filter run.
 
     Attributes:
@@ -154,13 +154,13 @@ class FaultFilter:
         prompt = [item for index, item in enumerate(signals) if index != self.delay_index]
         return self._augmented.inputs(run.time_min, run.certain_inputs, prompt)
 
-    def evaluate(self, run: Run, signals: Sequence[Signal]) -> FilterResult:
+    def evaluate(self, run: Run, signals: Sequence[Signal]) -> FilterEvaluation:
         """Run the filter with these deviations."""
         return self.evaluate_all(run, [signals])[0]
 
     def evaluate_all(
         self, run: Run, several: Sequence[Sequence[Signal]], shared: Sequence[SharedPrefix | None] | None = None
-    ) -> list[FilterResult]:
+    ) -> list[FilterEvaluation]:
         """Run the filter with several sets of deviations in parallel lanes, which take little longer than one.
 
         Args:
@@ -174,7 +174,7 @@ class FaultFilter:
         innovations = self._filter_rows([rows for rows, _ in laid], prefixes)
         return [self._evaluate_rows(run, by, item) for (_, by), item in zip(laid, innovations, strict=True)]
 
-    def _evaluate_rows(self, run: Run, by: ShiftedRun | None, innovations: FilterResult) -> FilterResult:
+    def _evaluate_rows(self, run: Run, by: ShiftedRun | None, innovations: FilterResult) -> FilterEvaluation:
         measured, unseen, least = run.measured, np.zeros(run.measured.shape, dtype=np.bool_), self.noise.measurement_sd
         if by is not None and self.delay_index is not None:
             output = self._output(self.delay_index)
@@ -187,9 +187,11 @@ class FaultFilter:
         loss, w = _huber_likelihood(
             measured, unseen, begins, innovations.normalized, innovations.conditional_sd, np.array(least)
         )
-        return FilterResult(float(loss), w, innovations)
+        return FilterEvaluation(float(loss), w, innovations)
 
-    def _filter_rows(self, several: Sequence[ResampledRecord], shared: Sequence[SharedPrefix | None]) -> list[FilterResult]:
+    def _filter_rows(
+        self, several: Sequence[ResampledRecord], shared: Sequence[SharedPrefix | None]
+    ) -> list[FilterResult]:
         """Filter the laid-out rows, in batches of `LANES`; rows of shared prefixes are not computed again."""
         innovations: list[FilterResult] = []
         for begin in range(0, len(several), LANES):
@@ -197,7 +199,9 @@ class FaultFilter:
             innovations += self._filter_lanes(part, shared[begin : begin + LANES])
         return innovations
 
-    def _filter_lanes(self, several: Sequence[ResampledRecord], shared: Sequence[SharedPrefix | None]) -> list[FilterResult]:
+    def _filter_lanes(
+        self, several: Sequence[ResampledRecord], shared: Sequence[SharedPrefix | None]
+    ) -> list[FilterResult]:
         """Filter as many records at once as there are lanes, all from the same row on."""
         first = min(_count_shared_rows(prefix, rows) for prefix, rows in zip(shared, several, strict=True))
         if first == several[0].time_min.size:

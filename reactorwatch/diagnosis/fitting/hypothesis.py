@@ -196,7 +196,12 @@ class Hypothesis:
         return np.array([effect.upper - effect.lower] * profile.n_linear + of_numbers)
 
     def _jacobian(
-        self, run: Run, fit: Fit, differences: Sequence[Array], dynamics: ErrorDynamics | None = None, rough: bool = False
+        self,
+        run: Run,
+        fit: Fit,
+        differences: Sequence[Array],
+        dynamics: ErrorDynamics | None = None,
+        rough: bool = False,
     ) -> Array:
         """Derivatives of the innovations' reduction, shape (values from the third row on, n_parameters).
 

@@ -12,14 +12,14 @@ from typing import TypeAlias
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.fault_filter import FilterResult, huber_clip
+from reactorwatch.diagnosis.fitting.fault_filter import FilterEvaluation, huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.fitting.profiles import Constant, Decay, FittedProfile, PiecewiseLinear, Ramp, Signal, Step
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.screen import DECAYS, EDGE_ROWS, KNOTS, Candidate
 from reactorwatch.process.effect import Effect
 
-Evaluate: TypeAlias = Callable[[Effect, Sequence[Signal]], Sequence[FilterResult]]
+Evaluate: TypeAlias = Callable[[Effect, Sequence[Signal]], Sequence[FilterEvaluation]]
 """From deviations of an effect to the filter results with them."""
 
 
@@ -79,7 +79,10 @@ class DynamicEffectsScreen:
         confirmed, to_confirm = [1.0] * len(scaled), []
         for number, candidates in enumerate(scaled):
             constant = candidates[0]
-            if constant.effect.is_discontinuous or max(item.score(self._run.values) for item in candidates) <= least_score:
+            if (
+                constant.effect.is_discontinuous
+                or max(item.score(self._run.values) for item in candidates) <= least_score
+            ):
                 continue
             if constant.gain > 0.0:
                 to_confirm.append(number)

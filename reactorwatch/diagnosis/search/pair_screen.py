@@ -85,7 +85,9 @@ class PairScreen:
         t = run.time_min
         self._constant, self._free, self._sine = Constant(t), PiecewiseLinear(t, KNOTS), Sine(t)
 
-    def candidates(self, dynamics: ErrorDynamics, dynamic: Sequence["DynamicSignature"], count: int) -> list[CandidatePair]:
+    def candidates(
+        self, dynamics: ErrorDynamics, dynamic: Sequence["DynamicSignature"], count: int
+    ) -> list[CandidatePair]:
         """Best candidate of each pair of causes, the most promising first.
 
         Args:

@@ -19,7 +19,7 @@ from math import inf
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.fault_filter import FilterResult, huber_clip
+from reactorwatch.diagnosis.fitting.fault_filter import FilterEvaluation, huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, PiecewiseLinear, Signal
 from reactorwatch.diagnosis.search.pair_screen import CandidatePair, DynamicSignature, PairScreen
@@ -271,7 +271,9 @@ class PairSearch:
         candidates = [item for item in candidates if item.effect is not other.effect]
         return sorted(candidates, key=lambda item: -item.score(self._run.values))
 
-    def _evaluate_with(self, beside: Sequence[Part], effect: Effect, signals: Sequence[Signal]) -> list[FilterResult]:
+    def _evaluate_with(
+        self, beside: Sequence[Part], effect: Effect, signals: Sequence[Signal]
+    ) -> list[FilterEvaluation]:
         """Run filters with one more deviation, for several such deviations."""
         others = {part.effect.name: part.profile.signal(part.parameters) for part in beside}
         effects = self._order_effects([*(part.effect for part in beside), effect])

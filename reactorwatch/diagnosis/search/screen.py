@@ -144,7 +144,7 @@ class Screen:
     def _signature_of(self, hypothesis: Hypothesis, fit: Fit, index: int) -> Array:
         """Signature of a fitted deviation, shape (rows, n_y)."""
         ekf = hypothesis.filter
-        if index == ekf.delay_index or ekf.effects[index].jumps or ekf.shifts_time(index):
+        if index == ekf.delay_index or ekf.effects[index].is_discontinuous or ekf.shifts_time(index):
             return huber_clip(hypothesis.innovations_without(self._run, fit, index)[2:]) - huber_clip(fit.w[2:])
         signals = hypothesis.signals(fit)
         dynamics = ekf.error_dynamics(self._run, signals, fit.innovations)
@@ -153,7 +153,9 @@ class Screen:
             dynamics, hypothesis.input_index(index), interval_mean[1:-1, None], sample_value[2:, None]
         )[:, :, 0]
 
-    def _dynamics(self, ekf: FaultFilter, signals: Sequence[Signal], fit: Fit, effects: Sequence[Effect]) -> ErrorDynamics:
+    def _dynamics(
+        self, ekf: FaultFilter, signals: Sequence[Signal], fit: Fit, effects: Sequence[Effect]
+    ) -> ErrorDynamics:
         """Error equations for some effects about a filter run."""
         if ekf.is_plain and all(effect in self.static_effects for effect in ekf.effects):
             errors, inputs = self._full_equations(ekf, signals)
@@ -165,7 +167,7 @@ class Screen:
         columns = [self.static_effects.index(effect) for effect in effects]
         return replace(dynamics, G=dynamics.G[:, :, columns], D=dynamics.D[:, :, columns])
 
-    def _full_equations(self, ekf: FaultFilter, signals: Sequence[Signal]) -> tuple[FilterErrors, Array]:
+    def _full_equations(self, ekf: FaultFilter, signals: Sequence[Signal]) -> tuple[ErrorLinearization, Array]:
         """Error equations of a model with all static effects, and its inputs.
 
         It is compiled once for all hypotheses.
@@ -176,7 +178,7 @@ class Screen:
         sizes = [by_effect.get(effect, Signal(nothing, nothing)) for effect in self.static_effects]
         return of_all.errors, of_all.inputs(self._run.time_min, self._run.certain_inputs, sizes)
 
-    def _equations_beside(self, ekf: FaultFilter) -> FilterErrors:
+    def _equations_beside(self, ekf: FaultFilter) -> ErrorLinearization:
         """Error equations of a filter's model with all static effects added."""
         if ekf not in self._errors:
             extended = ekf.model
@@ -188,7 +190,7 @@ class Screen:
                     own = (extended.parameters[-1].symbol,) * 2
                 interval_inputs.append(own[0])
                 sample_inputs.append(own[1])
-            self._errors[ekf] = FilterErrors(extended, ekf.noise_levels, interval_inputs, sample_inputs)
+            self._errors[ekf] = ErrorLinearization(extended, ekf.noise_levels, interval_inputs, sample_inputs)
         return self._errors[ekf]
 
     def _onset_candidates(self, dynamics: ErrorDynamics, effects: Sequence[Effect]) -> list[Candidate]:

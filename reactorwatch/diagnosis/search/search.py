@@ -18,7 +18,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import grid_search, onset_refinement
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, detect_colored_noise
-from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterResult
+from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvaluation
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.knot_selection import fine_grid, select_knots
 from reactorwatch.diagnosis.fitting.outliers import find_gross_outliers, find_outliers, remove_outliers
@@ -274,7 +274,7 @@ class Search:
                 break
         return result
 
-    def _evaluate_with(self, effect: Effect, signals: Sequence[Signal]) -> list[FilterResult]:
+    def _evaluate_with(self, effect: Effect, signals: Sequence[Signal]) -> list[FilterEvaluation]:
         return self.filter((effect,)).evaluate_all(self.run, [[signal] for signal in signals])
 
     @cached_property
