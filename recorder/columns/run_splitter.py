@@ -99,8 +99,8 @@ class RunSplitter:
         if not run.samples and self.current == stray:
             self.current = number
         if time_ns == run.last_ns and number == stray:
-            newest = [counter.newest_ns for name, counter in self.counters.items() if self._last[name]]
-            run.last_ns = max(time for time in newest if time != time_ns)
+            newest = (counter.newest_ns for name, counter in self.counters.items() if self._last[name])
+            run.last_ns = max(newest, default=run.first_ns)
         return number
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from itertools import pairwise
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
@@ -123,6 +123,7 @@ def test_what_is_said_of_the_run_before_stays_with_it() -> None:
     which=st.sampled_from([(0,), (1,), (2,), (0, 1, 2)]),
     time_ns=st.one_of(st.integers(-(2**63), 2**63 - 1), st.integers(0, 100).map(lambda row: row * PERIOD)),
 )
+@example(row=3, which=(2,), time_ns=4 * PERIOD)  # the others' next row has that time already
 def test_a_damaged_time_is_out_of_place_and_cuts_no_run(row: int, which: tuple[int, ...], time_ns: int) -> None:
     """Of one signal, or of all in a row that is stamped an hour early, say."""
     found = samples([Session(100, 0, restarted=True)], 0)
