@@ -6,6 +6,7 @@ interrupt would be lost, and the command continue. So none is raised within such
 again until the command handles it.
 """
 
+import atexit
 import signal
 import sys
 from types import FrameType
@@ -19,15 +20,20 @@ _CALLBACKS = "_raw_object_cache_"
 def raise_until_handled() -> None:
     """Let SIGINT raise KeyboardInterrupt in the main thread, repeatedly until `clear_interrupt` is called."""
     signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGALRM, _interrupt)
+    atexit.register(clear_interrupt)
 
 
 def clear_interrupt() -> None:
-    """Stop raising for the interrupts so far."""
+    """Stop raising for the interrupts so far; an alarm that comes yet is ignored, also while the interpreter ends."""
+    signal.signal(signal.SIGALRM, signal.SIG_IGN)
     signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
-def _interrupt(_number: int, frame: FrameType | None) -> None:
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    if number == signal.SIGINT:
+        signal.signal(signal.SIGALRM, _interrupt)
+    elif signal.getsignal(signal.SIGALRM) is signal.SIG_IGN:  # it was on its way when the interrupts were cleared
+        return
     signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
     if isinstance(sys.exception(), KeyboardInterrupt):  # it is being handled
         return

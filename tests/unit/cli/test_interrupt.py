@@ -34,6 +34,19 @@ def test_an_interrupt_that_was_handled_is_not_raised_again() -> None:
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
+def test_an_alarm_that_comes_after_the_interrupt_was_cleared_does_nothing() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+    on_its_way = signal.getsignal(signal.SIGALRM)
+    clear_interrupt()
+    signal.raise_signal(signal.SIGALRM)
+    assert callable(on_its_way)
+    on_its_way(signal.SIGALRM, None)  # Python calls handlers later than signals come
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
 def test_an_interrupt_within_a_callback_of_the_compiler_is_raised_behind_it() -> None:
     is_done = []
 
