@@ -6,10 +6,10 @@ Each group is reported once, with the first shared plant, and once more when its
 
 >>> ours, fleet = keys.monitor_token("a", "01"), keys.fleet_token("0f", "1", "1", keys.fleet_member("02", "reactor/*"))
 >>> others = OtherMonitors(ours, lambda: ["a"])
->>> others.note(ours, is_alive=True)
->>> others.note(fleet, is_alive=True)
+>>> others.on_token(ours, is_alive=True)
+>>> others.on_token(fleet, is_alive=True)
 Report(plant='a', other='fleet reactor/* (1 shard)', is_alive=True)
->>> others.note(fleet, is_alive=False).is_alive
+>>> others.on_token(fleet, is_alive=False).is_alive
 False
 """
 

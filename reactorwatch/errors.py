@@ -15,8 +15,8 @@ class InputError(ValueError):
 def describe_unknown(what: str, name: str, valid: Iterable[str]) -> str:
     """Describe an unknown name, with a hint at the closest valid one, and the valid names.
 
-    >>> describe_unknown("input", "qq", ("qc",))
-    "unknown input 'qq'; did you mean 'qc'? (valid: qc)"
+    >>> describe_unknown("input", "flwo", ("flow",))
+    "unknown input 'flwo'; did you mean 'flow'? (valid: flow)"
     """
     names = list(valid)
     close = difflib.get_close_matches(name, names, n=1)

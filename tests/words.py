@@ -52,7 +52,6 @@ PEOPLE = re.compile(
 
 EXCEPTIONS = {
     "reactorwatch/cli/alarm.py::By: people, who": "an operator is a person",
-    "reactorwatch/diagnosis/report/svg.py::plot: people, who": "a reader is a person",
 }
 """Entries that stay, each with its reason."""
 

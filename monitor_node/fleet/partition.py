@@ -6,15 +6,15 @@ states, which takes a moment. A stalled process receives that only after its del
 first.
 
 >>> second, linked = 1_000_000_000, [True]
->>> absence = LeaseMonitor(lambda: linked[-1])
->>> [absence.lasts(time_s * second) for time_s in (0, 1)]
+>>> lease = LeaseMonitor(lambda: linked[-1])
+>>> [lease.is_expired(time_s * second) for time_s in (0, 1)]
 [False, False]
->>> absence.begins(now_ns=second)
+>>> lease.expire(now_ns=second)
 >>> linked.append(False)
->>> [absence.lasts(time_s * second) for time_s in (2, 6)]
+>>> [lease.is_expired(time_s * second) for time_s in (2, 6)]
 [True, True]
 >>> linked.append(True)
->>> [absence.lasts(time_s * second) for time_s in (7, 8, 20)]  # twelve seconds after it looked last
+>>> [lease.is_expired(time_s * second) for time_s in (7, 8, 20)]  # twelve seconds after it looked last
 [True, False, True]
 """
 

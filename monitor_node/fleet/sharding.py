@@ -45,7 +45,7 @@ WHOLE = Shard(1, 1)
 def parse_shard(text: str) -> Shard:
     """Parse a shard.
 
-    >>> parsed("2/5")
+    >>> parse_shard("2/5")
     Shard(number=2, of=5)
 
     Raises:

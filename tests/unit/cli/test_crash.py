@@ -81,7 +81,7 @@ def test_an_unexpected_error_is_one_line_with_the_path_of_a_report(
     folder: Path, typed: str, monkeypatch: Patch, capsys: Shown
 ) -> None:
     for name in (
-        "recorder.tools.inspect.look_over",
+        "recorder.tools.inspect.inspect",
         "reactorwatch.cli.linear_models.describe",
         "reactorwatch.spc.run_length.design.design",
     ):
@@ -103,7 +103,7 @@ def test_where_no_report_can_be_written_the_line_names_the_place(
     folder: Path, monkeypatch: Patch, capsys: Shown
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(folder / "nowhere"))
-    monkeypatch.setattr("recorder.tools.inspect.look_over", crashing)
+    monkeypatch.setattr("recorder.tools.inspect.inspect", crashing)
     assert run(["info", "plant0.mcap"], monkeypatch) == crash.EXIT_CODE
     said = capsys.readouterr().err
     assert said.count("\n") == 1
@@ -225,7 +225,7 @@ def test_a_recording_of_a_plant_with_an_impossible_name_is_watched_under_no_name
     "fails",
     [
         "reactorwatch.diagnosis.report.page.as_page",
-        "reactorwatch.cli.diagnosis.with_differences",
+        "reactorwatch.cli.diagnosis.report_object",
         "reactorwatch.cli.diagnosis.write_extended_model",
         "reactorwatch.cli.diagnosis_drawing.write_drawing",
     ],
@@ -249,7 +249,7 @@ def test_an_input_error_is_not_a_crash(folder: Path, monkeypatch: Patch, capsys:
     def refuse(*_: object) -> None:
         raise InputError("no such reactor")
 
-    monkeypatch.setattr("recorder.tools.inspect.look_over", refuse)
+    monkeypatch.setattr("recorder.tools.inspect.inspect", refuse)
     assert run(["info", "plant0.mcap"], monkeypatch) == 2
     assert capsys.readouterr().err == "reactorwatch: no such reactor\n"
     assert not list((folder / "reports").iterdir())

@@ -38,7 +38,10 @@ def test_the_bus_is_on_loopback_unless_asked() -> None:
     ("text", "expected"),
     [
         ("[monitr]\n", "unknown table 'monitr'; did you mean 'monitor'? (valid: bus, plant, monitor"),
-        ("[monitor]\ntraning_min = 1\n", "unknown key 'traning_min'; did you mean 'training_min'? (valid: plant,"),
+        (
+            "[monitor]\ntraning_min = 1\n",
+            "unknown key 'traning_min'; did you mean 'training_min'? (valid: ewma_weight,",
+        ),
         ("[monitor]\ntraining_min = 'long'\n", "training_min"),
         ("[monitor]\ntraining_min = -5.0\n", "training_min must be in [0.001, 1e+06], got -5"),
         ("monitor = 3\n", "'monitor' must be a table, like [monitor]"),
