@@ -8,20 +8,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from reactorwatch.api import (
-        InputError,
-        Monitor,
-        ProcessModel,
-        Record,
-        backtest,
-        charts,
-        diagnose,
-        effects,
-        identify,
-        processes,
-        read_record,
-        simulate,
-    )
+    from reactorwatch.api import Monitor, backtest, diagnose, effects, identify, processes, read_record, simulate
+    from reactorwatch.errors import InputError
+    from reactorwatch.process.model import ProcessModel
+    from reactorwatch.records.record import Record
+    from reactorwatch.spc.charts import catalogue as charts
 
 __version__ = "0.1.0"
 

@@ -39,23 +39,8 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.record import Record, to_minutes, to_time_ns
 from reactorwatch.runtime.model_file import read_extended_model
-from reactorwatch.spc.charts import catalogue as charts
+from reactorwatch.spc.charts import catalogue as charts  # noqa: F401 # a public name
 from recorder.tools.player import samples_of
-
-__all__ = [
-    "InputError",
-    "Monitor",
-    "ProcessModel",
-    "Record",
-    "backtest",
-    "charts",
-    "diagnose",
-    "effects",
-    "identify",
-    "processes",
-    "read_record",
-    "simulate",
-]
 
 ProcessLike: TypeAlias = str | Path | ProcessModel
 

@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.records import Attachment, Metadata
-
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.errors import InputError
@@ -23,6 +21,7 @@ from recorder.policy.latched import LatchedMessages
 from recorder.storage.gaps import GAP, from_metadata
 from recorder.storage.mcap_chunks import damage_error, read_summary, span_ns
 from recorder.storage.mcap_scan import LATEST_NS, RawMessage, Scan, Wanted, profile_of
+from recorder.storage.mcap_types import Attachment, Metadata
 from recorder.storage.mcap_writer import METADATA, RecordingWriter
 from recorder.tools.overlap import group_overlapping
 

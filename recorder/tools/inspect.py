@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mcap.records import Metadata
-
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, decode
 from reactorwatch.contract.messages_pb2 import Sample
@@ -16,6 +14,7 @@ from recorder.columns.run_splitter import RunSplitter
 from recorder.storage.gaps import GAP, from_metadata
 from recorder.storage.mcap_chunks import metadata_records
 from recorder.storage.mcap_scan import Scan
+from recorder.storage.mcap_types import Metadata
 from recorder.storage.mcap_writer import own_metadata
 from recorder.tools.mcap_file import read_messages, read_metadata, recordings_in, zero_from
 from recorder.tools.overview import Overview, overview

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from mcap.summary import Summary
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
@@ -39,6 +38,7 @@ from recorder.storage.mcap_chunks import (
     sorted_messages,
     span_ns,
 )
+from recorder.storage.mcap_types import Summary
 from recorder.storage.mcap_writer import RecordingWriter, own_metadata
 from recorder.tools.overlap import group_overlapping
 
