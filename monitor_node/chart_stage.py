@@ -14,12 +14,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.alarms.alarms import ChartAlarm, Explanation
+from monitor_node.alarms.alarms import ChartAlarm, Explanation, chart_point
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import ChartPoint
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.baseline import Baseline, complete_rows, memory_sds
 from reactorwatch.spc.charts.base import Chart, Judgement, Shown, SignalChart
@@ -33,7 +32,7 @@ from reactorwatch.stored_state import StoredState
 Array = NDArray[np.float64]
 
 ALL = "all"
-"""What a chart of all outputs together is of."""
+"""Name in place of a signal for charts of all outputs together."""
 
 SD = "sd"
 """The unit of what charts show: standard deviations of the residual."""
@@ -196,7 +195,7 @@ class ChartWatch:
         self._chosen: list[str] = []
         self._passed: list[float] = []
         self.widths: list[float] = []
-        """Of the Shewhart limits, one an output, in standard deviations; they are shown about the predictions."""
+        """Shewhart limits, one an output, in standard deviations; they are shown about the predictions."""
 
     def _priority(self, signal: str) -> PriorityName | None:
         if signal != ALL:
@@ -332,7 +331,7 @@ class ChartWatch:
                 if judgement is None:
                     continue
                 if points:
-                    publications.append(Publication(watched.keys[index], _point(time_ns, judgement)))
+                    publications.append(Publication(watched.keys[index], chart_point(time_ns, judgement)))
                 rule = alarm.memory.rule
                 if judgement.out or rule.standing or rule.recent:
                     stood = rule.standing
@@ -367,14 +366,3 @@ def _split(data: bytes, count: int) -> list[bytes]:
     if len(states) != count:
         raise ValueError(f"there must be {count} charts, got {len(states)}")
     return states
-
-
-def _point(time_ns: int, judgement: Judgement) -> ChartPoint:
-    return ChartPoint(
-        time_ns=time_ns,
-        statistic=judgement.statistic,
-        centre=judgement.centre,
-        lower_limit=judgement.lower_limit,
-        upper_limit=judgement.upper_limit,
-        out=judgement.out,
-    )

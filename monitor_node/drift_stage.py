@@ -8,13 +8,12 @@ budget of false alarms.
 from collections.abc import Callable
 from itertools import compress
 
-from monitor_node.alarms.alarms import Explanation
+from monitor_node.alarms.alarms import Explanation, chart_point
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.predictor import ArxPredictor
 from monitor_node.config import MonitorConfig
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import ChartPoint
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterT2
@@ -106,7 +105,7 @@ class DriftWatch:
                 continue
             judgement, parts = found
             if self._told:
-                publications.append(Publication(key, _point(time_ns, judgement)))
+                publications.append(Publication(key, chart_point(time_ns, judgement)))
             if signal in self._alarms:
                 explain = _explaining(signal, parts)
                 publications += self._board.evaluate(self._alarms[signal], time_ns, judgement, "", explain)
@@ -117,14 +116,3 @@ def _explaining(signal: str, parts: dict[str, float]) -> Callable[[Judgement], E
     largest = sorted(parts, key=lambda name: -parts[name])[:NAMED]
     text = f"the model of {signal} that adapts has drifted from its reference, most in {' and '.join(largest)}"
     return lambda _: Explanation(text, {signal: 1.0})
-
-
-def _point(time_ns: int, judgement: Judgement) -> ChartPoint:
-    return ChartPoint(
-        time_ns=time_ns,
-        statistic=judgement.statistic,
-        centre=judgement.centre,
-        lower_limit=judgement.lower_limit,
-        upper_limit=judgement.upper_limit,
-        out=judgement.out,
-    )

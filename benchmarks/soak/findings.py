@@ -1,4 +1,4 @@
-"""What came of a soak: is every sample accounted for, was every fault alarmed once, is memory level?
+"""Results of a soak: is every sample accounted for, was every fault alarmed once, is memory level?
 
 - **Samples.** A monitor puts each sample of a plant into a row, or counts it as lost (it never came, by its number) or
   late (its row had been judged). The rows have three places each, of which one or two are empty in each incomplete

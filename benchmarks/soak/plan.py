@@ -62,8 +62,8 @@ KINDS: tuple[tuple[Kind, Manner], ...] = (
     ("kill router", "closed"),
     ("flood", "closed"),
 )
-"""What befalls the processes. Each comes once before any comes again. Only the second monitor is killed: the memory of
-the first is to be seen for the whole run."""
+"""Disturbances of the processes. Each comes once before any comes again. Only the second monitor is killed, so that the
+memory of the first is measured over the whole run."""
 
 
 class Blow(NamedTuple):

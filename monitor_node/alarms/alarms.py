@@ -9,7 +9,7 @@ from monitor_node.alarms.incidents import Count
 from monitor_node.alarms.on_off_delay import OnOffDelay, OnOffDelayState
 from monitor_node.alarms.states import Event, State, next_state
 from reactorwatch.contract import keys
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Contribution, Priority, Suspect
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, ChartPoint, Contribution, Priority, Suspect
 from reactorwatch.spc.charts.base import Judgement, format_quantity
 
 PRIORITIES: Mapping[str, Priority] = {
@@ -269,3 +269,15 @@ class ChartAlarm:
         if self.memory.above:
             return deviation <= self._reach * (judgement.upper_limit - judgement.centre)
         return deviation >= self._reach * (judgement.lower_limit - judgement.centre)
+
+
+def chart_point(time_ns: int, judgement: Judgement) -> ChartPoint:
+    """Message of a point on a chart."""
+    return ChartPoint(
+        time_ns=time_ns,
+        statistic=judgement.statistic,
+        centre=judgement.centre,
+        lower_limit=judgement.lower_limit,
+        upper_limit=judgement.upper_limit,
+        out=judgement.out,
+    )

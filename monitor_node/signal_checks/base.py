@@ -14,7 +14,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.spc.charts.base import Judgement
 
 PLANT = "plant"
-"""What an alarm of all signals together is of."""
+"""Name in place of a signal for alarms of all signals together."""
 
 SENSOR = "sensor"
 
