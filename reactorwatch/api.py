@@ -2,7 +2,7 @@
 
     >>> import reactorwatch as rw
     >>> sorted(rw.processes)
-    ['cstr', 'tanks']
+    ['cstr', 'tanks', 'three_tanks']
 
 A process is given by its name, by the path of an extended model (`extended.json`, as `diagnose` writes it) or as a
 `ProcessModel`. Times are in minutes, values in the units of the process.

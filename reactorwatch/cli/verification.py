@@ -16,7 +16,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import format_utc, to_minutes
-from reactorwatch.runtime.config import parse_toml, read_settings, section
+from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.terminal import printable_lines
 from recorder.tools.inspect import gaps_in, zero_ns_of
 from recorder.tools.mcap_file import has_clock, one_plant_in, read_messages, read_metadata
@@ -82,7 +82,7 @@ def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: 
         tables = read_settings(config)
     elif SETTINGS in metadata:
         try:
-            tables = parse_toml(metadata[SETTINGS].encode())
+            tables = parse_tables(metadata[SETTINGS].encode())
         except InputError as error:
             raise InputError(f"{file}: its metadata's settings: {error}") from error
     else:
