@@ -51,12 +51,12 @@ from monitor_node.quiet.slots import NEVER_NS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.runtime import bus_zenoh
-from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
+from tests.memory_bus import Exchange, MemoryBus
 
 SIZES = (1, 10, 100, 1000, 10_000)
 FAST_SAMPLES = 600_000

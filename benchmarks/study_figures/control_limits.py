@@ -8,9 +8,9 @@ import numpy as np
 
 from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, VERMILION, label, panels
 from benchmarks.study_figures.figure import Finding, verdict
+from benchmarks.study_figures.flow_chart import Conclusion, follow
 from benchmarks.study_figures.study import TRAINING_ROWS, Study
 from reactorwatch.arrays import Array
-from reactorwatch.identification.flow_chart import Conclusion, follow
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import UNITS, Record
 from reactorwatch.spc.charts.shewhart import Shewhart, probability_out

@@ -9,6 +9,7 @@ import numpy as np
 from benchmarks.study_figures.canvas import GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, panels
 from benchmarks.study_figures.control_limits import ORDER, watched
 from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.flow_chart import Conclusion, follow
 from benchmarks.study_figures.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
@@ -17,7 +18,6 @@ from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
 from reactorwatch.contract.codec import encode
-from reactorwatch.identification.flow_chart import Conclusion, follow
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record, to_minutes
 from recorder.tools.player import samples_of

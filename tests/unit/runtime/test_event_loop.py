@@ -10,8 +10,8 @@ import pytest
 
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply, Health
-from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 
 FAR = 10**19

@@ -17,9 +17,9 @@ from monitor_node.storage.fleet_states import FleetStates
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
-from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.metrics import FleetMetrics
 from reactorwatch.runtime.security.command_rate import PER_NAME
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
 
 from ..fleets import PLANTS, QUICK, fleet, row_by_row, run_of

@@ -21,7 +21,7 @@ from monitor_node.storage.kept_aside import find_kept_aside, keep_aside
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.bus import Exchange, MemoryBus
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
 
 from ..fleets import of_plant

@@ -7,7 +7,7 @@ import pytest
 from monitor_node.storage import state_recovery
 from monitor_node.storage.state_recovery import StateRecovery
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.runtime.bus import Exchange, MemoryBus
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
 
 
