@@ -46,7 +46,7 @@ def main() -> None:
     blind = best_of(lambda: backtest.run(messages, MonitorConfig(isolation=False)))
     short = best_of(lambda: backtest.run(sound, MonitorConfig()))
     peer = best_of(lambda: decode_all(messages))
-    print(f"back-test            {ROWS / ours:10,.0f} rows/s   ({len(result.raised)} alarms; goal: 20,000)")
+    print(f"back-test            {ROWS / ours:10,.0f} rows/s   ({len(result.raised_alarms)} alarms; goal: 20,000)")
     print(f"without isolation    {ROWS / blind:10,.0f} rows/s   (the looks cost {ours - blind:.2f} s)")
     print(f"{SHORT:,} sound rows     {SHORT / short:10,.0f} rows/s")
     print(f"decoding alone       {ROWS / peer:10,.0f} rows/s")

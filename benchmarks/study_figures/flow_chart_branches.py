@@ -78,9 +78,9 @@ def draw(study: Study, drawing: Drawing) -> Finding:
 def _isolated(name: str, record: Record) -> str:
     """What the monitor says of a record, as a row of the table."""
     result = backtest.run([encode(item) for item in samples_of(record, _PLANT)], MonitorConfig(plant=_PLANT))
-    if not result.raised:
+    if not result.raised_alarms:
         return f"| {name} | none | | |"
-    first = min((alarm for alarm, _ in result.raised), key=lambda alarm: alarm.raised_ns)
+    first = min((alarm for alarm, _ in result.raised_alarms), key=lambda alarm: alarm.raised_ns)
     raised = f"{to_minutes(first.raised_ns, result.first_ns):.1f} min"
     if not first.suspects:
         return f"| {name} | {raised} | none told | |"

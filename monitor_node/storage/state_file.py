@@ -110,4 +110,4 @@ class StateFile:
         self.was_aside = fitting is not None
         if fitting is not None:
             return f"{status}; {fitting.name} fits and is in use again"
-        return f"{status}{';' if data is None else ', and'} the monitor learns anew"
+        return f"{status}{';' if data is None else ', and'} the monitor learns again"

@@ -166,7 +166,7 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folde
             processes.start(node)
         started = time.monotonic()
         while not woken.wait(POLL_S):
-            ended = processes.ended()
+            ended = processes.exit_codes()
             failed = {node: code for node, code in ended.items() if code or node != "plant"}
             if failed:
                 node, code = next(iter(failed.items()))

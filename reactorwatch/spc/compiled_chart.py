@@ -198,10 +198,10 @@ class Bank(Generic[Kind]):
         return any(out) and any(here and much > 0.0 for here, much in zip(present, out, strict=True))
 
     def judgement(self, plant: int) -> Judgement:
-        """What a chart said of its last value."""
+        """Judgement of the newest value of a chart."""
         plants = self._plants
-        told = self._numbers[STATISTIC * plants + plant : SETTINGS * plants : plants].tolist()
-        statistic, centre, lower, upper, out = told
+        columns = self._numbers[STATISTIC * plants + plant : SETTINGS * plants : plants].tolist()
+        statistic, centre, lower, upper, out = columns
         return Judgement(statistic, centre, lower, upper, out > 0.0)
 
     def restart(self, plants: NDArray[np.bool_] | None = None) -> None:

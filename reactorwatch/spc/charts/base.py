@@ -1,8 +1,8 @@
-"""What a control chart is here: one statistic, judged sample by sample against limits.
+"""Control charts: one statistic each, evaluated sample by sample against limits.
 
-All charts speak this language: `update(x)` takes the next value, a number or a vector, and returns a `Judgement`; all
-that a chart is and remembers is in `state`, and `from_state` goes on where it was, bit for bit. A chart never restarts
-by itself after a point that is out: `restart` does, when whoever watches it says that the cause is gone.
+All charts have one interface: `update(x)` takes the next value, a number or a vector, and returns a `Judgement`.
+`state` holds the parameters and the memory of a chart, and `from_state` resumes from it, bit for bit. A chart does not
+restart by itself after a point that is out: its owner calls `restart` when the cause is gone.
 """
 
 from abc import ABC, abstractmethod
@@ -69,8 +69,8 @@ class Shown(NamedTuple):
     """A signal as texts of alarms show it.
 
     Attributes:
-        name: of the signal.
-        unit: of its values.
+        name: name of the signal.
+        unit: unit of its values.
         scale: one standard deviation of its prewhitened residual, in that unit.
         passed: the part of a lasting shift of the signal that its prewhitened residual shows.
     """
@@ -136,8 +136,8 @@ class SignalChart(Chart):
         """The text of an alarm, and each signal's share of it.
 
         Args:
-            judgement: of the newest sample, which is out.
-            signal: what the chart is of.
+            judgement: the judgement of the newest sample, which is out.
+            signal: the signal of the chart.
         """
         return f"{signal.name} is {judgement.side} the limit of its {self.name} chart", {signal.name: 1.0}
 
@@ -153,7 +153,7 @@ def format_quantity(value: float, unit: str, form: str = ".3g") -> str:
     Args:
         value: the number.
         unit: empty where it is not known; 1 where there is none.
-        form: of the number.
+        form: format of the number.
     """
     return f"{value:{form}}" if unit in ("", "1") else f"{value:{form}} {unit}"
 

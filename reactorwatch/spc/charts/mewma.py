@@ -55,10 +55,10 @@ class Mewma(JointChart):
     [False, False, False, True]
 
     Args:
-        mean: of the vectors when all is well, shape (p,).
-        covariance: of the vectors, shape (p, p).
+        mean: mean of the vectors when all is well, shape (p,).
+        covariance: covariance of the vectors, shape (p, p).
         weight: lambda, of the newest vector, in (0, 1]; small for small changes.
-        limit: H, of z' Sz^-1 z.
+        limit: limit H of z' Sz^-1 z.
 
     Raises:
         InputError: an argument out of its range, or covariance not a symmetric positive definite matrix of that size.

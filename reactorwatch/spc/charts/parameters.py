@@ -45,7 +45,7 @@ class ParameterState(ChartState, frozen=True):
 
 
 class ParameterT2(Chart):
-    """How far the parameters are from the reference's, measured by how far chance takes them.
+    """Distance of the parameters from the reference's, scaled by the covariance of its chance part.
 
     Usually `reactorwatch.spc.parameter_drift.learn` makes it.
 
@@ -56,12 +56,12 @@ class ParameterT2(Chart):
     {'a1': 25.0, 'b1': 1.0}
 
     Args:
-        names: of the parameters, p of them.
+        names: names of the p parameters.
         root: shape (m, p) for m directions that are charted: root' root is the inverse of the difference's covariance.
-        limit: of T2.
+        limit: limit of T2.
         inputs: shape (q, p): makes the inputs in a regressor, and the 1 of an offset, white as in the training; without
             it nothing is known of their excitation, and it is taken to be as in the training.
-        forgetting: of the model that adapts.
+        forgetting: forgetting factor of the adaptive model.
 
     Raises:
         InputError: an argument out of its range, or of a shape that does not fit the names.
@@ -124,8 +124,9 @@ class ParameterT2(Chart):
         """Judge the parameters after a row; see `Chart`.
 
         Args:
-            difference: of the parameters, adapted less reference's, shape (p,), in the units of the training.
-            regressor: of the row, shape (p,), likewise; without it the row is taken to excite as those in memory.
+            difference: adaptive parameters minus those of the reference, shape (p,), in the units of the training.
+            regressor: regressor of the row, shape (p,), in the same units; without it the row is taken to excite as
+                those in memory.
 
         Raises:
             ValueError: a wrong shape, or a value that is not finite; the chart's state is as before.

@@ -35,9 +35,9 @@ class T2(JointChart):
     (False, True)
 
     Args:
-        mean: of the vectors when all is well, shape (p,).
-        covariance: of the vectors, shape (p, p).
-        limit: of T2.
+        mean: mean of the vectors when all is well, shape (p,).
+        covariance: covariance of the vectors, shape (p, p).
+        limit: limit of T2.
 
     Raises:
         InputError: limit is not a positive number, or covariance not a symmetric positive definite matrix of that size.
