@@ -141,7 +141,7 @@ class _OfAll:
         return self._chart.state.to_bytes()
 
     def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...]) -> bool:
-        """Take a row in; whether the chart is out. A row in which an output is missing is left out."""
+        """Update with a row; returns True if the chart is out. A row with a missing output is skipped."""
         if not self._all:
             e, known = list(compress(e, self._evaluated)), list(compress(known, self._evaluated))
         if False in known or True in withheld:

@@ -199,7 +199,7 @@ class FleetNode(FleetMonitor):
                 log.warning(refused)
             if self.evictions > self._evicted_logged:
                 self._evicted_logged = self.evictions
-                log.warning("plants were forgotten that showed no token and said nothing more", so_far=self.evictions)
+                log.warning("unverified plants without messages were evicted", so_far=self.evictions)
         return publications
 
     def next_tick_ns(self) -> int:

@@ -94,7 +94,7 @@ class SignalChecks:
 
     @property
     def state(self) -> SignalChecksState:
-        """A copy of all that is remembered; the alarms are the board's."""
+        """A copy of the full state; the alarms belong to the board."""
         states = {check.name: state for check in self._checks if (state := check.state) != b""}
         own = {field: states.pop(name) for name, field in FIELDS.items()}
         return SignalChecksState(**own, others=states)

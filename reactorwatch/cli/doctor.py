@@ -240,7 +240,7 @@ def _check_nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Findin
                 yield Finding(node, "is alive")  # a replay and the diagnosis node publish no health
             else:
                 cure = "call doctor with its settings; or listen for longer than its health_period_s by --timeout"
-                yield Finding(node, f"is alive, and says nothing of itself within {timeout_s:g} s", cure)
+                yield Finding(node, f"is alive, and publishes no health within {timeout_s:g} s", cure)
         else:
             yield _check_node(node, *reports[node])
     if (monitors := listener.monitors.count(plant)) > 1:

@@ -1,6 +1,6 @@
 """Predictions of an alternative explanation for a new input, and how well another alternative could imitate them.
 
-The causes stay in the plant: what has set in keeps its magnitude at the end of the record, a sine goes on. So each
+The causes stay in the plant: each keeps its magnitude at the end of the record, and a sine continues. So each
 alternative predicts the outputs for an input that has not been tried.
 
 Assume alternative i is true. The evidence against alternative j is not the difference of the two predictions but the

@@ -148,15 +148,15 @@ def access_control(
         monitors = keys.monitor_token(plant, "*")
         everything = [f"{root}/**", f"{root}/**/{CACHE_SUFFIX}", f"{root}/*/{PROOF}", monitors, keys.FLEET_TOKENS]
         reading = [
-            _rule(plant, "hear", ("ingress",), READ_INGRESS, everything),
+            _rule(plant, "subscribe", ("ingress",), READ_INGRESS, everything),
             _rule(plant, "receive", ("egress",), READ_EGRESS, everything),
-            _rule(plant, "ask what is remembered", ("ingress",), ("query",), everything[1:2]),
+            _rule(plant, "query caches", ("ingress",), ("query",), everything[1:2]),
         ]
         rules += reading
         for role in ROLES:
             name = common_name(plant, role.name)
             asks = [f"{root}/{keys.COMMAND}/{command}" for command in role.asks]
-            own = [_rule(name, "ask", ("ingress",), ("query",), asks)]
+            own = [_rule(name, "command", ("ingress",), ("query",), asks)]
             if role.nodes:
                 published = [f"{root}/{expression}" for expression in role.key_space]
                 caches = [f"{key}/{CACHE_SUFFIX}" for key in published]
@@ -166,10 +166,10 @@ def access_control(
                 alive += [monitors] if role.name == "monitor" else []
                 own += [
                     _rule(name, "publish", ("ingress",), ("put", "reply"), [*published, *caches, *proofs]),
-                    _rule(name, "remember", ("ingress",), ("declare_queryable", "liveliness_token"), caches),
+                    _rule(name, "cache", ("ingress",), ("declare_queryable", "liveliness_token"), caches),
                     _rule(name, "answer", ("ingress",), ("declare_queryable", "reply"), answers),
-                    _rule(name, "be alive", ("ingress",), ("liveliness_token",), alive),
-                    _rule(name, "be asked", ("egress",), ("query",), [*everything[1:2], *answers]),
+                    _rule(name, "declare token", ("ingress",), ("liveliness_token",), alive),
+                    _rule(name, "receive queries", ("egress",), ("query",), [*everything[1:2], *answers]),
                     _rule(name, "see subscribers", ("egress",), ("declare_liveliness_subscriber",), everything),
                 ]
                 others = [f"{root}/{expression}" for expression in key_space_of_others(role)]

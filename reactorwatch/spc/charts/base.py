@@ -23,11 +23,11 @@ LARGEST_VALUE = 1e30
 
 
 class Judgement(NamedTuple):
-    """A chart's view of one sample.
+    """Point of a chart for one sample.
 
     Attributes:
-        statistic: what is plotted.
-        centre: where it should be.
+        statistic: plotted value.
+        centre: expected value of the statistic.
         lower_limit: below it, it is out.
         upper_limit: above it, it is out.
         out: whether it is beyond a limit, or against another rule of the chart.
@@ -41,16 +41,16 @@ class Judgement(NamedTuple):
 
     @property
     def side(self) -> str:
-        """On which side of the centre the statistic is."""
+        """Side of the centre on which the statistic is."""
         return "above" if self.statistic > self.centre else "below"
 
 
 class ChartState(StoredState, frozen=True):
-    """All that a chart, or a bank of charts, is and remembers; the base of what each kind stores."""
+    """Base class of the stored states of a chart or a bank of charts."""
 
 
 class Setting(NamedTuple):
-    """A number that people can set for a chart: a key of the monitor's settings.
+    """A number that a user can set for a chart: a key of the monitor's settings.
 
     Attributes:
         key: begins with the chart's name.
@@ -100,7 +100,7 @@ class Chart(ABC):
     @classmethod
     @abstractmethod
     def from_state(cls, state: Any) -> Self:
-        """The chart that goes on, bit for bit, where `state` was taken.
+        """Resume a chart, bit for bit, from its state.
 
         Raises:
             ValueError: the state is damaged.
@@ -109,7 +109,7 @@ class Chart(ABC):
     @property
     @abstractmethod
     def state(self) -> ChartState:
-        """A copy of all that it is and remembers."""
+        """A copy of the full state."""
 
     @abstractmethod
     def update(self, x: Any) -> Judgement:

@@ -1,4 +1,4 @@
-"""Charts of many signals that are driven by few: T2 of what the signals have in common, SPE of what is left over.
+"""Charts of many signals that are driven by few: T2 of what the signals have in common, SPE of the residual.
 
 Jackson & Mudholkar (1979), Control procedures for residuals associated with principal component analysis,
 Technometrics 21(3). Signals, each scaled by its mean and standard deviation in the training, are x. The eigenvectors of
@@ -140,7 +140,7 @@ class _PcaChart(JointChart):
 
     @property
     def state(self) -> PcaModel:
-        """All that it is; it has no memory."""
+        """The model; the chart has no memory."""
         return self._model
 
     def restart(self) -> None:

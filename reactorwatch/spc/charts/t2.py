@@ -20,7 +20,7 @@ from reactorwatch.spc.joint_chart import JointChart, correlation, joint_limit
 
 
 class T2State(ChartState, frozen=True):
-    """All that a T2 chart is: the arguments of `T2`."""
+    """State of a T2 chart: the arguments of `T2`."""
 
     mean: list[float]
     covariance: list[list[float]]
@@ -64,7 +64,7 @@ class T2(JointChart):
 
     @property
     def state(self) -> T2State:
-        """All that it is; it has no memory."""
+        """The arguments; the chart has no memory."""
         return T2State(self.whitening.mean.tolist(), self.whitening.covariance.tolist(), self.limit)
 
     def update(self, x: ArrayLike) -> Judgement:
