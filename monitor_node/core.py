@@ -382,7 +382,7 @@ class Monitor:
         return self._pipeline.expected_false_alarms
 
     @property
-    def left_out(self) -> dict[str, str]:
+    def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
         never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
         return dict.fromkeys(never_came, NO_VALUE) | self._pipeline.left_out

@@ -271,7 +271,7 @@ def backtest(record: Record, process: ProcessLike | None = None, **settings: Any
     Args:
         record: with the signals that the settings name (by default those of the reactor).
         process: model whose equations judge; None: as the settings say.
-        settings: of the monitor, see `docs/watching.md`, such as `training_min=50` or `charts=("ewma", "t2")`.
+        settings: settings of the monitor, see `docs/watching.md`, such as `training_min=50` or `charts=("ewma", "t2")`.
 
     Raises:
         InputError: settings that do not fit together, or a record without a usable value.
@@ -292,7 +292,7 @@ class AlarmChange(msgspec.Struct, frozen=True):
     """A change of an alarm.
 
     Attributes:
-        time_min: of the row that caused it.
+        time_min: time of the row that caused it, in minutes.
         alarm: its name, `chart/signal`.
         event: `raised`, `cleared`, `suspects` and others, see `docs/alarms.md`.
         priority: `low`, `medium`, `high` or `critical`.
@@ -313,7 +313,7 @@ class Monitor:
 
     Args:
         process: model whose equations judge; None: as the settings say.
-        settings: of the monitor, as for `backtest`.
+        settings: settings of the monitor, as for `backtest`.
 
     >>> monitor = Monitor(outputs=("T",), reference="arx", training_min=10.0)
     >>> monitor.update(0.0, {"qc": 100.0, "T": 440.0})
@@ -341,7 +341,7 @@ class Monitor:
         Args:
             time_min: time of the row, at least 0.
             values: by signal; a signal that is missing was not measured.
-            units: of the signals, by name; None: not known.
+            units: units of the signals, by name; None: not known.
 
         Returns:
             The changes of alarms that the row causes.

@@ -35,8 +35,10 @@ IRREGULAR = _words("""
 NOT_PARTICIPLES = _words("bed bleed breed embed exceed feed hundred indeed need proceed red seed shed speed succeed")
 PREDICATES = _words("are can had has have is must on should was were")
 """First words that make a predicate (is_closed) or an event (on_closed) of a participle."""
-IMPERATIVES = _words("add check count drop mark note presume skip")
-"""First words of which a participle is the object: count_lost."""
+IMPERATIVES = _words("""
+    add check count drop list map mark note pop presume publish run search skip solve subscribe
+""")
+"""First words of which a participle is the object or the manner: count_lost, map_unordered."""
 CONJUNCTIONS = _words("be if until when while")
 PARTICLES = _words("""
     after again anew apart as at away back before between by down for from here in into now of off on once out over
@@ -51,6 +53,9 @@ PEOPLE = re.compile(
 )
 
 EXCEPTIONS = {
+    "monitor_node/alarms/annunciator.py::AnnunciatorState: people, told": "a field of the stored state",
+    "monitor_node/baseline/predictor.py::PredictorState: people, told": "a field of the stored state",
+    "reactorwatch/api.py::DiagnosisResult.extended: participle": "a public name",
     "reactorwatch/cli/alarm.py::By: people, who": "an operator is a person",
 }
 """Entries that stay, each with its reason."""

@@ -83,7 +83,7 @@ class FleetMonitor:
         self._watched = WatchedPlants(config, start_ns, model, points=points)
         self._pending = PendingPlants()
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
-        self._registered: dict[str, None] = {}  # all plants, whoever owns them
+        self._registered: dict[str, None] = {}  # all plants, with any owner
         self._unverified = UnverifiedPlants()
         self._signals = (config.input, *config.outputs)
         self._plants: dict[str, str] = {}  # plants that are not quiet, by key of a sample
@@ -148,7 +148,7 @@ class FleetMonitor:
         if state is None and not self._restore_kept_aside(plant, monitor):
             monitor.resume_from_alarms(alarm for alarm in self._handed_over.of(plant) if alarm.alarm != TIMEOUT_ALARM)
             if unusable:
-                monitor.notes.append(f"{unusable}; the plant is learned anew{kept}")
+                monitor.notes.append(f"{unusable}; the plant is learned again{kept}")
                 self._store(plant, monitor.to_bytes())  # or the folder would not list the plant
         elif unusable:
             monitor.notes.append(f"{unusable}{kept}")
@@ -247,13 +247,13 @@ class FleetMonitor:
         return plant not in self._unverified and (own is None or own.rows > 0)
 
     @property
-    def evicted(self) -> int:
+    def evictions(self) -> int:
         """Number of unverified plants that were evicted."""
         return self._unverified.evicted
 
-    def received_of(self, plant: str) -> int | None:
+    def received_count(self, plant: str) -> int | None:
         """Number of messages of a plant; None: it is not owned."""
-        return self._watched.received_of(plant)
+        return self._watched.received_count(plant)
 
     def count_not_stored(self, plant: str) -> None:
         """Count a failure to store the state of a plant."""

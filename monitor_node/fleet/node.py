@@ -197,9 +197,9 @@ class FleetNode(FleetMonitor):
                 log.debug("traceback", plant=plant, traceback=text)
             if (refused := self._commands_refused.report(now_ns)) is not None:
                 log.warning(refused)
-            if self.evicted > self._evicted_logged:
-                self._evicted_logged = self.evicted
-                log.warning("plants were forgotten that showed no token and said nothing more", so_far=self.evicted)
+            if self.evictions > self._evicted_logged:
+                self._evicted_logged = self.evictions
+                log.warning("unverified plants without messages were evicted", so_far=self.evictions)
         return publications
 
     def next_tick_ns(self) -> int:
@@ -277,18 +277,18 @@ class FleetNode(FleetMonitor):
         for plant in self._states.pop_lost():
             log.info("another monitor has stored a newer state", plant=plant)
             self.rejoin(plant, now_ns)
-        due = [plant for plant in self._changed if self.received_of(plant) is not None]
+        due = [plant for plant in self._changed if self.received_count(plant) is not None]
         self._changed.clear()
         if not self._round and not 0 <= now_ns - self._round_ns < self._every_ns:
             self._round, self._round_ns = self.plants, now_ns
         looked = 0
         while self._round and looked < MOST_STORED and self._states.has_room:
             plant, looked = self._round.pop(), looked + 1
-            if self.received_of(plant) not in (None, self._stored_at.get(plant)):
+            if self.received_count(plant) not in (None, self._stored_at.get(plant)):
                 due.append(plant)
         for plant in filter(self.is_worth_storing, due):
             self._states.put(plant, self.state_of(plant))
-            self._stored_at[plant] = self.received_of(plant) or 0
+            self._stored_at[plant] = self.received_count(plant) or 0
 
     def _count_failures(self) -> None:
         """Count failures to store states, and log each reason once."""

@@ -132,8 +132,8 @@ class QuietPlants:
         state = self._form.read(plant, self._slots.plants[slot], rest, rows, [])
         return seal_state(msgspec.structs.replace(state, settings=self._settings | {"plant": plant}))
 
-    def received_of(self, plant: str) -> int:
-        """How many messages of a plant came."""
+    def received_count(self, plant: str) -> int:
+        """Number of messages of a plant."""
         return int(self._slots.plants["received"][self._slots.of[plant]])
 
     def not_stored(self, plant: str) -> None:

@@ -258,7 +258,7 @@ class SpikeCheck(SignalCheck):
 
     @property
     def state(self) -> list[SpikeState | None]:
-        """Of each output; None for an output that is not judged; none before the training ends."""
+        """State of each output; None for an output without the check; empty before the training ends."""
         return [None if spike is None else spike.state for spike in self._spikes]
 
     def restore(self, state: list[SpikeState | None]) -> None:

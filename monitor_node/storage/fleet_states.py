@@ -1,11 +1,10 @@
-"""The folder in which a fleet's monitors keep what they remember, a file for each plant.
+"""Folder of the stored states of a fleet's monitors, a file for each plant.
 
 A file is written whole or not at all, by a thread of its own, so that a slow disk delays no alarm. Monitors that share
-the fleet may share the folder: who takes a plant over goes on from what the one before stored.
+the fleet may share the folder: a monitor that takes a plant over resumes from the state that the last owner stored.
 
-Two may take themselves for in charge of a plant for a moment: one of them was cut off, or frozen. So nobody writes over
-a file that is not the one that he has read or written last, by its time and size; he is told that another has
-(`pop_lost`).
+Two monitors may own a plant for a moment, after one of them was cut off or frozen. So a monitor does not overwrite a
+file that changed, by its time and size, since the monitor itself read or wrote it; `pop_lost` returns such plants.
 
 A state that cannot be used is kept aside, and used again when it fits (see `kept_aside`). A file that is no state is
 left alone, and nothing is stored of its plant.

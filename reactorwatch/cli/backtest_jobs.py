@@ -121,7 +121,7 @@ def _row(file: Path, found: dict[str, Any]) -> Row:
     }
 
 
-def _failed(file: Path, reason: str) -> Row:
+def _error_row(file: Path, reason: str) -> Row:
     return {"file": str(file), **dict.fromkeys((*_COLUMNS, *_OF_ALARMS)), "error": reason}
 
 
@@ -143,4 +143,4 @@ def _summary(rows: Sequence[Row]) -> str:
     return f"{as_table(lines)}\n\n{len(rows)} files: {counts}"
 
 
-BACKTEST = JobKind("watching", run_job, _failed, _summary)
+BACKTEST = JobKind("watching", run_job, _error_row, _summary)

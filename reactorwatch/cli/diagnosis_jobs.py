@@ -140,15 +140,15 @@ _COLUMNS = ("samples", "span_min", "seconds", "verdict", "causes", "location", "
 
 def _row(file: Path, diagnosis: Diagnosis, seconds: float) -> Row:
     report = as_object(diagnosis, str(file), seconds)
-    report |= {"causes": " + ".join(map(_written, diagnosis.causes)), "delta_bic": report["gain"]["delta_bic"]}
+    report |= {"causes": " + ".join(map(_fault_text, diagnosis.causes)), "delta_bic": report["gain"]["delta_bic"]}
     return {"file": str(file), **{name: report[name] for name in _COLUMNS}, "error": None}
 
 
-def _failed(file: Path, reason: str) -> Row:
+def _error_row(file: Path, reason: str) -> Row:
     return {"file": str(file), **dict.fromkeys(_COLUMNS), "error": reason}
 
 
-def _written(cause: Cause) -> str:
+def _fault_text(cause: Cause) -> str:
     """Format a cause as a fault: `coolant_flow:step:-0.0497@312min`."""
     size, onset = cause.parameters["size"], cause.parameters.get("onset")
     begin = "" if onset is None else f"@{onset.value:.4g}min"
@@ -189,4 +189,4 @@ def _summary(rows: Sequence[Row]) -> str:
     return f"{as_table(lines)}\n\n{len(rows)} files: {counts}"
 
 
-DIAGNOSIS = JobKind("diagnosing", run_job, _failed, _summary)
+DIAGNOSIS = JobKind("diagnosing", run_job, _error_row, _summary)

@@ -1,4 +1,4 @@
-"""What a record says: `simulate`, `backtest` and `diagnose`."""
+"""Commands on records: `simulate`, `backtest` and `diagnose`."""
 
 from pathlib import Path
 from typing import Annotated

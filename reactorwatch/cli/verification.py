@@ -133,10 +133,10 @@ def _text(report: dict[str, Any]) -> str:
         lines.append(f"{report['differing']} DIFFER:")
     for item in report["differences"][:MAX_LINES]:
         values = f": recorded {_short(item['recorded'])}, again {_short(item['again'])}"
-        told = item["what"] + (values if item["recorded"] and item["again"] else "")
-        lines.append(f"  {item['at_min']:9.4g} min  {item['topic']}: {told}")
+        text = item["what"] + (values if item["recorded"] and item["again"] else "")
+        lines.append(f"  {item['at_min']:9.4g} min  {item['topic']}: {text}")
     if report["differing"] > MAX_LINES:
-        lines.append(f"  and {report['differing'] - MAX_LINES} more (--json tells the first hundred)")
+        lines.append(f"  and {report['differing'] - MAX_LINES} more (--json lists the first hundred)")
     if report["after_the_end"]:
         lines.append(f"{report['after_the_end']} more would have come after the end of the recording")
     lines += [f"note: {note}" for note in report["notes"]]

@@ -69,5 +69,5 @@ class CodeCache:
 
 
 def user_cache() -> CodeCache:
-    """The cache of the user who runs this process."""
+    """The cache of the current user."""
     return CodeCache(platformdirs.user_cache_path("reactorwatch") / "machine_code")

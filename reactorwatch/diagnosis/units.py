@@ -2,7 +2,7 @@
 
 With its inputs at their median, a plant is within a few scales of one of the model's steady states, whatever its
 faults. If the record is further off, and would be near one with one of its signals multiplied by a unit conversion, the
-unit is wrong; likewise if a median is out of the signal's bounds. If the rows are so far apart that the process has
+unit is wrong, and also if a median is out of the signal's bounds. If the rows are so far apart that the process has
 forgotten each before the next, or the record ends before the process has moved, its times have another unit, or it
 carries no information.
 """

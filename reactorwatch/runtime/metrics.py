@@ -80,7 +80,7 @@ class Metrics:
                 None: the node has no alarms.
         """
 
-        def published(publication: Publication) -> None:
+        def on_publication(publication: Publication) -> None:
             message = publication.message
             if isinstance(message, Health):
                 self._health = message
@@ -90,7 +90,7 @@ class Metrics:
             if changed is not None:
                 self._by_state = Counter(alarm.state for alarm in changed)
 
-        return published
+        return on_publication
 
     def collect(self) -> "Iterator[Metric]":
         """Yield the metrics; those not known yet are left out."""

@@ -45,7 +45,7 @@ class JointChart(Chart):
 
         Args:
             e: prewhitened residuals without missing ones, shape (rows, signals).
-            names: of the signals.
+            names: names of the signals.
         """
         count = len(names)
         if count < 2:
@@ -68,7 +68,7 @@ class JointChart(Chart):
 
         Args:
             x: the newest sample, which is out.
-            signals: of the sample, in order.
+            signals: signals of the sample, in order.
         """
         parts = np.maximum(self.contributions(x), 0.0)
         shares = parts / np.sum(parts)
@@ -79,7 +79,7 @@ class JointChart(Chart):
 
 
 def correlation(e: Array) -> Array:
-    """Of the columns, shape (columns, columns); 0 with one that does not vary."""
+    """Correlation matrix of the columns, shape (columns, columns); 0 with one that does not vary."""
     off = e - e.mean(axis=0) if len(e) else np.zeros((1, e.shape[1]))
     lengths = np.linalg.norm(off, axis=0)
     products = np.outer(lengths, lengths)

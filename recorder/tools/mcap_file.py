@@ -68,7 +68,7 @@ def read_messages(
         _files(path), lambda file: file.span
     )  # not within a generator: errors are raised at the call
 
-    def wanted(key: str) -> bool:
+    def is_selected(key: str) -> bool:
         topic = keys.parse(key)
         if topic is None:
             return kinds is None and plant is None
@@ -76,10 +76,10 @@ def read_messages(
 
     def read(file: _File) -> Iterator[RecordedMessage]:
         if is_in_order(file.summary):
-            numbers = {number for number, channel in file.summary.channels.items() if wanted(channel.topic)}
+            numbers = {number for number, channel in file.summary.channels.items() if is_selected(channel.topic)}
             found = ordered_messages(file.path, file.summary, numbers)
         else:
-            found = (entry for entry in sorted_messages(file.path, file.summary) if wanted(entry.key))
+            found = (entry for entry in sorted_messages(file.path, file.summary) if is_selected(entry.key))
         return found if file.first else (entry for entry in found if not entry.latched)
 
     if len(groups) == len(groups[0]) == 1:

@@ -42,6 +42,7 @@ def test_a_participle_is_no_name_of_a_function(name: str) -> None:
         "read",
         "run_until_stopped",
         "count_lost",
+        "map_unordered",
         "need",
         "on",
     ],

@@ -36,9 +36,9 @@ RECOVERY_TIMEOUT_NS = 15_000_000_000
 POLL_NS = 250_000_000
 START_WINDOW_NS = 500_000_000
 MAX_LOST_RANGES = 100_000
-"""Ranges of lost numbers of a stream that are remembered, so that a message in one can still be released."""
+"""Largest number of stored ranges of lost numbers of a stream, so that a message in one can still be released."""
 MAX_STREAMS = 100_000
-"""Streams that are remembered. A restarted publisher is another stream, and so is each plant of a fleet."""
+"""Largest number of stored streams. A restarted publisher is another stream, and so is each plant of a fleet."""
 ORPHAN_TIMEOUT_NS = 60_000_000_000
 """Time after which a stream is evicted that started with another number than 0, without a known last number and without
 a second message: garbage makes one stream a message."""

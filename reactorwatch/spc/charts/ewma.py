@@ -66,7 +66,7 @@ class Ewma(CompiledChart):
     [False, True]
 
     Args:
-        mean: of the values when all is well.
+        mean: mean of the values when all is well.
         sigma: their standard deviation.
         weight: lambda, of the newest value, in (0, 1]; small for small changes.
         limit: L, in standard deviations of the average in the long run.
@@ -110,4 +110,4 @@ def designed_limit(arl0: float, weight: float, learned: Prewhitening) -> float:
         weight: lambda.
         learned: the training.
     """
-    return false_alarm_budget.widened(ewma_limit(arl0, weight), weight, learned)
+    return false_alarm_budget.widen_limit(ewma_limit(arl0, weight), weight, learned)

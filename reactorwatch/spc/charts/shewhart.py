@@ -95,7 +95,7 @@ class Shewhart(CompiledChart):
     [False, False, True, True]
 
     Args:
-        mean: of the values when all is well.
+        mean: mean of the values when all is well.
         sigma: their standard deviation.
         width: L, in sigma.
         rules: some of 1, 2, 3, 4.
@@ -133,7 +133,7 @@ class Shewhart(CompiledChart):
 
     @property
     def mean(self) -> float:
-        """Of the values when all is well."""
+        """Mean of the values when all is well."""
         return self.setting(_MEAN)
 
     @property
@@ -151,14 +151,14 @@ def designed_width(p: float, learned: Prewhitening) -> float:
     """The width L that a point is beyond with the probability p.
 
     Args:
-        p: of a single point.
+        p: probability of a single point.
         learned: the training.
     """
-    return false_alarm_budget.widened(float(-special.ndtri(0.5 * p)), 1.0, learned)
+    return false_alarm_budget.widen_limit(float(-special.ndtri(0.5 * p)), 1.0, learned)
 
 
 def probability_out(width: float) -> float:
-    """How often a point is out by rule 1 by chance, for independent normal values.
+    """Probability that a point is out by rule 1 by chance, for independent normal values.
 
     >>> round(probability_out(3.0), 5)
     0.0027

@@ -191,7 +191,7 @@ def test_a_state_that_cannot_be_used_is_told_and_the_plant_learned_anew(runs: di
     assert (monitor.plants, monitor.monitor("a").rows) == (["a"], 10)
     ((plant, line),) = monitor.reports(0)
     assert plant == "a"
-    assert "learned anew; a is kept aside" in line
+    assert "learned again; a is kept aside" in line
 
 
 def test_what_is_told_of_a_plant_that_is_anothers_by_then_is_passed_over() -> None:

@@ -341,7 +341,7 @@ def test_a_fleet_s_unusable_state_is_reported_before_its_plant_says_anything(
     for data in (b"", b"reactorwatch monitor\x00\x01 and then no state"):
         (tmp_path / "a.state").write_bytes(data)
         assert fleet_of(tmp_path, 3, []).plants == ["a"]
-        assert "the plant is learned anew, and the state kept as a.state.damaged" in capsys.readouterr().out
+        assert "the plant is learned again, and the state kept as a.state.damaged" in capsys.readouterr().out
     assert sorted(files(tmp_path)) == ["a.state", "a.state.damaged", "a.state.damaged.2"]
     assert FleetStates(tmp_path).plants == ["a"]
 
