@@ -160,8 +160,8 @@ class Monitor:
     def _reject(self, signal: str, sample: HeldSample, run: SequenceCheck) -> None:
         self.rejects.add(
             "out_of_place",
-            f"{signal} number {sample.number} at {sample.time_ns} ns does not follow number {run.number} at "
-            f"{run.time_ns} ns; do two plants publish as {self.config.plant}?",
+            f"{signal} number {sample.number} at {sample.time_ns} ns does not follow number {run.newest} at "
+            f"{run.newest_ns} ns; do two plants publish as {self.config.plant}?",
         )
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:

@@ -24,7 +24,7 @@ _MEMORY, _LEARN_FROM = MEMORY, LEARN_FROM
 
 @jit
 def allowed_ns(limit: float, count: int, mean: float, deviation: float) -> int:
-    """As `Spacing.allowed_ns`; -1: too little is known."""
+    """Allowed time, as in `DataTimeout`; -1: too little is known."""
     if count < _LEARN_FROM:
         return -1
     return int(limit * (mean + DEVIATIONS * deviation))
