@@ -5,11 +5,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, get_args
 
-from reactorwatch.description.reading import Reading
-from reactorwatch.description.units import conversion
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.file_format import FileFormat
+from reactorwatch.units import conversion
 
 Role = Literal["input", "output", "setpoint", "mode", "label"]
 
@@ -83,7 +83,7 @@ class Process:
         effects: what can be named as a cause and injected as a fault.
         controllers: controllers of its inputs, for a simulation.
         parameters: constants of the equations that are given, by name: value, standard deviation and unit.
-        reading: hints on how to read its files.
+        file_format: statements on how to read its files; the rest is guessed for each file.
         has_generic_effects: whether the effects made from the equations are added to its own.
 
     Raises:
@@ -96,7 +96,7 @@ class Process:
     effects: tuple[Effect, ...] = ()
     controllers: tuple[object, ...] = ()
     parameters: Mapping[str, KnownParameter | tuple[float, float, str]] = field(default_factory=dict)
-    reading: Reading = field(default_factory=Reading)
+    file_format: FileFormat = field(default_factory=FileFormat)
     has_generic_effects: bool = False
 
     def __post_init__(self) -> None:

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 import msgspec
 
 from reactorwatch.description.process import KnownParameter, Process, Signal
-from reactorwatch.description.reading import Reading, parse_period
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.records.file_format import FileFormat
 from reactorwatch.toml_text import parse_toml
 
 _Column = str | Annotated[int, msgspec.Meta(ge=1)]
@@ -55,6 +55,16 @@ class _Document(msgspec.Struct, forbid_unknown_fields=True):
     file: _File = msgspec.field(default_factory=_File)
 
 
+_KEYS = {
+    "--time-unit": "[time] unit",
+    "--time-format": "[time] format",
+    "--period": "[time] period",
+    "--zone": "[time] zone",
+    "--separator": "[file] separator",
+    "--decimal": "[file] decimal",
+}
+"""Keys by the options that state the same."""
+
 _PLACE = re.compile(r" - at `\$\.?([^`]*)`")
 _SIGNAL = re.compile(r"signals\[(\d+)\]")
 _UNKNOWN_FIELD = re.compile(r"Object contains unknown field `(\w+)`")
@@ -82,15 +92,6 @@ def parse_process(content: bytes, catalogue: Mapping[str, Callable[[], Process]]
         document = msgspec.convert(tables, _Document)
     except msgspec.ValidationError as error:
         raise InputError(_describe_error(str(error), tables)) from error
-    reading = Reading(
-        time_column=document.time.column,
-        period_s=None if document.time.period is None else parse_period(document.time.period),
-        time_unit=document.time.unit,
-        zone=document.time.zone,
-        time_format=document.time.format,
-        missing=document.missing,
-        **msgspec.structs.asdict(document.file),
-    )
     described: dict[str, Any] = {}
     if document.equations is not None:
         if document.equations not in catalogue:
@@ -101,10 +102,38 @@ def parse_process(content: bytes, catalogue: Mapping[str, Callable[[], Process]]
         document.name,
         tuple(Signal(**msgspec.structs.asdict(item)) for item in document.signals),
         parameters={name: KnownParameter(item.value, item.sd, item.unit) for name, item in document.parameters.items()},
-        reading=reading,
+        file_format=_file_format(document),
         has_generic_effects=document.generic,
         **described,
     )
+
+
+def _file_format(document: _Document) -> FileFormat:
+    """Statements of a document about its files.
+
+    Raises:
+        InputError: a value breaks a rule.
+    """
+    time = document.time
+    if time.column is not None and time.period is not None:
+        raise InputError(
+            f"[time] has a column or a period, got column {time.column!r} and period {time.period!r}; leave one out"
+        )
+    try:
+        return FileFormat(
+            time=None if time.column is None else str(time.column),
+            time_unit=time.unit,
+            zone=time.zone,
+            time_format=time.format,
+            period=time.period,
+            missing=tuple(str(cell) for cell in document.missing),
+            **msgspec.structs.asdict(document.file),
+        )
+    except InputError as error:
+        text = str(error)
+        for option, key in _KEYS.items():
+            text = text.replace(option, key)
+        raise InputError(text) from error
 
 
 def _describe_error(text: str, tables: Mapping[str, Any]) -> str:

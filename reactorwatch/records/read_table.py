@@ -23,7 +23,7 @@ from reactorwatch.records.time_column import (
     choose_time,
     read_times,
 )
-from reactorwatch.records.units import UnitError, convert
+from reactorwatch.units import UnknownUnitError, conversion
 
 RUN = "run"
 """Column with the run of each row, if a record has several."""
@@ -276,20 +276,18 @@ def _convert(
     signal = source.signal
     if not (signal.unit and source.unit) or signal.unit == source.unit:
         return values, signal.unit or source.unit
+    name = f"{layout.path}, row {layout.header_row}, column {layout.names[source.column]!r}"
     try:
-        converted = convert(values, source.unit, signal.unit)
-    except UnitError:
-        raise InputError(
-            f"{layout.path}, row {layout.header_row}, column {layout.names[source.column]!r}: "
-            f"expected a unit that converts to {signal.unit}, got {source.unit!r}; "
-            f"correct the header or the unit of signal {signal.name!r}"
-        ) from None
-    if converted is None:
+        scale, offset = conversion(source.unit, signal.unit, name)
+    except UnknownUnitError:
         notes.append(f"{signal.name} in {signal.unit}, whatever {source.unit!r} means")
         return values, signal.unit
-    if converted is not values:
-        notes.append(f"{signal.name} from {source.unit} to {signal.unit}")
-    return converted, signal.unit
+    except InputError as error:
+        raise InputError(f"{error}; correct the header or the unit of signal {signal.name!r}") from error
+    if (scale, offset) == (1.0, 0.0):
+        return values, signal.unit
+    notes.append(f"{signal.name} from {source.unit} to {signal.unit}")
+    return scale * values + offset, signal.unit
 
 
 def _read_long(

@@ -61,10 +61,10 @@ def test_a_file_describes_signals_times_and_cells(tmp_path: Path) -> None:
     q, th = process.signals
     assert (q.name, q.role, q.unit, q.column) == ("q", "input", "l/s", None)
     assert (th.column, th.resolution, th.bounds) == (3, 0.01, (0.0, 100.0))
-    reading = process.reading
-    assert (reading.time_column, reading.time_unit, reading.zone) == ("ts", "s", "Europe/Berlin")
-    assert (reading.header, reading.separator, reading.decimal, reading.transposed) == (False, ";", ",", None)
-    assert reading.missing == (-999, "Bad Input")
+    stated = process.file_format
+    assert (stated.time, stated.time_unit, stated.zone) == ("ts", "s", "Europe/Berlin")
+    assert (stated.header, stated.separator, stated.decimal, stated.transposed) == (False, ";", ",", None)
+    assert stated.missing == ("-999.0", "Bad Input")
 
 
 def test_a_file_names_equations_of_the_catalogue_and_their_constants(tmp_path: Path) -> None:
@@ -123,14 +123,14 @@ def test_a_python_file_that_gives_no_process_is_refused_with_its_path(tmp_path: 
         ("bounds = [0, 100]", "bounds = [100, 0]", "bounds must be a lower and a higher number"),
         ("bounds = [0, 100]", "bounds = [0]", "bounds"),
         ("resolution = 0.01", "resolution = -1", "resolution must be a positive number"),
-        ('zone = "Europe/Berlin"', 'zone = "Berlin"', "zone must be a time zone such as 'Europe/Berlin'"),
-        ('zone = "Europe/Berlin"', 'zone = "../etc"', "zone must be a time zone"),
-        ('zone = "Europe/Berlin"', 'period = "4 s"', "a column of times or a period"),
-        ('unit = "s"', 'unit = "sec"', "unit of time must be one of s, min, h, iso, got 'sec'"),
-        ('column = "ts"', 'period = "4"', "period must be a positive number with a unit"),
-        ('decimal = ","', 'decimal = ";"', "decimal must be"),
-        ('separator = ";"', 'separator = ","', "separator and decimal must differ"),
-        ('separator = ";"', 'separator = "::"', "separator must be one character"),
+        ('zone = "Europe/Berlin"', 'zone = "Berlin"', r"\[time\] zone must be a time zone such as Europe/Berlin"),
+        ('zone = "Europe/Berlin"', 'zone = "../etc"', r"\[time\] zone must be a time zone"),
+        ('zone = "Europe/Berlin"', 'period = "4 s"', "a column or a period"),
+        ('unit = "s"', 'unit = "sec"', r"unknown \[time\] unit 'sec'"),
+        ('column = "ts"', 'period = "4"', r"\[time\] period must be a positive number with its unit"),
+        ('decimal = ","', 'decimal = ";"', r"\[file\] decimal must be"),
+        ('separator = ";"', 'separator = ","', r"\[file\] separator and \[file\] decimal must differ"),
+        ('separator = ";"', 'separator = "::"', r"\[file\] separator must be one character"),
         ('name = "exchanger"', "", "missing required field `name`"),
         ('name = "exchanger"', 'name = "exchanger"\n    equations = "three_tank"', r"did you mean 'three_tanks'\?"),
         ('name = "exchanger"', 'name = "exchanger"\n    equations = "tanks"', "need the input 'u'"),

@@ -192,7 +192,7 @@ REFUSED = {
     "a unit of another quantity": (
         table(MINUTES, cells(), ("time_min", "qc", "C", "T [bar]")),
         FileFormat(),
-        "column 'T [bar]': expected a unit that converts to K, got 'bar'; correct the header",
+        "column 'T [bar]': unit must convert to 'K', got 'bar'; correct the header",
     ),
     "a column that is not there": (
         table(MINUTES, cells()),

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from reactorwatch.description.units import convert
 from reactorwatch.errors import InputError
+from reactorwatch.units import convert
 
 
 @pytest.mark.parametrize(
@@ -21,6 +21,8 @@ from reactorwatch.errors import InputError
         (1.0, "1", "%", 100.0),
         (60.0, "1/min", "s-1", 1.0),
         (1.0, "bar", "kPa", 100.0),
+        (2.0, "Nm3/h", "m3/h", 2.0),
+        (20.0, "C", "K", 293.15),
         (60.0, "V^0.5/min", "V^0.5/s", 1.0),
     ],
 )
