@@ -28,9 +28,7 @@ from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import Cause, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.output import check_output_folder
-from reactorwatch.runtime.model_file import read_extended_model
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ def make_jobs(
     paths = list(files)
     if elsewhere:
         paths, out = [file.absolute() for file in files], out and out.absolute()
-        asked = replace(asked, model=asked.model and asked.model.absolute())
+        asked = replace(asked, process=asked.process.absolute())
     folders = _folders(files, out)
     return [Job(*item, asked, as_json) for item in zip(files, paths, folders, strict=True)]
 
@@ -83,7 +81,7 @@ def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, fo
     Args:
         files: files to be diagnosed.
         out: as for `make_jobs`.
-        model: file of an extended model, or None.
+        model: file that describes the process, or None.
         force: as for `check_output_file`.
 
     Raises:
@@ -117,7 +115,7 @@ def run_job(job: Job) -> JobResult:
 
 
 def _check(asked: DiagnosisOptions) -> None:
-    model = cstr() if asked.model is None else read_extended_model(asked.model).build()
+    model = asked.process.load_model()
     if asked.uncertain is not None:
         parse_priors(asked.uncertain, model)
     check_limits(model, asked.limits)

@@ -17,13 +17,18 @@ FUNCTION = "process"
 
 DEFAULT_PROCESS = "cstr"
 
+FILE_KINDS = (".toml", ".py", ".json")
+"""Suffixes of files that describe a process."""
 
-def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS) -> Process:
+
+def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS, zero_ns: int = 0) -> Process:
     """Find a process.
 
     Args:
         process: a name in the catalogue; a path to a `.toml`, to a `.py`, whose function `process()` is run, or to an
             extended model (`.json`); or the process itself.
+        zero_ns: time from which the minutes of an extended model's effects are to count, in nanoseconds since
+            1970-01-01 UTC; 0: the zero that its file states.
 
     Raises:
         InputError: there is no such name or file, or the file does not describe a process; the text starts with its
@@ -34,9 +39,8 @@ def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS)
     if isinstance(process, ProcessModel):
         return describe_model(process, effects_of(process))
     path = Path(process)
-    readers = {".toml": _read_toml, ".py": _run_python, ".json": _read_extended_model}
-    read = readers.get(path.suffix.lower())
-    if read is None:
+    kind = path.suffix.lower()
+    if kind not in FILE_KINDS:
         catalogue = Catalogue()
         if str(process) not in catalogue:
             cure = ", or a path to a .toml, .py or .json file"
@@ -45,30 +49,23 @@ def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS)
     with wrap_read_errors(path):
         content = path.read_bytes()
     try:
-        return read(path, content)
+        if kind == ".toml":
+            return parse_process(content, Catalogue())
+        if kind == ".py":
+            return check_process(_call_function(path), f"{FUNCTION}()")
+        extended = parse_extended_model(content)
+        model = (extended.rebase(zero_ns) if zero_ns else extended).build()
+        return describe_model(model, effects_of(model))
     except InputError as error:
         raise InputError(f"process file {path}: {error}") from error
 
 
-def _read_toml(_: Path, content: bytes) -> Process:
-    return parse_process(content, Catalogue())
-
-
-def _read_extended_model(_: Path, content: bytes) -> Process:
-    model = parse_extended_model(content).build()
-    return describe_model(model, effects_of(model))
-
-
-def _run_python(path: Path, _: bytes) -> Process:
+def _call_function(path: Path) -> object:
     """Run a file of the user, as `python FILE` would, and call its function.
 
     Raises:
         InputError: it raises an error, or has no such function.
     """
-    return check_process(_call_function(path), f"{FUNCTION}()")
-
-
-def _call_function(path: Path) -> object:
     try:
         return runpy.run_path(str(path))[FUNCTION]()
     except InputError:

@@ -1,7 +1,7 @@
 """A process: its signals with their roles and, if there are any, equations, effects and controllers."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal, get_args
 
@@ -138,6 +138,23 @@ class Process:
             return None
         return self.equations.with_values({name: item.value for name, item in self._parameters_in_model_units.items()})
 
+    def without_equations(self) -> "Process":
+        """Copy with the signals alone."""
+        return replace(self, equations=None, effects=(), controllers=(), parameters={})
+
+    def require_model(self) -> ProcessModel:
+        """The model.
+
+        Raises:
+            InputError: the process has no equations.
+        """
+        if self.model is None:
+            raise InputError(
+                f"process {self.name!r}: must have equations for this, got none; name those of the catalogue with "
+                'equations = "NAME", or write them in a .py file'
+            )
+        return self.model
+
     @property
     def uncertain(self) -> dict[str, float]:
         """Standard deviations of the parameters that are not exact, by name, in the units of the equations."""
@@ -203,9 +220,9 @@ class Process:
 
 
 def describe_model(model: ProcessModel, effects: tuple[Effect, ...] = (), name: str | None = None) -> Process:
-    """Describe a model: each input and output is a signal of its name, with its unit and bounds."""
+    """Describe a model: each input and output is a signal of its name, with its unit."""
     signals = (
-        *(Signal(item.name, item.unit, "input", bounds=(item.lower, item.upper)) for item in model.inputs),
+        *(Signal(item.name, item.unit, "input") for item in model.inputs),
         *(Signal(item.name, item.unit, "output") for item in model.outputs),
     )
     return Process(name or model.name, signals, model, effects)
