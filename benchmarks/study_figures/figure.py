@@ -41,7 +41,7 @@ class Figure:
 
     Attributes:
         number: number in the study, in the report's order.
-        title: its subject.
+        title: subject of the figure.
         claim: statement of the report, as far as it is known.
         draw: function that puts it on an empty drawing and returns the finding.
         height_px: height of the picture, which is 900 px wide.
