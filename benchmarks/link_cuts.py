@@ -232,7 +232,7 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
     """A publisher and a recorder at a router.
 
     Args:
-        folder: where the file is written.
+        folder: folder of the recording.
         router: address of the router.
         whose: node whose link goes through the proxy.
         cache_messages: number of messages in the cache of the publisher.

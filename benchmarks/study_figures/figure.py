@@ -60,5 +60,5 @@ class Figure:
 
 
 def verdict(agrees: bool) -> Verdict:
-    """For a claim that is right or wrong as a whole."""
+    """Verdict on a claim that is right or wrong as a whole."""
     return Verdict.AGREES if agrees else Verdict.DISAGREES
