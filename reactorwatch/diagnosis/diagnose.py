@@ -279,7 +279,7 @@ def _describe_outliers(whole: Run, run: Run) -> list[str]:
     if count == 0:
         return []
     values = "1 value was" if count == 1 else f"{count} values were"
-    return [f"{values} excluded as outliers: each is far from its neighbours"]
+    return [f"{values} excluded as outliers"]
 
 
 def _smallest_sd(model: ProcessModel) -> list[float]:
