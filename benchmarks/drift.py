@@ -37,7 +37,7 @@ def adaptive_parameters(regressors: Array, outputs: Array, forgetting: float) ->
 
 
 def newey_west(scores: Array, lags: int) -> Array:
-    """Their long-run covariance with the weights of Bartlett."""
+    """Long-run covariance of scores with the weights of Bartlett."""
     total = scores.T @ scores
     for lag in range(1, lags):
         at_lag = scores[lag:].T @ scores[:-lag]
@@ -66,7 +66,7 @@ def alarms(chart: ParameterT2, differences: Array) -> float:
 
 
 def false_alarms(training: int, correlation: float) -> list[tuple[float, float]]:
-    """Their number over that promised and its standard error, of the three charts."""
+    """Number of false alarms over the promised one, and its standard error, of the three charts."""
     counts = []
     for seed in range(PLANTS):
         rng = np.random.default_rng(seed)
@@ -90,7 +90,7 @@ def false_alarms(training: int, correlation: float) -> list[tuple[float, float]]
 
 
 def reactor(u: Array, rng: np.random.Generator) -> Array:
-    """Its outputs C and T, with noise."""
+    """Outputs C and T of the reactor, with noise."""
     run = Simulator(cstr()).run(np.arange(u.size) / 10, u, np.array([0.1, 438.54]))
     return run.outputs + NOISE * rng.standard_normal(run.outputs.shape)
 

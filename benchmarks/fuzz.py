@@ -1,4 +1,4 @@
-"""Does anything that can be sent or written make a node fall over, or raise an alarm that is not its own?
+"""Fuzz test: no message, command, state or setting makes a node fail or raise a false alarm.
 
 Random and mutated messages are put between the samples of a sound plant and fed to the cores of monitor and recorder,
 runs of bad values take the place of samples while causes are looked for,

@@ -45,7 +45,7 @@ threading.Event().wait()
 
 
 class Arrivals:
-    """When what came, by the time of its sample."""
+    """Arrival times of messages, by the time of their samples."""
 
     def __init__(self) -> None:
         self.alarms: dict[int, float] = {}

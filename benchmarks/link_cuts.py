@@ -222,8 +222,8 @@ class Load:
     heard: Heard
     found: list[Found]
 
-    def go_on(self, span_s: float) -> None:
-        """Wait until as much more was published as is in so many seconds."""
+    def wait_for_rows(self, span_s: float) -> None:
+        """Wait for the rows of a number of seconds."""
         self.publisher.wait(self.publisher.sequence + round(span_s * ROWS_PER_S))
 
 
@@ -232,8 +232,8 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
     """A publisher and a recorder at a router.
 
     Args:
-        folder: where the file is written.
-        router: its address.
+        folder: folder of the recording.
+        router: address of the router.
         whose: node whose link goes through the proxy.
         cache_messages: number of messages in the cache of the publisher.
     """
@@ -251,7 +251,7 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
         tokens.wait(alive=True)
         publisher = Publisher(bus, RATE_PER_S)
         load = Load(proxy, publisher, bus, heard, [])
-        load.go_on(WARM_UP_S)
+        load.wait_for_rows(WARM_UP_S)
         yield load
         publisher.close()
         heard.wait(publisher.sequence * SIGNALS)
@@ -261,7 +261,7 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
         bus.close()
         observer.close()
         proxy.close()
-    load.found.append(look([path], publisher))
+    load.found.append(read_content([path], publisher))
 
 
 def connect_client(config: BusConfig) -> ZenohBus:
@@ -278,7 +278,7 @@ def cut(folder: Path, whose: Whose, manner: Manner, span_s: float, cache_message
         under_load(folder, endpoint, whose, cache_messages) as load,
         load.proxy.cut(manner),
     ):
-        load.go_on(span_s)
+        load.wait_for_rows(span_s)
     return load.found[0]
 
 
@@ -289,12 +289,12 @@ def kill_router(folder: Path, span_s: float, cache_messages: int = 10_000) -> Fo
         under_load(folder, endpoint, None, cache_messages) as load,
     ):
         router.kill()
-        load.go_on(span_s)
+        load.wait_for_rows(span_s)
         router.restart()
     return load.found[0]
 
 
-def look(files: Sequence[Path], publisher: Publisher) -> Found:
+def read_content(files: Sequence[Path], publisher: Publisher) -> Found:
     """Read the content of consecutive recordings."""
     numbers: dict[str, list[int]] = {}
     behind, newest = 0, 0
@@ -329,7 +329,7 @@ def main() -> None:
 
 
 def stick(folder: Path, span_s: float, cache_messages: int = 20_000) -> tuple[Found, Found]:
-    """Have one of two recorders stand still for a time, as one that waits for a broken disk; what the two then have."""
+    """Freeze one of two recorders, as a broken disk would; returns the content of both recordings."""
     stuck = folder / "stuck"
     stuck.mkdir()
     with (
@@ -339,12 +339,12 @@ def stick(folder: Path, span_s: float, cache_messages: int = 20_000) -> tuple[Fo
         heard = Heard(load.bus, "stuck")
         with recorder_process(stuck, endpoint, Tokens(load.bus, "stuck"), plant="stuck") as process:
             process.send_signal(signal.SIGSTOP)
-            load.go_on(span_s)
+            load.wait_for_rows(span_s)
             assert load.heard.wait(load.publisher.sequence * SIGNALS), "one that is stuck holds the other up"
             process.send_signal(signal.SIGCONT)
             load.publisher.close()
             heard.wait(load.publisher.sequence * SIGNALS)
-    return load.found[0], look(recordings_in(stuck), load.publisher)
+    return load.found[0], read_content(recordings_in(stuck), load.publisher)
 
 
 @contextlib.contextmanager

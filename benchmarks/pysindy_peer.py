@@ -43,7 +43,7 @@ Array = NDArray[np.float64]
 
 SEED, RECORDS, NOMINAL_RECORDS = 20_000_000, 13, 3
 THRESHOLDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)
-"""In scaled units; the last leaves nothing, which is the nominal model."""
+"""Thresholds in scaled units; the last leaves no term, which is the nominal model."""
 
 WINDOWS = (5, 9, 15)
 """Rows that are smoothed over, by a cubic."""
@@ -63,8 +63,8 @@ class Compared:
         seed: seed of the record.
         truth: hidden causes.
         before: error of the simulation of the nominal model on rows held out, over the true noise; larger of C and T.
-        extended: the same error of the extended model.
-        pysindy: the same error of the model that pysindy found.
+        extended: error of the extended model, over the noise.
+        pysindy: error of the model that pysindy found, over the noise.
         said: cause named by the diagnosis.
         terms: number of terms that pysindy added to the balances of C and of T.
     """

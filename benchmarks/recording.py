@@ -47,7 +47,7 @@ FSYNC_RATE_PER_S, FSYNC_SECONDS = 5_000, 30
 
 
 def samples(count: int) -> list[Encoded]:
-    """So many samples, a tenth of a minute apart, signal by signal."""
+    """A number of samples, a tenth of a minute apart, signal by signal."""
     out = []
     for number in range(count):
         row, signal_number = divmod(number, len(SIGNALS))

@@ -71,8 +71,8 @@ def _without(known: list[bool], withheld: tuple[bool, ...]) -> list[bool]:
 class _Banked:
     """Compiled charts, one an output.
 
-    `update` takes a row in and returns whether any chart is out; `judgement` is that of one chart, None if it had
-    nothing to judge. So it is with `_OfEach` and `_OfAll`.
+    `update` takes a row and returns True if any chart is out; `judgement` is that of one chart, None without a value.
+    `_OfEach` and `_OfAll` have the same methods.
     """
 
     def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
@@ -128,7 +128,7 @@ class _OfAll:
 
     Args:
         joint: the chart.
-        evaluated: which outputs it looks at.
+        evaluated: for each output, True if the chart uses it.
     """
 
     def __init__(self, joint: JointChart, evaluated: list[bool]) -> None:
@@ -207,7 +207,7 @@ class ChartWatch:
         """Choose the charts that can be made; returns the others, by alarm, each with the reason.
 
         Args:
-            evaluated: which outputs are evaluated.
+            evaluated: for each output, True if it is evaluated.
             e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
         """
         rows, signals = (
@@ -260,7 +260,7 @@ class ChartWatch:
 
         Args:
             state: state of the other charts.
-            evaluated: which outputs are evaluated.
+            evaluated: for each output, True if it is evaluated.
 
         Raises:
             ValueError: the state is damaged.

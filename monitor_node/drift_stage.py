@@ -65,7 +65,7 @@ class DriftWatch:
         """Number of its alarms that chance can raise.
 
         Args:
-            evaluated: which outputs are evaluated.
+            evaluated: for each output, True if it is evaluated.
         """
         return sum(evaluated) if self._alarms else 0
 
@@ -74,7 +74,7 @@ class DriftWatch:
 
         Args:
             predictors: predictors of the outputs, with references.
-            evaluated: which outputs are evaluated.
+            evaluated: for each output, True if it is evaluated.
             arl0: run length of each alarm without a fault, in rows.
         """
         notes: list[str] = []

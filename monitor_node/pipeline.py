@@ -64,7 +64,7 @@ class PlantPipeline:
         config: settings of the monitor.
         board: alarms of the plant.
         points: True to publish estimates, chart points and models.
-        model: as for `Monitor`.
+        model: see `Monitor`.
         failures: counter of errors in the search for causes; None: a new one.
 
     Raises:

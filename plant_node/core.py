@@ -85,9 +85,9 @@ class Plant:
     """The simulated plant.
 
     Args:
-        config: its settings; those about pace and health are not used here.
+        config: settings of the plant; those about pace and health are not used here.
         model: the process, without the faults of `config`.
-        scenario: its input.
+        scenario: input of the plant.
 
     Raises:
         InputError: settings that do not fit the model.

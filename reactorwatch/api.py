@@ -217,7 +217,7 @@ class RaisedAlarm(msgspec.Struct, frozen=True):
     """An alarm of a back-test.
 
     Attributes:
-        alarm: its name, `chart/signal`.
+        alarm: name of the alarm, `chart/signal`.
         priority: `low`, `medium`, `high` or `critical`.
         raised_min: minute in which it was raised.
         cleared_min: minute in which it was cleared; None: it is active at the end.
@@ -247,7 +247,7 @@ class BacktestResult(msgspec.Struct, frozen=True):
         reference: model that the rows are judged by, `equations` or `arx`; None: no row was judged.
         noise_levels: standard deviations of the equations' noise; None: they did not judge.
         alarms: the alarms in the order in which they were raised.
-        text: the same for people, as `reactorwatch backtest` prints it.
+        text: report as `reactorwatch backtest` prints it.
     """
 
     samples: int
@@ -294,7 +294,7 @@ class AlarmChange(msgspec.Struct, frozen=True):
 
     Attributes:
         time_min: time of the row that caused it, in minutes.
-        alarm: its name, `chart/signal`.
+        alarm: name of the alarm, `chart/signal`.
         event: `raised`, `cleared`, `suspects` and others, see `docs/alarms.md`.
         priority: `low`, `medium`, `high` or `critical`.
         text: a sentence for people.
@@ -341,7 +341,7 @@ class Monitor:
 
         Args:
             time_min: time of the row, at least 0.
-            values: by signal; a signal that is missing was not measured.
+            values: values by signal; a missing signal was not measured.
             units: units of the signals, by name; None: not known.
 
         Returns:

@@ -14,8 +14,8 @@ class Axis(NamedTuple):
     """An axis that holds some values.
 
     Attributes:
-        lower: its beginning.
-        upper: its end.
+        lower: start of the axis.
+        upper: end of the axis.
         ticks: shape (ticks,), between both.
         labels: a text for each tick.
     """

@@ -46,8 +46,13 @@ PARTICLES = _words("""
 """)
 """Words after a participle that are no nouns."""
 
-HEAD = re.compile(r"\W*(What|Whether|How|Which|Where|Who|Of|Likewise)\b")
-FRAGMENT = re.compile(r"^\s+\*{0,2}\w+(?: \(.*?\))?: (?:of|likewise|as it is|as above)\b", re.MULTILINE)
+HEAD = re.compile(
+    r"\W*(What|Whether|How|Which|Where|Who|Whose|Whom|When|Why|Until|Of|Likewise|Is|Are|Does|Did|Can|Has|Have)\b"
+)
+FRAGMENT = re.compile(
+    r"^\s+\*{0,2}\w+(?: \(.*?\))?: (?:(?:of|whose|as for|as in|likewise|as it is|as above)\b|(?:its|their) \w+[.;,])",
+    re.MULTILINE,
+)
 PEOPLE = re.compile(
     r"\b(he|him|his|she|who|whom|whoever|nobody|ours|strangers?|vouch(?:es|ed)?|told|anew|likewise)\b", re.IGNORECASE
 )

@@ -124,10 +124,10 @@ class Case:
 
 
 def cases(seeds: int) -> list[Case]:
-    """All faults in all sizes.
+    """Cases of all faults in all sizes.
 
     Args:
-        seeds: how many runs of each.
+        seeds: number of runs of each case.
     """
     found = []
     for place, fault in enumerate(BANK):

@@ -33,7 +33,7 @@ def oracle_suspect(case: Case, record: Record, truth: Truth) -> str:
     Args:
         case: case of the bank.
         record: record of that case.
-        truth: the same run without noise.
+        truth: noise-free run of that case.
     """
     since = int(np.argmax(record.time_min >= case.onset_min)) - 1
     misfits = {effect.name: _misfit(effect, case, record, truth, since) for effect in CAUSES}

@@ -51,18 +51,18 @@ def soak(plan: Plan, folder: Path, *, tell: bool = False) -> Findings:
                     f"row {site.row:6d}: {blow.kind}, {blow.manner} for {blow.rows} rows, {blow.monitor + 1}",
                     flush=True,
                 )
-            site.suffer(blow, witness.wait_for_monitors)
+            site.disturb(blow, witness.wait_for_monitors)
         site.allow(plan.rows)
         site.wait_for_row(plan.rows - 1)
         garbage = site.end_garbage()
         rows = -1
         while rows < (rows := sum(item.rows for item in witness.health.values())):  # as long as they go on
-            if witness.wait(lambda: all(_is_heard(plan, witness, plant) for plant in plan.plants), CATCH_UP_S):
+            if witness.wait(lambda: all(_is_complete(plan, witness, plant) for plant in plan.plants), CATCH_UP_S):
                 break
         return assess(plan, zero_ns, witness.alarms, witness.health, witness.longest_lag_ms, garbage, site.memory)
 
 
-def _is_heard(plan: Plan, witness: Witness, plant: str) -> bool:
+def _is_complete(plan: Plan, witness: Witness, plant: str) -> bool:
     """True if the health of a plant's monitor accounts for all of its samples."""
     health = witness.health.get(plant)
     return health is not None and not count_unaccounted(health, plan.rows)

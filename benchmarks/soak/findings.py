@@ -61,7 +61,7 @@ class Findings:
         duplicated: repeated samples.
         refused: rejected messages of the plants, by reason.
         garbage: number of garbage messages.
-        stalls: how often a monitor did not run for more than a second.
+        stalls: number of stalls of a monitor longer than a second.
         lag_ms: longest wait of a message in a monitor.
         faults: number of faults in the plants.
         alarmed_once: number of faults alarmed once.

@@ -48,7 +48,7 @@ FAULTS = (
     "activation_energy:step:0.01",
     "heat_loss:step:0.05",
 )
-"""So large that alarms come up within five rows and stand for good; no operator would wait for a chart."""
+"""Faults so large that alarms are raised within five rows and stay active."""
 
 Kind = Literal["kill monitor", "cut monitor", "cut plants", "kill router", "flood"]
 Manner = Literal["closed", "stalled"]

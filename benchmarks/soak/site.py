@@ -193,7 +193,7 @@ class Site:
 
     # --- disturbances ---------------------------------------------------------------------------------------
 
-    def suffer(self, blow: Blow, wait_for_monitors: Callable[[int], None]) -> None:
+    def disturb(self, blow: Blow, wait_for_monitors: Callable[[int], None]) -> None:
         """Strike a blow, and wait until all processes are there again.
 
         Args:

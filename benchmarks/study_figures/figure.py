@@ -41,7 +41,7 @@ class Figure:
 
     Attributes:
         number: number in the study, in the report's order.
-        title: its subject.
+        title: subject of the figure.
         claim: statement of the report, as far as it is known.
         draw: function that puts it on an empty drawing and returns the finding.
         height_px: height of the picture, which is 900 px wide.
@@ -60,5 +60,5 @@ class Figure:
 
 
 def verdict(agrees: bool) -> Verdict:
-    """For a claim that is right or wrong as a whole."""
+    """Verdict on a claim that is right or wrong as a whole."""
     return Verdict.AGREES if agrees else Verdict.DISAGREES

@@ -83,11 +83,11 @@ def _draw(study: Study, drawing: Drawing, family: str, free: bool) -> Finding:
 
 
 def _lead(fits: dict[tuple[int, str], float], output: str) -> float:
-    """By how many points the best order is ahead of the next."""
+    """Lead of the best order over the next, in points."""
     ranked = np.sort([fits[order, output] for order in ORDERS])
     return float(ranked[-1] - ranked[-2])
 
 
 def _third_lead(fits: dict[tuple[int, str], float], output: str) -> float:
-    """By how many points the highest order is ahead of the best of the others."""
+    """Lead of the highest order over the best of the others, in points."""
     return fits[max(ORDERS), output] - max(fits[order, output] for order in ORDERS[:-1])

@@ -60,6 +60,6 @@ def _heading(figure: Figure) -> str:
 
 
 def _anchor(figure: Figure) -> str:
-    """As GitHub makes it of the heading."""
+    """Anchor that GitHub makes of the heading."""
     kept = "".join(letter for letter in _heading(figure).lower() if letter.isalnum() or letter in " -")
     return kept.replace(" ", "-")

@@ -85,7 +85,7 @@ class Study:
 
     @cached_property
     def small_steps(self) -> Record:
-        """Without noise, and so close to 100 l/min that the plant is nearly linear."""
+        """Record without noise, so close to 100 l/min that the plant is nearly linear."""
         return self.quiet({"kind": "random-steps", "low": 99.9, "high": 100.1, "hold_min": 1.0})
 
     def quiet(self, scenario: dict[str, Any]) -> Record:

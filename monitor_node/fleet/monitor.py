@@ -49,8 +49,8 @@ class FleetMonitor:
         config: settings of each plant's monitor; its plant name is ignored.
         start_ns: present time.
         shards: monitors that share the fleet.
-        model: as for `Monitor`.
-        points: as for `Monitor`.
+        model: see `Monitor`.
+        points: see `Monitor`.
         request_history: called with a plant to adopt, and True if another owned it until now; returns True if its
             history will be passed to `on_history`. If not, the plant is adopted at once.
         store: called with a released plant and its state.
@@ -382,7 +382,7 @@ class FleetMonitor:
             return []
         if self._presume_gone_ns is not None and now_ns >= self._presume_gone_ns:
             self._presume_gone_ns = None
-            if self._shards.presume_gone():
+            if self._shards.drop_unseen():
                 self._reassign(now_ns)
         for plant in self._unverified.evict(now_ns):
             self._evict(plant)

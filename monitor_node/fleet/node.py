@@ -39,7 +39,7 @@ from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sende
 log = structlog.get_logger()
 
 DRAIN_TIMEOUT_S = 0.5
-"""As for the monitor of one plant."""
+"""Time for messages on their way at the end, as for the monitor of one plant."""
 
 UNCACHED = (keys.HEALTH, keys.ALARM_KPIS)
 """Periodic messages of each plant; a cache of them would take more memory than all else of a plant."""
@@ -50,7 +50,7 @@ MOST_TOKENS = 200
 LOG_INTERVAL_NS = 10_000_000_000
 
 POLL_NS = 100_000_000
-"""Interval of looks for recovered histories and for states to store."""
+"""Interval of checks for recovered histories and for states to store."""
 
 MOST_STORED = 20
 """Plants whose state is stored at a time: half a millisecond each. With thousands, each is stored less often."""
@@ -203,7 +203,7 @@ class FleetNode(FleetMonitor):
         return publications
 
     def next_tick_ns(self) -> int:
-        """See `FleetMonitor`; or the next look for recovered histories and states to store."""
+        """See `FleetMonitor`; or the next check for recovered histories and states to store."""
         due_ns = super().next_tick_ns()
         if self._states is None and not self._recovery.is_pending:
             return due_ns
@@ -232,7 +232,7 @@ class FleetNode(FleetMonitor):
             return []
         if absent:
             if self.shards.is_shared:
-                log.warning("the other monitors may take us for gone: nothing is judged until we are back")
+                log.warning("the lease of this monitor may have expired: its plants are paused until it is back")
                 self.pause()
             return []
         others = self._states.written_elsewhere(self.plants)
@@ -255,7 +255,7 @@ class FleetNode(FleetMonitor):
         if self._states is None:
             return ""
         if isinstance(why, ForeignFileError):
-            name = self._states.leave_alone(plant)
+            name = self._states.protect(plant)
             return f", and {name} is left as it is; nothing is stored of the plant until it is moved away"
         ending = OTHER_SETTINGS if isinstance(why, OtherSettingsError) else DAMAGED
         return f", and the state kept as {self._states.keep_aside(plant, ending)}"
@@ -281,9 +281,9 @@ class FleetNode(FleetMonitor):
         self._changed.clear()
         if not self._round and not 0 <= now_ns - self._round_ns < self._every_ns:
             self._round, self._round_ns = self.plants, now_ns
-        looked = 0
-        while self._round and looked < MOST_STORED and self._states.has_room:
-            plant, looked = self._round.pop(), looked + 1
+        checked = 0
+        while self._round and checked < MOST_STORED and self._states.has_room:
+            plant, checked = self._round.pop(), checked + 1
             if self.received_count(plant) not in (None, self._stored_at.get(plant)):
                 due.append(plant)
         for plant in filter(self.is_worth_storing, due):

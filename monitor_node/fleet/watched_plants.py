@@ -32,8 +32,8 @@ class WatchedPlants:
     Args:
         config: settings of each plant's monitor; its plant name is ignored.
         start_ns: present time.
-        model: as for `Monitor`.
-        points: as for `Monitor`.
+        model: see `Monitor`.
+        points: see `Monitor`.
 
     Attributes:
         alarms: names of a plant's alarms.

@@ -75,7 +75,7 @@ class SuspicionState(StoredState, frozen=True):
         incident: that was looked at last.
         since: rows since its first alarm; None: no alarm stands that has to be explained.
         way: how far its fault has been followed.
-        output: whose sensor is, or was last, reconstructed.
+        output: output of the newest reconstruction.
         cause: and why.
         reconstruction: None: there is none.
     """

@@ -87,7 +87,7 @@ def run(
         messages: messages; all but samples of `config.plant` are ignored.
         config: settings of the monitor.
         zero_ns: zero of the model's minutes, if its file does not have it.
-        model: whose equations judge, its minutes counted from 1970-01-01 UTC; None: the one that the settings name.
+        model: model with the equations, with minutes from 1970-01-01 UTC; None: the one that the settings name.
 
     Raises:
         InputError: the settings are inconsistent, or the model's file is unusable.

@@ -77,7 +77,7 @@ class Verdict(NamedTuple):
     Attributes:
         quarantine: True if the value is a missing sample to filters and to charts with a memory.
         spike: True if the value *before* it was a spike.
-        size: that value; 0 if it was no spike.
+        size: size of the spike; 0 without one.
     """
 
     quarantine: bool

@@ -179,7 +179,7 @@ class SignalChecks:
 
     @property
     def receipts_ns(self) -> tuple[int | None, int | None]:
-        """When something came last, and from when the next spacing is counted; None: what comes next is the first."""
+        """Receive time of the newest sample, and start of the next spacing; None before the first."""
         return self._silence.of_plant.receipts_ns
 
     @receipts_ns.setter
@@ -187,12 +187,12 @@ class SignalChecks:
         self._silence.of_plant.receipts_ns = receipts_ns
 
     def due_ns(self) -> int | None:
-        """When to `check`, unless something comes before; None: there is nothing to wait for."""
+        """Time of the next `check` without samples; None: there is nothing to wait for."""
         return self._silence.of_plant.due_ns()
 
     @property
     def deadline_ns(self) -> int | None:
-        """Until when the next row is allowed, in the time of the samples."""
+        """Latest allowed time of the next row, in the time of the samples."""
         return self._silence.of_plant.deadline_ns()
 
     def check(self, now_ns: int) -> list[Publication]:

@@ -54,7 +54,7 @@ class FleetStates:
         self._failed: list[tuple[str, str]] = []
         self._marks: dict[str, _Mark] = {}  # of each plant's file as last read or written
         self._lost: list[str] = []
-        self._left_alone: set[str] = set()  # plants whose file is no state, or unreadable
+        self._protected: set[str] = set()  # plants whose file is no state, or unreadable
         self._changed = threading.Condition()
         self._closed = False
         try:
@@ -99,7 +99,7 @@ class FleetStates:
             self._update_mark(plant)
             return read_regular(path)
         except (InputError, OSError) as error:
-            self._left_alone.add(plant)
+            self._protected.add(plant)
             why = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else str(error)
             raise InputError(f"state {path}: {why}; nothing is stored of the plant") from error
 
@@ -109,14 +109,14 @@ class FleetStates:
         try:
             aside = keep_aside(path, ending)
         except OSError as error:
-            self._left_alone.add(plant)
+            self._protected.add(plant)
             return f"{path.name}, as it cannot be renamed: {error.strerror}"
         self._aside[path.name] = [aside, *self._aside.get(path.name, [])]
         return aside.name
 
-    def leave_alone(self, plant: str) -> str:
+    def protect(self, plant: str) -> str:
         """Store nothing of a plant as long as its present file exists; returns the name of the file."""
-        self._left_alone.add(plant)
+        self._protected.add(plant)
         return self._path(plant).name
 
     def put_back(self, plant: str, use: Callable[[bytes], None]) -> str | None:
@@ -124,7 +124,7 @@ class FleetStates:
 
         Args:
             plant: name of a plant without a state in use.
-            use: as for `kept_aside.put_back`.
+            use: see `kept_aside.put_back`.
         """
         path = self._path(plant)
         asides = self._aside.get(path.name, [])
@@ -215,10 +215,10 @@ class FleetStates:
     def _write(self, plant: str, state: bytes) -> str | None:
         """Write a state; returns the reason if it cannot be written."""
         path = self._path(plant)
-        if plant in self._left_alone:
+        if plant in self._protected:
             if path.exists():
                 return f"state {path}: cannot be used and is not overwritten; move it away"
-            self._left_alone.discard(plant)
+            self._protected.discard(plant)
         try:
             with atomic_write(path) as temporary:
                 with temporary.open("wb") as file:

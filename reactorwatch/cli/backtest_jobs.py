@@ -78,7 +78,7 @@ def run_job(job: Job) -> JobResult:
     plant = resolve_plant(check_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
     recording, first = open_messages(job.at, plant, job.columns, _units(settings)), FirstSamples(plant)
-    result = run(first.pass_on(recording.messages), settings, recording.zero_ns or 0)
+    result = run(first.collect_samples(recording.messages), settings, recording.zero_ns or 0)
     if not result.rows:
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items()))
         raise InputError(f"{job.at}: holds no sample that can be used{f'; refused: {why}' if why else ''}")

@@ -156,7 +156,7 @@ def run_in_order(
 
     Args:
         work: a plain function.
-        jobs: its arguments.
+        jobs: arguments of the calls.
         doing: name of the work, for the bar.
         processes: number of processes; None: one a core.
         scheduler: address of a cluster, or None.

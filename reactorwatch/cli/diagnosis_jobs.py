@@ -80,9 +80,9 @@ def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, fo
 
     Args:
         files: files to be diagnosed.
-        out: as for `make_jobs`.
+        out: see `make_jobs`.
         model: file that describes the process, or None.
-        force: as for `check_output_file`.
+        force: see `check_output_file`.
 
     Raises:
         InputError: as `check_output_folder`.

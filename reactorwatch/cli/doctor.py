@@ -140,7 +140,7 @@ def _check_publishing(bus: ZenohBus, config: BusConfig, plant: str, timeout_s: f
     role = _role(config)
     kinds = (keys.SAMPLE,) if role is None else kinds_of(role)
     if not kinds:
-        yield Finding("heard", "this certificate is for reading and asking; it publishes nothing")
+        yield Finding("heard", "this certificate is for reading and queries; it publishes nothing")
         return
     speaker = connect_now(config)
     try:
@@ -149,9 +149,9 @@ def _check_publishing(bus: ZenohBus, config: BusConfig, plant: str, timeout_s: f
         speaker.close()
     if refused:
         cure = "its rules know no such holder: call `certify` for the plant, and start the router with its router.json5"
-        yield Finding("heard", f"what we publish does not come through: {', '.join(refused)}", cure)
+        yield Finding("heard", f"messages published from here do not arrive: {', '.join(refused)}", cure)
     else:
-        yield Finding("heard", f"what we publish comes through: {', '.join(kinds)}")
+        yield Finding("heard", f"messages published from here arrive: {', '.join(kinds)}")
 
 
 def _is_received(speaker: ZenohBus, listener: ZenohBus, plant: str, kind: str, timeout_s: float) -> bool:

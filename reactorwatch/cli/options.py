@@ -202,8 +202,8 @@ def check_output(path: Path, suffix: str, sources: Iterable[Path | None], *, for
     Args:
         path: the file.
         suffix: the required suffix.
-        sources: as for `check_output_file`.
-        force: as for `check_output_file`.
+        sources: see `check_output_file`.
+        force: see `check_output_file`.
 
     Raises:
         InputError: as `check_output_file`; or its name has another suffix.

@@ -94,7 +94,7 @@ class CompiledFunction:
             The number of rows before any chain stopped; later results are undefined.
 
         Raises:
-            ValueError: as for `fill`.
+            ValueError: see `fill`.
         """
         for given, into in zip(arguments, results, strict=True):
             self._check(rows, given, into)

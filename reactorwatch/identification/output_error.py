@@ -86,7 +86,7 @@ def fit_oe(
     """Fit an output-error model of one output.
 
     Args:
-        structure: its terms; one output.
+        structure: terms of the model; one output.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.

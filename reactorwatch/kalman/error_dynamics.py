@@ -87,7 +87,7 @@ class ErrorLinearization:
         model: model of the filter.
         noise: noise of the plant and its sensors.
         rate_symbols: symbols of the model, the sizes as they act in the balances.
-        output_symbols: the same sizes as they act in the outputs; may be the same symbols.
+        output_symbols: symbols of these sizes in the outputs; may be the same symbols.
 
     Attributes:
         noise: noise of the plant and its sensors.

@@ -50,7 +50,7 @@ class ExtendedModel:
 
     Attributes:
         name: name of the model.
-        effects: its effects in the order in which they were added; times in minutes of the record.
+        effects: effects of the model in the order in which they were added; times in minutes of the record.
         parameters: values that differ from the model's nominal ones, by name, in their units.
         zero_ns: time from which the minutes are counted; 0: unknown.
     """

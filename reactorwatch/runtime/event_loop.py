@@ -178,12 +178,12 @@ def stop_on_signals() -> Iterator[StopSignal]:
     def handler(_number: int, _frame: FrameType | None) -> None:
         pass
 
-    def wake_when_asked() -> None:
+    def wake_on_request() -> None:
         while _END not in (numbers := os.read(source, 64)):
             if set(numbers) & {signal.SIGINT, signal.SIGTERM}:
                 stop.set()
 
-    waker = threading.Thread(target=wake_when_asked, name="stop", daemon=True)
+    waker = threading.Thread(target=wake_on_request, name="stop", daemon=True)
     waker.start()
     previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     previous_fd = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)

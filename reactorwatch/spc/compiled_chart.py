@@ -36,7 +36,7 @@ class SignalState(ChartState, frozen=True):
     """State of a chart of one signal, or of a bank of them.
 
     Attributes:
-        chart: its name.
+        chart: name of the chart.
         plants: number of plants.
         numbers: little-endian doubles, shape (numbers of one chart, plants).
     """
@@ -51,7 +51,7 @@ class CompiledChart(SignalChart):
 
     Args:
         settings: the numbers of its constructor, as its kernel wants them.
-        start: its memory before the first value.
+        start: memory of the chart before the first value.
     """
 
     State = SignalState

@@ -93,10 +93,10 @@ def joint_limit(arl0: float, weight: float, learned: Sequence[Prewhitening], row
     """The limit of a MEWMA's, or with the weight 1 of a T2's, statistic.
 
     Args:
-        arl0: its run length without a fault.
+        arl0: run length of the chart without a fault.
         weight: lambda.
         learned: the training of each signal.
-        rows: from which the correlations of the signals were estimated.
+        rows: number of rows from which the correlations of the signals were estimated.
     """
     dimension = len(learned)
     known = mewma_limit(arl0, dimension, weight)

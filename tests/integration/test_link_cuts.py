@@ -19,7 +19,7 @@ from benchmarks.link_cuts import (
     connect_client,
     cut,
     kill_router,
-    look,
+    read_content,
     recorder_process,
     stick,
 )
@@ -143,7 +143,7 @@ def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
         bus.close()
     files = recordings_in(tmp_path)
     assert len(files) == 2
-    found = look(files, publisher)
+    found = read_content(files, publisher)
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
 
 

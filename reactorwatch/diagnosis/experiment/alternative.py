@@ -50,7 +50,7 @@ class Prediction:
 
     Args:
         hypothesis: hypothesis at the present noise levels.
-        fit: its fit.
+        fit: fit of the hypothesis.
         run: the record.
         resting: inputs at which the plant settles before the experiment, shape (n_u,).
         rest_rows: number of rows for settling.
@@ -130,7 +130,7 @@ def extrapolate(
 
     Args:
         profile: profile in the record.
-        parameters: its parameters there.
+        parameters: parameters of the alternative at that time.
         time_min: times of the new rows, shape (rows,).
         pattern_min: see `Prediction`.
     """
@@ -146,7 +146,7 @@ def decision_probability(expected: float, evidence: float) -> float:
 
     Args:
         expected: expected difference in BIC.
-        evidence: its noncentrality.
+        evidence: noncentrality of the evidence.
 
     >>> round(decision_probability(30.0, 30.0), 3)
     0.966

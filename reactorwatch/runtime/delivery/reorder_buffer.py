@@ -49,7 +49,7 @@ class Gap(NamedTuple):
         first: number of the first of them in the stream.
         last: number of the last; between them others may have arrived, on another key for instance.
         messages: count of missing messages.
-        noticed_ns: when they were given up, by the clock of receipt.
+        noticed_ns: time when they were given up, by the clock of receipt.
     """
 
     stream: str
@@ -186,7 +186,7 @@ class ReorderBuffer(Generic[Item]):
             state.drop_hold_state()
 
     def due_ns(self) -> int | None:
-        """When to call `release_overdue`; None: nothing is held."""
+        """Time of the next `release_overdue`; None: nothing is held."""
         if not self._holding:
             return None
         due = {name: state.hold.due_ns for name, state in self._holding.items() if state.hold is not None}

@@ -47,7 +47,7 @@ class Executor(Protocol):
 
         Args:
             work: a function of a module that the workers can import.
-            jobs: its arguments.
+            jobs: arguments of the calls.
         """
 
 

@@ -54,9 +54,9 @@ class Setting(NamedTuple):
 
     Attributes:
         key: begins with the chart's name.
-        default: its value where the settings give none.
-        lower: the smallest value that it can have.
-        upper: the largest value that it can have.
+        default: value where the settings give none.
+        lower: smallest allowed value.
+        upper: largest allowed value.
     """
 
     key: str
@@ -89,7 +89,7 @@ class Chart(ABC):
         State: the type of its state.
         has_memory: whether a point depends on samples before it. One point out then raises the alarm; otherwise it
             takes `raise_count` of the last `window`, so that a single outlier raises none.
-        settings: its own keys of `[monitor]`.
+        settings: keys of `[monitor]` that belong to the chart.
     """
 
     name: ClassVar[str]

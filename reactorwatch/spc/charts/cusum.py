@@ -71,10 +71,10 @@ class Cusum(CompiledChart):
 
     Args:
         mean: mean of the values when all is well.
-        sigma: their standard deviation.
+        sigma: standard deviation of the values when all is well.
         k: the allowance in sigma; half the change that matters.
         h: the limit in sigma.
-        head_start: where both sums start, in sigma; often h / 2.
+        head_start: initial value of both sums, in sigma; often h / 2.
 
     Raises:
         InputError: sigma or h is not a positive number, k is negative, head_start is not in [0, h].

@@ -69,7 +69,7 @@ class PcaModel(ChartState, frozen=True):
             training: shape (n, p), rows of a time when all was well.
             components: a, how many the signals have in common, in [1, p - 1].
             false_alarm: alpha, the probability of a false alarm per sample, of each of the two charts.
-            spe_limit: whose limit.
+            spe_limit: method of the limit of SPE.
 
         Raises:
             InputError: an argument out of its range, or a signal that does not vary.
@@ -144,7 +144,7 @@ class _PcaChart(JointChart):
         return self._model
 
     def restart(self) -> None:
-        """Nothing: there is no memory."""
+        """Do nothing: there is no memory."""
 
     def _scale_values(self, x: ArrayLike) -> Array:
         return np.asarray((vector(x, self._mean.size) - self._mean) / self._scale)

@@ -96,7 +96,7 @@ class Shewhart(CompiledChart):
 
     Args:
         mean: mean of the values when all is well.
-        sigma: their standard deviation.
+        sigma: standard deviation of the values when all is well.
         width: L, in sigma.
         rules: some of 1, 2, 3, 4.
 
@@ -138,12 +138,12 @@ class Shewhart(CompiledChart):
 
     @property
     def lower_limit(self) -> float:
-        """Below it, a value is out."""
+        """Lower limit of the values."""
         return self.setting(_LOWER)
 
     @property
     def upper_limit(self) -> float:
-        """Above it, a value is out."""
+        """Upper limit of the values."""
         return self.setting(_UPPER)
 
 

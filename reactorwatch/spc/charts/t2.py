@@ -74,7 +74,7 @@ class T2(JointChart):
         return Judgement(statistic, float(white.size), 0.0, self.limit, statistic > self.limit)
 
     def restart(self) -> None:
-        """Nothing: there is no memory."""
+        """Do nothing: there is no memory."""
 
     def contributions(self, x: ArrayLike) -> Array:
         """Each signal's part of T2, shape (p,): d_j (S^-1 d)_j. Their sum is T2; one may be negative.
