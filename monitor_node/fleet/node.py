@@ -86,7 +86,9 @@ class FleetNode(FleetMonitor):
         self._bus, self.metrics = bus, metrics
         self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
         self._states = states
-        self._recovery = StateRecovery(bus, self._states, lambda plant, line: log.warning(line, plant=plant))
+        self._recovery = StateRecovery(
+            bus, self._states, self._is_contested, lambda plant, line: log.warning(line, plant=plant)
+        )
         self._every_ns = int(config.state_every_s * 1e9)
         self._lease = LeaseMonitor(lambda: bus.has_router)
         self._pending_subscriptions = len(self.subscriptions)
@@ -115,6 +117,7 @@ class FleetNode(FleetMonitor):
             store=self._store_state,
             unusable=self._keep_aside,
             put_back=self._restore_kept_aside,
+            claimed_elsewhere=self._is_claimed_elsewhere,
             on_ownership=self._set_ownership,
         )
         for plant in sorted({*states.plants, *states.plants_aside}) if states is not None else []:
@@ -235,7 +238,7 @@ class FleetNode(FleetMonitor):
                 log.warning("the other monitors may take us for gone: nothing is judged until we are back")
                 self.pause()
             return []
-        others = self._states.written_elsewhere(self.plants)
+        others = self._states.adopted_elsewhere(self.plants)
         log.info("back", plants=len(self.plants), watched_by_others=len(others))
         return self._log_alarms(self.resume(others, now_ns))
 
@@ -246,6 +249,12 @@ class FleetNode(FleetMonitor):
             return False
         self._recovery.request(plant)
         return True
+
+    def _is_contested(self, plant: str) -> bool:
+        return self.shards.is_shared and self.is_pending(plant)
+
+    def _is_claimed_elsewhere(self, plant: str) -> bool:
+        return self._states is not None and self.shards.is_shared and self._states.is_claimed_elsewhere(plant)
 
     def _store_state(self, plant: str, state: bytes) -> None:
         if self._states is not None:

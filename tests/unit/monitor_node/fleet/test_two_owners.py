@@ -1,0 +1,73 @@
+"""Two monitors take over from each other, and one is stalled anywhere: each alarm is published once, and none lost."""
+
+from collections import Counter
+
+import msgspec
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from monitor_node.core import Monitor
+from reactorwatch.contract.codec import Encoded
+
+from ..fleets import QUICK, SECOND_NS
+from .two_owners import FIRST_ROW, PLANT, ROWS, Published, World, alone_from, leaking
+
+
+class Case:
+    """A plant, its state before the leak, and what a monitor says that has it alone."""
+
+    def __init__(self, state: bytes, rows: list[Encoded]) -> None:
+        self.state, self.rows = state, rows
+        self.expected = Counter(alone_from(state, rows[3 * FIRST_ROW :]))
+
+    def run(self, script: list[str]) -> Counter[Published]:
+        return Counter(World(self.state, self.rows, script).run())
+
+
+@pytest.fixture(scope="module")
+def case() -> Case:
+    rows = leaking()[: 3 * (FIRST_ROW + ROWS)]
+    monitor = Monitor(msgspec.structs.replace(QUICK, plant=PLANT), 0, points=False)
+    for place, message in enumerate(rows[: 3 * FIRST_ROW]):
+        monitor.on_message(message, place // 3 * SECOND_NS)
+    return Case(monitor.to_bytes(), rows)
+
+
+STEPS = st.one_of(
+    st.integers(1, 5).map(lambda rows: ["row"] * rows),
+    st.integers(1, 12).map(lambda steps: [f"stall {steps}"]),  # of the monitor that comes to its next alarm
+    st.sampled_from(
+        ["token", "handle first", "handle second", "store first", "store second", "kill first", "kill second"]
+    ).map(lambda step: [step]),
+    st.sampled_from(["first", "second"]).map(lambda name: ["token", f"handle {name}"]),
+    st.sampled_from(["first", "second"]).map(lambda name: [f"handle {name}", f"recover {name}", f"recover {name}"]),
+)
+SCRIPTS = st.lists(STEPS, max_size=30).map(lambda parts: [step for part in parts for step in part])
+
+
+LEAK = ["row"] * 5
+"""Rows up to the first alarm."""
+
+TAKE_OVER = ["token", "handle second", "recover second", "recover second"]
+COME_BACK = ["kill first", "recover first", "recover first", "token"]
+
+
+STALLED_BEFORE_PUBLISHING = [*LEAK, "stall 4", "handle first", *TAKE_OVER]
+STALLED_WITH_A_BACKLOG = [*LEAK, *TAKE_OVER, "handle first"]
+BOTH_STALLED = ["stall 8", *LEAK, *TAKE_OVER, *COME_BACK, "handle second"]
+OLDER_STATE_STORED = ["token", *LEAK, "handle second", "recover second", "recover second", "store first"]
+RESTARTED = [*LEAK, *TAKE_OVER, *COME_BACK, "handle second"]
+
+
+@given(script=SCRIPTS)
+@example(script=STALLED_BEFORE_PUBLISHING)
+@example(script=STALLED_WITH_A_BACKLOG)
+@example(script=BOTH_STALLED)
+@example(script=OLDER_STATE_STORED)
+@example(script=RESTARTED)
+@settings(max_examples=20, deadline=None)
+def test_with_any_stall_and_any_order_of_what_is_noticed_each_alarm_is_published_once(
+    script: list[str], case: Case
+) -> None:
+    assert case.run(script) == case.expected
