@@ -95,6 +95,7 @@ class FleetMonitor:
         self._plants: dict[str, str] = {}  # plants that are not quiet, by key of a sample
         self._handed_over, self._recent = HandedOverAlarms(self._watched.alarms), RecentlyAdopted()
         self._paused_messages: list[Encoded] | None = None  # buffered in a pause
+        self._paused_histories: list[PlantHistory] = []
 
     # --- ownership -------------------------------------------------------------------------------------------
 
@@ -118,7 +119,13 @@ class FleetMonitor:
         return []
 
     def on_history(self, past: PlantHistory, now_ns: int) -> list[Publication]:
-        """Adopt a plant whose history was requested, if it is still owned: process the history and messages since."""
+        """Adopt a plant whose history was requested, if it is still owned: process the history and messages since.
+
+        In a pause the history is buffered behind the messages, which may be alarms of the previous owner.
+        """
+        if self.paused:
+            self._paused_histories.append(past)
+            return []
         if past.plant not in self._pending:
             return []
         if past.state is not None:
@@ -210,9 +217,11 @@ class FleetMonitor:
             now_ns: present time.
         """
         held, self._paused_messages = self._paused_messages or [], None
+        histories, self._paused_histories = self._paused_histories, []
         for plant in {*others, *self._reported_elsewhere(held)}:
             self.rejoin(plant, now_ns)
-        return self._process(held, now_ns)
+        publications = self._process(held, now_ns)
+        return publications + [item for past in histories for item in self.on_history(past, now_ns)]
 
     def _confirm(self, publications: list[Publication], now_ns: int) -> list[Publication]:
         """Withhold publications on plants with a changed alarm that another monitor has claimed, and rejoin these."""

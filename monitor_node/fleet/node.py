@@ -2,6 +2,7 @@
 
 import secrets
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import structlog
@@ -17,6 +18,7 @@ from monitor_node.fleet.partition import LeaseMonitor
 from monitor_node.fleet.sharding import ShardGroup
 from monitor_node.fleet.watched_plants import WatchedPlants
 from monitor_node.health import NODE
+from monitor_node.ingest.pending import PlantHistory
 from monitor_node.ingest.rejects import RejectCounter
 from monitor_node.other_monitors import OtherMonitors, log_report
 from monitor_node.state.monitor_state import OtherSettingsError
@@ -50,7 +52,7 @@ MOST_TOKENS = 200
 LOG_INTERVAL_NS = 10_000_000_000
 
 POLL_NS = 100_000_000
-"""Interval of looks for recovered histories and for states to store."""
+"""Interval of looks for states to store."""
 
 MOST_STORED = 20
 """Plants whose state is stored at a time: half a millisecond each. With thousands, each is stored less often."""
@@ -166,6 +168,12 @@ class FleetNode(FleetMonitor):
         log_report(self._others.on_token(token, is_alive=is_alive))
         return self._check_lease(now_ns) + self._log_alarms(super().on_alive(token, is_alive, now_ns))
 
+    def on_history(self, past: PlantHistory, now_ns: int) -> list[Publication]:
+        """See `FleetMonitor`; alarms are logged, and an unusable state is reported at once."""
+        publications = self._check_lease(now_ns) + self._log_alarms(super().on_history(past, now_ns))
+        self._report_ns = now_ns
+        return publications
+
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """See `FleetMonitor`; alarms are logged; too many commands, over all plants, are refused."""
         topic = keys.parse(question.key)
@@ -188,9 +196,6 @@ class FleetNode(FleetMonitor):
             if not self._bus.has_router:
                 self._lease.expire(now_ns)
             self._store_due(now_ns)
-            for past in self._recovery.pop_recovered():
-                publications += self._log_alarms(self.on_history(past, now_ns))
-                self._report_ns = now_ns  # an unusable state is reported at once
         publications += self._log_alarms(super().on_tick(now_ns))
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + LOG_INTERVAL_NS
@@ -206,17 +211,19 @@ class FleetNode(FleetMonitor):
         return publications
 
     def next_tick_ns(self) -> int:
-        """See `FleetMonitor`; or the next look for recovered histories and states to store."""
+        """See `FleetMonitor`; or the next look for states to store."""
         due_ns = super().next_tick_ns()
-        if self._states is None and not self._recovery.is_pending:
-            return due_ns
-        return min(due_ns, self._poll_ns)
+        return due_ns if self._states is None else min(due_ns, self._poll_ns)
 
-    def on_subscribed(self) -> None:
-        """Count a completed subscription; when all are, start the recovery."""
+    def on_subscribed(self, call: Callable[[Callable[[int], list[Publication]]], None]) -> None:
+        """Count a completed subscription; when all are, start the recovery.
+
+        Args:
+            call: see `EventLoop.call`.
+        """
         self._pending_subscriptions -= 1
         if not self._pending_subscriptions:
-            self._recovery.start()
+            self._recovery.start(lambda past: call(lambda now_ns: self.on_history(past, now_ns)))
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; states are stored for the last time."""
@@ -366,7 +373,7 @@ def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
     log.info("listening", plants=node.expression)
     on_publish = node.metrics.on_publish if node.metrics is not None else None
     loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
-    loop.subscribe(*node.subscriptions, on_history_end=node.on_subscribed, on_batch=node.on_messages)
+    loop.subscribe(*node.subscriptions, on_history_end=lambda: node.on_subscribed(loop.call), on_batch=node.on_messages)
     loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
     loop.accept_commands(*(f"{node.expression}/{keys.COMMAND}/{name}" for name in COMMANDS))
     bus.declare_token(node.shards.token)

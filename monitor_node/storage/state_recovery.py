@@ -12,7 +12,7 @@ connected again, and until it can see the others.
 import threading
 import time
 from collections.abc import Callable
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import NamedTuple
 
 from monitor_node.ingest.pending import PlantHistory
@@ -59,34 +59,21 @@ class StateRecovery:
     ) -> None:
         self._bus, self._states, self._is_contested, self._report = bus, states, is_contested, report
         self._requests: SimpleQueue[_Request | None] = SimpleQueue()
-        self._recovered: SimpleQueue[PlantHistory] = SimpleQueue()
-        self._open = 0
         self._ended = threading.Event()
 
-    def start(self) -> None:
-        """Start the threads, when all subscriptions are complete: later messages arrive by themselves."""
-        for _ in range(WORKERS):
-            threading.Thread(target=self._recover, name="pasts", daemon=True).start()
+    def start(self, deliver: Callable[[PlantHistory], None]) -> None:
+        """Start the threads, when all subscriptions are complete: later messages arrive by themselves.
 
-    @property
-    def is_pending(self) -> bool:
-        """True while a requested history was not returned yet."""
-        return self._open > 0
+        Args:
+            deliver: called from another thread with a recovered history. The predecessor's alarms that arrived before
+                have to be handled before it.
+        """
+        for _ in range(WORKERS):
+            threading.Thread(target=self._recover, args=(deliver,), name="pasts", daemon=True).start()
 
     def request(self, plant: str) -> None:
         """Request the history of a plant."""
-        self._open += 1
         self._requests.put(_Request(plant, time.monotonic() + HANDOVER_S))
-
-    def pop_recovered(self) -> list[PlantHistory]:
-        """Remove and return the recovered histories."""
-        pasts: list[PlantHistory] = []
-        try:
-            while True:
-                pasts.append(self._recovered.get_nowait())
-        except Empty:
-            self._open -= len(pasts)
-            return pasts
 
     def close(self) -> None:
         """Stop the threads."""
@@ -94,7 +81,7 @@ class StateRecovery:
         for _ in range(WORKERS):
             self._requests.put(None)
 
-    def _recover(self) -> None:
+    def _recover(self, deliver: Callable[[PlantHistory], None]) -> None:
         while (request := self._requests.get()) is not None:
             plant = request.plant
             self._ended.wait(max(0.0, request.not_before_s - time.monotonic()))
@@ -104,7 +91,7 @@ class StateRecovery:
             if not request.claimed and self._claim(plant):
                 self._requests.put(_Request(plant, time.monotonic() + HANDOVER_S, claimed=True))
             else:
-                self._recovered.put(self._history(plant))
+                deliver(self._history(plant))
 
     def _claim(self, plant: str) -> bool:
         """Claim a plant, if another monitor may own it; returns True if it did."""

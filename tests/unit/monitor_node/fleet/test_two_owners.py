@@ -34,14 +34,16 @@ def case() -> Case:
     return Case(monitor.to_bytes(), rows)
 
 
+ALONE = ("handle", "store", "kill", "pause", "resume")
+RECOVERY = ("handle", "recover", "recover", "handle")
+
 STEPS = st.one_of(
     st.integers(1, 5).map(lambda rows: ["row"] * rows),
     st.integers(1, 12).map(lambda steps: [f"stall {steps}"]),  # of the monitor that comes to its next alarm
-    st.sampled_from(
-        ["token", "handle first", "handle second", "store first", "store second", "kill first", "kill second"]
-    ).map(lambda step: [step]),
+    st.builds(lambda step, name: [f"{step} {name}"], st.sampled_from(ALONE), st.sampled_from(["first", "second"])),
+    st.just(["token"]),
     st.sampled_from(["first", "second"]).map(lambda name: ["token", f"handle {name}"]),
-    st.sampled_from(["first", "second"]).map(lambda name: [f"handle {name}", f"recover {name}", f"recover {name}"]),
+    st.sampled_from(["first", "second"]).map(lambda name: [f"{step} {name}" for step in RECOVERY]),
 )
 SCRIPTS = st.lists(STEPS, max_size=30).map(lambda parts: [step for part in parts for step in part])
 
@@ -49,14 +51,14 @@ SCRIPTS = st.lists(STEPS, max_size=30).map(lambda parts: [step for part in parts
 LEAK = ["row"] * 5
 """Rows up to the first alarm."""
 
-TAKE_OVER = ["token", "handle second", "recover second", "recover second"]
-COME_BACK = ["kill first", "recover first", "recover first", "token"]
+TAKE_OVER = ["token", *[f"{step} second" for step in RECOVERY]]
+COME_BACK = ["kill first", *[f"{step} first" for step in RECOVERY], "token"]
 
 
-STALLED_BEFORE_PUBLISHING = [*LEAK, "stall 4", "handle first", *TAKE_OVER]
+STALLED_BEFORE_PUBLISHING = [*LEAK, "stall 5", "handle first", *TAKE_OVER]
 STALLED_WITH_A_BACKLOG = [*LEAK, *TAKE_OVER, "handle first"]
 BOTH_STALLED = ["stall 8", *LEAK, *TAKE_OVER, *COME_BACK, "handle second"]
-OLDER_STATE_STORED = ["token", *LEAK, "handle second", "recover second", "recover second", "store first"]
+OLDER_STATE_STORED = ["token", *LEAK, *TAKE_OVER[1:], "store first"]
 RESTARTED = [*LEAK, *TAKE_OVER, *COME_BACK, "handle second"]
 
 
@@ -71,3 +73,9 @@ def test_with_any_stall_and_any_order_of_what_is_noticed_each_alarm_is_published
     script: list[str], case: Case
 ) -> None:
     assert case.run(script) == case.expected
+
+
+def test_alarms_of_a_killed_monitor_that_arrived_before_its_plant_s_history_are_not_published_again(case: Case) -> None:
+    """The first publishes after the second has noticed that it is gone, and is killed before it stores anything."""
+    publishes = [*LEAK, "token", "handle second", "handle first", "crash first"]
+    assert case.run([*publishes, "recover second", "recover second", "handle second"]) == case.expected

@@ -57,7 +57,7 @@ class Member:
 
     def __init__(self, world: "World", name: str, number: int) -> None:
         self.world, self.name = world, name
-        self.inbox: list[Encoded | tuple[str, bool]] = []
+        self.inbox: list[Encoded | tuple[str, bool] | PlantHistory] = []
         self.recovery = ""  # "requested", "claimed" or none
         self.read_version = self.resumes = 0
         self.published: list[Encoded] = []  # alarms, as its cache has them
@@ -107,7 +107,10 @@ class Member:
                 batch.append(item)
                 continue
             self.publish(self.core.on_messages(batch, self.world.now_ns))
-            self.publish(self.core.on_alive(*item, self.world.now_ns))
+            if isinstance(item, PlantHistory):
+                self.publish(self.core.on_history(item, self.world.now_ns))
+            else:
+                self.publish(self.core.on_alive(*item, self.world.now_ns))
             batch = []
         self.publish(self.core.on_messages(batch, self.world.now_ns))
 
@@ -121,12 +124,15 @@ class Member:
         elif self.recovery == "claimed":
             self.recovery, self.read_version = "", world.version
             known = [message for member in world.members.values() for message in member.published]
-            self.publish(self.core.on_history(PlantHistory(PLANT, world.state, world.history(), known), world.now_ns))
+            self.inbox.append(PlantHistory(PLANT, world.state, world.history(), known))
 
     def store(self) -> None:
         """Store the plant's state, as the node does now and then."""
         if self.core.is_watched(PLANT) and not self.core.paused:
             self.put(self.core.state_of(PLANT))
+
+    def pause(self) -> None:
+        self.core.pause()
 
     def resume(self) -> None:
         if self.core.paused:
@@ -158,6 +164,7 @@ class World:
             self.start(name)
         self.members["first"].recover()
         self.members["first"].recover()
+        self.members["first"].handle()
 
     def start(self, name: str) -> None:
         self.members[name] = Member(self, name, AT_HOME if name == "first" else 3 - AT_HOME)
@@ -182,13 +189,15 @@ class World:
         elif kind == "stall":  # where the next monitor is about to publish
             self.stall_steps = int(name)
         elif kind == "kill" and name not in self.stalled:
+            self.members[name].store()  # an alarm that is not stored yet is published again, unless another heard it
+            self.kill(name)
+        elif kind == "crash":
             self.kill(name)
         elif name not in self.stalled:
             getattr(self.members[name], kind)()
 
     def kill(self, name: str) -> None:
-        """Kill a monitor, when its state is stored, and start it again; its token is noticed when it is shown again."""
-        self.members[name].store()
+        """Kill a monitor and start it again; its token is noticed when it is shown again."""
         if name == "first" and self.is_alive:
             self.step("token")
         self.start(name)

@@ -44,7 +44,7 @@ def test_who_is_cut_off_takes_nobody_s_plants_over_until_the_others_are_to_be_se
     bus = CutOff()
     state_recovery = StateRecovery(bus, None, lambda _plant: True, lambda _plant, _line: None)
     state_recovery.request("a")
-    state_recovery.start()
+    state_recovery.start(lambda _past: None)
     assert bus.asked.wait(WITHIN_S)
     state_recovery.close()
     assert bus.seen[:2] == ["no router", "no router"]
