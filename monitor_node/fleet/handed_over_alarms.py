@@ -86,11 +86,12 @@ class HandedOverAlarms:
             known_ns: time at which the last known one was raised.
         """
         theirs, ours = self._by_others.get(plant, {}).get(TIMEOUT_ALARM), self._ours.get(plant, {}).get(TIMEOUT_ALARM)
-        over_ns = theirs.raised_ns if theirs is not None and theirs.event == Event.CLEARED.value else 0
+        published = [alarm for alarm in (theirs, ours) if alarm is not None]
+        over_ns = [alarm.raised_ns for alarm in published if alarm.event == Event.CLEARED.value]
         active = [
             alarm
-            for alarm in (theirs, ours)
-            if alarm is not None and alarm.event == Event.RAISED.value and alarm.raised_ns > max(known_ns, over_ns)
+            for alarm in published
+            if alarm.event == Event.RAISED.value and alarm.raised_ns > max(known_ns, *over_ns, 0)
         ]
         return sorted(active, key=lambda alarm: alarm.raised_ns)[-1:]
 

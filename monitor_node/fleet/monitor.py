@@ -32,8 +32,8 @@ from monitor_node.fleet.watched_plants import State, WatchedPlants
 from monitor_node.ingest.pending import PendingPlants, PlantHistory, truncate
 from monitor_node.replay.recorded_sessions import TIMEOUT_ALARM
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 
@@ -134,9 +134,15 @@ class FleetMonitor:
         self._handed_over.on_history(past.plant, past.alarms)
         self.adopt(past.plant, past.state, now_ns)
         monitor = self.monitor(past.plant)
-        publications = [item for message in messages for item in monitor.on_message(message, now_ns)]
-        publications = self._handed_over.filter_new(publications)
-        self._restore_timeout(past.plant, monitor)
+        publications: list[Publication] = []
+        timeouts = self._timeouts_after(past.plant, monitor)
+        for message in messages:
+            # Rows from before a data timeout do not end it; the first row after it does.
+            if timeouts and not monitor.has_pending_rows and _sample_time_ns(message) > timeouts[0].raised_ns:
+                monitor.resume_from_alarms(timeouts)
+                timeouts = []
+            publications += self._evaluate(past.plant, monitor, message, now_ns)
+        monitor.resume_from_alarms(timeouts)
         monitor.on_history_end()
         self._recent.add(past.plant, monitor, now_ns)
         self._handed_over.expire(past.plant)
@@ -170,11 +176,9 @@ class FleetMonitor:
         self._registered[plant] = None
         self._on_ownership(plant, True)
 
-    def _restore_timeout(self, plant: str, monitor: Monitor) -> None:
-        """Resume an active data timeout: the next sample ends it; rows from before it do not."""
-        monitor.resume_from_alarms(
-            self._handed_over.timeouts_after(plant, monitor.alarms.alarm(TIMEOUT_ALARM).raised_ns)
-        )
+    def _timeouts_after(self, plant: str, monitor: Monitor) -> list[Alarm]:
+        """An active data timeout of a plant that its monitor does not know."""
+        return self._handed_over.timeouts_after(plant, monitor.alarms.alarm(TIMEOUT_ALARM).raised_ns)
 
     def release(self, plant: str) -> State | None:
         """Release a plant; returns its state for the next owner. None: it was not owned."""
@@ -354,7 +358,8 @@ class FleetMonitor:
             self._pending.start(plant)
         else:
             self.adopt(plant, None, now_ns)
-            self._restore_timeout(plant, self.monitor(plant))
+            monitor = self.monitor(plant)
+            monitor.resume_from_alarms(self._timeouts_after(plant, monitor))
 
     # --- event loop ------------------------------------------------------------------------------------------
 
@@ -381,7 +386,7 @@ class FleetMonitor:
                 if self._recent.is_repeat(plant, message, now_ns):
                     own.count_duplicate()
                 else:
-                    publications += self._handed_over.filter_new(own.on_message(message, now_ns))
+                    publications += self._evaluate(plant, own, message, now_ns)
             elif plant in self._pending:
                 self._pending.add(plant, message)
             elif messages_of >= PROVEN_MESSAGES:
@@ -393,6 +398,13 @@ class FleetMonitor:
         for plant in self._watched.settle(touched):
             self._remove_keys(plant)
         return self._confirm(publications, now_ns)
+
+    def _evaluate(self, plant: str, own: Monitor, message: Encoded, now_ns: int) -> list[Publication]:
+        """Process a message of a plant; returns publications that its previous owners have not published."""
+        restarts, publications = own.restarts, own.on_message(message, now_ns)
+        if own.restarts != restarts:  # the clock may be set back: their alarms would cover those to come
+            self._handed_over.remove(plant)
+        return self._handed_over.filter_new(publications)
 
     def _plant_of(self, message: Encoded, now_ns: int) -> str:
         """Plant of a sample; empty for another message."""
@@ -464,3 +476,12 @@ def _plant_of_key(key: str) -> str:
     """Plant in a key; empty if there is none."""
     topic = keys.parse(key)
     return topic.plant if topic is not None else ""
+
+
+def _sample_time_ns(message: Encoded) -> int:
+    """Time of a sample; the earliest if the message is none."""
+    try:
+        sample = decode(message.payload, message.encoding)
+    except DecodeError:
+        sample = None
+    return sample.time_ns if isinstance(sample, Sample) else -NEVER_NS

@@ -34,6 +34,7 @@ def case() -> Case:
     return Case(monitor.to_bytes(), rows)
 
 
+TIMEOUT = "silence/plant"
 ALONE = ("handle", "store", "kill", "pause", "resume")
 RECOVERY = ("handle", "recover", "recover", "handle")
 
@@ -68,11 +69,38 @@ RESTARTED = [*LEAK, *TAKE_OVER, *COME_BACK, "handle second"]
 @example(script=BOTH_STALLED)
 @example(script=OLDER_STATE_STORED)
 @example(script=RESTARTED)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_with_any_stall_and_any_order_of_what_is_noticed_each_alarm_is_published_once(
     script: list[str], case: Case
 ) -> None:
     assert case.run(script) == case.expected
+
+
+SILENT_SCRIPTS = st.lists(
+    st.one_of(
+        STEPS,
+        st.integers(1, 8).map(lambda seconds: ["second"] * seconds),
+        st.sampled_from(["first", "second"]).map(lambda name: [f"handle {name}", *["second", f"tick {name}"] * 7]),
+    ),
+    max_size=30,
+).map(lambda parts: [step for part in parts for step in part])
+
+
+@given(script=SILENT_SCRIPTS)
+@example(script=["row", "handle first", *["second", "tick first"] * 7, *TAKE_OVER, *["second", "tick second"] * 7])
+@example(script=["row", "handle first", "stall 5", *["second", "tick first"] * 5, "tick first", *TAKE_OVER])
+@settings(max_examples=10, deadline=None)
+def test_a_data_timeout_by_the_clock_is_raised_once_and_cleared_once_by_either_owner(
+    script: list[str], case: Case
+) -> None:
+    """No row shows it: the plant pauses, and either monitor may notice."""
+    published = case.run(script)
+    timeouts = Counter((event, raised_ns) for alarm, event, _, raised_ns in published.elements() if alarm == TIMEOUT)
+    raised, cleared = ({ns for event, ns in timeouts if event == change} for change in ("raised", "cleared"))
+    assert (set(timeouts.values()), raised) == ({1}, cleared)
+    assert {change for change in published if change[0] != TIMEOUT} == {
+        change for change in case.expected if change[0] != TIMEOUT
+    }
 
 
 def test_alarms_of_a_killed_monitor_that_arrived_before_its_plant_s_history_are_not_published_again(case: Case) -> None:

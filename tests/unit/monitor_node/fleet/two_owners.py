@@ -59,7 +59,7 @@ class Member:
         self.world, self.name = world, name
         self.inbox: list[Encoded | tuple[str, bool] | PlantHistory] = []
         self.recovery = ""  # "requested", "claimed" or none
-        self.read_version = self.resumes = 0
+        self.read_version = 0
         self.published: list[Encoded] = []  # alarms, as its cache has them
         self.core: FleetMonitor = fleet(
             shard=Shard(number, 2),
@@ -218,11 +218,12 @@ class World:
         self.stall_steps = 0
         if not self.is_alive:
             self.step("token")
-        while self.sent < len(self.rows):
-            self.step("row")
-        for _ in range(20):
-            for member in self.members.values():
-                member.resume()
-                member.recover()
-                member.handle()
+        for rows_left in (2, 0):  # the last rows end what the history left open
+            while self.sent < len(self.rows) - 3 * rows_left:
+                self.step("row")
+            for _ in range(20):
+                for member in self.members.values():
+                    member.resume()
+                    member.recover()
+                    member.handle()
         return published_of(self.published)
