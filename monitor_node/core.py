@@ -367,6 +367,11 @@ class Monitor:
         return self._aligner.state.counts.rows
 
     @property
+    def has_pending_rows(self) -> bool:
+        """True while a row waits for samples."""
+        return bool(self._aligner.state.pending)
+
+    @property
     def restarts(self) -> int:
         """Number of restarts of the plant, or of its clock, so far."""
         return self._aligner.state.counts.restarts

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeAlias
 
+from monitor_node.storage.claims import Claims
 from monitor_node.storage.kept_aside import find_kept_aside, keep_aside, put_back, read_regular
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write, is_disk_full
@@ -49,7 +50,7 @@ class FleetStates:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self._folder, self._claims = folder, Claims(folder)
         self._queued: dict[str, bytes] = {}
         self._failed: list[tuple[str, str]] = []
         self._marks: dict[str, _Mark] = {}  # of each plant's file as last read or written
@@ -141,6 +142,19 @@ class FleetStates:
         self._update_mark(plant)
         return fitting.name
 
+    def claim(self, plant: str) -> bool:
+        """Claim a plant that has a state, see `claims`; returns True if the previous owner may know it only later."""
+        if not self._path(plant).exists():
+            return False
+        why = self._claims.claim(plant)
+        if why is not None:
+            self._failed.append((plant, why))
+        return why is None
+
+    def is_claimed_elsewhere(self, plant: str) -> bool:
+        """True if another monitor has claimed a plant last."""
+        return self._claims.is_claimed_elsewhere(plant)
+
     @property
     def has_room(self) -> bool:
         """True while the disk keeps up."""
@@ -167,9 +181,9 @@ class FleetStates:
         own, present = self._marks.get(plant), _file_mark(self._path(plant))
         return present not in (None, own) and own is not None
 
-    def written_elsewhere(self, plants: Iterable[str]) -> list[str]:
-        """Select the plants whose state another monitor has written."""
-        return [plant for plant in plants if self.is_written_elsewhere(plant)]
+    def adopted_elsewhere(self, plants: Iterable[str]) -> list[str]:
+        """Select the plants that another monitor has claimed, or whose state it has written."""
+        return [plant for plant in plants if self.is_claimed_elsewhere(plant) or self.is_written_elsewhere(plant)]
 
     def close(self) -> None:
         """Write the queued states, and stop."""
