@@ -14,7 +14,7 @@ from monitor_node.alarms.commands import execute_command
 from monitor_node.baseline.training import NO_VALUE
 from monitor_node.config import MonitorConfig
 from monitor_node.failures import Failures
-from monitor_node.health import NODE, health_message
+from monitor_node.health import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Aligner, Row
 from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveStats
 from monitor_node.ingest.rejects import RejectCounter
@@ -126,7 +126,7 @@ class Monitor:
         publications: list[Publication] = []
         time_ns, number = sample.time_ns, sample.sequence
         run, is_accepted = self._runs[self._indices[signal]], True
-        if run.accept_next(time_ns, number):  # as nearly always
+        if run.accept_next(number, time_ns):  # as nearly always
             self._accept(signal, time_ns, number, value, sample.unit, publications)
         elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
             self.rejects.add(
@@ -486,16 +486,15 @@ class Monitor:
         health = health_message(
             now_ns,
             phase,
-            self._start_ns,
-            self._aligner.state.counts,
-            self.rejects.by_reason,
-            received=self.received,
-            published=self._published,
-            lag_ns=self._lag_ns,
-            heard_from_ns=self._heard_from_ns,
-            not_stored=self.not_stored,
-            stalls=self._stalls,
-            failures=self.failures.by_stage,
+            Processed(
+                self._aligner.state.counts,
+                self.received,
+                self._published,
+                self.rejects.by_reason,
+                self.failures.by_stage,
+                self._heard_from_ns,
+            ),
+            self.receive_stats,
             reference=self._pipeline.reference,
             training=self._pipeline.trained_share(self.last_ns),
         )
