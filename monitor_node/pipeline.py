@@ -282,7 +282,7 @@ class PlantPipeline:
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
         trained_min = (time_ns - self._began_ns) / MINUTE_NS
-        if trained_min >= config.training_min and self._training.is_enough(self.signals.timed_out[1:]):
+        if trained_min >= config.training_min and self._training.is_enough(self.signals.silence.silent[1:]):
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
                 self._refusals += 1

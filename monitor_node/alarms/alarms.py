@@ -92,30 +92,27 @@ class AlarmMemory(msgspec.Struct, forbid_unknown_fields=True):
     comment: str = ""
 
 
+SHARED = (
+    "raised_ns", "cleared_ns", "value", "limit", "unit", "text", "incident", "first_in", "shelved_until_ns", "by",
+    "comment",
+)  # fmt: skip
+"""Fields that the state of an alarm and its message have in common."""
+
+
 def memory_from_message(alarm: Alarm) -> AlarmMemory:
     """Reconstruct the state of an alarm from a message, as far as the message has it."""
     active = alarm.raised_ns != 0 and alarm.cleared_ns == 0
     return AlarmMemory(
         state=next((state for state, code in STATES.items() if code == alarm.state), State.NORMAL),
         rule=OnOffDelayState(standing=active),
-        raised_ns=alarm.raised_ns,
-        cleared_ns=alarm.cleared_ns,
-        value=alarm.value,
-        limit=alarm.limit,
         above=alarm.limit > 0.0,
-        unit=alarm.unit,
-        text=alarm.text,
         contributions={item.signal: item.share for item in alarm.contributions},
         suspects=[
             SuspectedCause(**{field: getattr(item, field) for field in SuspectedCause.__struct_fields__})
             for item in alarm.suspects
         ],
-        incident=alarm.incident,
-        first_in=alarm.first_in,
         shelved_ns=alarm.time_ns if alarm.shelved_until_ns else 0,
-        shelved_until_ns=alarm.shelved_until_ns,
-        by=alarm.by,
-        comment=alarm.comment,
+        **{field: getattr(alarm, field) for field in SHARED},
     )
 
 
@@ -237,20 +234,10 @@ class ChartAlarm:
             alarm=self.name,
             state=STATES[memory.state],
             priority=self.priority,
-            raised_ns=memory.raised_ns,
-            cleared_ns=memory.cleared_ns,
-            value=memory.value,
-            limit=memory.limit,
-            unit=memory.unit,
             contributions=[Contribution(signal=name, share=share) for name, share in memory.contributions.items()],
             suspects=[Suspect(**msgspec.structs.asdict(item)) for item in memory.suspects],
-            text=memory.text,
             event=event,
-            incident=memory.incident,
-            first_in=memory.first_in,
-            shelved_until_ns=memory.shelved_until_ns,
-            comment=memory.comment,
-            by=memory.by,
+            **{field: getattr(memory, field) for field in SHARED},
         )
 
     def _is_normal(self, judgement: Judgement) -> bool:

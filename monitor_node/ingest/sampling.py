@@ -13,6 +13,10 @@ from statistics import median
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.arrays import Array
 
 LEARN_FROM = 32  # spacings
 TOLERANCE = 0.1  # of the period
@@ -127,3 +131,28 @@ def missing_rows(periods: float) -> int:
     """
     whole = round(periods)
     return whole - 1 if whole > 1 and abs(periods - whole) <= WHOLE else 0
+
+
+def regular_intervals(time_min: Array) -> NDArray[np.bool_]:
+    """Flags of the intervals of a record that are one sampling period, its median interval, to a tenth; shape (n - 1,).
+
+    Args:
+        time_min: times of the rows, shape (n,).
+    """
+    spacings = np.diff(time_min)
+    period = np.median(spacings) if spacings.size else 0.0
+    return np.abs(spacings - period) <= TOLERANCE * period
+
+
+def missing_in_intervals(time_min: Array) -> NDArray[np.intp]:
+    """Numbers of rows missing in the intervals of a record, by its median interval, shape (n - 1,).
+
+    Args:
+        time_min: times of the rows, shape (n,).
+
+    >>> missing_in_intervals(np.array([0.0, 1.0, 2.0, 4.0, 5.0])).tolist()
+    [0, 0, 1, 0]
+    """
+    spacings = np.diff(time_min)
+    periods = spacings / (np.median(spacings) if spacings.size else 1.0)
+    return np.array([missing_rows(item) for item in periods.tolist()], dtype=np.intp)

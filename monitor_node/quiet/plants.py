@@ -1,5 +1,6 @@
 """The quiet plants as a fleet sees them: they come and go, samples come in, and what is to be said goes out."""
 
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import msgspec
@@ -167,7 +168,7 @@ class QuietPlants:
             monitor.failures.add("promotion", error, "the plant is learned again")
         monitor.on_history_end()
         p["health_due_ns"] = self._slots.health_due_ns[slot]
-        monitor.receive_stats = _receive_stats(p)
+        monitor.stats, monitor.receipts_ns = _receive_stats(p), (int(p["received_ns"]), int(p["counted_ns"]))
         self._slots.leave(plant)
         return monitor
 
@@ -349,4 +350,4 @@ class _Rows(NamedTuple):
 
 def _receive_stats(p: np.void) -> ReceiveStats:
     """Statistics by receive time of a record."""
-    return ReceiveStats(*(p[name].item() for name in ReceiveStats._fields))
+    return ReceiveStats(*(p[field.name].item() for field in fields(ReceiveStats)))

@@ -58,7 +58,8 @@ class SignalChecks:
         self._board, self._outputs = board, config.outputs
         known = ranges or [ANY] * (1 + len(config.outputs))
         self._checks = [check(config, board, known) for check in CHECKS]
-        self._silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
+        self.silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
+        """The check for missing data, which a receive time can decide as well."""
         self.check_row: Callable[[int, tuple[float, ...]], list[Publication]]
         self.check_row = self._only("on_row", _in_one_list)
         """Checks a row, see `SignalCheck.on_row`."""
@@ -81,11 +82,6 @@ class SignalChecks:
             if getattr(type(check), name) is not getattr(SignalCheck, name)
         ]
         return hooks[0] if len(hooks) == 1 else combine(hooks)
-
-    @property
-    def timed_out(self) -> list[bool]:
-        """Silence of each signal, the input first."""
-        return self._silence.silent
 
     def start(self, values: list[list[float]], e: list[list[float]], arl0: float) -> None:
         """Learn from the training; arguments as for `SignalCheck.start`."""
@@ -123,7 +119,7 @@ class SignalChecks:
                 check.restore(getattr(state, FIELDS[check.name]))
             elif check.name in others:
                 check.restore(state.others[check.name])
-        self._silence.arm(now_ns)
+        self.silence.arm(now_ns)
 
     # --- rows ------------------------------------------------------------------------------------------------
 
@@ -136,42 +132,6 @@ class SignalChecks:
         """Drop earlier rows: the publisher was restarted."""
         for check in self._checks:
             check.on_restart()
-
-    def resume_from_alarms(self) -> None:
-        """Take as silent what the alarms say is silent: the next sample ends it."""
-        self._silence.resume_from_alarms()
-
-    # --- receive time ----------------------------------------------------------------------------------------
-
-    def on_receipt(self, now_ns: int) -> None:
-        """Note that something came from the plant."""
-        self._silence.of_plant.on_receipt(now_ns)
-
-    @property
-    def receipts_ns(self) -> tuple[int | None, int | None]:
-        """When something came last, and from when the next spacing is counted; None: what comes next is the first."""
-        return self._silence.of_plant.receipts_ns
-
-    @receipts_ns.setter
-    def receipts_ns(self, receipts_ns: tuple[int | None, int | None]) -> None:
-        self._silence.of_plant.receipts_ns = receipts_ns
-
-    def due_ns(self) -> int | None:
-        """When to `check`, unless something comes before; None: there is nothing to wait for."""
-        return self._silence.of_plant.due_ns()
-
-    @property
-    def deadline_ns(self) -> int | None:
-        """Until when the next row is allowed, in the time of the samples."""
-        return self._silence.of_plant.deadline_ns()
-
-    def check(self, now_ns: int) -> list[Publication]:
-        """Look whether the plant is silent, by the clock of receipt."""
-        return self._silence.publish(0, self._silence.of_plant.check(now_ns))
-
-    def declare_timeout(self) -> list[Publication]:
-        """Take the plant as silent, as the clock of receipt told it when this was recorded."""
-        return self._silence.publish(0, self._silence.of_plant.declare_timeout())
 
 
 def _in_one_list(hooks: list[Callable[..., list[Publication]]]) -> Callable[..., list[Publication]]:
