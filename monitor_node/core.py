@@ -14,7 +14,7 @@ from monitor_node.alarms.commands import execute_command
 from monitor_node.baseline.training import NO_VALUE
 from monitor_node.config import MonitorConfig
 from monitor_node.failures import Failures
-from monitor_node.health import NODE, health_message
+from monitor_node.health import NODE, Processed, health_message
 from monitor_node.ingest.alignment import Aligner, Row
 from monitor_node.ingest.receive_stats import HEARD_AGAIN_NS, STALL_NS, ReceiveStats
 from monitor_node.ingest.rejects import RejectCounter
@@ -22,6 +22,7 @@ from monitor_node.ingest.replay_filter import ReplayFilter
 from monitor_node.ingest.sample_limits import LARGEST_NUMBER, LARGEST_SAMPLE, LARGEST_VALUE, USABLE, reject_reason
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from monitor_node.pipeline import PlantPipeline
+from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
@@ -51,7 +52,7 @@ class Monitor:
         last_ns: time of the last row; None before the first.
         span_ns: time span of the rows, summed over the runs of the plant, since this monitor was made.
         received: number of messages so far.
-        not_stored: number of failures to store the state, counted by the storage.
+        stats: statistics by receive time, which a restart resets.
     """
 
     def __init__(
@@ -78,13 +79,8 @@ class Monitor:
         self.span_ns = 0
         self._watching_since_ns: int | None = None
         self.received = 0
-        self.not_stored = 0
-        self._stalls, self._ticked = 0, False
+        self.stats = ReceiveStats(start_ns, start_ns)
         self._published = 0
-        self._heard_ns = 0
-        self._lag_ns = 0
-        self._start_ns = start_ns
-        self._health_due_ns = start_ns
         self._snapshot_due_ns: int | None = None
         self._snapshot_ns = int(config.snapshot_min * MINUTE_NS)
 
@@ -93,8 +89,8 @@ class Monitor:
     def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
         """Process a message on a key of the plant's samples; returns publications."""
         self.received += 1
-        if message.received_ns and now_ns - message.received_ns > self._lag_ns:
-            self._lag_ns = now_ns - message.received_ns
+        if message.received_ns and now_ns - message.received_ns > self.stats.lag_ns:
+            self.stats.lag_ns = now_ns - message.received_ns
         signal = self._signal_by_key.get(message.key)
         if signal is None:
             self.rejects.add("unknown_signal", f"{message.key} is none of {', '.join(self._signals)}")
@@ -126,7 +122,7 @@ class Monitor:
         publications: list[Publication] = []
         time_ns, number = sample.time_ns, sample.sequence
         run, is_accepted = self._runs[self._indices[signal]], True
-        if run.accept_next(time_ns, number):  # as nearly always
+        if run.accept_next(number, time_ns):  # as nearly always
             self._accept(signal, time_ns, number, value, sample.unit, publications)
         elif not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
             self.rejects.add(
@@ -140,9 +136,9 @@ class Monitor:
                 self._reject(signal, item, run)
             for item in accepted:
                 self._accept(signal, *item, publications)
-        if is_accepted and now_ns >= self._heard_ns + HEARD_AGAIN_NS:
-            self._heard_ns = now_ns
-            self._pipeline.signals.on_receipt(now_ns)
+        if is_accepted and now_ns >= self.stats.heard_ns + HEARD_AGAIN_NS:
+            self.stats.heard_ns = now_ns
+            self._silence.of_plant.on_receipt(now_ns)
         self._published += len(publications)
         return publications
 
@@ -178,23 +174,20 @@ class Monitor:
 
     def on_tick(self, now_ns: int) -> list[Publication]:
         """Publish health if it is due; raise the alarm of a plant without data."""
-        if self._ticked and now_ns - self._due_ns() > STALL_NS:
-            self._stalls += 1
-        self._ticked = True
+        if self.stats.ticked and now_ns - self.next_tick_ns() > STALL_NS:
+            self.stats.stalls += 1
+        self.stats.ticked = True
         publications = self._check_timeout(now_ns)
         self._published += len(publications)
-        if now_ns >= self._health_due_ns:
-            self._health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
+        if now_ns >= self.stats.health_due_ns:
+            self.stats.health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
             publications.append(self._health(now_ns, self.phase))
         return publications
 
     def next_tick_ns(self) -> int:
         """Time when health or the plant's data timeout is due."""
-        return self._due_ns()
-
-    def _due_ns(self) -> int:
-        overdue_ns = self._pipeline.signals.due_ns()
-        return self._health_due_ns if overdue_ns is None else min(self._health_due_ns, overdue_ns)
+        overdue_ns = self._silence.of_plant.due_ns()
+        return self.stats.health_due_ns if overdue_ns is None else min(self.stats.health_due_ns, overdue_ns)
 
     @property
     def finished(self) -> bool:
@@ -257,7 +250,7 @@ class Monitor:
         try:
             pipeline = self._new_pipeline(board)
             board.from_bytes(state.board)
-            pipeline.restore(state.watch, self._start_ns)
+            pipeline.restore(state.watch, self.stats.start_ns)
         except ValueError as error:
             raise InputError(f"is no state of this software's monitor: {error}") from error
         self.alarms, self._pipeline = board, pipeline
@@ -297,7 +290,7 @@ class Monitor:
             InputError: see `Annunciator.from_bytes`; nothing has changed.
         """
         self.alarms.from_bytes(data)
-        self._pipeline.signals.resume_from_alarms()
+        self._silence.resume_from_alarms()
 
     def resume_from_alarms(self, alarms: Iterable[Alarm]) -> None:
         """Resume from the alarms that another monitor of the plant published last, without its state.
@@ -308,34 +301,7 @@ class Monitor:
             alarms: the newest message of each alarm.
         """
         self.alarms.resume_from(alarms)
-        self._pipeline.signals.resume_from_alarms()
-
-    @property
-    def receive_stats(self) -> ReceiveStats:
-        """Statistics by receive time, which a restart resets."""
-        received_ns, counted_ns = self._pipeline.signals.receipts_ns
-        return ReceiveStats(
-            self._start_ns,
-            self._heard_ns,
-            received_ns,
-            counted_ns,
-            self._lag_ns,
-            self._health_due_ns,
-            self._ticked,
-            self._stalls,
-            self.not_stored,
-        )
-
-    @receive_stats.setter
-    def receive_stats(self, receive_stats: ReceiveStats) -> None:
-        self._start_ns, self._heard_ns, self._lag_ns = (
-            receive_stats.start_ns,
-            receive_stats.heard_ns,
-            receive_stats.lag_ns,
-        )
-        self._pipeline.signals.receipts_ns = receive_stats.received_ns, receive_stats.counted_ns
-        self._health_due_ns, self._ticked = receive_stats.health_due_ns, receive_stats.ticked
-        self._stalls, self.not_stored = receive_stats.stalls, receive_stats.not_stored
+        self._silence.resume_from_alarms()
 
     # --- status ----------------------------------------------------------------------------------------------
 
@@ -408,13 +374,26 @@ class Monitor:
     # --- replay of timeouts ----------------------------------------------------------------------------------
 
     @property
+    def _silence(self) -> SilenceCheck:
+        return self._pipeline.signals.silence
+
+    @property
+    def receipts_ns(self) -> tuple[int | None, int | None]:
+        """See `DataTimeout.receipts_ns`, of the plant."""
+        return self._silence.of_plant.receipts_ns
+
+    @receipts_ns.setter
+    def receipts_ns(self, receipts_ns: tuple[int | None, int | None]) -> None:
+        self._silence.of_plant.receipts_ns = receipts_ns
+
+    @property
     def timeout_deadline_ns(self) -> int | None:
         """Sample time at which the plant's data timeout expires; None if unknown."""
-        return self._pipeline.signals.deadline_ns
+        return self._silence.of_plant.deadline_ns()
 
     def declare_timeout(self) -> list[Publication]:
         """Declare a data timeout that was recorded, where the receive time expired it."""
-        return self._pipeline.signals.declare_timeout()
+        return self._silence.declare_timeout()
 
     # --- rows ------------------------------------------------------------------------------------------------
 
@@ -464,7 +443,7 @@ class Monitor:
 
     def _check_timeout(self, now_ns: int) -> list[Publication]:
         try:
-            return self._pipeline.signals.check(now_ns)
+            return self._silence.check(now_ns)
         except Exception as error:  # noqa: BLE001 # the plant's border, see `_on_row`
             self._contain("silence", error)
             return []
@@ -481,9 +460,9 @@ class Monitor:
         """
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
         alarms = self.alarms.all_alarms()
-        notes, receipts_ns = self._pipeline.notes, self._pipeline.signals.receipts_ns
+        notes, receipts_ns = self._pipeline.notes, self.receipts_ns
         self._pipeline = self._new_pipeline(self.alarms)
-        self._pipeline.notes, self._pipeline.signals.receipts_ns = notes, receipts_ns
+        self._pipeline.notes, self.receipts_ns = notes, receipts_ns
         self._watching_since_ns = None
         self.resume_from_alarms(alarms)
 
@@ -491,18 +470,17 @@ class Monitor:
         health = health_message(
             now_ns,
             phase,
-            self._start_ns,
-            self._aligner.state.counts,
-            self.rejects.by_reason,
-            received=self.received,
-            published=self._published,
-            lag_ns=self._lag_ns,
-            heard_from_ns=self._heard_from_ns,
-            not_stored=self.not_stored,
-            stalls=self._stalls,
-            failures=self.failures.by_stage,
+            Processed(
+                self._aligner.state.counts,
+                self.received,
+                self._published,
+                self.rejects.by_reason,
+                self.failures.by_stage,
+                self._heard_from_ns,
+            ),
+            self.stats,
             reference=self._pipeline.reference,
             training=self._pipeline.trained_share(self.last_ns),
         )
-        self._lag_ns = 0
+        self.stats.lag_ns = 0
         return Publication(keys.key(self.config.plant, keys.HEALTH, NODE), health)

@@ -24,7 +24,7 @@ from monitor_node.chart_stage import ChartWatch, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
-from monitor_node.ingest.alignment import Row
+from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.signal_checks.stage import SignalChecks
@@ -224,19 +224,21 @@ class PlantPipeline:
         Args:
             row: values, the input first.
             units: units of the outputs.
-            publications: list to which publications are added.
+            publications: list to which publications are added; those before an error are published nevertheless.
         """
         time_ns = row.time_ns
-        follows = self._sampling.follows(time_ns) and not row.restarted
+        interval = self._sampling.update(time_ns)
         publications.extend(self.signals.check_row(time_ns, row.values))
         measured = self.signals.mask_values(time_ns, row.values, publications) if self._is_process else row.values
         input_value, *values = measured
+        follows = interval.follows and not row.restarted
+        measured_row = MeasuredRow(time_ns, input_value, values, units, interval, follows, publications)
         if self._reference is None:
-            self._train(time_ns, input_value, values, units, publications, follows=follows)
+            self._train(measured_row)
         else:
             if row.restarted:
                 self.signals.reset()
-            self._evaluate(time_ns, input_value, values, units, publications, follows=follows)
+            self._evaluate(measured_row)
 
     def snapshots(self, time_ns: int) -> list[Publication]:
         """Snapshots of each output's models: the adaptive one, the one fitted to the training, and the reference.
@@ -272,24 +274,15 @@ class PlantPipeline:
         ]
         self._training: Training = Training(config, self.model, self._predictors)
 
-    def _train(
-        self,
-        time_ns: int,
-        input_value: float,
-        values: list[float],
-        units: list[str],
-        publications: list[Publication],
-        *,
-        follows: bool,
-    ) -> None:
-        config = self._config
+    def _train(self, row: MeasuredRow) -> None:
+        config, time_ns, values, publications = self._config, row.time_ns, row.values, row.publications
         if not self._promise_checked and self._sampling.state.period_ns is not None:
             check_promise(config, self._sampling.period_ns / MINUTE_NS)
             self._promise_checked = True
         if self._began_ns is None or time_ns < self._began_ns:
             self._began_ns = time_ns
         trained_min = (time_ns - self._began_ns) / MINUTE_NS
-        if trained_min >= config.training_min and self._training.is_enough(self.signals.timeout_flags[1:]):
+        if trained_min >= config.training_min and self._training.is_enough(self.signals.silence.silent[1:]):
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
                 self._refusals += 1
@@ -297,22 +290,31 @@ class PlantPipeline:
                 self._start_training(time_ns)
             else:
                 self._start(trained)
-                self._evaluate(time_ns, input_value, values, units, publications, follows=follows)
+                self._evaluate(row)
                 publications.extend(self.snapshots(time_ns))
                 return
-        self._training.add(time_ns, input_value, values)
+        self._training.add(time_ns, row.input_value, values)
         if not self._points:
-            for predictor, value in zip(self._predictors, values, strict=True):
-                predictor.buffer(time_ns, input_value, value, follows=follows)
+            self._buffer(row)
         else:
-            predictions = [
-                predictor.update(time_ns, input_value, value, follows=follows)
-                for predictor, value in zip(self._predictors, values, strict=True)
-            ]
-            for key, prediction, value, unit in zip(self._estimate_keys, predictions, values, units, strict=True):
+            for key, prediction, value, unit in zip(
+                self._estimate_keys, self._predict(row), values, row.units, strict=True
+            ):
                 residual = value - prediction
                 if isfinite(residual):
                     publications.append(Publication(key, _estimate(time_ns, prediction, residual, unit)))
+
+    def _predict(self, row: MeasuredRow) -> list[float]:
+        """Predict each output by its identified model, which is updated with the row."""
+        return [
+            predictor.update(row.time_ns, row.input_value, value, follows=row.follows)
+            for predictor, value in zip(self._predictors, row.values, strict=True)
+        ]
+
+    def _buffer(self, row: MeasuredRow) -> None:
+        """Buffer a row for the identified models, whose predictions nothing needs now."""
+        for predictor, value in zip(self._predictors, row.values, strict=True):
+            predictor.buffer(row.time_ns, row.input_value, value, follows=row.follows)
 
     def _leave_out(self, left_out: dict[str, str]) -> None:
         """Exclude signals from monitoring."""
@@ -362,13 +364,11 @@ class PlantPipeline:
             return None
         return Suspicion(self._config, self._board, reference)
 
-    def _search_causes(
-        self, time_ns: int, input_value: float, values: list[float], units: list[str], stuck: list[bool]
-    ) -> list[Publication]:
+    def _search_causes(self, row: MeasuredRow, stuck: Sequence[bool]) -> list[Publication]:
         """Search the causes of alarms; an error there costs the state of the search, and no alarm."""
         assert self._suspicion is not None
         try:
-            return self._suspicion.update(time_ns, input_value, values, units, stuck)
+            return self._suspicion.update(row.time_ns, row.input_value, row.values, row.units, list(stuck))
         except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
             self._failures.add("isolation", error, "the search for the cause of this alarm starts again")
             assert self._reference is not None
@@ -377,44 +377,33 @@ class PlantPipeline:
 
     # --- monitoring ------------------------------------------------------------------------------------------
 
-    def _evaluate(
-        self,
-        time_ns: int,
-        input_value: float,
-        values: list[float],
-        units: list[str],
-        publications: list[Publication],
-        *,
-        follows: bool,
-    ) -> None:
-        reference = self._reference
+    def _evaluate(self, row: MeasuredRow) -> None:
+        reference, time_ns, units, publications = self._reference, row.time_ns, row.units, row.publications
         assert reference is not None
         if self.left_out:
-            self._note_late_signals(input_value, values)
-            input_value = 0.0 if self._config.input in self.left_out else input_value  # as in the training
-            values = [value if evaluated else nan for value, evaluated in zip(values, self._evaluated, strict=True)]
-        publications.extend(self.signals.check_values(time_ns, values, units))
-        stuck = self.signals.invalid_outputs
-        if True in stuck:
-            values = [nan if still else value for value, still in zip(values, stuck, strict=True)]
-        if isinstance(reference, ArxReference):
-            reference.predictions = [
-                predictor.update(time_ns, input_value, value, follows=follows)
-                for predictor, value in zip(self._predictors, values, strict=True)
+            self._note_late_signals(row.input_value, row.values)
+            row.input_value = 0.0 if self._config.input in self.left_out else row.input_value  # as in the training
+            row.values = [
+                value if evaluated else nan for value, evaluated in zip(row.values, self._evaluated, strict=True)
             ]
+        publications.extend(self.signals.check_values(time_ns, row.values, units))
+        stuck = self.signals.invalid()
+        if True in stuck:
+            row.values = [nan if still else value for value, still in zip(row.values, stuck, strict=True)]
+        values = row.values
+        if isinstance(reference, ArxReference):
+            reference.predictions = self._predict(row)
         elif self._drift.wanted:
-            for predictor, value in zip(self._predictors, values, strict=True):
-                predictor.buffer(time_ns, input_value, value, follows=follows)
-        if self._sampling.gap:  # the input in it is unknown
+            self._buffer(row)
+        if row.interval.is_gap:  # the input in it is unknown
             reference.restart()
             self.signals.restart()
             for whitener in self._whiteners:
                 whitener.restart()
-        missing = self._sampling.missing
-        predictions, sds = reference.update(time_ns, input_value, values, self._quarantined, missing)
+        predictions, sds = reference.update(time_ns, row.input_value, values, self._quarantined, row.interval.missing)
         scales = [sd * whitened for sd, whitened in zip(sds, self._whitened_sds, strict=True)]
         if self._points:
-            publications.extend(self._estimates(time_ns, values, predictions, sds, scales, units))
+            publications.extend(self._estimates(row, predictions, sds, scales))
         e = [
             whitener.update((value - prediction) / sd)
             for whitener, value, prediction, sd in zip(self._whiteners, values, predictions, sds, strict=True)
@@ -425,10 +414,11 @@ class PlantPipeline:
             for whitener, outlier in zip(self._whiteners, quarantined, strict=True):
                 if outlier:
                     whitener.reject_last()
-        self._charts.update(time_ns, e, quarantined, scales, units, publications, points=self._points)
-        publications.extend(self._drift.update(time_ns, self._predictors))
+        self._charts.update(row, e, quarantined, scales, points=self._points)
+        if self._drift.wanted:
+            publications.extend(self._drift.update(time_ns, self._predictors))
         if self._suspicion is not None:
-            publications.extend(self._search_causes(time_ns, input_value, values, units, stuck))
+            publications.extend(self._search_causes(row, stuck))
 
     def _note_late_signals(self, input_value: float, values: list[float]) -> None:
         """Note once each signal whose first value arrives after the training."""
@@ -440,23 +430,17 @@ class PlantPipeline:
                 )
 
     def _estimates(
-        self,
-        time_ns: int,
-        values: list[float],
-        predictions: Sequence[float],
-        sds: Sequence[float],
-        scales: list[float],
-        units: list[str],
+        self, row: MeasuredRow, predictions: Sequence[float], sds: Sequence[float], scales: list[float]
     ) -> Iterator[Publication]:
         """Estimates of a row, made before the prewhitening filter is updated with it."""
         for index, whitener in enumerate(self._whiteners):
-            prediction, residual = predictions[index], values[index] - predictions[index]
+            prediction, residual = predictions[index], row.values[index] - predictions[index]
             if isfinite(residual):
                 usual, reach = (
                     prediction + sds[index] * whitener.expected_value(),
                     scales[index] * self._charts.widths[index],
                 )
-                estimate = _estimate(time_ns, prediction, residual, units[index])
+                estimate = _estimate(row.time_ns, prediction, residual, row.units[index])
                 estimate.residual_sd = scales[index]
                 estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach
                 yield Publication(self._estimate_keys[index], estimate)

@@ -140,7 +140,7 @@ class WatchedPlants:
         if self._quiet is not None and plant in self._quiet:
             self._quiet.not_stored(plant)
         elif (monitor := self._monitors.get(plant)) is not None:
-            monitor.not_stored += 1
+            monitor.stats.not_stored += 1
 
     # --- event loop ------------------------------------------------------------------------------------------
 

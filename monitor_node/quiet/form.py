@@ -5,6 +5,7 @@ kept beside it (`Rest`), and shared between plants where it is the same.
 """
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import NamedTuple
 
 import msgspec
@@ -162,10 +163,10 @@ class QuietForm:
             monitor: of the plant.
             record: shape (1,).
         """
-        receive_stats = monitor.receive_stats
         if monitor.is_replaying_history or monitor.phase != "watching":
             return None
-        if receive_stats.received_ns is None or receive_stats.counted_ns is None:
+        received_ns, counted_ns = monitor.receipts_ns
+        if received_ns is None or counted_ns is None:
             return None
         state = monitor.state
         watched, alignment = state.watch.watched, state.alignment
@@ -181,7 +182,8 @@ class QuietForm:
             return None
         record[:] = np.zeros(1, self.record)
         p = record[0]
-        for name, known in receive_stats._asdict().items():
+        p["received_ns"], p["counted_ns"] = received_ns, counted_ns
+        for name, known in asdict(monitor.stats).items():
             p[name] = known
         write_runs(p, state.runs)
         p["received"], p["published"] = state.received, state.published

@@ -87,10 +87,10 @@ class StateFile:
                 file.flush()
                 os.fsync(file.fileno())
         except InputError:
-            self._monitor.not_stored += 1
+            self._monitor.stats.not_stored += 1
             raise
         except OSError as error:
-            self._monitor.not_stored += 1
+            self._monitor.stats.not_stored += 1
             raise InputError(f"state_file {self._path}: cannot be written: {error.strerror}") from error
 
     def _restore(self, data: bytes | None) -> str:

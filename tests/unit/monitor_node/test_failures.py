@@ -16,7 +16,7 @@ from monitor_node.isolation.isolation import Isolation
 from monitor_node.isolation.window import Window
 from monitor_node.pipeline import PlantPipeline
 from monitor_node.quiet.form import QuietForm
-from monitor_node.signal_checks.stage import SignalChecks
+from monitor_node.signal_checks.timeout import SilenceCheck
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError
@@ -33,7 +33,7 @@ def fail_from(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, from_ns: 
     method = getattr(owner, name)
 
     def failing(self: Any, *arguments: Any, **others: Any) -> Any:
-        config = self._board._config if isinstance(self, SignalChecks) else self._config
+        config = (self.board if isinstance(self, SilenceCheck) else self)._config
         times = [item for item in arguments if isinstance(item, int) and not isinstance(item, bool)]
         times += [item.time_ns for item in arguments if hasattr(item, "time_ns")]
         if config.plant == BROKEN and max(times, default=from_ns) >= from_ns:
@@ -54,7 +54,7 @@ def health_message(said: list[Publication], plant: str) -> Health:
     [
         (PlantPipeline, "update", "row"),
         (ChartWatch, "update", "row"),
-        (SignalChecks, "check_row", "row"),
+        (SilenceCheck, "on_row", "row"),
         (Annunciator, "end_row", "row"),
         (PlantPipeline, "snapshots", "models"),
         (QuietForm, "written", "demotion"),
@@ -154,7 +154,7 @@ def test_a_silence_that_cannot_be_checked_ends_no_monitor(
     monitor = Monitor(MonitorConfig(plant=BROKEN, training_min=20.0, isolation=False), 0, points=False)
     for message in runs[BROKEN][:900]:
         monitor.on_message(message, 0)
-    fail_from(monkeypatch, SignalChecks, "check", 0)
+    fail_from(monkeypatch, SilenceCheck, "check", 0)
     said = monitor.on_tick(10**18)
     assert health_message(said, BROKEN).failures == {"silence": 1}
 
