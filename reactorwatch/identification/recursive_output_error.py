@@ -107,11 +107,6 @@ class RecursiveOutputError:
         )
 
     @property
-    def rows(self) -> int:
-        """Number of rows learned from."""
-        return self._estimator.rows
-
-    @property
     def model(self) -> LinearModel:
         """The learned model, in the signals' own units."""
         return model_of(self._structure, self._scaling, self._estimator, simulates=True)

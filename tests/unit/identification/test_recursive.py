@@ -63,7 +63,7 @@ def test_a_row_that_is_not_complete_is_refused_and_changes_nothing() -> None:
     np.testing.assert_array_equal(running.model.covariance, untouched.model.covariance)
     running.restart()
     assert running.update([1.0], 1.0) is None
-    assert running.rows == 20
+    assert running.model.rows == 20
 
 
 def test_several_outputs_are_refused() -> None:
