@@ -160,8 +160,8 @@ class Monitor:
     def _reject(self, signal: str, sample: HeldSample, run: SequenceCheck) -> None:
         self.rejects.add(
             "out_of_place",
-            f"{signal} number {sample.number} at {sample.time_ns} ns does not follow number {run.number} at "
-            f"{run.time_ns} ns; do two plants publish as {self.config.plant}?",
+            f"{signal} number {sample.number} at {sample.time_ns} ns does not follow number {run.newest} at "
+            f"{run.newest_ns} ns; do two plants publish as {self.config.plant}?",
         )
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply, list[Publication]]:
@@ -367,6 +367,11 @@ class Monitor:
         return self._aligner.state.counts.rows
 
     @property
+    def has_pending_rows(self) -> bool:
+        """True while a row waits for samples."""
+        return bool(self._aligner.state.pending)
+
+    @property
     def restarts(self) -> int:
         """Number of restarts of the plant, or of its clock, so far."""
         return self._aligner.state.counts.restarts
@@ -382,7 +387,7 @@ class Monitor:
         return self._pipeline.expected_false_alarms
 
     @property
-    def left_out(self) -> dict[str, str]:
+    def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
         never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
         return dict.fromkeys(never_came, NO_VALUE) | self._pipeline.left_out

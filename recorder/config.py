@@ -25,8 +25,8 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         health_period_s: time between two health reports.
         flush_period_s: time between two flushes to the operating system, which is what a recorder that is killed may
             lose. At most a second.
-        fsync: when to sync flushed data to the disk, against power loss: `never`, after each `chunk` that was flushed,
-            or once a `second`.
+        fsync: policy of syncing flushed data to the disk, against power loss: `never`, after each flushed `chunk`, or
+            once a `second`.
         rotate_min: age of a file, in minutes, at which a new one is started; inf never starts one.
         rotate_mb: size of a file, in megabytes, at which a new one is started; inf never starts one.
         keep_mb: total size of all files, in megabytes, beyond which the oldest is deleted; inf deletes none.

@@ -15,6 +15,7 @@ from monitor_node.ingest.sample_limits import LARGEST_SAMPLE
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.runtime.delivery.gap_tracker import GapTracker
 
 AGAIN_NS = 60_000_000_000
 """At least twice the longest time that the bus waits for missing messages."""
@@ -22,7 +23,7 @@ AGAIN_NS = 60_000_000_000
 
 class _Newest(NamedTuple):
     until_ns: int
-    samples: dict[str, tuple[int, int]]  # by key, number and time
+    samples: dict[str, GapTracker]  # by key
 
 
 class RecentlyAdopted:
@@ -41,9 +42,7 @@ class RecentlyAdopted:
         """
         runs = zip((monitor.config.input, *monitor.config.outputs), monitor.state.runs, strict=True)
         samples = {
-            keys.key(plant, keys.SAMPLE, signal): (run.number, run.time_ns)
-            for signal, run in runs
-            if run.number is not None
+            keys.key(plant, keys.SAMPLE, signal): GapTracker(run.expected, run.newest_ns) for signal, run in runs
         }
         self._newest.pop(plant, None)
         self._newest[plant] = _Newest(now_ns + AGAIN_NS, samples)
@@ -59,4 +58,4 @@ class RecentlyAdopted:
             sample = decode(message.payload, message.encoding)
         except DecodeError:
             return False
-        return isinstance(sample, Sample) and sample.sequence <= newest[0] and sample.time_ns <= newest[1]
+        return isinstance(sample, Sample) and newest.is_past(sample.sequence, sample.time_ns)

@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 from math import nan
 from typing import NamedTuple
 
+from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+
 MOST_LOST = 2**62  # more than any plant publishes; corrupt sequence numbers must not overflow the count in a message
 REMEMBERED = 4  # times the reordering: emitted rows kept to detect duplicates; step back that means a restart
 
@@ -48,19 +50,6 @@ class Counts:
 
 
 @dataclass(slots=True)
-class Sequence:
-    """Sequence numbers of one signal.
-
-    Attributes:
-        expected: the number after the highest received; None before the first.
-        newest_ns: the latest sample time received; meaningless before the first.
-    """
-
-    expected: int | None = None
-    newest_ns: int = 0
-
-
-@dataclass(slots=True)
 class PendingRow:
     """A row that is not emitted yet.
 
@@ -84,7 +73,7 @@ class AlignmentState:
         left: sequence numbers of the rows emitted last, by time, oldest first; None where a sample was missing.
         newest_left_ns: time of the row emitted last; None before the first.
         newest_numbers: sequence numbers of that row, extrapolated where missing; None before the first.
-        sequences: one entry a signal.
+        sequences: position in the run of each signal.
         restarted: True if the next row is the first of a new run.
         counts: counts so far.
     """
@@ -93,7 +82,7 @@ class AlignmentState:
     left: dict[int, list[int | None]] = field(default_factory=dict)
     newest_left_ns: int | None = None
     newest_numbers: list[int | None] = field(default_factory=list)
-    sequences: list[Sequence] = field(default_factory=list)
+    sequences: list[GapTracker] = field(default_factory=list)
     restarted: bool = True
     counts: Counts = field(default_factory=Counts)
 
@@ -130,8 +119,8 @@ class Aligner:
         rows: list[Row] = []
         index, state = self._index[signal], self.state
         position = state.sequences[index]
-        if sequence == position.expected and time_ns > position.newest_ns:  # as nearly always
-            position.expected, position.newest_ns = sequence + 1, time_ns
+        if position.is_next(sequence, time_ns):  # as nearly always
+            position.advance(sequence, time_ns)
         else:
             rows = self._restart(index, time_ns, sequence)
             if self._is_duplicate(index, time_ns):
@@ -222,16 +211,14 @@ class Aligner:
         """Start a new run of the publisher."""
         state = self.state
         state.left, state.newest_left_ns, state.newest_numbers = {}, None, [None] * self._count
-        state.sequences, state.restarted = [Sequence() for _ in range(self._count)], True
+        state.sequences, state.restarted = [GapTracker() for _ in range(self._count)], True
 
-    def _count_sequence(self, position: Sequence, time_ns: int, sequence: int) -> None:
+    def _count_sequence(self, position: GapTracker, time_ns: int, sequence: int) -> None:
         counts = self.state.counts
-        if position.expected is None:
-            position.expected, position.newest_ns = sequence + 1, time_ns
-        elif sequence >= position.expected:
-            counts.lost = min(counts.lost + sequence - position.expected, MOST_LOST)
-            position.expected = sequence + 1
+        if position.expected is None or sequence >= position.expected:
+            counts.lost = min(counts.lost + position.advance(sequence, time_ns), MOST_LOST)
         elif time_ns < position.newest_ns:
             counts.out_of_order += 1
             counts.lost -= 1 if counts.lost else 0  # it was counted when it was overtaken
-        position.newest_ns = max(position.newest_ns, time_ns)
+        else:
+            position.newest_ns = time_ns

@@ -15,7 +15,7 @@ class ReceiveStats(NamedTuple):
     Attributes:
         start_ns: start of the monitor.
         heard_ns: receive time of the newest sample that counted, see `HEARD_AGAIN_NS`.
-        received_ns: the same for the plant's `DataTimeout`; None before the first.
+        received_ns: receive time of the newest sample for the plant's `DataTimeout`; None before the first.
         counted_ns: receive time from which the next spacing is counted; None before the first.
         lag_ns: longest delay of a message since the last health message.
         health_due_ns: time of the next health message.

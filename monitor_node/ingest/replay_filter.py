@@ -11,7 +11,10 @@ for its time: then the plant was restarted with its clock set back. A sample tha
 not processed, and passes.
 """
 
+from dataclasses import replace
+
 from monitor_node.ingest.alignment import AlignmentState
+from reactorwatch.runtime.delivery.gap_tracker import GapTracker
 
 
 class ReplayFilter:
@@ -22,8 +25,8 @@ class ReplayFilter:
     """
 
     def __init__(self, state: AlignmentState) -> None:
-        self._newest: list[tuple[int, int] | None] = [
-            None if item.expected is None else (item.expected, item.newest_ns) for item in state.sequences
+        self._newest: list[GapTracker | None] = [
+            None if item.expected is None else replace(item) for item in state.sequences
         ]
         waiting = {time_ns: row.numbers for time_ns, row in state.pending.items()}
         self._numbers = {time_ns: list(numbers) for time_ns, numbers in (state.left | waiting).items()}
@@ -48,7 +51,7 @@ class ReplayFilter:
         if numbers is not None and numbers[index] is None:
             return False
         known = numbers is not None and numbers[index] == sequence
-        older = numbers is None and sequence < newest[0] and time_ns <= newest[1]
+        older = numbers is None and newest.is_past(sequence, time_ns)
         if not (known or older):
             self._newest[index] = None
         return known or older

@@ -1,4 +1,7 @@
-"""Sampling period, and the interval between a row and its predecessor.
+"""Spacing of samples, sampling period of rows, and the interval between a row and its predecessor.
+
+`Spacing` follows a plant that slows down, as timeouts and the check of sequence numbers need. `SamplingPeriod` is fixed
+once it is learned, because the models of the training hold for one period; so it is the median of the first intervals.
 
 A row *follows* if it is one sampling period after its predecessor, to a tenth: a linear model of lagged samples holds
 only then. A *gap* is more than two and a half periods, or a step back in time: the rows before it are then too old to
@@ -8,10 +11,34 @@ tell chance from change.
 from dataclasses import dataclass, field, replace
 from statistics import median
 
+import msgspec
+
 LEARN_FROM = 32  # spacings
 TOLERANCE = 0.1  # of the period
 LARGEST_GAP = 2.5  # periods
 WHOLE = 0.25  # of a period: tolerance of an interval of several whole periods, in which rows are missing
+
+
+class Spacing(msgspec.Struct, forbid_unknown_fields=True):
+    """Usual spacing of samples, by exponential means; the object is its own state.
+
+    Attributes:
+        count: number of spacings in the means, up to their memory.
+        mean_ns: exponential mean of the spacings.
+        deviation_ns: exponential mean of their absolute deviations.
+    """
+
+    count: int = 0
+    mean_ns: float = 0.0
+    deviation_ns: float = 0.0
+
+    def learn(self, spacing_ns: float, memory: int) -> None:
+        """Update the means, over `memory` spacings, with a spacing."""
+        self.count = min(self.count + 1, memory)
+        deviation = spacing_ns - self.mean_ns
+        self.mean_ns += deviation / self.count
+        if self.count > 1:
+            self.deviation_ns += (abs(deviation) - self.deviation_ns) / self.count
 
 
 @dataclass

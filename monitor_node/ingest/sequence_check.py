@@ -29,6 +29,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 from monitor_node.ingest.alignment import REMEMBERED
+from monitor_node.ingest.sampling import Spacing
+from reactorwatch.runtime.delivery.gap_tracker import GapTracker
 
 CONFIRMED, COUNTED = 8, 3
 """Samples that confirm a new run: with any numbers, and with the next numbers. One publisher's samples may be delayed
@@ -38,7 +40,7 @@ TOLERANCE, DEVIATIONS = 0.25, 4.0
 """Allowed deviation: share of the usual spacing, and mean deviations."""
 
 MEMORY = 16
-"""Spacings in the exponential mean, and needed before their evenness is judged."""
+"""Spacings in the exponential mean, and needed before their evenness is checked."""
 
 AT_FIRST = 4.0
 """Times the mean spacing, allowed before it is known."""
@@ -57,32 +59,25 @@ class HeldSample(NamedTuple):
 
 
 @dataclass(slots=True)
-class SequenceCheck:
+class SequenceCheck(GapTracker):
     """The run of samples of one signal; the object is its own state.
 
     Attributes:
-        number: sequence number of the newest sample; None before the first.
-        time_ns: time of the newest sample.
-        spacing_ns: usual spacing; 0 before it is known.
-        deviation_ns: mean deviation from it.
-        spacings: number of spacings in these means, up to `MEMORY`.
+        spacing: usual spacing of the run, over `MEMORY` spacings.
         held: held samples.
     """
 
-    number: int | None = None
-    time_ns: int = 0
-    spacing_ns: float = 0.0
-    deviation_ns: float = 0.0
-    spacings: int = 0
+    spacing: Spacing = field(default_factory=Spacing)
     held: list[HeldSample] = field(default_factory=list)
 
     def accept_next(self, time_ns: int, number: int) -> bool:
         """Accept a sample that has the next number at the usual time; returns True if it does."""
-        if self.held or number - 1 != self.number:
+        if self.held or number != self.expected:
             return False
-        if self.spacings < MEMORY or abs(time_ns - self.time_ns - self.spacing_ns) > ALIKE * self.spacing_ns:
+        spacing_ns = self.spacing.mean_ns
+        if self.spacing.count < MEMORY or abs(time_ns - self.newest_ns - spacing_ns) > ALIKE * spacing_ns:
             return False
-        self.number, self.time_ns = number, time_ns
+        self.expected, self.newest_ns = number + 1, time_ns
         return True
 
     def update(self, sample: HeldSample, reorder_rows: int) -> tuple[list[HeldSample], list[HeldSample]]:
@@ -90,13 +85,13 @@ class SequenceCheck:
 
         Args:
             sample: the new sample.
-            reorder_rows: as for the alignment.
+            reorder_rows: see the alignment.
         """
         held, window = self.held, REMEMBERED * reorder_rows
         follows = self._follows(sample, window)
         if not held:
             if follows:
-                self._advance(sample)
+                self._accept(sample)
                 return [sample], []
             self.held = [sample]
             return [], []
@@ -104,12 +99,12 @@ class SequenceCheck:
         if follows:
             between = [item for item in held if self._is_between(item, sample)]
             for item in (*between, sample):
-                self._advance(item)
+                self._accept(item)
             return [*between, sample], [item for item in held if item not in between]
         held.append(sample)
         if self._is_after_pause(held):
             for item in held:
-                self._advance(item)
+                self._accept(item)
             return held, []
         if not self._is_run(held, window):
             self.held = [sample]
@@ -118,9 +113,9 @@ class SequenceCheck:
         if len(held) < confirmed:
             self.held = held
             return [], []
-        self.number, self.spacing_ns, self.deviation_ns, self.spacings = None, 0.0, 0.0, 0
+        self.expected, self.spacing = None, Spacing()
         for item in held:
-            self._advance(item)
+            self._accept(item)
         return held, []
 
     def release(self) -> list[HeldSample]:
@@ -130,55 +125,50 @@ class SequenceCheck:
 
     def _is_after_pause(self, held: list[HeldSample]) -> bool:
         """True if samples have the next numbers at increasing times: the plant has paused."""
-        times_ns = [self.time_ns, *(item.time_ns for item in held)]
+        times_ns = [self.newest_ns, *(item.time_ns for item in held)]
         return self._are_next(held) and all(before < after for before, after in pairwise(times_ns))
 
     def _are_next(self, held: list[HeldSample]) -> bool:
         """True if samples have the next numbers."""
-        return self.number is not None and all(item.number == self.number + i for i, item in enumerate(held, start=1))
+        first = self.expected
+        return first is not None and all(item.number == number for number, item in enumerate(held, start=first))
 
     def _is_run(self, held: list[HeldSample], window: int) -> bool:
         """True if samples follow each other as evenly as the run."""
         pairs = [(item.number - last.number, item.time_ns - last.time_ns) for last, item in pairwise(held)]
         if any(abs(numbers) > window or numbers * time_ns <= 0 for numbers, time_ns in pairs):
             return False
-        if self.spacings < MEMORY:
+        if self.spacing.count < MEMORY:
             return True
-        unlike = TOLERANCE + DEVIATIONS * self.deviation_ns / self.spacing_ns
+        unlike = TOLERANCE + DEVIATIONS * self.spacing.deviation_ns / self.spacing.mean_ns
         spacings = [time_ns / numbers for numbers, time_ns in pairs]
         return max(spacings) - min(spacings) <= unlike * max(spacings)
 
     def _is_between(self, item: HeldSample, sample: HeldSample) -> bool:
         """True if number and time of an item are between the newest of the run and a sample."""
-        newest = self.number if self.number is not None else item.number
-        return newest < item.number < sample.number and self.time_ns < item.time_ns < sample.time_ns
+        newest = item.number if self.newest is None else self.newest
+        return newest < item.number < sample.number and self.newest_ns < item.time_ns < sample.time_ns
 
-    def _advance(self, sample: HeldSample) -> None:
-        if self.number is None or sample.number > self.number:
-            if self.number is not None:
-                self._learn((sample.time_ns - self.time_ns) / (sample.number - self.number))
-            self.number, self.time_ns = sample.number, sample.time_ns
-
-    def _learn(self, spacing_ns: float) -> None:
-        if spacing_ns <= 0.0:
-            return
-        self.spacings = min(self.spacings + 1, MEMORY)
-        deviation = spacing_ns - self.spacing_ns
-        self.spacing_ns += deviation / self.spacings
-        if self.spacings > 1:
-            self.deviation_ns += (abs(deviation) - self.deviation_ns) / self.spacings
+    def _accept(self, sample: HeldSample) -> None:
+        newest = self.newest
+        if newest is not None:
+            if sample.number <= newest:
+                return
+            spacing_ns = (sample.time_ns - self.newest_ns) / (sample.number - newest)
+            if spacing_ns > 0.0:
+                self.spacing.learn(spacing_ns, MEMORY)
+        self.advance(sample.number, sample.time_ns)
 
     def _follows(self, sample: HeldSample, window: int) -> bool:
         """True if a sample follows the newest of the run."""
-        if self.number is None:
+        if self.newest is None:
             return True
-        numbers, time_ns = sample.number - self.number, sample.time_ns - self.time_ns
+        numbers, time_ns = sample.number - self.newest, sample.time_ns - self.newest_ns
         if not numbers:
             return not time_ns
         if numbers < -window or time_ns * numbers <= 0:
             return False
-        spacing_ns = time_ns / numbers
-        if self.spacings < MEMORY:
-            return not self.spacings or spacing_ns <= AT_FIRST * self.spacing_ns
-        deviation = abs(spacing_ns - self.spacing_ns)
-        return deviation <= TOLERANCE * self.spacing_ns + DEVIATIONS * self.deviation_ns
+        spacing_ns, usual = time_ns / numbers, self.spacing
+        if usual.count < MEMORY:
+            return not usual.count or spacing_ns <= AT_FIRST * usual.mean_ns
+        return abs(spacing_ns - usual.mean_ns) <= TOLERANCE * usual.mean_ns + DEVIATIONS * usual.deviation_ns

@@ -7,10 +7,11 @@ import msgspec
 import numpy as np
 
 from monitor_node.baseline.references import ProcessReferenceState
+from monitor_node.ingest.sampling import Spacing
 from monitor_node.signal_checks.spike import SpikeState
 from monitor_node.signal_checks.stage import SignalChecksState
 from monitor_node.signal_checks.stuck import StuckState, longest_normal_run
-from monitor_node.signal_checks.timeout import DataTimeoutState, Spacing
+from monitor_node.signal_checks.timeout import DataTimeoutState
 from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.kalman.ekf import FilterState, NoiseLevels, variances
 from reactorwatch.process.model import ProcessModel

@@ -3,9 +3,10 @@
 import numpy as np
 
 from monitor_node.ingest.alignment import AlignmentState, Counts, PendingRow
-from monitor_node.ingest.alignment import Sequence as Numbering
+from monitor_node.ingest.sampling import Spacing
 from monitor_node.ingest.sequence_check import MEMORY as FULL_RUN
 from monitor_node.ingest.sequence_check import SequenceCheck
+from reactorwatch.runtime.delivery.gap_tracker import GapTracker
 
 COUNTS = ("rows", "incomplete_rows", "late", "duplicated", "out_of_order", "lost", "restarts")
 
@@ -32,17 +33,17 @@ def run_on(runs: list[SequenceCheck], alignment: AlignmentState) -> bool:
     """Whether no sample is held, the usual spacings are known, and the runs have come as far as the rows."""
     return all(
         not run.held
-        and run.spacings == FULL_RUN
-        and run.number is not None
-        and (run.number + 1, run.time_ns) == (numbering.expected, numbering.newest_ns)
+        and run.spacing.count == FULL_RUN
+        and run.expected is not None
+        and (run.expected, run.newest_ns) == (numbering.expected, numbering.newest_ns)
         for run, numbering in zip(runs, alignment.sequences, strict=True)
     )
 
 
 def write_runs(p: np.void, runs: list[SequenceCheck]) -> None:
     """Note the runs of the signals' samples, which have come as far as the rows."""
-    p["run_spacing_ns"] = [run.spacing_ns for run in runs]
-    p["run_deviation_ns"] = [run.deviation_ns for run in runs]
+    p["run_spacing_ns"] = [run.spacing.mean_ns for run in runs]
+    p["run_deviation_ns"] = [run.spacing.deviation_ns for run in runs]
 
 
 def runs_of(p: np.void) -> list[SequenceCheck]:
@@ -50,8 +51,8 @@ def runs_of(p: np.void) -> list[SequenceCheck]:
     runs: list[SequenceCheck] = []
     for place in range(len(p["expected"])):
         newest_ns = int(p["pending_ns"] if p["have"] >> place & 1 else p["left_ns"])
-        spacing_ns, deviation_ns = float(p["run_spacing_ns"][place]), float(p["run_deviation_ns"][place])
-        runs.append(SequenceCheck(int(p["expected"][place]) - 1, newest_ns, spacing_ns, deviation_ns, FULL_RUN))
+        spacing = Spacing(FULL_RUN, float(p["run_spacing_ns"][place]), float(p["run_deviation_ns"][place]))
+        runs.append(SequenceCheck(int(p["expected"][place]), newest_ns, spacing=spacing))
     return runs
 
 
@@ -87,7 +88,7 @@ def alignment_of(p: np.void, times_ns: list[int]) -> AlignmentState:
         numbers = [number - 1 if here else None for number, here in zip(expected, have, strict=True)]
         pending[pending_ns] = PendingRow(values, numbers, have.count(False))
     numbering = [
-        Numbering(number, pending_ns if here else left_ns) for number, here in zip(expected, have, strict=True)
+        GapTracker(number, pending_ns if here else left_ns) for number, here in zip(expected, have, strict=True)
     ]
     counts = Counts(**dict(zip(COUNTS, p["counts"].tolist(), strict=True)))
     return AlignmentState(pending, left, left_ns, list(newest), numbering, False, counts)

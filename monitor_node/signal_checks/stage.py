@@ -26,9 +26,9 @@ class SignalChecksState(StoredState, frozen=True, omit_defaults=True):
     """State of the checks of a plant's signals.
 
     Attributes:
-        silences: of the plant, of the input and of each output.
-        stuck: of each output; none before the training ends.
-        spikes: of each output; None for an output that is not judged; none before the training ends.
+        silences: state of the plant, of the input and of each output.
+        stuck: state of each output; empty before the training ends.
+        spikes: state of each output; None for an output without the check; empty before the training ends.
         others: the states of the other checks, by name.
     """
 
@@ -46,9 +46,9 @@ class SignalChecks:
     """Checks the signals of one plant.
 
     Args:
-        config: of the monitor.
+        config: configuration of the monitor.
         board: the alarms of the plant; those of the signals are declared here.
-        ranges: of the input and of each output; None: no bounds are known.
+        ranges: ranges of the input and of each output; None: no bounds are known.
     """
 
     CHANCE_ALARMS = sum(check.can_be_false for check in CHECKS)
@@ -60,7 +60,7 @@ class SignalChecks:
         self._checks = [check(config, board, known) for check in CHECKS]
         self._silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
         self._on_row: list[Callable[..., list[Publication]]] = self._hooks("on_row")
-        self._measured: list[Callable[..., tuple[float, ...]]] = self._hooks("measured")
+        self._measured: list[Callable[..., tuple[float, ...]]] = self._hooks("measured_values")
         self._on_values: list[Callable[..., list[Publication]]] = self._hooks("on_values")
         self._on_residuals: list[Callable[..., Flags]] = self._hooks("on_residuals")
         self._invalid = [check for check in self._checks if type(check).invalid is not SignalCheck.invalid]
@@ -74,12 +74,12 @@ class SignalChecks:
         ]
 
     @property
-    def timed_out(self) -> list[bool]:
-        """Silence of each signal, the input first."""
+    def timeout_flags(self) -> list[bool]:
+        """Flags of the signals without data, the input first."""
         return self._silence.silent
 
     @property
-    def stuck(self) -> list[bool]:
+    def invalid_outputs(self) -> list[bool]:
         """Outputs whose sensors are stuck: their readings are no measurements."""
         if len(self._invalid) == 1:
             return self._invalid[0].invalid
@@ -94,7 +94,7 @@ class SignalChecks:
 
     @property
     def state(self) -> SignalChecksState:
-        """A copy of all that is remembered; the alarms are the board's."""
+        """A copy of the full state; the alarms belong to the board."""
         states = {check.name: state for check in self._checks if (state := check.state) != b""}
         own = {field: states.pop(name) for name, field in FIELDS.items()}
         return SignalChecksState(**own, others=states)
@@ -179,7 +179,7 @@ class SignalChecks:
 
     @property
     def receipts_ns(self) -> tuple[int | None, int | None]:
-        """When something came last, and from when the next spacing is counted; None: what comes next is the first."""
+        """Receive time of the newest sample, and start of the next spacing; None before the first."""
         return self._silence.of_plant.receipts_ns
 
     @receipts_ns.setter
@@ -187,18 +187,18 @@ class SignalChecks:
         self._silence.of_plant.receipts_ns = receipts_ns
 
     def due_ns(self) -> int | None:
-        """When to `check`, unless something comes before; None: there is nothing to wait for."""
+        """Time of the next `check` without samples; None: there is nothing to wait for."""
         return self._silence.of_plant.due_ns()
 
     @property
     def deadline_ns(self) -> int | None:
-        """Until when the next row is allowed, in the time of the samples."""
+        """Latest allowed time of the next row, in the time of the samples."""
         return self._silence.of_plant.deadline_ns()
 
     def check(self, now_ns: int) -> list[Publication]:
-        """Look whether the plant is silent, by the clock of receipt."""
+        """Check for a silence of the plant, by the clock of receipt."""
         return self._silence.publish(0, self._silence.of_plant.check(now_ns))
 
     def declare_timeout(self) -> list[Publication]:
-        """Take the plant as silent, as the clock of receipt told it when this was recorded."""
+        """Declare the plant silent, as the clock of receipt did when this was recorded."""
         return self._silence.publish(0, self._silence.of_plant.declare_timeout())

@@ -48,6 +48,7 @@ import msgspec
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.baseline.signal_range import SignalRange
 from monitor_node.config import MonitorConfig
+from monitor_node.ingest.sampling import Spacing
 from monitor_node.signal_checks.base import PLANT, SignalCheck
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
@@ -89,42 +90,6 @@ class Change(NamedTuple):
 
 NO_CHANGE = Change(None, None)
 """Returned, the object itself, if nothing changes."""
-
-
-class Spacing(msgspec.Struct, forbid_unknown_fields=True):
-    """Spacing of samples on one clock.
-
-    Attributes:
-        count: number of spacings, up to `MEMORY`.
-        mean_ns: exponential mean of the spacings.
-        deviation_ns: exponential mean of their absolute deviations.
-    """
-
-    count: int = 0
-    mean_ns: float = 0.0
-    deviation_ns: float = 0.0
-
-    def allowed_ns(self, limit: float) -> int | None:
-        """`limit` times the usual spacing; None before it is known."""
-        usual_ns = self.usual_ns()
-        return None if usual_ns is None else int(limit * usual_ns)
-
-    def usual_ns(self) -> float | None:
-        """Usual spacing; None before it is known."""
-        return None if self.count < LEARN_FROM else self.mean_ns + DEVIATIONS * self.deviation_ns
-
-    @property
-    def steady_ns(self) -> float | None:
-        """The spacing, if all were equal; else None."""
-        return self.mean_ns if self.count == MEMORY and self.deviation_ns == 0.0 else None
-
-    def learn(self, spacing_ns: float) -> None:
-        """Update the means with a spacing."""
-        self.count = min(self.count + 1, MEMORY)
-        deviation = spacing_ns - self.mean_ns
-        self.mean_ns += deviation / self.count
-        if self.count > 1:
-            self.deviation_ns += (abs(deviation) - self.deviation_ns) / self.count
 
 
 class DataTimeoutState(StoredState, frozen=True):
@@ -180,7 +145,7 @@ class DataTimeout:
         timeout = cls(state.limit, state.least_s)
         timeout._rows, timeout._receipts = msgspec.structs.replace(state.rows), msgspec.structs.replace(state.receipts)
         timeout._last_ns, timeout.standing = state.last_ns, state.standing
-        timeout._steady_ns = timeout._rows.steady_ns
+        timeout._note_steady()
         return timeout
 
     @property
@@ -193,8 +158,7 @@ class DataTimeout:
 
     def fallback_allowed_ns(self) -> int | None:
         """Allowed time of a signal whose own spacing is unknown, by this plant's rows; None if that is unknown."""
-        usual_ns = self._rows.usual_ns()
-        return None if usual_ns is None else int(max(UNKNOWN_ROWS, self._limit) * usual_ns)
+        return _allowed_ns(self._rows, max(UNKNOWN_ROWS, self._limit))
 
     def update(self, time_ns: int, *, present: bool, fallback_allowed_ns: int | None = None) -> Change:
         """Update with a row.
@@ -215,7 +179,7 @@ class DataTimeout:
         if present and spacing_ns == self._steady_ns and not self.standing:
             self._last_ns = time_ns  # there is nothing to learn
             return NO_CHANGE
-        allowed_ns = rows.allowed_ns(self._limit)
+        allowed_ns = _allowed_ns(rows, self._limit)
         if allowed_ns is None and fallback_allowed_ns is not None:
             allowed_ns = max(fallback_allowed_ns, int(self._limit * rows.mean_ns))
         raised_ns = None
@@ -223,8 +187,8 @@ class DataTimeout:
             self.standing, raised_ns = True, last_ns + allowed_ns
         if not present:
             return NO_CHANGE if raised_ns is None else Change(raised_ns, None)
-        rows.learn(spacing_ns if allowed_ns is None else min(spacing_ns, allowed_ns))
-        self._steady_ns = rows.steady_ns
+        rows.learn(spacing_ns if allowed_ns is None else min(spacing_ns, allowed_ns), MEMORY)
+        self._note_steady()
         self._last_ns = time_ns
         return self._change(raised_ns, max(time_ns, last_ns + (allowed_ns or 0)))
 
@@ -255,7 +219,7 @@ class DataTimeout:
             self._counted_ns = now_ns
         elif self._receipts.count < MEMORY or now_ns - before_ns >= BURST * self._receipts.mean_ns:
             self._counted_ns = now_ns
-            self._receipts.learn(min(now_ns - before_ns, self._timeout_ns() or now_ns - before_ns))
+            self._receipts.learn(min(now_ns - before_ns, self._timeout_ns() or now_ns - before_ns), MEMORY)
 
     def due_ns(self) -> int | None:
         """Time to `check`, unless a sample arrives before; None: no timeout is set."""
@@ -290,12 +254,17 @@ class DataTimeout:
 
     def deadline_ns(self) -> int | None:
         """Deadline of the next row in sample time; None before the spacing is known."""
-        allowed_ns = self._rows.allowed_ns(self._limit)
+        allowed_ns = _allowed_ns(self._rows, self._limit)
         return None if self._last_ns is None or allowed_ns is None else self._last_ns + allowed_ns
 
     def _timeout_ns(self) -> int | None:
-        allowed_ns = self._receipts.allowed_ns(self._limit)
+        allowed_ns = _allowed_ns(self._receipts, self._limit)
         return None if allowed_ns is None else max(allowed_ns, int(self._least_s * 1e9))
+
+    def _note_steady(self) -> None:
+        """Note the spacing of the rows if all were equal: then the next equal one teaches nothing."""
+        rows = self._rows
+        self._steady_ns = rows.mean_ns if rows.count == MEMORY and rows.deviation_ns == 0.0 else None
 
     def _change(self, raised_ns: int | None, heard_ns: int) -> Change:
         """Change due to a sample."""
@@ -303,6 +272,13 @@ class DataTimeout:
             return NO_CHANGE
         self.standing = False
         return Change(raised_ns, heard_ns)
+
+
+def _allowed_ns(spacing: Spacing, limit: float) -> int | None:
+    """`limit` times the usual spacing; None before it is known."""
+    if spacing.count < LEARN_FROM:
+        return None
+    return int(limit * (spacing.mean_ns + DEVIATIONS * spacing.deviation_ns))
 
 
 class SilenceCheck(SignalCheck):
@@ -328,12 +304,12 @@ class SilenceCheck(SignalCheck):
 
     @property
     def silent(self) -> list[bool]:
-        """Silence of each signal, the input first."""
+        """Flags of the signals without data, the input first."""
         return [silence.standing for silence in self._silences[1:]]
 
     @property
     def state(self) -> list[DataTimeoutState]:
-        """Of the plant, of the input and of each output."""
+        """State of the plant, of the input and of each output."""
         return [silence.state for silence in self._silences]
 
     def restore(self, state: list[DataTimeoutState]) -> None:

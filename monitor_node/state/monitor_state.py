@@ -13,6 +13,7 @@ import msgspec
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import AlignmentState
 from monitor_node.ingest.sequence_check import SequenceCheck
+from monitor_node.state import version_2
 from monitor_node.state.pipeline_state import PipelineState
 from monitor_node.state.seal import DIGEST_BYTES, Seal
 from reactorwatch.errors import InputError
@@ -20,7 +21,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import StoredState
 
 MAGIC = b"reactorwatch monitor"
-SEAL = Seal(MAGIC, 2, "state of a monitor")
+SEAL = Seal(MAGIC, 3, "state of a monitor", {2: version_2.upgrade})
 
 NOT_LEARNED_BY = frozenset({"model", "alarm_state_file", "state_file", "state_every_s", "health_period_s"})
 """Settings that do not change the state; the model is identified by its equations, not by its file."""
@@ -74,7 +75,7 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     Args:
         config: settings of the monitor.
         model: process model.
-        points: as for `Monitor`.
+        points: see `Monitor`.
     """
     fields = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
     fields |= {"points": points, "equations": fingerprint(model)}

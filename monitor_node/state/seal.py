@@ -4,7 +4,9 @@ Without it a wrong bit in a covariance, or in the name of an alarm, would stay u
 distinguishes a state from a user's file.
 """
 
+from collections.abc import Callable, Mapping
 from hashlib import blake2b
+from types import MappingProxyType
 from typing import NamedTuple
 
 from reactorwatch.errors import InputError
@@ -22,20 +24,22 @@ class Seal(NamedTuple):
 
     Attributes:
         word: magic word, the first bytes.
-        version: version of the layout that is written and read.
+        version: version of the layout that is written.
         name: name of the kind, for messages.
+        upgrades: older versions that are read, each with the function from its body to one of `version`.
     """
 
     word: bytes
     version: int
     name: str
+    upgrades: Mapping[int, Callable[[bytes], bytes]] = MappingProxyType({})
 
     def close(self, body: bytes) -> bytes:
         """Seal a body: word, version, digest and body."""
         return self.word + self.version.to_bytes(_VERSION_BYTES, "big") + _digest(body) + body
 
     def open(self, data: bytes) -> bytes:
-        """Body of sealed bytes.
+        """Body of sealed bytes, in the layout of `version`.
 
         Raises:
             ForeignFileError: the bytes are not a state of this kind.
@@ -50,11 +54,16 @@ class Seal(NamedTuple):
             is_ours = self.word.startswith(head[: len(self.word)]) or is_intact or not data.strip(b"\0")
             raise InputError(text) if is_ours else ForeignFileError(text)
         version = int.from_bytes(head[len(self.word) :], "big")
-        if version != self.version:
+        if version != self.version and version not in self.upgrades:
             raise InputError(f"is the {self.name} in version {version}, this software reads {self.version}")
         if not is_intact:
             raise InputError(f"is a damaged {self.name}: its digest is another")
-        return body
+        if version == self.version:
+            return body
+        try:
+            return self.upgrades[version](body)
+        except ValueError as error:
+            raise InputError(f"is a damaged {self.name} in version {version}: {error}") from error
 
 
 def _digest(body: bytes) -> bytes:

@@ -88,7 +88,7 @@ def fit_arx(
     Rows with a missing value, or just after a gap in time, are excluded.
 
     Args:
-        structure: its terms.
+        structure: terms of the model.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, outputs), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
@@ -111,7 +111,7 @@ def linear_model(
     """Make a model in the signals' own units from a solution for scaled signals.
 
     Args:
-        structure: its terms.
+        structure: terms of the model.
         scaling: scaling of the signals.
         solution: solution for all outputs.
         rows: number of rows of the fit.

@@ -73,7 +73,7 @@ class RecursiveLeastSquares(Recursion):
     array([ 3., -1.])
 
     Args:
-        parameters: their number, n.
+        parameters: number of parameters, n.
         forgetting: weight of a row relative to its successor, in (0, 1]; the memory is 1 / (1 - forgetting) rows.
         covariance_limit: bound on the eigenvalues of `covariance`, and their value at the start. The default is
             1e6; without forgetting it is inf: nothing is assumed at the start.

@@ -9,7 +9,6 @@ One file may serve all nodes, with a table for each:
     name = "cstr"
 """
 
-import tomllib
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -25,12 +24,10 @@ from reactorwatch.runtime.setting_rules import (
     check_values,
     valid_choices,
 )
+from reactorwatch.toml_text import parse_toml
 
 SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log")
 """Valid tables of a settings file."""
-
-MAX_FILE_BYTES = 1_000_000
-"""Largest size of a settings file."""
 
 IDENTITY = ("ca", "certificate", "key")
 """Files with which a node authenticates itself and the router."""
@@ -130,7 +127,7 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
     if path is None:
         return {}
     try:
-        tables = parse_toml(path.read_bytes())
+        tables = parse_tables(path.read_bytes())
     except OSError as error:
         raise InputError(f"settings file {path}: cannot be read: {error.strerror}") from error
     except InputError as error:
@@ -145,20 +142,13 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
     return tables
 
 
-def parse_toml(content: bytes) -> dict[str, dict[str, Any]]:
-    """Parse the tables of a TOML document, with or without a byte order mark.
+def parse_tables(content: bytes) -> dict[str, dict[str, Any]]:
+    """Parse the tables of a settings file.
 
     Raises:
-        InputError: it is not TOML, too large or too deep to be settings, or holds a value outside of a table.
+        InputError: as `parse_toml`, or it holds a value outside of a table.
     """
-    if len(content) > MAX_FILE_BYTES:
-        raise InputError(f"must be at most {MAX_FILE_BYTES} bytes to be settings, got {len(content)}")
-    try:
-        tables = tomllib.loads(content.decode("utf-8-sig"))
-    except RecursionError as error:
-        raise InputError("is nested too deeply; settings are tables of values and lists") from error
-    except ValueError as error:  # not TOML, not UTF-8, or a number of thousands of digits
-        raise InputError(f"is not TOML: {error}") from error
+    tables = parse_toml(content)
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise InputError(f"'{name}' must be a table, like [{name}]")

@@ -11,6 +11,8 @@ from bisect import bisect_left
 from dataclasses import dataclass, field
 from enum import Enum
 
+from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+
 MAX_GAPS = 256  # stored gaps of a signal; a late sample of an older gap is counted as a duplicate
 MAX_POINTS = 256
 """Stored (number, time) points; beyond it every second one of the older half is dropped."""
@@ -28,29 +30,31 @@ class RunTransition(Enum):
 
 
 @dataclass(slots=True)
-class _PublisherRun:
+class _PublisherRun(GapTracker):
     """One run of the publisher.
 
     Attributes:
-        next: expected next number.
-        newest_ns: time of the sample with the highest number.
         lowest: lowest possible number of the run.
-        gaps: (first, last) number of each gap.
         points: increasing (number, time) of samples.
     """
 
-    next: int
-    newest_ns: int
+    max_gaps = MAX_GAPS
+
     lowest: int = 0
-    gaps: list[tuple[int, int]] = field(default_factory=list)
     points: list[tuple[int, int]] = field(default_factory=list)
 
-    def advance(self, sequence: int, time_ns: int) -> None:
-        """Add the newest sample."""
-        self.next, self.newest_ns = sequence + 1, time_ns
-        self.points.append((sequence, time_ns))
+    @property
+    def next(self) -> int:
+        """Expected number."""
+        assert self.expected is not None
+        return self.expected
+
+    def advance(self, number: int, time_ns: int = 0) -> int:
+        """Add the newest sample; returns how many were skipped."""
+        self.points.append((number, time_ns))
         if len(self.points) > MAX_POINTS:
             del self.points[1 : MAX_POINTS // 2 : 2]
+        return GapTracker.advance(self, number, time_ns)
 
     def is_consistent(self, sequence: int, time_ns: int) -> bool:
         """True if an older number can have this time in this run."""
@@ -63,15 +67,6 @@ class _PublisherRun:
             return False
         return after == len(self.points) or time_ns < self.points[after][1]
 
-    def fill(self, sequence: int) -> bool:
-        """Remove a late number from its gap; False if it is in none."""
-        for index, (first, last) in enumerate(self.gaps):
-            if first <= sequence <= last:
-                parts = [(first, sequence - 1), (sequence + 1, last)]
-                self.gaps[index : index + 1] = [gap for gap in parts if gap[0] <= gap[1]]
-                return True
-        return False
-
 
 @dataclass(slots=True)
 class _Checkpoint:
@@ -79,14 +74,14 @@ class _Checkpoint:
 
     Attributes:
         run: run of the sample before it.
-        next: `next` of that run.
+        expected: expected number of that run.
         newest_ns: `newest_ns` of that run.
         lost: `lost` of the counter.
         gaps: number of gaps of that run.
     """
 
     run: _PublisherRun
-    next: int
+    expected: int
     newest_ns: int
     lost: int
     gaps: int
@@ -119,10 +114,10 @@ class SequenceCounter:
         """Count one sample."""
         run = self._run
         if run is None:
-            run = self._run = _PublisherRun(sequence, time_ns)
+            run = self._run = _PublisherRun()
             run.advance(sequence, time_ns)
             return RunTransition.SAME_RUN
-        if sequence == run.next and time_ns > run.newest_ns and len(run.points) > 1:
+        if run.is_next(sequence, time_ns) and len(run.points) > 1:
             self._checkpoint = None  # derived from the points when needed
             run.advance(sequence, time_ns)
             return RunTransition.SAME_RUN
@@ -143,9 +138,7 @@ class SequenceCounter:
 
     def _classify(self, run: _PublisherRun, sequence: int, time_ns: int) -> RunTransition:
         before = _Checkpoint(run, run.next, run.newest_ns, self.lost, len(run.gaps))
-        if sequence >= run.next and time_ns > run.newest_ns:
-            self._add_gap(run, run.next, sequence)
-        elif sequence == 0 and run.next == 1 and time_ns > run.newest_ns:  # the publisher does not count its samples
+        if sequence == 0 and run.next == 1 and time_ns > run.newest_ns:  # the publisher does not count its samples
             run.points.clear()
         elif sequence < run.next and run.is_consistent(sequence, time_ns):
             filled = run.fill(sequence)
@@ -153,25 +146,24 @@ class SequenceCounter:
             self.lost -= filled
             self.duplicated += not filled
             return RunTransition.SAME_RUN
-        else:
+        elif sequence < run.next or time_ns <= run.newest_ns:
             expected = run.next if sequence >= run.next else 0
-            self._run = run = _PublisherRun(sequence, time_ns, lowest=expected)
-            self._add_gap(run, expected, sequence)
+            self._run = run = _PublisherRun(expected, lowest=expected)
         self._checkpoint = before
-        run.advance(sequence, time_ns)
+        self.lost += run.advance(sequence, time_ns)
         return RunTransition.SAME_RUN if run is before.run else RunTransition.NEW_RUN
 
     def _follows_checkpoint(self, sequence: int, time_ns: int) -> bool:
         """True if a sample continues the run as if the newest sample had not been received."""
         before = self._checkpoint
-        if before is None or sequence < before.next or time_ns <= before.newest_ns:
+        if before is None or sequence < before.expected or time_ns <= before.newest_ns:
             return False
         points = before.run.points[:-1] if before.run is self._run else before.run.points
         if len(points) < 2:
             return False
         (number, then_ns), (last, last_ns) = points[-2:]
         usual_ns = (last_ns - then_ns) / (last - number)
-        spacing_ns = (time_ns - before.newest_ns) / (sequence - before.next + 1)
+        spacing_ns = (time_ns - before.newest_ns) / (sequence - before.expected + 1)
         return MIN_SPACING * usual_ns <= spacing_ns <= MAX_SPACING * usual_ns
 
     def _roll_back(self) -> None:
@@ -184,13 +176,7 @@ class SequenceCounter:
             run.points.pop()
             del run.gaps[before.gaps :]
         # A stray with the expected number is not lost.
-        before.run.next = before.next + (stray == before.next)
+        before.run.expected = before.expected + (stray == before.expected)
         before.run.newest_ns = before.newest_ns
         self._run, self._checkpoint, self.lost = before.run, None, before.lost
         self.out_of_place += 1
-
-    def _add_gap(self, run: _PublisherRun, expected: int, sequence: int) -> None:
-        if sequence > expected:
-            self.lost += sequence - expected
-            run.gaps.append((expected, sequence - 1))
-            del run.gaps[:-MAX_GAPS]

@@ -21,11 +21,9 @@ The subscriber can then tell history from live messages. A stream without a know
 another number arrives first, when nothing older has arrived for `START_WINDOW_NS`.
 """
 
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import accumulate
-from operator import itemgetter
 from typing import Generic, NamedTuple
 
 from reactorwatch.runtime.delivery.stream_state import HoldState, Item, StreamState
@@ -35,10 +33,8 @@ RECOVERY_TIMEOUT_NS = 15_000_000_000
 """Zenoh gives a query up after 10 s; then it releases what it has."""
 POLL_NS = 250_000_000
 START_WINDOW_NS = 500_000_000
-MAX_LOST_RANGES = 100_000
-"""Ranges of lost numbers of a stream that are remembered, so that a message in one can still be released."""
 MAX_STREAMS = 100_000
-"""Streams that are remembered. A restarted publisher is another stream, and so is each plant of a fleet."""
+"""Largest number of stored streams. A restarted publisher is another stream, and so is each plant of a fleet."""
 ORPHAN_TIMEOUT_NS = 60_000_000_000
 """Time after which a stream is evicted that started with another number than 0, without a known last number and without
 a second message: garbage makes one stream a message."""
@@ -53,7 +49,7 @@ class Gap(NamedTuple):
         first: number of the first of them in the stream.
         last: number of the last; between them others may have arrived, on another key for instance.
         messages: count of missing messages.
-        noticed_ns: when they were given up, by the clock of receipt.
+        noticed_ns: time when they were given up, by the clock of receipt.
     """
 
     stream: str
@@ -108,7 +104,7 @@ class ReorderBuffer(Generic[Item]):
             yield item
             return
         if state.expected is not None and number < state.expected:
-            if state.lost is not None and _remove_from_ranges(state.lost, number):
+            if state.fill(number):
                 yield item  # given up before, and arrived after all
             return
         yield from self._hold(name, state, number, item, now_ns)
@@ -186,11 +182,11 @@ class ReorderBuffer(Generic[Item]):
             if hold.held:
                 yield from self._give_up(name, state, hold, now_ns, now_ns, hold.newest)
             elif state.last_before >= 0:
-                state.advance_to(state.last_before)
+                state.advance(state.last_before)
             state.drop_hold_state()
 
     def due_ns(self) -> int | None:
-        """When to call `release_overdue`; None: nothing is held."""
+        """Time of the next `release_overdue`; None: nothing is held."""
         if not self._holding:
             return None
         due = {name: state.hold.due_ns for name, state in self._holding.items() if state.hold is not None}
@@ -227,7 +223,7 @@ class ReorderBuffer(Generic[Item]):
             idle = [(state.last_arrival_ns, other) for other, state in self._streams.items() if state.hold is None]
             for _, longest_idle in sorted(idle)[: MAX_STREAMS // 10]:
                 self._evict(longest_idle)
-        state: StreamState[Item] = StreamState(*name)
+        state: StreamState[Item] = StreamState(publisher=name[0])
         self._streams[name] = state
         self._unconfirmed.append((now_ns, name))
         return state
@@ -271,11 +267,11 @@ class ReorderBuffer(Generic[Item]):
         arrival_ns = [hold.held[number][0] for number in numbers]
         noticed_ns = list(accumulate(reversed(arrival_ns), min))[::-1]  # earliest arrival at or behind each number
         for number, known_ns in zip(numbers, noticed_ns, strict=True):
-            if state.expected is not None and number > state.expected:
-                if is_start or known_ns > since_ns or number > reached:
-                    break  # the missing ones may still arrive
-                lost.append((state.expected, number - 1))
-            state.advance_to(number)
+            is_behind_gap = state.expected is not None and number > state.expected
+            if is_behind_gap and (is_start or known_ns > since_ns or number > reached):
+                break  # the missing ones may still arrive
+            if skipped := state.advance(number):
+                lost.append((number - skipped, number - 1))
             items.append(self._release(hold, number))
         hold.due_ns = None
         if hold.held:
@@ -285,18 +281,6 @@ class ReorderBuffer(Generic[Item]):
             hold.recovered_ns = max(hold.recovered_ns, first_ns)
         state.drop_hold_state()
         if lost:
-            state.lost = [*(state.lost or ()), *lost][-MAX_LOST_RANGES:]
             count = sum(last - first + 1 for first, last in lost)
             yield Gap(name[1], name[0], lost[0][0], lost[-1][1], count, now_ns)
         yield from items
-
-
-def _remove_from_ranges(ranges: list[tuple[int, int]], number: int) -> bool:
-    """Remove a number from sorted ranges; returns whether one of them held it."""
-    index = bisect_right(ranges, number, key=itemgetter(0)) - 1
-    if index < 0 or number > ranges[index][1]:
-        return False
-    first, last = ranges[index]
-    parts = [(first, number - 1), (number + 1, last)]
-    ranges[index : index + 1] = [part for part in parts if part[0] <= part[1]]
-    return True

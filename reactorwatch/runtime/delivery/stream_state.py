@@ -7,11 +7,15 @@ while messages are held is a separate object.
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
+from reactorwatch.runtime.delivery.gap_tracker import GapTracker
+
 Item = TypeVar("Item")
 
 MAX_HELD = 1_000_000
 MAX_HELD_BYTES = 256 << 20
 """Messages of a stream that may be held, and their payload; beyond either, missing messages are given up."""
+MAX_LOST_RANGES = 100_000
+"""Ranges of lost numbers of a stream that are remembered, so that a message in one can still be released."""
 MAX_KEYS = 1000
 """Keys of a stream that are tracked."""
 
@@ -46,19 +50,18 @@ class HoldState(Generic[Item]):
         return max(self.history_from.values(), default=0)
 
 
-@dataclass(slots=True)
-class StreamState(Generic[Item]):
-    """Position in a stream."""
+@dataclass(slots=True, kw_only=True)
+class StreamState(GapTracker, Generic[Item]):
+    """Position in a stream; its gaps are given up, and a message in one is released at once."""
+
+    max_gaps = MAX_LOST_RANGES
 
     publisher: int
-    name: str
-    expected: int | None = None
     first: int = -1  # number of the first message released
     last_before: int = -1  # last number published before the subscription
     last_arrival_ns: int = 0
     keys: tuple[str, ...] = ()
     hold: HoldState[Item] | None = None
-    lost: list[tuple[int, int]] | None = None  # (first, last) of each range
 
     def record_key(self, key: str, number: int) -> None:
         """Record that a key has reached a number."""
@@ -96,8 +99,8 @@ class StreamState(Generic[Item]):
         if not hold.reached:
             self.hold = None
 
-    def advance_to(self, number: int) -> None:
-        """Mark all messages up to a number as released or lost."""
+    def advance(self, number: int, time_ns: int = 0) -> int:
+        """Mark all messages up to a number as released or lost; returns how many are lost."""
         if self.expected is None:
             self.first = number
-        self.expected = number + 1
+        return GapTracker.advance(self, number, time_ns)

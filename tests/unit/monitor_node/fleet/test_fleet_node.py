@@ -1,8 +1,9 @@
 """A fleet's monitor with a folder of states, beside another one: who has a plant last, has it."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from queue import SimpleQueue
 
 import msgspec
 import pytest
@@ -38,13 +39,16 @@ class Bench:
         self.bus, self.states, self.now_ns = Linked(Exchange()), FleetStates(folder), 0
         config = msgspec.structs.replace(QUICK, state_every_s=0.1)
         self.node = FleetNode(config, FleetConfig(plants="reactor/*", shard=shard), self.bus, 0, self.states)
+        self.calls: SimpleQueue[Callable[[int], list[Publication]]] = SimpleQueue()
         for _ in self.node.subscriptions:
-            self.node.on_subscribed()
+            self.node.on_subscribed(self.calls.put)
 
     def tick(self) -> None:
         """A moment later."""
         self.now_ns += POLL_NS
         self.node.on_tick(self.now_ns)
+        while not self.calls.empty():
+            self.calls.get()(self.now_ns)
 
     def tick_until_watched(self, plant: str) -> None:
         """Its past is found by a thread."""

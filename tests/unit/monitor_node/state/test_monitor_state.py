@@ -96,6 +96,35 @@ def test_a_state_that_was_gone_on_from_is_the_same_bytes(leak: list[Encoded]) ->
     assert again.to_bytes() == monitor.to_bytes()
 
 
+def to_version_2(stored: bytes) -> bytes:
+    """A state as software of layout 2 stored it."""
+    fields = msgspec.msgpack.decode(SEAL.open(stored))
+    fields["runs"] = [
+        {
+            "number": None if run["expected"] is None else run["expected"] - 1,
+            "time_ns": run["newest_ns"],
+            "spacing_ns": run["spacing"]["mean_ns"],
+            "deviation_ns": run["spacing"]["deviation_ns"],
+            "spacings": run["spacing"]["count"],
+            "held": run["held"],
+        }
+        for run in fields["runs"]
+    ]
+    return SEAL._replace(version=2).close(msgspec.msgpack.encode(fields))
+
+
+@pytest.mark.parametrize("place", [0, 20, 1500, 2400])
+def test_a_state_of_the_layout_before_is_read_without_loss(place: int, leak: list[Encoded]) -> None:
+    """Before the first sample, with runs that are not known yet, in training and while a sample is held."""
+    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
+    run(monitor, leak, 0, place)
+    if place:
+        monitor.on_message(sample("T", 10**6, 1e6, 440.0), 0)  # out of place, so that it is held
+    stored = monitor.to_bytes()
+    again.from_bytes(to_version_2(stored))
+    assert again.to_bytes() == stored
+
+
 def test_a_monitor_that_heard_nothing_yet_is_stored_and_restored() -> None:
     again = Monitor(CONFIG, 0)
     again.from_bytes(Monitor(CONFIG, 0).to_bytes())
