@@ -149,11 +149,6 @@ class Plant:
         """The true state at `time_min`, by name."""
         return dict(zip(self._model.state_names, self._x.tolist(), strict=True))
 
-    @property
-    def faults(self) -> tuple[FaultSpecification, ...]:
-        """All faults in the plant, including those that have not set in yet."""
-        return tuple(item.specification for item in self._installed)
-
     def next_row(self) -> Row:
         """Measure a row, and integrate to the next."""
         time_min, inputs = self.time_min, self._input()

@@ -195,7 +195,6 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         write_report,
     )
     from reactorwatch.diagnosis.report.words import describe_verdict
-    from reactorwatch.process import effects_of
     from recorder.columns.run_reader import read_segments
     from recorder.dashboard.file import write_rrd
 
@@ -245,7 +244,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         + (", ".join(f"`{alarm.alarm}` at {minutes(alarm.time_ns)}" for alarm in before) or "none")
         + f" ({again.expected_false_alarms:.2g} to be expected in the whole run)."
     )
-    lines.append(f"- Diagnosis of the whole recording: {describe_verdict(diagnosis, effects_of(case.model))}")
+    lines.append(f"- Diagnosis of the whole recording: {describe_verdict(diagnosis)}")
     lines.append(f"- Back-test over the recording: {'the same alarms, value for value' if same else 'OTHER ALARMS'}.")
     lines += [
         "",

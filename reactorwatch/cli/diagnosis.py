@@ -50,7 +50,6 @@ class DiagnosisOptions:
         uncertain: parameters with a standard deviation, as text; None: none.
         tolerance: differences that do not matter, by output.
         limits: lowest and highest values of an experiment, by signal.
-        as_json: format the result as JSON.
     """
 
     plant: str | None = None
@@ -59,7 +58,6 @@ class DiagnosisOptions:
     uncertain: str | None = None
     tolerance: dict[str, float] = field(default_factory=dict)
     limits: Limits = field(default_factory=dict)
-    as_json: bool = False
 
 
 @dataclass(frozen=True)

@@ -22,22 +22,21 @@ def register_commands(app: typer.Typer) -> None:
     app.add_typer(playback, name="playback", help="Pause a running replay, step it, or change its rate.")
 
 
-@playback.command("pause")
-def pause(config: Settings = None, endpoint: Endpoint = None, name: Plant = None, timeout: Timeout = TIMEOUT_S) -> None:
-    """Pause a replay."""
-    from reactorwatch.contract.messages_pb2 import ReplayCommand
+def _register(command: str, description: str) -> None:
+    """Register a subcommand without arguments."""
 
-    _send("pause", ReplayCommand(), config, endpoint, name, timeout)
+    def act(
+        config: Settings = None, endpoint: Endpoint = None, name: Plant = None, timeout: Timeout = TIMEOUT_S
+    ) -> None:
+        from reactorwatch.contract.messages_pb2 import ReplayCommand
+
+        _send(command, ReplayCommand(), config, endpoint, name, timeout)
+
+    playback.command(command, help=description)(act)
 
 
-@playback.command("resume")
-def resume(
-    config: Settings = None, endpoint: Endpoint = None, name: Plant = None, timeout: Timeout = TIMEOUT_S
-) -> None:
-    """Resume a paused replay."""
-    from reactorwatch.contract.messages_pb2 import ReplayCommand
-
-    _send("resume", ReplayCommand(), config, endpoint, name, timeout)
+_register("pause", "Pause a replay.")
+_register("resume", "Resume a paused replay.")
 
 
 @playback.command("step")

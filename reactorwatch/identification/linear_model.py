@@ -74,16 +74,6 @@ class LinearModel:
         """Standard deviations of the parameters, shape (outputs, parameters)."""
         return np.array([standard_deviations(covariance) for covariance in self.covariance])
 
-    @property
-    def poles(self) -> NDArray[np.complex128]:
-        """Poles of the recursion in the z plane; it is unstable if one is outside the unit circle."""
-        structure = self.structure
-        outputs, size = structure.outputs, structure.output_lags * structure.outputs
-        companion = np.zeros((size, size))
-        companion[:outputs] = self.parameters[:, :size]
-        companion[outputs:, :-outputs] = np.eye(size - outputs)
-        return np.asarray(np.linalg.eigvals(companion), dtype=np.complex128)
-
     def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> NDArray[np.float64]:
         """Predict each row one step ahead from the measured rows before it.
 

@@ -74,11 +74,6 @@ class Recursion:
         return self._forgetting
 
     @property
-    def covariance_limit(self) -> float:
-        """Bound on the eigenvalues of P; inf without a prior."""
-        return self._covariance_limit
-
-    @property
     def state(self) -> RlsState:
         """A copy of the full state."""
         size = information.state_size(self._parameters)

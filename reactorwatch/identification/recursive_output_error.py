@@ -15,8 +15,6 @@ first rows count little: forgetting starts at 0.95 and rises, f <- 0.99 f + 0.01
 first gradients belong to poor parameters. And after a gap the run restarts from measured rows (`restart`).
 """
 
-from typing import Self
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -24,38 +22,14 @@ from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import model_of
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.output_error import is_stable
-from reactorwatch.identification.recursion import RlsState
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsUpdate
 from reactorwatch.identification.structure import Scaling, Structure
-from reactorwatch.stored_state import StoredState
 
 START_FORGETTING = 0.95
 FORGETTING_RISE = 0.99
 COVARIANCE_LIMIT = 1e4
 """See `RecursiveLeastSquares`; also how far from zero the parameters may be."""
 _HALVINGS = 40
-
-
-class RecursiveOutputErrorState(StoredState, frozen=True):
-    """State of a `RecursiveOutputError`.
-
-    Attributes:
-        structure: the model's terms.
-        scaling: scaling of the signals.
-        forgetting: final forgetting factor.
-        estimator: the parameters and their covariance.
-        own: the simulation's newest outputs, newest first; fewer while the history fills.
-        inputs: newest inputs, newest first.
-        gradients: newest gradients, newest first, each of shape (parameters,).
-    """
-
-    structure: Structure
-    scaling: Scaling
-    forgetting: float
-    estimator: RlsState
-    own: tuple[float, ...]
-    inputs: tuple[tuple[float, ...], ...]
-    gradients: tuple[tuple[float, ...], ...]
 
 
 class RecursiveOutputError:
@@ -80,36 +54,6 @@ class RecursiveOutputError:
             structure.parameters, min(START_FORGETTING, forgetting), COVARIANCE_LIMIT
         )
         self.restart()
-
-    @classmethod
-    def from_state(cls, state: RecursiveOutputErrorState) -> Self:
-        """Resume, bit for bit from a state.
-
-        Raises:
-            ValueError: the state is damaged.
-        """
-        model = cls(state.structure, state.scaling, state.forgetting)
-        model._estimator = RecursiveLeastSquares.from_state(state.estimator)
-        model._filled = len(state.own)
-        model._own[: model._filled] = state.own
-        if model._filled:
-            model._inputs[: model._filled] = state.inputs
-            model._gradients[: model._filled] = state.gradients
-        return model
-
-    @property
-    def state(self) -> RecursiveOutputErrorState:
-        """A copy of the full state."""
-        filled = self._filled
-        return RecursiveOutputErrorState(
-            self._structure,
-            self._scaling,
-            self._forgetting,
-            self._estimator.state,
-            tuple(map(float, self._own[:filled])),
-            tuple(tuple(map(float, row)) for row in self._inputs[:filled]),
-            tuple(tuple(map(float, row)) for row in self._gradients[:filled]),
-        )
 
     def restart(self) -> None:
         """Clear the simulation, as after a gap in the rows; keep the parameters."""
@@ -161,11 +105,6 @@ class RecursiveOutputError:
             result.residual_sd * spread,
             result.leverage,
         )
-
-    @property
-    def rows(self) -> int:
-        """Number of rows learned from."""
-        return self._estimator.rows
 
     @property
     def model(self) -> LinearModel:

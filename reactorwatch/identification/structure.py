@@ -65,18 +65,16 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Number of rows before row k that its equation needs."""
         return max(self.output_lags, self.delay + self.input_lags - 1)
 
-    def parameter_names(self, inputs: tuple[str, ...] = (), outputs: tuple[str, ...] = ()) -> tuple[str, ...]:
-        """Names of one equation's parameters, in order; signals are named only where there are several.
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of one equation's parameters, in order; signals are numbered only where there are several.
 
         >>> Structure.of_order(2).parameter_names()
         ('a1', 'a2', 'b1', 'b2', 'c')
-        >>> Structure.of_order(1, outputs=2).parameter_names(("qc",), ("C", "T"))
-        ('a1_C', 'a1_T', 'b1', 'c')
+        >>> Structure.of_order(1, outputs=2).parameter_names()
+        ('a1_1', 'a1_2', 'b1', 'c')
         """
-        of_outputs = _suffixes(self.outputs, outputs)
-        of_inputs = _suffixes(self.inputs, inputs)
-        names = [f"a{lag}{suffix}" for lag in range(1, self.output_lags + 1) for suffix in of_outputs]
-        names += [f"b{lag}{suffix}" for lag in range(1, self.input_lags + 1) for suffix in of_inputs]
+        names = [f"a{lag}{suffix}" for lag in range(1, self.output_lags + 1) for suffix in _suffixes(self.outputs)]
+        names += [f"b{lag}{suffix}" for lag in range(1, self.input_lags + 1) for suffix in _suffixes(self.inputs)]
         return tuple([*names, "c"] if self.offset else names)
 
 
@@ -260,9 +258,5 @@ def as_columns(values: ArrayLike, name: str, count: int | None = None) -> NDArra
     return columns
 
 
-def _suffixes(count: int, names: tuple[str, ...]) -> tuple[str, ...]:
-    if count == 1:
-        return ("",)
-    if names and len(names) != count:
-        raise InputError(f"{count} signals need {count} names, got {names}")
-    return tuple(f"_{name}" for name in names) or tuple(f"_{i + 1}" for i in range(count))
+def _suffixes(count: int) -> tuple[str, ...]:
+    return ("",) if count == 1 else tuple(f"_{i + 1}" for i in range(count))

@@ -64,7 +64,7 @@ def balances(model: ProcessModel, effects: Sequence[Effect]) -> list[Equation]:
         text = f"further balances of the cause's own, too long to be read here: {hidden}"
         result.append(Equation("", mathml.mark_added(f"<mtext>{text}</mtext>"), changed=True))
     for now, was in zip(extended.outputs, model.outputs, strict=True):
-        if _has(now.expression, new):
+        if mathml.depends_on(now.expression, new):
             left = f"<msub>{mathml.name(now.name)}<mi>measured</mi></msub>"
             result.append(_equation(left, now.expression, was.expression, new))
     return result
@@ -86,16 +86,12 @@ def _equation(left: str, now: ca.SX, before: ca.SX | None, new: ca.SX) -> Equati
     if before is None:
         return Equation(left, mathml.mark_added(mathml.to_mathml(now)), changed=True)
     if mathml.is_readable(now):
-        return Equation(left, mathml.to_mathml(now, before, new), _has(now, new))
+        return Equation(left, mathml.to_mathml(now, before, new), mathml.depends_on(now, new))
     was = mathml.to_mathml(before) if mathml.is_readable(before) else "<mtext>what it was</mtext>"
-    remark = mathml.mark_added("<mtext>, changed as said above</mtext>") if _has(now, new) else ""
-    return Equation(left, f"{was}{remark}", _has(now, new))
+    remark = mathml.mark_added("<mtext>, changed as said above</mtext>") if mathml.depends_on(now, new) else ""
+    return Equation(left, f"{was}{remark}", mathml.depends_on(now, new))
 
 
 def _rate(state: str) -> str:
     d = '<mi mathvariant="normal">d</mi>'
     return f"<mfrac><mrow>{d}{mathml.name(state)}</mrow><mrow>{d}<mi>t</mi></mrow></mfrac>"
-
-
-def _has(expression: ca.SX, new: ca.SX) -> bool:
-    return new.numel() > 0 and bool(ca.depends_on(expression, new))

@@ -74,7 +74,7 @@ class _Writer:
 
     def text(self, now: ca.SX, before: ca.SX | None, binds: int = 0) -> str:
         """Write an expression inside an operation of this precedence."""
-        if not self._has_new(now):
+        if not depends_on(now, self._new):
             return self._plain(now, (None, None), binds)
         if before is None:
             return mark_added(_Writer(ca.SX())._plain(now, (None, None), binds))
@@ -105,7 +105,7 @@ class _Writer:
         op, parts = now.op(), [now.dep(index) for index in range(now.n_dep())]
 
         def part(index: int, inner: int = 0) -> str:
-            return self.text(parts[index], before[index] if self._has_new(parts[index]) else None, inner)
+            return self.text(parts[index], before[index] if depends_on(parts[index], self._new) else None, inner)
 
         match op:
             case ca.OP_ADD:
@@ -144,8 +144,10 @@ class _Writer:
                 return f'<mi mathvariant="normal">{_FUNCTIONS[op]}</mi><mo>(</mo>{listed}<mo>)</mo>'
         raise ValueError(f"operation {op} has no sign")
 
-    def _has_new(self, expression: ca.SX) -> bool:
-        return self._new.numel() > 0 and bool(ca.depends_on(expression, self._new))
+
+def depends_on(expression: ca.SX, symbols: ca.SX) -> bool:
+    """True if an expression has one of the symbols, of which there may be none."""
+    return symbols.numel() > 0 and bool(ca.depends_on(expression, symbols))
 
 
 def _within(text: str, own: int, binds: int) -> str:

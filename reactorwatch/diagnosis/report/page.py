@@ -88,7 +88,7 @@ def as_page(
     return _PAGES.get_template("page.html.j2").render(
         diagnosis=diagnosis,
         file=file,
-        verdict=describe_verdict(diagnosis, effects),
+        verdict=describe_verdict(diagnosis),
         place=describe_location(diagnosis) if diagnosis.verdict != NOMINAL else "",
         causes=[
             _describe_cause(diagnosis, effects, cause, item.symbol)

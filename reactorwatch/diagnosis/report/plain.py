@@ -26,7 +26,7 @@ def as_text(diagnosis: Diagnosis, file: str, effects: Sequence[Effect]) -> str:
         file: name of the file as given.
         effects: the catalogue.
     """
-    lines = [f"{file}: {diagnosis.samples} rows over {diagnosis.span_min:g} min", describe_verdict(diagnosis, effects)]
+    lines = [f"{file}: {diagnosis.samples} rows over {diagnosis.span_min:g} min", describe_verdict(diagnosis)]
     ambiguous = diagnosis.verdict == AMBIGUOUS
     if ambiguous:
         lines += [_line("either", f"{describe_explanation(diagnosis.causes, effects)}  (95 %)")]

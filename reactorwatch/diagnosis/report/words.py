@@ -37,7 +37,7 @@ PLACES = {
 """Phrases of locations whose name is not enough."""
 
 
-def describe_verdict(diagnosis: Diagnosis, effects: Sequence[Effect]) -> str:
+def describe_verdict(diagnosis: Diagnosis) -> str:
     """Verdict in a sentence or two."""
     off = [name for name, item in diagnosis.parameters.items() if item.differs]
     if diagnosis.verdict == NOMINAL and off:

@@ -12,16 +12,14 @@ covariance are estimated, the sample is a new one):
 
     a (n^2 - 1) / (n (n - a)) F(a, n - a; 1 - alpha).
 
-SPE, with th_i = sum of l_j^i over the components left out, h = 1 - 2 th_1 th_3 / (3 th_2^2) and c the normal quantile:
+SPE, with th_i = sum of l_j^i over the components left out, h = 1 - 2 th_1 th_3 / (3 th_2^2) and c the normal quantile,
+by the moments of a sum of chi-squares:
 
-    Jackson & Mudholkar   th_1 (1 + c sqrt(2 th_2 h^2) / th_1 + th_2 h (h - 1) / th_1^2)^(1/h)
-    Box (1954)            g chi2(f; 1 - alpha) with g = th_2 / th_1, f = th_1^2 / th_2.
-
-Both match moments of a sum of chi-squares. Box's is exact where the eigenvalues left out are equal.
+    th_1 (1 + c sqrt(2 th_2 h^2) / th_1 + th_2 h (h - 1) / th_1^2)^(1/h).
 """
 
 from collections.abc import Sequence
-from typing import Literal, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -30,8 +28,6 @@ from reactorwatch.errors import InputError
 from reactorwatch.spc.baseline import Baseline
 from reactorwatch.spc.charts.base import Array, ChartState, Judgement, vector
 from reactorwatch.spc.joint_chart import JointChart
-
-SpeLimit = Literal["jackson_mudholkar", "box"]
 
 
 class PcaModel(ChartState, frozen=True):
@@ -56,20 +52,13 @@ class PcaModel(ChartState, frozen=True):
     spe_limit: float
 
     @classmethod
-    def fit(
-        cls,
-        training: ArrayLike,
-        components: int,
-        false_alarm: float = 0.0027,
-        spe_limit: SpeLimit = "jackson_mudholkar",
-    ) -> Self:
+    def fit(cls, training: ArrayLike, components: int, false_alarm: float = 0.0027) -> Self:
         """The model of a training matrix.
 
         Args:
             training: shape (n, p), rows of a time when all was well.
             components: a, how many the signals have in common, in [1, p - 1].
             false_alarm: alpha, the probability of a false alarm per sample, of each of the two charts.
-            spe_limit: method of the limit of SPE.
 
         Raises:
             InputError: an argument out of its range, or a signal that does not vary.
@@ -86,8 +75,6 @@ class PcaModel(ChartState, frozen=True):
             raise InputError(f"training must have more rows than its {p} signals, got {n}")
         if not 0.0 < false_alarm < 1.0:
             raise InputError(f"false_alarm must be in (0, 1), got {false_alarm}")
-        if spe_limit not in ("jackson_mudholkar", "box"):
-            raise InputError(f"spe_limit must be jackson_mudholkar or box, got {spe_limit!r}")
         mean, scale = matrix.mean(axis=0), matrix.std(axis=0, ddof=1)
         still = np.flatnonzero(scale <= 1e-12 * np.abs(mean))
         if still.size:
@@ -98,9 +85,8 @@ class PcaModel(ChartState, frozen=True):
         if variances[a] < 1e-12:
             raise InputError(f"components must leave some variance over, {components} of {p} signals leave none")
         t2 = a * (n * n - 1) / (n * (n - a)) * float(stats.f.isf(false_alarm, a, n - a))
-        limit_of_spe = _box_limit if spe_limit == "box" else _jackson_mudholkar_limit
-        left_out = limit_of_spe(variances[a:], false_alarm)
-        return cls(mean.tolist(), scale.tolist(), directions[:a].T.tolist(), variances.tolist(), n, t2, left_out)
+        spe = _jackson_mudholkar_limit(variances[a:], false_alarm)
+        return cls(mean.tolist(), scale.tolist(), directions[:a].T.tolist(), variances.tolist(), n, t2, spe)
 
 
 class _PcaChart(JointChart):
@@ -211,10 +197,3 @@ def _jackson_mudholkar_limit(left_out: Array, alpha: float) -> float:
     c = float(stats.norm.isf(alpha)) * (1.0 if h > 0.0 else -1.0)
     inner = c * np.sqrt(2.0 * th2 * h * h) / th1 + 1.0 + th2 * h * (h - 1.0) / th1**2
     return float(th1 * inner ** (1.0 / h))
-
-
-def _box_limit(left_out: Array, alpha: float) -> float:
-    from scipy import stats
-
-    th1, th2 = float(np.sum(left_out)), float(np.sum(left_out**2))
-    return th2 / th1 * float(stats.chi2.isf(alpha, th1 * th1 / th2))

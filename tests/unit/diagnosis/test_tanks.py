@@ -67,7 +67,7 @@ def test_each_other_cause_is_named(rig: Rig, name: str, size: float) -> None:
 def test_its_report_speaks_of_tanks(overflowing: Diagnosis) -> None:
     found = overflowing
     catalogue = effects_of(tanks())
-    assert describe_verdict(found, catalogue).startswith("The simulation is wrong: overflow of the upper tank, ")
+    assert describe_verdict(found).startswith("The simulation is wrong: overflow of the upper tank, ")
     page = as_page(found, tanks(), catalogue, "tanks.csv", "extended.json", on_the_bus=False)
     assert "in the upper tank" in page
     assert "half of it into the lower tank" in page

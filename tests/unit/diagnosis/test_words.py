@@ -44,7 +44,7 @@ from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
     ],
 )
 def test_the_verdict_is_a_sentence(case: str, expected: str) -> None:
-    assert describe_verdict(CASES[case], EFFECTS) == expected
+    assert describe_verdict(CASES[case]) == expected
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_the_object_holds_what_was_found() -> None:
 
 
 def test_what_was_stated_to_be_uncertain_is_told_as_it_is_known_now() -> None:
-    assert describe_verdict(ADJUSTED, EFFECTS) == (
+    assert describe_verdict(ADJUSTED) == (
         "The simulation is right within what was stated of its parameters: K3 is a little off, "
         "and what the record shows beyond that is noise."
     )

@@ -5,18 +5,17 @@ import pytest
 from scipy import stats
 
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2, SpeLimit
+from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2
 from reactorwatch.spc.charts.t2 import T2
 from tests.unit.spc.members import COVARIANCE, MEANS, MODEL, related
 
 
-@pytest.mark.parametrize("spe_limit", ["jackson_mudholkar", "box"])
-def test_the_limit_of_spe_is_that_of_its_distribution(spe_limit: SpeLimit) -> None:
-    """Equal eigenvalues left out: SPE is their value times chi-square, Box's limit its quantile, the other near."""
-    model = PcaModel.fit(related(np.random.default_rng(1), 20_000), 2, 0.01, spe_limit)
+def test_the_limit_of_spe_is_that_of_its_distribution() -> None:
+    """Equal eigenvalues left out: SPE is their value times chi-square, and the limit near its quantile."""
+    model = PcaModel.fit(related(np.random.default_rng(1), 20_000), 2, 0.01)
     left_out = np.array(model.variances[2:])
     exact = left_out.mean() * stats.chi2.isf(0.01, 4)
-    assert model.spe_limit == pytest.approx(exact, rel=0.01 if spe_limit == "box" else 0.02)
+    assert model.spe_limit == pytest.approx(exact, rel=0.02)
 
 
 def test_the_limits_of_spe_hold_for_unlike_eigenvalues() -> None:
@@ -28,10 +27,9 @@ def test_the_limits_of_spe_hold_for_unlike_eigenvalues() -> None:
         return np.asarray(rng.standard_normal((rows, 1)) + sizes * rng.standard_normal((rows, 6)))
 
     training, fresh = sample(50_000), sample(20_000)
-    for rule in ("jackson_mudholkar", "box"):
-        chart = PcaSpe(PcaModel.fit(training, 1, 0.01, rule))
-        share = np.mean([chart.update(x).out for x in fresh])
-        assert abs(share - 0.01) < 4 * np.sqrt(0.01 * 0.99 / 20_000) + 0.001
+    chart = PcaSpe(PcaModel.fit(training, 1, 0.01))
+    share = np.mean([chart.update(x).out for x in fresh])
+    assert abs(share - 0.01) < 4 * np.sqrt(0.01 * 0.99 / 20_000) + 0.001
 
 
 def test_the_limit_of_t2_allows_for_a_short_training() -> None:
