@@ -401,9 +401,9 @@ class FleetMonitor:
 
     def _evaluate(self, plant: str, own: Monitor, message: Encoded, now_ns: int) -> list[Publication]:
         """Process a message of a plant; returns publications that its previous owners have not published."""
-        restarts, publications = own.restarts, own.on_message(message, now_ns)
-        if own.restarts != restarts:  # the clock may be set back: their alarms would cover those to come
-            self._handed_over.remove(plant)
+        before_ns, publications = own.last_ns, own.on_message(message, now_ns)
+        if before_ns is not None and own.last_ns is not None and own.last_ns < before_ns:
+            self._handed_over.remove(plant)  # the clock was set back: their alarms would cover those to come
         return self._handed_over.filter_new(publications)
 
     def _plant_of(self, message: Encoded, now_ns: int) -> str:
