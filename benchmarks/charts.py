@@ -1,4 +1,4 @@
-"""What do the charts cost a row, and what does autocorrelation do to their false alarms?
+"""Cost of the charts a row, and effect of autocorrelation on their false alarms.
 
 Cost: those of one signal, in the single form and, a plant, in the form for thousands; and all charts of one plant as
 the monitor runs them, of two outputs. Goals: 20 and 1 microseconds.
@@ -94,7 +94,7 @@ def of_a_plant() -> None:
         print(f"{', '.join(charts)}: {each * 1e6:.2f} us a row of one plant   (goal: 20)")
 
 
-def simulated(charts: Sequence[CompiledChart], phi: float, seed: int) -> tuple[float, float]:
+def simulated_run_length(charts: Sequence[CompiledChart], phi: float, seed: int) -> tuple[float, float]:
     """Mean run length on AR(1) data of unit variance, and its standard error."""
     rng = np.random.default_rng(seed)
     bank = Bank(charts)
@@ -118,7 +118,7 @@ def autocorrelation() -> None:
     print("\n| phi | " + " | ".join(name for name, _, _ in charts) + " |\n" + "|---" * (len(charts) + 1) + "|")
     print("| 0, computed | " + " | ".join(f"{length:.0f}" for _, _, length in charts) + " |")
     for phi in PHIS:
-        found = [simulated([chart] * RUNS, phi, seed=1) for _, chart, _ in charts]
+        found = [simulated_run_length([chart] * RUNS, phi, seed=1) for _, chart, _ in charts]
         print(f"| {phi:g} | " + " | ".join(f"{mean:.0f} ± {error:.0f}" for mean, error in found) + " |")
 
 

@@ -1,9 +1,9 @@
-"""How long does a dashboard of a million samples take, and how much memory? Goal: 10 s and 500 MB.
+"""Time and memory of a dashboard of a million samples. Goal: 10 s and 500 MB.
 
-Drawn are a recording of samples alone, one four times as long, which must not take more memory, and one with what a
-monitor says of each row beside its samples. Each is drawn in a process of its own, whose peak memory is told; the time
-is also told as a multiple of that of the bare MCAP library reading the same file without decoding anything, because
-the machine's speed is not ours.
+Drawn are a recording of samples alone, one four times as long, which must not take more memory, and one with the
+messages of a monitor beside its samples. Each is drawn in a process of its own, whose peak memory is printed; the time
+is also printed as a multiple of that of the bare MCAP library reading the same file without decoding anything, because
+machines differ in speed.
 
     python benchmarks/dashboard.py
 """
@@ -83,7 +83,7 @@ def read_bare(path: Path) -> None:
 
 
 def draw(path: Path) -> None:
-    """What `dashboard` does."""
+    """Draw a recording as `dashboard` does."""
     from recorder.columns.run_reader import read_segments
     from recorder.dashboard.file import write_rrd
 
@@ -93,7 +93,7 @@ def draw(path: Path) -> None:
 TASKS = {"bare": read_bare, "draw": draw}
 
 
-def measured(task: str, path: Path) -> tuple[float, float]:
+def measure(task: str, path: Path) -> tuple[float, float]:
     """Seconds and megabytes of a task in a process of its own, its start included."""
     start = time.perf_counter()
     command = [sys.executable, __file__, task, str(path)]
@@ -116,7 +116,7 @@ def main() -> None:
         ):
             path = Path(name) / f"{title}.mcap"
             count = record(path, run(samples, watched=watched))
-            (bare_s, _), (seconds, peak_mb) = (measured(task, path) for task in ("bare", "draw"))
+            (bare_s, _), (seconds, peak_mb) = (measure(task, path) for task in ("bare", "draw"))
             sizes = [file.stat().st_size / 1e6 for file in (path, path.with_suffix(".rrd"))]
             print(
                 f"{title:30s} {seconds:8.1f} {peak_mb:6.0f} {seconds / bare_s:16.2f} {sizes[0]:13.0f} {sizes[1]:8.0f}"

@@ -1,4 +1,4 @@
-"""Does the diagnosis find what is hidden in a record, how large it is, and nothing where nothing is?
+"""Study of the diagnosis: hidden causes found, their sizes, and false causes in records without any.
 
 Records of every class (`benchmarks/hidden/classes.py`) are drawn from fresh seeds, with a solver and equations that the
 diagnosis does not use (`tests/hidden_effect/`), diagnosed in parallel, and held against the truth.
@@ -21,7 +21,7 @@ import msgspec
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.hidden.classes import CLASSES, StudyClass, class_named, drawn
+from benchmarks.hidden.classes import CLASSES, StudyClass, draw_record, find_class
 from benchmarks.hidden.tables import confusion_table, failures, main_table
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.model import cstr
@@ -65,7 +65,7 @@ def main() -> None:
     if chosen.earlier:
         report(earlier(chosen.earlier), chosen, 0.0)
         return
-    classes = [class_named(name) for name in chosen.classes] if chosen.classes else list(CLASSES)
+    classes = [find_class(name) for name in chosen.classes] if chosen.classes else list(CLASSES)
     tasks = [(study, number) for study in classes for number in range(_records(study, chosen))]
     began = time.perf_counter()
     found: dict[str, list[Judged]] = {study.name: [] for study in classes}
@@ -75,7 +75,7 @@ def main() -> None:
         for number, outcome in choose_executor(chosen.jobs, chosen.scheduler).map_unordered(judge_one, jobs):
             study, of_class = tasks[number]
             found[study.name].append(
-                failed(drawn(study, of_class, chosen.seed), outcome.reason, 0.0)
+                failed(draw_record(study, of_class, chosen.seed), outcome.reason, 0.0)
                 if isinstance(outcome, Failed)
                 else outcome
             )
@@ -101,7 +101,7 @@ def report(found: dict[str, list[Judged]], chosen: argparse.Namespace, seconds: 
 
 
 def earlier(files: Sequence[Path]) -> dict[str, list[Judged]]:
-    """What was found before and written by `--json`, in the order of the classes."""
+    """Read earlier results, written by `--json`, in the order of the classes."""
     found: dict[str, list[Judged]] = {}
     for file in files:
         for name, items in json.loads(file.read_text()).items():
@@ -110,20 +110,20 @@ def earlier(files: Sequence[Path]) -> dict[str, list[Judged]]:
 
 
 def judge_one(job: tuple[str, int, int]) -> Judged:
-    """As `judged`: class, number and first seed in one."""
-    return judged(*job)
+    """Call `judge_record` with class, number and first seed in one."""
+    return judge_record(*job)
 
 
-def judged(name: str, number: int, first_seed: int) -> Judged:
+def judge_record(name: str, number: int, first_seed: int) -> Judged:
     """Draw, diagnose and judge one record."""
     warm_up()
-    hidden = drawn(class_named(name), number, first_seed)
+    hidden = draw_record(find_class(name), number, first_seed)
     began = time.process_time()
     try:
-        said = diagnose(hidden.record, cstr())
+        diagnosis = diagnose(hidden.record, cstr())
     except Exception as error:  # noqa: BLE001 # whatever it is, it is a result of the study
         return failed(hidden, f"{type(error).__name__}: {error}", time.process_time() - began)
-    return judge(hidden, said, time.process_time() - began)
+    return judge(hidden, diagnosis, time.process_time() - began)
 
 
 def warm_up() -> None:
@@ -135,7 +135,7 @@ def warm_up() -> None:
 
 
 def section(found: dict[str, list[Judged]], seed: int) -> str:
-    """What is told of the study."""
+    """Section of the page on the study."""
     text = TEMPLATE.format(seed=seed, main=main_table(found), confusion=confusion_table(found))
     missed = failures(found)
     if missed:
@@ -166,7 +166,7 @@ def _records(study: StudyClass, chosen: argparse.Namespace) -> int:
 
 
 def arguments() -> argparse.Namespace:
-    """What was asked for on the command line."""
+    """Arguments of the command line."""
     parser = argparse.ArgumentParser(description="The diagnosis on records with something hidden in them.")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_RECORDS} records a class, for a try")
     parser.add_argument("--records", type=int, help=f"a class (default {RECORDS}, {NOMINAL_RECORDS} nominal ones)")

@@ -1,4 +1,4 @@
-"""What does the chart on parameters cost a row, does it keep its promise, and what does a plant at rest do to it?
+"""Chart on parameters: cost a row, rate of false alarms, and effect of a plant at rest.
 
 Cost: in the single form. Goal: 3 microseconds.
 False alarms: of a first-order ARX plant with AR(1) noise, as a multiple of the number promised. Omega of the covariance
@@ -27,8 +27,8 @@ NOISE = np.array([0.002, 0.3])
 TRAINING, REFERENCE = 1000, 600
 
 
-def adapted(regressors: Array, outputs: Array, forgetting: float) -> Array:
-    """The parameters after each row, shape (rows, p)."""
+def adaptive_parameters(regressors: Array, outputs: Array, forgetting: float) -> Array:
+    """Adaptive parameters after each row, shape (rows, p)."""
     forget = ([1.0], [1.0, -forgetting])
     information = signal.lfilter(*forget, regressors[:, :, None] * regressors[:, None, :], axis=0)
     information += 1e-6 * np.eye(regressors.shape[1])
@@ -37,7 +37,7 @@ def adapted(regressors: Array, outputs: Array, forgetting: float) -> Array:
 
 
 def newey_west(scores: Array, lags: int) -> Array:
-    """Their long-run covariance with the weights of Bartlett."""
+    """Long-run covariance of scores with the weights of Bartlett."""
     total = scores.T @ scores
     for lag in range(1, lags):
         at_lag = scores[lag:].T @ scores[:-lag]
@@ -59,14 +59,14 @@ def other(regressors: Array, residuals: Array, *, textbook: bool) -> ParameterT2
 
 
 def alarms(chart: ParameterT2, differences: Array) -> float:
-    """How many: a further one only after the statistic has been back at its centre."""
-    said = [chart.update(d) for d in differences]
-    events = [1 if point.out else -1 for point in said if point.out or point.statistic <= point.centre]
+    """Number of alarms; a further one counts only after the statistic has been back at its centre."""
+    points = [chart.update(d) for d in differences]
+    events = [1 if point.out else -1 for point in points if point.out or point.statistic <= point.centre]
     return float(np.sum(np.diff(events, prepend=-1) == 2))
 
 
 def false_alarms(training: int, correlation: float) -> list[tuple[float, float]]:
-    """Their number over that promised and its standard error, of the three charts."""
+    """Number of false alarms over the promised one, and its standard error, of the three charts."""
     counts = []
     for seed in range(PLANTS):
         rng = np.random.default_rng(seed)
@@ -75,7 +75,7 @@ def false_alarms(training: int, correlation: float) -> list[tuple[float, float]]
         v = signal.lfilter([1.0], [1.0, -correlation], white)
         y = signal.lfilter([1.0], [1.0, -0.8], 0.5 * np.concatenate([[0.0], u[:-1]]) + v)
         regressors = np.column_stack([y[:-1], u[:-1], np.ones(u.size - 1)])[100:]
-        parameters = adapted(regressors, y[101:], FORGETTING)
+        parameters = adaptive_parameters(regressors, y[101:], FORGETTING)
         reference = parameters[training - 1]
         seen = regressors[:training]
         residuals = y[101 : 101 + training] - seen @ reference
@@ -90,7 +90,7 @@ def false_alarms(training: int, correlation: float) -> list[tuple[float, float]]
 
 
 def reactor(u: Array, rng: np.random.Generator) -> Array:
-    """Its outputs C and T, with noise."""
+    """Outputs C and T of the reactor, with noise."""
     run = Simulator(cstr()).run(np.arange(u.size) / 10, u, np.array([0.1, 438.54]))
     return run.outputs + NOISE * rng.standard_normal(run.outputs.shape)
 
@@ -102,7 +102,7 @@ def in_service(name: str, later: Array, rng: np.random.Generator) -> None:
         scaled_u, scaled_y = ((x - x[:50].mean()) / x[:50].std() for x in (u, y))
         lags = [scaled_y[3 - i : -i] for i in (1, 2, 3)] + [scaled_u[3 - i : -i] for i in (1, 2, 3)]
         regressors = np.column_stack([*lags, np.ones(u.size - 3)])
-        parameters = adapted(regressors, scaled_y[3:], 0.999)
+        parameters = adaptive_parameters(regressors, scaled_y[3:], 0.999)
         differences = parameters - parameters[REFERENCE - 1]
         residuals = scaled_y[3 : 3 + TRAINING] - regressors[:TRAINING] @ parameters[REFERENCE - 1]
         names = ["a1", "a2", "a3", "b1", "b2", "b3", "c"]

@@ -1,9 +1,9 @@
-"""How soon does the monitor find a fault, beside the report's method and an oracle, and how often is it wrong?
+"""Detection delay and false alarms of the monitor, beside the report's method and an oracle.
 
 Every fault of the bank (`benchmarks/faults/bank.py`) in three sizes and for many seeds: 100 minutes of training, 200
 without a fault, then the fault for 150. All detectors watch the same records at the same promised rate of false alarms:
 
-- the oracle, which knows the fault (`benchmarks/faults/oracle.py`): nobody can be much faster;
+- the oracle, which knows the fault (`benchmarks/faults/oracle.py`): no detector can be much faster;
 - the monitor, as it is configured by default;
 - the report's method (`benchmarks/faults/report_method.py`), with limits widened to that rate, and at its own 3 sigma.
 
@@ -83,7 +83,7 @@ def main() -> None:
 
 
 def arguments() -> argparse.Namespace:
-    """What was asked for on the command line."""
+    """Arguments of the command line."""
     parser = argparse.ArgumentParser(description="The monitor against a bank of faults.")
     parser.add_argument("--quick", action="store_true", help=f"{QUICK_SEEDS} seeds, for a try")
     parser.add_argument("--jobs", type=int, help="processes (default: one a core)")
@@ -97,11 +97,11 @@ def arguments() -> argparse.Namespace:
 
 
 class Everywhere:
-    """Does a piece of work for many arguments, in order, under a bar.
+    """Runs a function over many arguments, in order, under a bar.
 
     Args:
-        executor: who does it.
-        progress: that is shown.
+        executor: executor of the jobs.
+        progress: bar on the terminal.
     """
 
     def __init__(self, executor: Executor, progress: Progress) -> None:
@@ -112,12 +112,12 @@ class Everywhere:
         """The results, in order.
 
         Args:
-            title: what a person reads meanwhile.
-            work: to be done.
-            arguments: for each argument of it, its values.
+            title: text beside the bar.
+            work: the function.
+            arguments: for each of its arguments, the values.
 
         Raises:
-            RuntimeError: one failed.
+            RuntimeError: a job failed.
         """
         jobs = list(zip(*arguments, strict=True))
         outcomes = in_job_order(self._executor.map_unordered(partial(_spread, work), jobs))
@@ -137,8 +137,8 @@ def report_widths(everywhere: Everywhere, runs: int, budgets: Sequence[float]) -
     """The widths at which the report's limits keep the promised rates in runs without a fault.
 
     Args:
-        everywhere: does the work.
-        runs: of how many.
+        everywhere: executor of the runs.
+        runs: number of runs.
         budgets: false alarms in 30 days that are promised.
     """
     statistics = everywhere.do(

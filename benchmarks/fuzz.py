@@ -1,4 +1,4 @@
-"""Does anything that can be sent or written make a node fall over, or raise an alarm that is not its own?
+"""Fuzz test: no message, command, state or setting makes a node fail or raise a false alarm.
 
 Random and mutated messages are put between the samples of a sound plant and fed to the cores of monitor and recorder,
 runs of bad values take the place of samples while causes are looked for,
@@ -49,7 +49,7 @@ BETWEEN = 5
 """Strange messages for each row of the plant."""
 
 PLANTS = 0.1
-"""Of the settings that are valid, how many a plant is made of: that takes a while."""
+"""Share of the valid settings from which a plant is made: that takes a while."""
 
 LONGEST_RUN = 50
 """Bad values in a row."""
@@ -61,10 +61,10 @@ TABLES: dict[str, Any] = {"bus": BusConfig, "plant": PlantConfig, "monitor": Mon
 
 
 class Mutator:
-    """Makes strange things from a seed.
+    """Makes random messages and mutates bytes.
 
     Args:
-        seed: of all that is drawn.
+        seed: seed of the random numbers.
     """
 
     def __init__(self, seed: int) -> None:
@@ -78,9 +78,9 @@ class Mutator:
             case 0:
                 return base._replace(payload=draw.randbytes(draw.choice((0, 1, 2, 8, 30, 60, 200, 2000))))
             case 1 | 2:
-                return base._replace(payload=self.flipped(base.payload))
+                return base._replace(payload=self.flip_bits(base.payload))
             case 3:
-                return base._replace(payload=self.spliced(base.payload, draw.choice(heard).payload))
+                return base._replace(payload=self.splice(base.payload, draw.choice(heard).payload))
             case 4:
                 return base._replace(encoding=draw.choice((*self._encodings, self.text(base.encoding), "")))
             case 5:
@@ -110,16 +110,16 @@ class Mutator:
         sample.value = value
         return base._replace(payload=sample.SerializeToString())
 
-    def flipped(self, data: bytes) -> bytes:
-        """Some bits are others."""
+    def flip_bits(self, data: bytes) -> bytes:
+        """Flip some bits."""
         changed = bytearray(data)
         for _ in range(self.draw.choice((1, 1, 1, 2, 8))):
             if changed:
                 changed[self.draw.randrange(len(changed))] ^= 1 << self.draw.randrange(8)
         return bytes(changed)
 
-    def spliced(self, first: bytes, second: bytes) -> bytes:
-        """The beginning of one and the end of another."""
+    def splice(self, first: bytes, second: bytes) -> bytes:
+        """Join the beginning of one and the end of another."""
         return first[: self.draw.randrange(len(first) + 1)] + second[self.draw.randrange(len(second) + 1) :]
 
     def text(self, text: str) -> str:
@@ -278,7 +278,7 @@ def fuzz_commands(count: int, seed: int = 2) -> dict[str, int]:
     asked = [Encoded(keys.key(MONITOR.plant, keys.COMMAND, name), *encode_message(body)) for name, body in commands]
     for _ in range(count):
         base = mutator.draw.choice(asked)
-        payload = mutator.flipped(base.payload) if mutator.draw.random() < 0.5 else base.payload
+        payload = mutator.flip_bits(base.payload) if mutator.draw.random() < 0.5 else base.payload
         question = base._replace(payload=payload)
         match mutator.draw.randrange(4):
             case 0:
@@ -286,7 +286,7 @@ def fuzz_commands(count: int, seed: int = 2) -> dict[str, int]:
             case 1:
                 question = question._replace(encoding=mutator.draw.choice(asked).encoding)
             case 2:
-                question = question._replace(payload=mutator.spliced(base.payload, mutator.draw.choice(asked).payload))
+                question = question._replace(payload=mutator.splice(base.payload, mutator.draw.choice(asked).payload))
             case _:
                 pass
         for node in nodes:
@@ -314,7 +314,7 @@ def fuzz_states(count: int, seed: int = 3) -> dict[str, int]:
     stored, other = monitor.to_bytes(), Monitor(MONITOR, 0)
     before = other.to_bytes()
     for _ in range(count):
-        strange = mutator.flipped(stored) if mutator.draw.random() < 0.5 else mutator.spliced(stored, stored)
+        strange = mutator.flip_bits(stored) if mutator.draw.random() < 0.5 else mutator.splice(stored, stored)
         if strange == stored:
             continue
         try:
@@ -349,7 +349,7 @@ def fuzz_settings(count: int, seed: int = 4) -> dict[str, int]:
 
 
 def studies(count: int) -> Iterator[tuple[str, Callable[[], dict[str, int]]]]:
-    """What is done, by name; so many messages, and of all else in proportion."""
+    """Yield the studies by name, with a number of messages and all else in proportion."""
     share = count / COUNT
     yield "messages", lambda: fuzz_messages(count)
     yield "bad values", lambda: fuzz_values(round(VALUES * share))

@@ -92,7 +92,7 @@ class Walk:
             self._file = file
 
 
-def walks() -> tuple[int, int]:
+def count_moves() -> tuple[int, int]:
     """Moves of an ordinary row's last sample, the median of those before the onset, and of the first alarm's."""
     fault = f"coolant_flow:step:-0.08@{ONSET_MIN:g}min"
     measured = simulate_record(PlantConfig(duration_min=SPAN_MIN, seed=1, faults=(fault,)))
@@ -120,7 +120,7 @@ def main() -> None:
     for package in SHAPED:
         rooms, storeys = floors(graph, package)
         print(f"{package:<42}{rooms} rooms on {storeys} floors")
-    ordinary, alarm = walks()
+    ordinary, alarm = count_moves()
     print(f"moves between files, an ordinary sample   {ordinary}")
     print(f"moves between files, one with an alarm    {alarm}")
 

@@ -1,4 +1,4 @@
-"""Which model of the DaISy CSTR record runs best on its held-out half, and how long does finding it take?
+"""Best model of the DaISy CSTR record by simulation of its held-out half, and the time of the search.
 
 ARX and output-error models of orders 1 to 3, and the neural predictor where its extra is installed, of C and T. The
 record is not part of the repository: name the folder that holds data/daisy_cstr.csv in REACTORWATCH_SHARED.

@@ -1,4 +1,4 @@
-"""How long from a sample to its alarm? Live, through a real router, at 100 rows a second.
+"""Latency from a sample to its alarm, live, through a real router, at 100 rows a second.
 
 The monitor is a process of its own; its rule is set so that one point out raises an alarm and one point in clears it,
 and every 10th row is far out. Time runs from before the sample is published to the alarm's arrival here. Beside it: the
@@ -45,7 +45,7 @@ threading.Event().wait()
 
 
 class Arrivals:
-    """When what came, by the time of its sample."""
+    """Arrival times of messages, by the time of their samples."""
 
     def __init__(self) -> None:
         self.alarms: dict[int, float] = {}

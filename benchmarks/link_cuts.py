@@ -1,4 +1,4 @@
-"""What is missing in a recording after a link was cut, or the router was killed, under load?
+"""Missing messages of a recording after a cut link or a killed router, under load.
 
 A publisher sends 5,000 samples a second through a router to a recorder. The link of one of them goes through a proxy,
 which cuts it for a while: either it is closed and refused, as when a machine is switched off, or nothing passes any
@@ -141,7 +141,7 @@ class Router:
 
     @property
     def pid(self) -> int:
-        """Of its process."""
+        """Process ID of the router."""
         return self._process.pid
 
     def kill(self) -> None:
@@ -162,7 +162,7 @@ class Router:
 
 
 class Heard:
-    """How many messages of others the recorder says that it has received, or that they are lost."""
+    """Counts the messages of others that the recorder has received or reports as lost."""
 
     def __init__(self, bus: ZenohBus, plant: str = "cstr") -> None:
         self._changed = threading.Condition()
@@ -170,7 +170,7 @@ class Heard:
         bus.subscribe(keys.key(plant, keys.HEALTH, "recorder"), self._on_health)
 
     def wait(self, count: int) -> bool:
-        """Wait until it is so many; False: they did not come in a while."""
+        """Wait for a number of messages; False if they did not come in time."""
         with self._changed:
             return self._changed.wait_for(lambda: self._count >= count, PATIENCE_S)
 
@@ -185,15 +185,15 @@ class Heard:
 
 @dataclass(frozen=True)
 class Found:
-    """What is in the file.
+    """Content of a recording.
 
     Attributes:
-        published: samples.
-        recorded: of them.
-        missing: by their sequence numbers.
-        twice: that are there more than once.
-        out_of_order: samples that stand behind one that was published after them.
-        slowest_put_s: the longest that publishing a batch of samples took.
+        published: number of samples published.
+        recorded: number of samples recorded.
+        missing: number of samples missing by sequence number.
+        twice: number of repeated samples.
+        out_of_order: number of samples behind one that was published after them.
+        slowest_put_s: longest time of publishing a batch of samples.
     """
 
     published: int
@@ -206,14 +206,14 @@ class Found:
 
 @dataclass(frozen=True)
 class Load:
-    """What runs.
+    """A publisher and a recorder under load.
 
     Attributes:
-        proxy: on the link of one of them.
-        publisher: of the samples.
-        bus: the publisher's.
-        heard: what the recorder has received.
-        found: what is in the recording, one for each, when all has ended.
+        proxy: proxy on the link of one of them.
+        publisher: publisher of the samples.
+        bus: link of the publisher.
+        heard: count of the messages that the recorder has received.
+        found: content of each recording, after the end.
     """
 
     proxy: Proxy
@@ -222,8 +222,8 @@ class Load:
     heard: Heard
     found: list[Found]
 
-    def go_on(self, span_s: float) -> None:
-        """Wait until as much more was published as is in so many seconds."""
+    def wait_for_rows(self, span_s: float) -> None:
+        """Wait for the rows of a number of seconds."""
         self.publisher.wait(self.publisher.sequence + round(span_s * ROWS_PER_S))
 
 
@@ -232,10 +232,10 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
     """A publisher and a recorder at a router.
 
     Args:
-        folder: where the file is written.
-        router: its address.
-        whose: the link that goes through the proxy.
-        cache_messages: that the publisher keeps.
+        folder: folder of the recording.
+        router: address of the router.
+        whose: node whose link goes through the proxy.
+        cache_messages: number of messages in the cache of the publisher.
     """
     proxy = Proxy(router)
     direct = BusConfig(endpoint=router, cache_messages=cache_messages)
@@ -243,15 +243,15 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
     path, stop = folder / "run.mcap", StopSignal()
     config = RecorderConfig(out=str(path), health_period_s=0.2, black_box_min=0.0)
     recording = threading.Thread(target=record, args=(config, via if whose == "recorder" else direct, stop))
-    observer = connected(direct)
+    observer = connect_client(direct)
     heard, tokens = Heard(observer), Tokens(observer)
     recording.start()
-    bus = connected(via if whose == "publisher" else direct)
+    bus = connect_client(via if whose == "publisher" else direct)
     try:
         tokens.wait(alive=True)
         publisher = Publisher(bus, RATE_PER_S)
         load = Load(proxy, publisher, bus, heard, [])
-        load.go_on(WARM_UP_S)
+        load.wait_for_rows(WARM_UP_S)
         yield load
         publisher.close()
         heard.wait(publisher.sequence * SIGNALS)
@@ -261,11 +261,11 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
         bus.close()
         observer.close()
         proxy.close()
-    load.found.append(look([path], publisher))
+    load.found.append(read_content([path], publisher))
 
 
-def connected(config: BusConfig) -> ZenohBus:
-    """A client of the router."""
+def connect_client(config: BusConfig) -> ZenohBus:
+    """Connect a client to the router."""
     bus = connect(config, "cuts", StopSignal())
     assert bus is not None
     return bus
@@ -278,7 +278,7 @@ def cut(folder: Path, whose: Whose, manner: Manner, span_s: float, cache_message
         under_load(folder, endpoint, whose, cache_messages) as load,
         load.proxy.cut(manner),
     ):
-        load.go_on(span_s)
+        load.wait_for_rows(span_s)
     return load.found[0]
 
 
@@ -289,13 +289,13 @@ def kill_router(folder: Path, span_s: float, cache_messages: int = 10_000) -> Fo
         under_load(folder, endpoint, None, cache_messages) as load,
     ):
         router.kill()
-        load.go_on(span_s)
+        load.wait_for_rows(span_s)
         router.restart()
     return load.found[0]
 
 
-def look(files: Sequence[Path], publisher: Publisher) -> Found:
-    """What is in recordings that follow each other."""
+def read_content(files: Sequence[Path], publisher: Publisher) -> Found:
+    """Read the content of consecutive recordings."""
     numbers: dict[str, list[int]] = {}
     behind, newest = 0, 0
     for entry in (entry for path in files for entry in read_messages(path, {keys.SAMPLE})):
@@ -329,7 +329,7 @@ def main() -> None:
 
 
 def stick(folder: Path, span_s: float, cache_messages: int = 20_000) -> tuple[Found, Found]:
-    """Have one of two recorders stand still for a time, as one that waits for a broken disk; what the two then have."""
+    """Freeze one of two recorders, as a broken disk would; returns the content of both recordings."""
     stuck = folder / "stuck"
     stuck.mkdir()
     with (
@@ -339,12 +339,12 @@ def stick(folder: Path, span_s: float, cache_messages: int = 20_000) -> tuple[Fo
         heard = Heard(load.bus, "stuck")
         with recorder_process(stuck, endpoint, Tokens(load.bus, "stuck"), plant="stuck") as process:
             process.send_signal(signal.SIGSTOP)
-            load.go_on(span_s)
+            load.wait_for_rows(span_s)
             assert load.heard.wait(load.publisher.sequence * SIGNALS), "one that is stuck holds the other up"
             process.send_signal(signal.SIGCONT)
             load.publisher.close()
             heard.wait(load.publisher.sequence * SIGNALS)
-    return load.found[0], look(recordings_in(stuck), load.publisher)
+    return load.found[0], read_content(recordings_in(stuck), load.publisher)
 
 
 @contextlib.contextmanager

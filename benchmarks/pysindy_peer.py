@@ -27,7 +27,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.signal import savgol_filter
 
-from benchmarks.hidden.classes import class_named, drawn
+from benchmarks.hidden.classes import draw_record, find_class
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.holdout import holdout_rows
 from reactorwatch.diagnosis.record_checks import make_run
@@ -43,37 +43,37 @@ Array = NDArray[np.float64]
 
 SEED, RECORDS, NOMINAL_RECORDS = 20_000_000, 13, 3
 THRESHOLDS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)
-"""In scaled units; the last leaves nothing, which is the nominal model."""
+"""Thresholds in scaled units; the last leaves no term, which is the nominal model."""
 
 WINDOWS = (5, 9, 15)
 """Rows that are smoothed over, by a cubic."""
 
 CENTRE, SCALE = (0.1, 438.5, 100.0), (0.03, 6.0, 6.0)
-"""Of C, T and qc: with them all are of the order of one."""
+"""Centre and scale of C, T and qc, which bring all of them to the order of one."""
 
 FIRST_ROW = 100
-"""Where free runs begin; by the first row held out, ten minutes later, the reactor has forgotten how."""
+"""First row of simulations; the initial state has no effect by the first row held out, ten minutes later."""
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One record.
+    """Errors of both methods on one record.
 
     Attributes:
-        seed: of it.
-        truth: what is hidden.
-        before: free run of the nominal model on rows held out, over the true noise; the larger of C and T.
-        ours: the same of the extended model.
-        theirs: the same of the model that pysindy found.
-        said: what the diagnosis calls it.
-        terms: how many terms pysindy added, in the balances of C and of T.
+        seed: seed of the record.
+        truth: hidden causes.
+        before: error of the simulation of the nominal model on rows held out, over the true noise; larger of C and T.
+        extended: error of the extended model, over the noise.
+        pysindy: error of the model that pysindy found, over the noise.
+        said: cause named by the diagnosis.
+        terms: number of terms that pysindy added to the balances of C and of T.
     """
 
     seed: int
     truth: str
     before: float
-    ours: float
-    theirs: float
+    extended: float
+    pysindy: float
     said: str
     terms: tuple[int, int]
 
@@ -85,22 +85,22 @@ def main() -> None:
     if find_spec("pysindy") is None:
         console.print("skipped: pysindy is not installed (pip install --group peers)")
         return
-    medium, nominal = class_named("medium"), class_named("nominal")
-    records = [drawn(medium, number, chosen.seed) for number in range(chosen.records)]
+    medium, nominal = find_class("medium"), find_class("nominal")
+    records = [draw_record(medium, number, chosen.seed) for number in range(chosen.records)]
     # Every eleventh nominal record is one as of the class `medium`.
-    records += [drawn(nominal, 11 * number, chosen.seed) for number in range(chosen.nominal)]
-    found = [compared(hidden) for hidden in records]
+    records += [draw_record(nominal, 11 * number, chosen.seed) for number in range(chosen.nominal)]
+    found = [compare(hidden) for hidden in records]
     table = Table(title="Free run on rows held out over the noise, the larger of C and T", title_justify="left")
     for heading in ("seed", "hidden", "nominal model", "extended model", "pysindy", "named", "terms in C, T"):
         table.add_column(heading)
     for item in found:
-        numbers = [f"{value:.3f}" for value in (item.before, item.ours, item.theirs)]
+        numbers = [f"{value:.3f}" for value in (item.before, item.extended, item.pysindy)]
         table.add_row(str(item.seed), item.truth, *numbers, item.said, f"{item.terms[0]}, {item.terms[1]}")
     console.print(table)
     wrong = [item for item in found if item.truth != "nothing"]
     for title, part in (("something hidden", wrong), ("nothing hidden", [item for item in found if item not in wrong])):
         if part:
-            medians = [np.median([getattr(item, name) for item in part]) for name in ("before", "ours", "theirs")]
+            medians = [np.median([getattr(item, name) for item in part]) for name in ("before", "extended", "pysindy")]
             console.print(
                 f"{title}, median: nominal {medians[0]:.3f}, extended {medians[1]:.3f}, pysindy {medians[2]:.3f}; "
                 f"terms {np.median([sum(item.terms) for item in part]):.0f}"
@@ -109,8 +109,8 @@ def main() -> None:
         chosen.json.write_text(json.dumps([asdict(item) for item in found], indent=1) + "\n")
 
 
-def compared(hidden: Hidden) -> Compared:
-    """Both on one record."""
+def compare(hidden: Hidden) -> Compared:
+    """Run both methods on one record."""
     run = make_run(hidden.record, cstr())
     said = diagnose(hidden.record, cstr())
     noise_sd = np.array(hidden.circumstances.noise_sd)
@@ -134,7 +134,7 @@ def sparse_discrepancy(run: Run, noise_sd: Array) -> tuple[ProcessModel, tuple[i
     best, best_error, terms = cstr(), inf, (0, 0)
     for window in WINDOWS:
         for threshold in THRESHOLDS:
-            coefficients, powers = fitted(run, learned, window, threshold)
+            coefficients, powers = fit_pysindy(run, learned, window, threshold)
             model = with_monomials(cstr(), coefficients, powers)
             error = free_error(model, run, learned, noise_sd)
             if error < best_error:
@@ -143,8 +143,8 @@ def sparse_discrepancy(run: Run, noise_sd: Array) -> tuple[ProcessModel, tuple[i
     return best, terms
 
 
-def fitted(run: Run, learned: NDArray[Any], window: int, threshold: float) -> tuple[Array, Array]:
-    """Coefficients of pysindy, shape (2, monomials), and the powers of each monomial, shape (monomials, 3)."""
+def fit_pysindy(run: Run, learned: NDArray[Any], window: int, threshold: float) -> tuple[Array, Array]:
+    """Fit pysindy; returns coefficients, shape (2, monomials), and powers of the monomials, shape (monomials, 3)."""
     import pysindy  # it may not be there
 
     period = float(np.median(np.diff(run.time_min)))
@@ -205,7 +205,7 @@ def free_error(model: ProcessModel, run: Run, rows: NDArray[Any], noise_sd: Arra
 
 
 def arguments() -> argparse.Namespace:
-    """What was asked for on the command line."""
+    """Arguments of the command line."""
     parser = argparse.ArgumentParser(description="The diagnosis beside pysindy.")
     parser.add_argument("--records", type=int, default=RECORDS, help="with something hidden")
     parser.add_argument("--nominal", type=int, default=NOMINAL_RECORDS, help="with nothing hidden")

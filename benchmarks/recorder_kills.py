@@ -1,4 +1,4 @@
-"""What does a recorder lose that is killed (SIGKILL) under load?
+"""Losses of a recorder that is killed (SIGKILL) under load.
 
 A publisher sends 5,000 samples a second through a real router. A recorder of its own process, once it keeps up with
 that, is killed at a random moment, started again, killed again; each start recovers what the kill before it left.
@@ -46,11 +46,11 @@ KEPT = 30 * RATE_PER_S // SIGNALS
 
 @dataclass(frozen=True)
 class Killed:
-    """What a kill left.
+    """Recording after a kill.
 
     Attributes:
         messages: samples in the recovered file.
-        lost_s: from the last sample in the file to the kill.
+        lost_s: time from the last sample in the file to the kill.
         missing: samples that are missing between the first and the last of the file, by sequence number.
         late: samples that were published after the recorder was alive and before the first in its file.
     """
@@ -70,7 +70,7 @@ class Publisher:
         self._ended = threading.Event()
         self._changed = threading.Condition()
         self.sequence = 0
-        """Of the samples that are published next."""
+        """Sequence number of the next samples."""
         self.slowest_s = 0.0
         """The longest that publishing a batch took."""
         self._thread = threading.Thread(target=self._run)
@@ -104,7 +104,7 @@ class Publisher:
 
 
 class Tokens:
-    """Whether a recorder shows that it is alive."""
+    """Watches the liveliness token of a recorder."""
 
     def __init__(self, bus: ZenohBus, plant: str = "cstr") -> None:
         self._changed = threading.Condition()
@@ -112,7 +112,7 @@ class Tokens:
         bus.subscribe_liveliness(keys.key(plant, keys.ALIVE, "recorder"), self._on_token)
 
     def wait(self, *, alive: bool) -> None:
-        """Wait until it does, or does not."""
+        """Wait until the token is there, or gone."""
         with self._changed:
             assert self._changed.wait_for(lambda: self._alive == alive, PATIENCE_S), "no recorder, or no end of it"
 
@@ -123,7 +123,7 @@ class Tokens:
 
 
 class Pace:
-    """Whether a recorder writes what comes about as soon as it comes; only then does a kill cost what it has to."""
+    """Watches the lag of a recorder: a kill costs its least only if the recorder keeps up."""
 
     def __init__(self, bus: ZenohBus) -> None:
         self._changed = threading.Condition()
@@ -175,7 +175,7 @@ def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Kil
         for _ in range(kills):
             with recorder(folder, config.endpoint, tokens) as process:
                 alive_at.append(publisher.sequence + 1)  # the row that is being published may be half heard
-                wait_for_a_flush(folder, publisher)  # it has been told what was before, and writes
+                wait_for_a_flush(folder, publisher)  # it has received the history, and writes
                 pace.wait()
                 time.sleep(random.uniform(SOONEST_S, LATEST_S))
                 killed_ns.append(time.time_ns())

@@ -1,6 +1,6 @@
-"""Does the recorder keep up, and what does it cost over the bare MCAP library?
+"""Throughput of the recorder, and its cost over the bare MCAP library.
 
-Printed are ratios measured in one run, because the machine's speed is not ours: recorded over published at 20,000
+Printed are ratios measured in one run, because machines differ in speed: recorded over published at 20,000
 messages/s through a real router; writing and reading over the bare library's.
 
     python benchmarks/recording.py
@@ -47,7 +47,7 @@ FSYNC_RATE_PER_S, FSYNC_SECONDS = 5_000, 30
 
 
 def samples(count: int) -> list[Encoded]:
-    """So many samples, a tenth of a minute apart, signal by signal."""
+    """A number of samples, a tenth of a minute apart, signal by signal."""
     out = []
     for number in range(count):
         row, signal_number = divmod(number, len(SIGNALS))
@@ -115,7 +115,7 @@ def bare_write(path: Path, entries: list[RecordedMessage]) -> None:
 
 
 def record(path: Path, sent: list[Encoded]) -> None:
-    """What the recorder does with each message between the bus and the file."""
+    """Process each message as the recorder does between the bus and the file."""
     core = Recorder("cstr", 0)
     with RecordingWriter(path, {}) as writer:
         for number, message in enumerate(sent):
@@ -144,27 +144,29 @@ def files(folder: Path) -> None:
     """Writing and reading, over the bare library."""
     sent = samples(MESSAGES)
     entries = [RecordedMessage(*item[:3], number, number) for number, item in enumerate(sent)]
-    bare, ours = folder / "bare.mcap", folder / "ours.mcap"
+    bare, path = folder / "bare.mcap", folder / "recorded.mcap"
 
-    def write_ours() -> None:
-        ours.unlink(missing_ok=True)
-        record(ours, sent)
+    def write_recording() -> None:
+        path.unlink(missing_ok=True)
+        record(path, sent)
 
     def read_bare(*, in_order: bool) -> None:
-        with ours.open("rb") as stream:
+        with path.open("rb") as stream:
             exhaust(make_reader(stream).iter_messages(log_time_order=in_order))
 
-    bare_rate, ours_rate = rate_of(lambda: bare_write(bare, entries)), rate_of(write_ours)
-    print(f"recording / bare writer                  {ours_rate / bare_rate:5.2f}   ({ours_rate:,.0f} messages/s)")
+    bare_rate, recorder_rate = rate_of(lambda: bare_write(bare, entries)), rate_of(write_recording)
+    print(
+        f"recording / bare writer                  {recorder_rate / bare_rate:5.2f}   ({recorder_rate:,.0f} messages/s)"
+    )
     ordered, unordered = rate_of(lambda: read_bare(in_order=True)), rate_of(lambda: read_bare(in_order=False))
-    reading = rate_of(lambda: exhaust(read_messages(ours)))
-    decoded = rate_of(lambda: exhaust(decode(entry.payload, entry.encoding) for entry in read_messages(ours)))
-    record_rate = rate_of(lambda: read_record(ours))
+    reading = rate_of(lambda: exhaust(read_messages(path)))
+    decoded = rate_of(lambda: exhaust(decode(entry.payload, entry.encoding) for entry in read_messages(path)))
+    record_rate = rate_of(lambda: read_record(path))
     print(f"reading / bare reader, in order          {reading / ordered:5.2f}   ({reading:,.0f} messages/s)")
     print(f"reading / bare reader, in file order     {reading / unordered:5.2f}")
     print(f"reading decoded / bare reader, in order  {decoded / ordered:5.2f}   ({decoded:,.0f} messages/s)")
     print(f"reading as a record / bare, in order     {record_rate / ordered:5.2f}   ({record_rate:,.0f} messages/s)")
-    assert read_metadata(ours)
+    assert read_metadata(path)
 
 
 class Timed(PartFile):
@@ -180,7 +182,7 @@ class Timed(PartFile):
 
 
 def fsync(folder: Path) -> None:
-    """What it costs to wait for the disk, for each second of traffic at 5,000 messages/s."""
+    """Cost of waiting for the disk, for each second of traffic at 5,000 messages/s."""
     sent = samples(FSYNC_RATE_PER_S * FSYNC_SECONDS)
     step_ns = 1_000_000_000 // FSYNC_RATE_PER_S
     policies: tuple[Fsync, ...] = ("never", "second", "chunk")
@@ -213,7 +215,7 @@ def csv(folder: Path) -> None:
     start = time.perf_counter()
     read_csv(path)
     seconds = time.perf_counter() - start
-    print(f"CSV, numpy.loadtxt / ours                {bare_s / seconds:5.2f}   ({seconds:.1f} s a million rows)")
+    print(f"CSV, numpy.loadtxt / read_csv            {bare_s / seconds:5.2f}   ({seconds:.1f} s a million rows)")
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
-"""How fast is one recursive least squares update of ARX(3,3), alone and with 10,000 plants in a call?
+"""Speed of one recursive least squares update of ARX(3,3), alone and with 10,000 plants in a call.
 
 Against padasip's FilterRLS.adapt on the same rows. The three take turns, so that whatever else the machine does meets
-all of them; told are the medians over the rounds, of the times and of the ratios within a round.
+all of them; printed are the medians over the rounds, of the times and of the ratios within a round.
 """
 
 from time import perf_counter

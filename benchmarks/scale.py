@@ -1,4 +1,4 @@
-"""How many plants can one monitor watch? Live, through a real router, with 1 to 10,000 plants.
+"""Capacity of one monitor: live, through a real router, with 1 to 10,000 plants.
 
 A table with, for each number of plants:
 
@@ -8,7 +8,7 @@ A table with, for each number of plants:
   the processor's time, of all threads of the process, so that others on the machine do not count;
 - the same without the bus: from bytes to judgements;
 - memory a plant: how much more the process takes with all plants than with a hundredth of them; and with the bus,
-  than with half of them, when samples of all have been heard, slowly, and the health of all has been told;
+  than with half of them, when samples of all have arrived, slowly, and the health of all has been published;
 - from a sample to its alarm at one sample a second a plant, 99 of 100, as long as the clock says.
 
 The plants are copies of one that was trained, with names of their own; all are quiet but those that are given an alarm.
@@ -51,12 +51,12 @@ from monitor_node.quiet.slots import NEVER_NS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.runtime import bus_zenoh
-from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
+from tests.memory_bus import Exchange, MemoryBus
 
 SIZES = (1, 10, 100, 1000, 10_000)
 FAST_SAMPLES = 600_000
@@ -78,8 +78,8 @@ SHARP = MonitorConfig(
 """One point out raises an alarm, one point back in clears it."""
 
 
-def sized(count: int) -> int:
-    """Rows that every plant publishes as fast as it goes."""
+def fast_rows(count: int) -> int:
+    """Rows of every plant that are published as fast as possible."""
     return min(max(FAST_SAMPLES // (SIGNALS * count), 10), MOST_ROWS)
 
 
@@ -87,13 +87,13 @@ def sized(count: int) -> int:
 
 
 def memory_bytes() -> int:
-    """What this process takes."""
+    """Memory of this process in bytes."""
     gc.collect()
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 class Counting(FleetNode):
-    """A fleet's monitor that counts what it judges, and stops when it was all."""
+    """A fleet's monitor that counts its samples and stops after the last."""
 
     def __init__(self, config: MonitorConfig, bus: Any, stop: StopSignal) -> None:
         super().__init__(config, FleetConfig(plants=FLEET), bus, time.time_ns())
@@ -148,13 +148,13 @@ def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
     ):  # or what is missing does not come any more
         last = node.samples
         serving.join(IDLE_S)
-    told = {"samples": node.samples - node.before, "cpu_s": node.ended_s - node.began_s, "quiet": len(node.quiet)}
-    print(json.dumps(told | {"bytes": taken, "core": core}), flush=True)
+    result = {"samples": node.samples - node.before, "cpu_s": node.ended_s - node.began_s, "quiet": len(node.quiet)}
+    print(json.dumps(result | {"bytes": taken, "core": core}), flush=True)
     os._exit(0)  # thousands of tokens need not be withdrawn one by one
 
 
-def held(endpoint: str, plants: int) -> None:
-    """Say what this process takes when half of the plants were heard and their health told, and then all.
+def report_memory(endpoint: str, plants: int) -> None:
+    """Print the memory of this process after samples and health of half of the plants, and then of all.
 
     What it takes for any number of plants, such as threads and their buffers, is in both.
     """
@@ -233,7 +233,7 @@ def bare(endpoint: str, expected: int, plants: int) -> None:
 # --- the table ---------------------------------------------------------------------------------------------------
 
 
-def started(*arguments: object) -> "subprocess.Popen[str]":
+def start_part(*arguments: object) -> "subprocess.Popen[str]":
     """Start this program as another process and wait until it is ready; its errors come out here."""
     process = subprocess.Popen([sys.executable, __file__, *map(str, arguments)], stdout=subprocess.PIPE, text=True)
     if arguments[0] != "publish":
@@ -258,21 +258,21 @@ def _line(process: "subprocess.Popen[str]") -> str:
     return line
 
 
-def told(process: "subprocess.Popen[str]") -> dict[str, Any]:
-    """The result that a process prints at its end."""
+def read_result(process: "subprocess.Popen[str]") -> dict[str, Any]:
+    """Read the result that a process prints at its end."""
     found: dict[str, Any] = json.loads(_line(process))
     return found
 
 
 def on_the_bus(endpoint: str, plants: int) -> float:
-    """What is kept for a plant that is heard, and whose health is told, beside what its monitor keeps; in bytes."""
-    process = started("held", endpoint, plants)
+    """Memory of the bus for a plant with samples and health, beside that of its monitor, in bytes."""
+    process = start_part("memory", endpoint, plants)
     taken: list[int] = []
     for first in (0, plants // 2):
         if first:
             assert _line(process) == "ready\n"
-        source = started("publish", endpoint, plants // 2, HELD_ROWS, HELD_PER_S, first)
-        found = told(process)
+        source = start_part("publish", endpoint, plants // 2, HELD_ROWS, HELD_PER_S, first)
+        found = read_result(process)
         source.kill()
         source.wait()
         assert found["quiet"] == plants, found
@@ -282,25 +282,25 @@ def on_the_bus(endpoint: str, plants: int) -> float:
 
 def row_of(plants: int) -> str:
     """Measure with so many plants."""
-    rows = sized(plants)
+    rows = fast_rows(plants)
     expected = plants * rows * SIGNALS
     endpoint = free_endpoint()
-    hub = started("route", endpoint)
+    hub = start_part("route", endpoint)
     try:
         rates = {}
         for listener in ("bare", "monitor"):
             arguments = (endpoint, expected, plants) if listener == "bare" else (endpoint, plants, expected, 0)
-            process = started(listener, *arguments)
-            source = started("publish", endpoint, plants, rows, 0)
-            found = told(process)
+            process = start_part(listener, *arguments)
+            source = start_part("publish", endpoint, plants, rows, 0)
+            found = read_result(process)
             source.wait()
             rates[listener] = found["samples"] / found["cpu_s"]
         size = f"{'–':>12}"
         if plants >= 1000:  # of fewer what differs from time to time is as much as the plants
             size = f"{(found['bytes'] + on_the_bus(endpoint, plants)) / 1000:9.1f} kB"
-        live = started("monitor", endpoint, plants, -1, 1)
-        source = started("publish", endpoint, plants, KNOWN_ROWS + LATENCY_S // SIGNALS, plants)
-        delays = told(source)
+        live = start_part("monitor", endpoint, plants, -1, 1)
+        source = start_part("publish", endpoint, plants, KNOWN_ROWS + LATENCY_S // SIGNALS, plants)
+        delays = read_result(source)
         live.kill()
         p99 = f"{np.percentile(delays['delays_ms'], 99):9.1f} ms" if delays["delays_ms"] else f"{'–':>12}"
         alone = f"{found['bytes'] / 1000:9.1f} kB" if plants >= 100 else f"{'–':>12}"
@@ -316,7 +316,7 @@ def row_of(plants: int) -> str:
 def main() -> None:
     """Measure and print."""
     configure(logging.WARNING)
-    if len(sys.argv) > 1 and sys.argv[1] in ("route", "publish", "monitor", "held", "bare"):
+    if len(sys.argv) > 1 and sys.argv[1] in ("route", "publish", "monitor", "memory", "bare"):
         command, endpoint, *numbers = sys.argv[1:]
         if command == "route":
             route(endpoint)
@@ -326,8 +326,8 @@ def main() -> None:
             )
         elif command == "monitor":
             monitor(endpoint, int(numbers[0]), int(numbers[1]), bool(int(numbers[2])))
-        elif command == "held":
-            held(endpoint, int(numbers[0]))
+        elif command == "memory":
+            report_memory(endpoint, int(numbers[0]))
         else:
             bare(endpoint, int(numbers[0]), int(numbers[1]))
         return

@@ -1,9 +1,9 @@
-"""How much faster is a free run than scipy's `solve_ivp` (LSODA, rtol 1e-8), and how far apart are the two?
+"""Speed of a simulation against scipy's `solve_ivp` (LSODA, rtol 1e-8), and the difference of the two.
 
     python benchmarks/simulate.py [rows]
 
 The record is the plant's own random-steps scenario: a new coolant flow every minute, a row every 0.1 min. LSODA must
-not step across a jump of the input, so it is started anew: at every row, which is how a held input is most simply
+not step across a jump of the input, so it is restarted: at every row, which is how a held input is most simply
 written down and right for any record; and, for comparison, only where the input changes, which is the least that
 this record needs. Goal: 80 times faster than the first, at most 1e-6 mol/l and 1e-3 K from both.
 """
@@ -39,7 +39,7 @@ def main(rows: int) -> None:
     ours_s, trajectory = fastest(lambda: simulator.run(times, flows, start))
     sensitive_s, _ = fastest(lambda: simulator.run_with_sensitivities(times, flows, start, ["K2", "K3", "Tf", "Cf"]))
     print(f"{rows} rows")
-    print(f"  free run                            {ours_s * 1e3:8.1f} ms")
+    print(f"  simulation                          {ours_s * 1e3:8.1f} ms")
     print(f"  with sensitivities to 4 parameters  {sensitive_s * 1e3:8.1f} ms")
     changes = np.append(np.flatnonzero(np.diff(flows, prepend=np.nan)), rows - 1)
     for where, edges in (("at every row", np.arange(rows)), ("where qc changes", np.unique(changes))):
@@ -47,8 +47,8 @@ def main(rows: int) -> None:
         states = lsoda(times, flows, start, edges)
         theirs_s = time.perf_counter() - began
         C, T = np.max(np.abs(states - trajectory.states), axis=0)
-        print(f"  LSODA, anew {where:<24}{theirs_s * 1e3:8.1f} ms", end="")
-        print(f"  {theirs_s / ours_s:5.0f} times the free run; at most {C:.1e} mol/l and {T:.1e} K apart")
+        print(f"  LSODA, restarted {where:<19}{theirs_s * 1e3:8.1f} ms", end="")
+        print(f"  {theirs_s / ours_s:5.0f} times the simulation; at most {C:.1e} mol/l and {T:.1e} K apart")
 
 
 def fastest(run: Callable[[], Result]) -> tuple[float, Result]:
@@ -62,7 +62,7 @@ def fastest(run: Callable[[], Result]) -> tuple[float, Result]:
 
 
 def lsoda(times: Array, flows: Array, start: Array, edges: NDArray[np.int64]) -> Array:
-    """States of every row, shape (rows, 2), integrated anew from each row of `edges` to the next."""
+    """States of every row, shape (rows, 2), restarted at each row of `edges`."""
     states = [start]
     for first, last in pairwise(edges.tolist()):
         run = solve_ivp(

@@ -10,7 +10,7 @@ If the plant stops or no data arrive while a diagnosis is pending, it starts wit
 from collections import deque
 from collections.abc import Callable
 from math import inf
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
 
@@ -18,6 +18,7 @@ from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decod
 from reactorwatch.contract.keys import check_plant
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Sample
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.runtime.setting_rules import check_bounds
 
 HIDDEN_STATES = (
     AlarmState.ALARM_STATE_SHELVED,
@@ -53,19 +54,15 @@ class DiagnosisConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     plant: str = "cstr"
     out: str | None = None
-    window_min: float = 240.0
-    after_min: float = 30.0
-    apart_min: float = 60.0
+    window_min: Annotated[float, msgspec.Meta(ge=20.0, le=1e6)] = 240.0
+    after_min: Annotated[float, msgspec.Meta(ge=1.0, le=1e6)] = 30.0
+    apart_min: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)] = 60.0
     model: str | None = None
     tolerance: dict[str, float] = {}
 
     def __post_init__(self) -> None:
         check_plant(self.plant)
-        for what, value, low in (("window_min", self.window_min, 20.0), ("after_min", self.after_min, 1.0)):
-            if not low <= value <= 1e6:
-                raise ValueError(f"{what} must be in [{low:g}, 1e+06], got {value:g}")
-        if not 0.0 <= self.apart_min <= 1e6:
-            raise ValueError(f"apart_min must be in [0, 1e+06], got {self.apart_min:g}")
+        check_bounds(DiagnosisConfig, msgspec.structs.asdict(self))
         for output, value in self.tolerance.items():
             if not 0.0 < value < inf:
                 raise ValueError(f"tolerance of {output} must be a positive number, got {value:g}")

@@ -40,12 +40,12 @@ SD = "sd"
 
 
 class ChartsState(StoredState, frozen=True):
-    """All that the charts of a plant are and remember.
+    """State of the charts of a plant.
 
     Attributes:
-        charts: by name, the state of each as bytes.
+        charts: state of each chart as bytes, by name.
         widths: see `ChartWatch`.
-        passed: of each output, the part of a lasting shift that the charts see.
+        passed: for each output, the part of a lasting shift that its prewhitened residual shows.
     """
 
     charts: dict[str, bytes]
@@ -75,8 +75,8 @@ def _without(known: list[bool], withheld: tuple[bool, ...]) -> list[bool]:
 class _Banked:
     """Compiled charts, one an output.
 
-    `update` takes a row in and returns the charts' views of it, None for a chart that had nothing to judge; None in
-    place of all if no chart is out, unless `always`. So it is with `_OfEach` and `_OfAll`.
+    `update` takes a row and returns the charts' judgements of it, None for a chart without a value; None in place of
+    all if no chart is out, unless `always`. `_OfEach` and `_OfAll` have the same methods.
     """
 
     def __init__(self, bank: Bank[CompiledChart], kind: type[CompiledChart]) -> None:
@@ -126,7 +126,7 @@ class _OfAll:
 
     Args:
         joint: the chart.
-        evaluated: which outputs it looks at.
+        evaluated: for each output, True if the chart uses it.
     """
 
     def __init__(self, joint: JointChart, evaluated: list[bool]) -> None:
@@ -138,7 +138,7 @@ class _OfAll:
         return self._chart.state.to_bytes()
 
     def update(self, e: list[float], known: list[bool], withheld: tuple[bool, ...], *, always: bool) -> _Judgements:
-        """Take a row in; one in which an output is missing is left out."""
+        """Update with a row; a row with a missing output is skipped."""
         if not self._all:
             e, known = list(compress(e, self._evaluated)), list(compress(known, self._evaluated))
         if False in known or True in withheld:
@@ -171,7 +171,7 @@ class ChartWatch:
     """The charts of one plant.
 
     Args:
-        config: of the monitor.
+        config: configuration of the monitor.
         board: the alarms of the plant; those of the charts are declared here.
     """
 
@@ -200,7 +200,7 @@ class ChartWatch:
         """Choose the charts that can be made; returns the others, by alarm, each with the reason.
 
         Args:
-            evaluated: which outputs are evaluated.
+            evaluated: for each output, True if it is evaluated.
             e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
         """
         rows, signals = (
@@ -232,28 +232,28 @@ class ChartWatch:
         p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
         sds = memory_sds(e, config.chart_settings["ewma_weight"])
         baseline = Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
-        self.widths, self._passed = [designed_width(p, item) for item in learned], [item.passed for item in learned]
+        self.widths, self._passed = [designed_width(p, item) for item in learned], [item.shift_gain for item in learned]
 
-        def designed(kind: type[Chart]) -> _Charts:
+        def design_charts(kind: type[Chart]) -> _Charts:
             if issubclass(kind, SignalChart):
                 return _of_each(kind, [kind.design(baseline.of([index])) for index in range(len(config.outputs))])
             assert issubclass(kind, JointChart)
             return _OfAll(kind.design(baseline.of(np.flatnonzero(self._evaluated).tolist())), self._evaluated)
 
-        self._watch(designed)
+        self._watch(design_charts)
 
     @property
     def state(self) -> ChartsState:
-        """A copy of all that the charts are and remember; their alarms are the board's."""
+        """A copy of the full state of the charts; their alarms belong to the board."""
         charts = {name: watched.charts.to_bytes() for name, watched in self._watched.items()}
         return ChartsState(charts, list(self.widths), list(self._passed))
 
     def restore(self, state: ChartsState, evaluated: list[bool]) -> None:
-        """Go on, bit for bit, where charts of the same settings were when `state` was taken; after the board.
+        """Resume, bit for bit, from the state of charts with the same settings; after the board.
 
         Args:
-            state: of the other charts.
-            evaluated: which outputs are evaluated.
+            state: state of the other charts.
+            evaluated: for each output, True if it is evaluated.
 
         Raises:
             ValueError: the state is damaged.
@@ -265,7 +265,7 @@ class ChartWatch:
         if not each <= set(state.charts) <= set(self._names) or not len(self.widths) == len(self._passed) == outputs:
             raise ValueError(f"there must be the charts {', '.join(self._names)}, got {', '.join(state.charts)}")
 
-        def restored(kind: type[Chart]) -> _Charts:
+        def restore_charts(kind: type[Chart]) -> _Charts:
             data = state.charts[kind.name]
             if issubclass(kind, CompiledChart):
                 columns = SignalState.from_bytes(data)
@@ -277,7 +277,7 @@ class ChartWatch:
             assert issubclass(kind, JointChart)
             return _OfAll(kind.from_state(kind.State.from_bytes(data)), self._evaluated)
 
-        self._watch(restored)
+        self._watch(restore_charts)
 
     def _watch(self, made: Callable[[type[Chart]], _Charts]) -> None:
         """Give the charts of each name their alarms and keys."""
@@ -297,7 +297,7 @@ class ChartWatch:
             row: the row; points and alarms are added to its publications.
             e: prewhitened residuals; NaN where there is none.
             withheld: outputs whose value may be an outlier and must not enter a memory yet.
-            scales: what one standard deviation is, in the outputs' units.
+            scales: one standard deviation of each, in the outputs' units.
             points: True to publish the charts' points.
         """
         publications = row.publications

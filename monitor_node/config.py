@@ -1,10 +1,11 @@
 """The monitor's settings."""
 
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 
 import msgspec
 
 from reactorwatch.contract.keys import check_plant
+from reactorwatch.runtime.setting_rules import check_bounds
 from reactorwatch.spc.charts.catalogue import CHARTS
 from reactorwatch.spc.m_of_n import check_rule
 
@@ -16,7 +17,12 @@ if TYPE_CHECKING:
 else:
     ChartName = Literal[tuple(chart.name for chart in CHARTS)]
     _OfCharts = msgspec.defstruct(
-        "_OfCharts", [(setting.key, float, setting.default) for setting in CHART_SETTINGS], frozen=True
+        "_OfCharts",
+        [
+            (item.key, Annotated[float, msgspec.Meta(ge=item.lower, le=item.upper)], item.default)
+            for item in CHART_SETTINGS
+        ],
+        frozen=True,
     )
 
 PriorityName = Literal["low", "medium", "high", "critical"]
@@ -69,30 +75,30 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     plant: str = "cstr"
     input: str = "qc"
     outputs: tuple[str, ...] = ("C", "T")
-    order: int = 3
-    delay: int = 1
-    forgetting: float = 0.999
-    training_min: float = 100.0
+    order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
+    delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
+    forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999
+    training_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 100.0
     reference: Literal["auto", "process", "arx"] = "auto"
     model: str | None = None
     charts: tuple[ChartName, ...] = ("shewhart", "ewma", "mewma")
-    false_alarms_per_30_days: float | None = None
+    false_alarms_per_30_days: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
     smallest_sd: dict[str, float] = msgspec.field(default_factory=SMALLEST_SD.copy)
     isolation: bool = True
-    isolation_rows: int = 600
+    isolation_rows: Annotated[int, msgspec.Meta(ge=50, le=10_000)] = 600
     raise_count: int = 3
     window: int = 5
     clear_count: int = 20
-    dead_band: float = 0.1
-    incident_min: float = 60.0
-    longest_shelf_min: float = 480.0
+    dead_band: Annotated[float, msgspec.Meta(ge=0.0, le=0.9)] = 0.1
+    incident_min: Annotated[float, msgspec.Meta(ge=0.0, le=1e6)] = 60.0
+    longest_shelf_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 480.0
     alarm_state_file: str | None = None
     state_file: str | None = None
-    state_every_s: float = 5.0
-    reorder_rows: int = 8
-    silence_periods: float = 5.0
-    snapshot_min: float = 5.0
-    health_period_s: float = 5.0
+    state_every_s: Annotated[float, msgspec.Meta(ge=0.1, le=3600.0)] = 5.0
+    reorder_rows: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 8
+    silence_periods: Annotated[float, msgspec.Meta(ge=1.5, le=1e6)] = 5.0
+    snapshot_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 5.0
+    health_period_s: Annotated[float, msgspec.Meta(ge=0.05, le=3600.0)] = 5.0
     priorities: dict[str, PriorityName] = msgspec.field(default_factory=lambda: DEFAULT_PRIORITIES)
 
     def __post_init__(self) -> None:
@@ -102,26 +108,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             raise ValueError(
                 f"outputs must be at least one signal, each once, without the input {self.input!r}, got {self.outputs}"
             )
-        asked = self.false_alarms_per_30_days
-        for what, value, low, high in (
-            ("order", self.order, 1, 20),
-            ("delay", self.delay, 1, 100),
-            ("forgetting", self.forgetting, 0.5, 1.0),
-            ("training_min", self.training_min, 1e-3, 1e6),
-            ("false_alarms_per_30_days", 1.0 if asked is None else asked, 1e-3, 1e6),
-            *((item.key, getattr(self, item.key), item.lower, item.upper) for item in CHART_SETTINGS),
-            ("isolation_rows", self.isolation_rows, 50, 10_000),
-            ("silence_periods", self.silence_periods, 1.5, 1e6),
-            ("dead_band", self.dead_band, 0.0, 0.9),
-            ("incident_min", self.incident_min, 0.0, 1e6),
-            ("longest_shelf_min", self.longest_shelf_min, 1e-3, 1e6),
-            ("reorder_rows", self.reorder_rows, 1, 1000),
-            ("state_every_s", self.state_every_s, 0.1, 3600.0),
-            ("snapshot_min", self.snapshot_min, 1e-3, 1e6),
-            ("health_period_s", self.health_period_s, 0.05, 3600.0),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"{what} must be in [{low:g}, {high:g}], got {value:g}")
+        check_bounds(MonitorConfig, msgspec.structs.asdict(self))
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")
         for signal, sd in self.smallest_sd.items():

@@ -333,6 +333,11 @@ class Monitor:
         return self._aligner.state.counts.rows
 
     @property
+    def has_pending_rows(self) -> bool:
+        """True while a row waits for samples."""
+        return bool(self._aligner.state.pending)
+
+    @property
     def restarts(self) -> int:
         """Number of restarts of the plant, or of its clock, so far."""
         return self._aligner.state.counts.restarts
@@ -348,7 +353,7 @@ class Monitor:
         return self._pipeline.expected_false_alarms
 
     @property
-    def left_out(self) -> dict[str, str]:
+    def excluded_signals(self) -> dict[str, str]:
         """Signals that are not monitored, with the reason: no value came, or the training could not use them."""
         never_came = (signal for signal in self._signals if signal not in self._heard_from_ns)
         return dict.fromkeys(never_came, NO_VALUE) | self._pipeline.left_out

@@ -1,8 +1,8 @@
-"""Drift: how far the models that adapt have gone from the references, told every few minutes.
+"""Drift: distance of the adaptive models from the references, published every few minutes.
 
-It is told, and by default no alarm: a plant that is run where it was not run in training drifts from its linear model
-without anything being wrong. Who wants an alarm of it puts `parameters` among the charts; it then has its share of the
-budget of false alarms.
+By default it raises no alarm: a plant that is run where it was not run in training drifts from its linear model
+without anything being wrong. With `parameters` among the charts it raises one, with its share of the budget of false
+alarms.
 """
 
 from itertools import compress
@@ -17,7 +17,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.parameters import ParameterT2
 
 ROWS = 50
-"""From one look to the next. The models remember hundreds of rows, so nothing is missed between."""
+"""Rows from one evaluation to the next. The models remember hundreds of rows, so nothing is missed between."""
 
 DEAD_BAND = 0.5
 """The statistic moves slowly and would come back again and again from just below the limit."""
@@ -30,12 +30,12 @@ class DriftWatch:
     """Compares the models of a plant.
 
     Args:
-        config: of the monitor.
+        config: configuration of the monitor.
         board: the alarms of the plant; those of the drift, if wanted, are declared here.
-        told: whether the drift is to be published.
+        publish: whether the drift is to be published.
     """
 
-    def __init__(self, config: MonitorConfig, board: Annunciator, *, told: bool) -> None:
+    def __init__(self, config: MonitorConfig, board: Annunciator, *, publish: bool) -> None:
         self._outputs = config.outputs
         self._board = board
         self._alarms = {
@@ -50,29 +50,29 @@ class DriftWatch:
             for signal in self._outputs
             if ParameterT2.name in config.charts
         }
-        self._told = told
+        self._publish = publish
         self._keys = [
             keys.key(config.plant, keys.CHART, keys.chart_name(ParameterT2.name, signal)) for signal in self._outputs
         ]
         self.until_next = ROWS
-        """Rows until the next look: all that is remembered here."""
-        self.wanted = told or bool(self._alarms)
-        """Whether the models have to adapt at all."""
+        """Rows until the next evaluation: the full state."""
+        self.wanted = publish or bool(self._alarms)
+        """True if the models have to adapt at all."""
 
     def chance_alarms(self, evaluated: list[bool]) -> int:
         """Number of its alarms that chance can raise.
 
         Args:
-            evaluated: which outputs are evaluated.
+            evaluated: for each output, True if it is evaluated.
         """
         return sum(evaluated) if self._alarms else 0
 
     def start(self, predictors: list[ArxPredictor], evaluated: list[bool], arl0: float) -> list[str]:
-        """Begin to compare; returns what people are to be told where that is not possible.
+        """Start the comparison; returns a note for each output where that is not possible.
 
         Args:
-            predictors: one an output, with references.
-            evaluated: which outputs are evaluated.
+            predictors: predictors of the outputs, with references.
+            evaluated: for each output, True if it is evaluated.
             arl0: run length of each alarm without a fault, in rows.
         """
         notes: list[str] = []
@@ -86,11 +86,11 @@ class DriftWatch:
         return notes
 
     def update(self, time_ns: int, predictors: list[ArxPredictor]) -> list[Publication]:
-        """Look, if it is time.
+        """Evaluate the drift, if it is time.
 
         Args:
-            time_ns: of the row.
-            predictors: as at the start.
+            time_ns: time of the row.
+            predictors: the predictors given to `start`.
         """
         self.until_next -= 1
         if self.until_next:
@@ -102,7 +102,7 @@ class DriftWatch:
             if found is None:
                 continue
             judgement, parts = found
-            if self._told:
+            if self._publish:
                 publications.append(Publication(key, chart_point(time_ns, judgement)))
             alarm = self._alarms.get(signal)
             if alarm is not None and (raised := alarm.update(judgement)) is not None:

@@ -4,9 +4,9 @@ Two monitors of one plant raise every alarm twice, and both answer commands. Mon
 themselves are one group: the shards of a fleet (see `fleet.sharding`). A monitor of one plant is a group of its own.
 Each group is reported once, with the first shared plant, and once more when its last monitor has gone.
 
->>> ours, fleet = keys.monitor_token("a", "01"), keys.fleet_token("0f", "1", "1", keys.fleet_member("02", "reactor/*"))
->>> others = OtherMonitors(ours, lambda: ["a"])
->>> others.on_token(ours, is_alive=True)
+>>> own, fleet = keys.monitor_token("a", "01"), keys.fleet_token("0f", "1", "1", keys.fleet_member("02", "reactor/*"))
+>>> others = OtherMonitors(own, lambda: ["a"])
+>>> others.on_token(own, is_alive=True)
 >>> others.on_token(fleet, is_alive=True)
 Report(plant='a', other='fleet reactor/* (1 shard)', is_alive=True)
 >>> others.on_token(fleet, is_alive=False).is_alive

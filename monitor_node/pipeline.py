@@ -64,7 +64,7 @@ class PlantPipeline:
         config: settings of the monitor.
         board: alarms of the plant.
         points: True to publish estimates, chart points and models.
-        model: as for `Monitor`.
+        model: see `Monitor`.
         failures: counter of errors in the search for causes; None: a new one.
 
     Raises:
@@ -96,7 +96,7 @@ class PlantPipeline:
         self._sampling = SamplingPeriod()
         self._charts = ChartWatch(config, board)
         self.signals = SignalChecks(config, board, signal_ranges(self.model, (config.input, *config.outputs)))
-        self._drift = DriftWatch(config, board, told=points)
+        self._drift = DriftWatch(config, board, publish=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
         self._refusals = 0
@@ -286,7 +286,7 @@ class PlantPipeline:
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
                 self._refusals += 1
-                self.notes.append(f"the training begins anew: {trained.refused}")
+                self.notes.append(f"the training starts again: {trained.refused}")
                 self._start_training(time_ns)
             else:
                 self._start(trained)
@@ -436,7 +436,10 @@ class PlantPipeline:
         for index, whitener in enumerate(self._whiteners):
             prediction, residual = predictions[index], row.values[index] - predictions[index]
             if isfinite(residual):
-                usual, reach = prediction + sds[index] * whitener.expected(), scales[index] * self._charts.widths[index]
+                usual, reach = (
+                    prediction + sds[index] * whitener.expected_value(),
+                    scales[index] * self._charts.widths[index],
+                )
                 estimate = _estimate(row.time_ns, prediction, residual, row.units[index])
                 estimate.residual_sd = scales[index]
                 estimate.lower_limit, estimate.upper_limit = usual - reach, usual + reach

@@ -1,7 +1,7 @@
 """The plant's settings."""
 
 from math import isfinite
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import msgspec
 
@@ -10,6 +10,7 @@ from plant_node.presets import PRESETS
 from plant_node.scenario import RandomSteps, Settings, scenario_settings
 from reactorwatch.contract.keys import check_plant
 from reactorwatch.process.fault import FaultSpecification, parse_fault
+from reactorwatch.runtime.setting_rules import check_bounds
 
 
 class NoiseSd(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -63,10 +64,10 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     presets: ClassVar[dict[str, dict[str, Any]]] = {item.name: item.settings for item in PRESETS}
 
     name: str = "cstr"
-    period_min: float = 0.1
+    period_min: Annotated[float, msgspec.Meta(ge=1e-4, le=60.0)] = 0.1
     speed: float = 1.0
     duration_min: float | None = None
-    seed: int = 0
+    seed: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)] = 0
     zero_ns: int | None = None
     scenario: str | dict[str, Any] = RandomSteps.kind
     temperature_control: TemperatureControl | None = None
@@ -78,18 +79,12 @@ class PlantConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model: str | None = None
     faults: tuple[str, ...] = ()
     start: Literal["operating", "extinguished"] | dict[str, float] = "operating"
-    health_period_s: float = 5.0
+    health_period_s: Annotated[float, msgspec.Meta(ge=0.1, le=3600.0)] = 5.0
     wait_for: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_plant(self.name)
-        for what, value, low, high in (
-            ("period_min", self.period_min, 1e-4, 60.0),
-            ("health_period_s", self.health_period_s, 0.1, 3600.0),
-            ("seed", self.seed, 0, 2**63 - 1),
-        ):
-            if not low <= value <= high:
-                raise ValueError(f"{what} must be in [{low:g}, {high:g}], got {value:g}")
+        check_bounds(PlantConfig, msgspec.structs.asdict(self))
         if not self.speed > 0:
             raise ValueError(f"speed must be above 0, or inf for as fast as it goes, got {self.speed:g}")
         if self.duration_min is not None and not (isfinite(self.duration_min) and self.duration_min > 0):

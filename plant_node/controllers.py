@@ -111,7 +111,7 @@ class TemperatureControl(msgspec.Struct, frozen=True, forbid_unknown_fields=True
         for _, value in self.steps:
             check_set_point(model, value)
 
-    def closed(self, model: ProcessModel, valve: CoolantValve) -> ProcessModel:
+    def closed_loop(self, model: ProcessModel, valve: CoolantValve) -> ProcessModel:
         """Model of the closed loop in continuous time, at the set point of plant time 0.
 
         It has the steady state of the sampled loop, which is its purpose, but other transients. The input is the

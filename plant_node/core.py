@@ -85,9 +85,9 @@ class Plant:
     """The simulated plant.
 
     Args:
-        config: its settings; those about pace and health are not used here.
+        config: settings of the plant; those about pace and health are not used here.
         model: the process, without the faults of `config`.
-        scenario: its input.
+        scenario: input of the plant.
 
     Raises:
         InputError: settings that do not fit the model.
@@ -124,7 +124,7 @@ class Plant:
         self._manual_l_min: float | None = None
         self._cleared: list[FaultChange] = []
         self._installed = [_Installed(item, item.values.get("onset", 0.0)) for item in config.fault_specifications()]
-        self._use(self._extended(self._installed))
+        self._use(self._extend_model(self._installed))
         self._x = self._start()
 
     @property
@@ -264,8 +264,8 @@ class Plant:
         if self._control is None:
             return start_state(self._model, self._input(), self._config.start)
         base = np.array([self._control.base_flow_l_min + self._dither()])
-        model = self._extended(self._physical(self._installed))
-        return start_state(self._control.closed(model, self._valve), base, self._config.start)
+        model = self._extend_model(self._physical(self._installed))
+        return start_state(self._control.closed_loop(model, self._valve), base, self._config.start)
 
     def _true_outputs(self, inputs: Array, function: ArrayFunction | None = None) -> Array:
         function = function or self._outputs
@@ -287,7 +287,7 @@ class Plant:
 
     def _install(self, faults: list[_Installed]) -> None:
         """Continue from the present state with these faults; nothing changes if they are invalid."""
-        model = self._extended(faults)
+        model = self._extend_model(faults)
         held = self._input() if self._held is None else self._held
         self._x = complete_state(model, self.state, held, self.time_min)
         self._installed = faults
@@ -297,7 +297,7 @@ class Plant:
         """Faults of the plant, without those of the timestamps, which a controller does not see."""
         return [fault for fault in faults if fault.specification.effect.location != TIMING]
 
-    def _extended(self, faults: list[_Installed]) -> ProcessModel:
+    def _extend_model(self, faults: list[_Installed]) -> ProcessModel:
         """The model with these faults; the physical ones come first, as timing faults shift their times."""
         model = self._base
         physical = self._physical(faults)
@@ -311,7 +311,7 @@ class Plant:
     def _use(self, model: ProcessModel) -> None:
         self._model, self._p = model, model.values()
         self._stepper, self._outputs = Stepper(model), ArrayFunction(model.function("outputs"))
-        physical = self._extended(self._physical(self._installed))
+        physical = self._extend_model(self._physical(self._installed))
         self._controller_outputs = ArrayFunction(physical.function("outputs"))
 
 

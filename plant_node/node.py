@@ -46,7 +46,7 @@ class PlantNode:
 
     Args:
         plant: the simulated plant, at its first row.
-        config: its settings.
+        config: settings of the plant.
         log: called with a line of text when something happens.
     """
 

@@ -2,10 +2,10 @@
 
     >>> import reactorwatch as rw
     >>> sorted(rw.processes)
-    ['cstr', 'tanks']
+    ['cstr', 'tanks', 'three_tanks']
 
-A process is given by its name, by the path of an extended model (`extended.json`, as `diagnose` writes it) or as a
-`ProcessModel`. Times are in minutes, values in the units of the process.
+A process is given by its name, by the path of a file that describes it (`.toml`, `.py`, or `extended.json`, as
+`diagnose` writes it), or as a `Process` or `ProcessModel`. Times are in minutes, values in the units of the process.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +25,8 @@ from reactorwatch.cli.simulation import simulate_along
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
+from reactorwatch.description.find import find_process
+from reactorwatch.description.process import Process
 from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
@@ -38,11 +40,11 @@ from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.record import Record, to_minutes, to_time_ns
-from reactorwatch.runtime.model_file import read_extended_model
+from reactorwatch.runtime.config import section
 from reactorwatch.spc.charts import catalogue as charts  # noqa: F401 # a public name
 from recorder.tools.player import samples_of
 
-ProcessLike: TypeAlias = str | Path | ProcessModel
+ProcessLike: TypeAlias = str | Path | Process | ProcessModel
 
 processes: Mapping[str, Callable[[], ProcessModel]] = {make().name: make for make in MODELS}
 """The processes that are shipped, by name: functions that build their models."""
@@ -57,7 +59,7 @@ def effects(process: ProcessLike = "cstr") -> tuple[Effect, ...]:
     >>> effects("tanks")[0].name
     'pump_gain'
     """
-    return effects_of(_model_of(process))
+    return find_process(process).effects
 
 
 def read_record(
@@ -70,16 +72,15 @@ def read_record(
     """Read a measured record.
 
     Args:
-        file: a `.csv`, a recording (`.mcap`), or a folder of recordings.
-        process: decides which signals the file must have.
+        file: a table (`.csv`, `.xlsx`, `.parquet` and others), a recording (`.mcap`), or a folder of recordings.
+        process: decides which signals the file must have, and how it is read.
         plant: name of the plant in a recording; None: the only one in it.
-        columns: names of the columns in a `.csv`, by signal, where they differ.
+        columns: names of the columns in a table, by signal, where they differ.
 
     Raises:
         InputError: the file cannot be read, or a signal is missing.
     """
-    model = _model_of(process)
-    return read_file(Path(file), plant, dict(columns or {}), (*model.input_names, *model.output_names))
+    return read_file(Path(file), plant, dict(columns or {}), find_process(process))
 
 
 def simulate(record: Record, process: ProcessLike = "cstr", faults: Sequence[str] = ()) -> Record:
@@ -216,7 +217,7 @@ class RaisedAlarm(msgspec.Struct, frozen=True):
     """An alarm of a back-test.
 
     Attributes:
-        alarm: its name, `chart/signal`.
+        alarm: name of the alarm, `chart/signal`.
         priority: `low`, `medium`, `high` or `critical`.
         raised_min: minute in which it was raised.
         cleared_min: minute in which it was cleared; None: it is active at the end.
@@ -246,7 +247,7 @@ class BacktestResult(msgspec.Struct, frozen=True):
         reference: model that the rows are judged by, `equations` or `arx`; None: no row was judged.
         noise_levels: standard deviations of the equations' noise; None: they did not judge.
         alarms: the alarms in the order in which they were raised.
-        text: the same for people, as `reactorwatch backtest` prints it.
+        text: report as `reactorwatch backtest` prints it.
     """
 
     samples: int
@@ -271,7 +272,7 @@ def backtest(record: Record, process: ProcessLike | None = None, **settings: Any
     Args:
         record: with the signals that the settings name (by default those of the reactor).
         process: model whose equations judge; None: as the settings say.
-        settings: of the monitor, see `docs/watching.md`, such as `training_min=50` or `charts=("ewma", "t2")`.
+        settings: settings of the monitor, see `docs/watching.md`, such as `training_min=50` or `charts=("ewma", "t2")`.
 
     Raises:
         InputError: settings that do not fit together, or a record without a usable value.
@@ -292,8 +293,8 @@ class AlarmChange(msgspec.Struct, frozen=True):
     """A change of an alarm.
 
     Attributes:
-        time_min: of the row that caused it.
-        alarm: its name, `chart/signal`.
+        time_min: time of the row that caused it, in minutes.
+        alarm: name of the alarm, `chart/signal`.
         event: `raised`, `cleared`, `suspects` and others, see `docs/alarms.md`.
         priority: `low`, `medium`, `high` or `critical`.
         text: a sentence for people.
@@ -313,7 +314,7 @@ class Monitor:
 
     Args:
         process: model whose equations judge; None: as the settings say.
-        settings: of the monitor, as for `backtest`.
+        settings: settings of the monitor, as for `backtest`.
 
     >>> monitor = Monitor(outputs=("T",), reference="arx", training_min=10.0)
     >>> monitor.update(0.0, {"qc": 100.0, "T": 440.0})
@@ -340,8 +341,8 @@ class Monitor:
 
         Args:
             time_min: time of the row, at least 0.
-            values: by signal; a signal that is missing was not measured.
-            units: of the signals, by name; None: not known.
+            values: values by signal; a missing signal was not measured.
+            units: units of the signals, by name; None: not known.
 
         Returns:
             The changes of alarms that the row causes.
@@ -394,25 +395,13 @@ def _settings(process: ProcessLike | None, settings: Mapping[str, Any]) -> Monit
     if process is not None:
         model = _model_of(process)
         defaults |= {"input": model.input_names[0], "outputs": model.output_names}
-    try:
-        return msgspec.convert(defaults | dict(settings), MonitorConfig)
-    except (msgspec.ValidationError, ValueError) as error:
-        raise InputError(f"settings: {error}") from error
+    return section(MonitorConfig, "monitor", {}, defaults | dict(settings))
 
 
 def _model_of(process: ProcessLike, record: Record | None = None) -> ProcessModel:
-    """The model of a process, its clock that of a record.
+    """The equations of a process, their clock that of a record.
 
     Raises:
-        InputError: there is no such process, or the file cannot be read.
+        InputError: there is no such process, the file cannot be read, or the process has no equations.
     """
-    if isinstance(process, ProcessModel):
-        return process
-    if str(process) in processes:
-        return processes[str(process)]()
-    path = Path(process)
-    if path.suffix != ".json":
-        names = ", ".join(processes)
-        raise InputError(f"process must be one of {names}, the path of an extended.json or a model, got {process!r}")
-    extended = read_extended_model(path)
-    return (extended.rebase(record.zero_ns) if record is not None and record.zero_ns else extended).build()
+    return find_process(process, 0 if record is None else record.zero_ns).require_model()

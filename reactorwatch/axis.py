@@ -1,4 +1,4 @@
-"""Where the ticks of an axis stand. Pure.
+"""Axes and their ticks. Pure.
 
 Steps are 1, 2 or 5 times a power of ten, as on any instrument.
 """
@@ -14,8 +14,8 @@ class Axis(NamedTuple):
     """An axis that holds some values.
 
     Attributes:
-        lower: its beginning.
-        upper: its end.
+        lower: start of the axis.
+        upper: end of the axis.
         ticks: shape (ticks,), between both.
         labels: a text for each tick.
     """
@@ -26,7 +26,7 @@ class Axis(NamedTuple):
     labels: tuple[str, ...]
 
     def share(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Where values lie, 0 at the beginning of the axis and 1 at its end."""
+        """Positions of values, 0 at the beginning of the axis and 1 at its end."""
         return (values - self.lower) / (self.upper - self.lower)
 
 
@@ -34,8 +34,8 @@ def axis(lowest: float, highest: float, intervals: int = 5) -> Axis:
     """The axis for values from the lowest to the highest, with a little room at both ends.
 
     Args:
-        lowest: of the values.
-        highest: of the values.
+        lowest: smallest value.
+        highest: largest value.
         intervals: about how many steps it should have.
 
     Raises:

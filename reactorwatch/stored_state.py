@@ -1,6 +1,6 @@
-"""What a streaming part remembers, in a form that can be stored: one explicit structure, no pickle.
+"""State of a streaming stage as one explicit structure that can be stored, without pickle.
 
-Many numbers of one kind are stored as doubles one after the other (`packed`): shorter than a list of MessagePack, and
+Many numbers of one kind are stored as consecutive doubles (`pack_numbers`): shorter than a list of MessagePack, and
 much faster to read.
 """
 
@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 
 class StoredState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base of the states; a subclass lists what there is to remember."""
+    """Base class of the states; a subclass lists the fields."""
 
     def to_bytes(self) -> bytes:
         """The state as MessagePack; numbers come back bit for bit."""
@@ -32,13 +32,13 @@ class StoredState(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"not a {cls.__name__}: {error}") from error
 
 
-def packed(values: ArrayLike) -> bytes:
-    """Little-endian doubles, row after row."""
+def pack_numbers(values: ArrayLike) -> bytes:
+    """Write numbers as little-endian doubles, row after row."""
     return np.asarray(values, dtype="<f8").tobytes()
 
 
-def unpacked(data: bytes, columns: int) -> NDArray[np.float64]:
-    """What `packed` stored, shape (rows, columns).
+def unpack_numbers(data: bytes, columns: int) -> NDArray[np.float64]:
+    """Read the output of `pack_numbers`, shape (rows, columns).
 
     Raises:
         ValueError: it is no whole number of rows.
@@ -46,13 +46,13 @@ def unpacked(data: bytes, columns: int) -> NDArray[np.float64]:
     return np.frombuffer(data, dtype="<f8").reshape(-1, columns).astype(np.float64)
 
 
-def packed_times(times_ns: Iterable[int]) -> bytes:
-    """Little-endian integers of 64 bits."""
+def pack_times(times_ns: Iterable[int]) -> bytes:
+    """Write times as little-endian integers of 64 bits."""
     return np.fromiter(times_ns, dtype="<i8").tobytes()
 
 
-def unpacked_times(data: bytes) -> list[int]:
-    """What `packed_times` stored.
+def unpack_times(data: bytes) -> list[int]:
+    """Read the output of `pack_times`.
 
     Raises:
         ValueError: it is no whole number of times.

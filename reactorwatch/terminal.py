@@ -1,6 +1,6 @@
-r"""Text for terminals: what a terminal would act on is shown, and not sent.
+r"""Text for terminals: control characters are shown as escapes, and not sent.
 
-Names, comments and units come from files and from the bus, and whoever writes those is not the one who reads them.
+Names, comments and units come from files and from the bus, which other programs write.
 """
 
 import unicodedata
@@ -21,7 +21,7 @@ def printable(text: str) -> str:
     """
     if text.isascii() and text.isprintable():
         return text
-    return "".join(_escaped(letter) if unicodedata.category(letter) in _ACTED_ON else letter for letter in text)
+    return "".join(_escape(letter) if unicodedata.category(letter) in _ACTED_ON else letter for letter in text)
 
 
 def printable_lines(lines: Iterable[str]) -> str:
@@ -29,6 +29,6 @@ def printable_lines(lines: Iterable[str]) -> str:
     return "\n".join(map(printable, lines))
 
 
-def _escaped(letter: str) -> str:
+def _escape(letter: str) -> str:
     units = letter.encode("utf-16-be", "surrogatepass").hex()
     return "".join(f"\\u{units[place : place + 4]}" for place in range(0, len(units), 4))

@@ -149,7 +149,7 @@ def start_node(
     channels = ChannelBudget(config.most_keys, (*own, keys.key(config.plant, keys.HEALTH, NODE)))
     return RecorderNode(
         Recorder(config.plant, start_ns, fingerprints, fingerprints_until_ns),
-        Policies(rotation, LatchedMessages(channels.max_latched), black_box, channels),
+        Policies(rotation, LatchedMessages(channels.max_latched_messages), black_box, channels),
         files,
         health_period_ns=round(config.health_period_s * 1e9),
         start_ns=start_ns,

@@ -1,10 +1,12 @@
 """The settings of the recorder and of the replay."""
 
 import math
+from typing import Annotated
 
 import msgspec
 
 from reactorwatch.contract import keys
+from reactorwatch.runtime.setting_rules import check_bounds
 from recorder.policy.channel_budget import MAX_KEYS
 from recorder.policy.rotation import Fsync
 
@@ -23,8 +25,8 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         health_period_s: time between two health reports.
         flush_period_s: time between two flushes to the operating system, which is what a recorder that is killed may
             lose. At most a second.
-        fsync: when to sync flushed data to the disk, against power loss: `never`, after each `chunk` that was flushed,
-            or once a `second`.
+        fsync: policy of syncing flushed data to the disk, against power loss: `never`, after each flushed `chunk`, or
+            once a `second`.
         rotate_min: age of a file, in minutes, at which a new one is started; inf never starts one.
         rotate_mb: size of a file, in megabytes, at which a new one is started; inf never starts one.
         keep_mb: total size of all files, in megabytes, beyond which the oldest is deleted; inf deletes none.
@@ -52,7 +54,7 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     keep_mb: float = math.inf
     keep_days: float = math.inf
     keep_files: float = math.inf
-    most_keys: int = MAX_KEYS
+    most_keys: Annotated[int, msgspec.Meta(ge=MIN_KEYS, le=MAX_KEYS)] = MAX_KEYS
     black_box_min: float = 10.0
     resume_mb: float = 50.0
     linger_s: float = 0.5
@@ -72,8 +74,7 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 raise ValueError(f"{name} must be positive, or inf, got {getattr(self, name)!r}")
         if not self.keep_files >= 1.0:
             raise ValueError(f"keep_files must be at least 1, or inf, got {self.keep_files!r}")
-        if not MIN_KEYS <= self.most_keys <= MAX_KEYS:
-            raise ValueError(f"most_keys must be in [{MIN_KEYS}, {MAX_KEYS}], got {self.most_keys!r}")
+        check_bounds(RecorderConfig, msgspec.structs.asdict(self))
         for name in ("black_box_min", "resume_mb"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} must be finite and not negative, got {getattr(self, name)!r}")

@@ -170,7 +170,7 @@ class RecordingFiles:
             if any(first_ns <= at_ns <= last_ns for first_ns, last_ns in saved):
                 continue
             try:
-                ended.append(black_box.on_message(decode(stored.payload, stored.recorded.encoding), at_ns))
+                ended.append(black_box.on_message(decode(stored.payload, stored.recorded_message.encoding), at_ns))
             except DecodeError:
                 continue
         ended.append(black_box.pop_ended(now_ns))

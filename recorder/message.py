@@ -8,7 +8,7 @@ class RecordedMessage(NamedTuple):
 
     Attributes:
         key: key that it was published on; the topic in the file.
-        payload: its bytes.
+        payload: bytes of the message.
         encoding: encoding that the publisher claimed.
         log_time_ns: time of receipt.
         publish_time_ns: time of the sample; the time of receipt where the message has none.

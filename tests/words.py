@@ -35,8 +35,10 @@ IRREGULAR = _words("""
 NOT_PARTICIPLES = _words("bed bleed breed embed exceed feed hundred indeed need proceed red seed shed speed succeed")
 PREDICATES = _words("are can had has have is must on should was were")
 """First words that make a predicate (is_closed) or an event (on_closed) of a participle."""
-IMPERATIVES = _words("add check count drop mark note presume skip")
-"""First words of which a participle is the object: count_lost."""
+IMPERATIVES = _words("""
+    add check count drop list map mark note pop presume publish run search skip solve subscribe
+""")
+"""First words of which a participle is the object or the manner: count_lost, map_unordered."""
 CONJUNCTIONS = _words("be if until when while")
 PARTICLES = _words("""
     after again anew apart as at away back before between by down for from here in into now of off on once out over
@@ -44,13 +46,21 @@ PARTICLES = _words("""
 """)
 """Words after a participle that are no nouns."""
 
-HEAD = re.compile(r"\W*(What|Whether|How|Which|Where|Who|Of|Likewise)\b")
-FRAGMENT = re.compile(r"^\s+\*{0,2}\w+(?: \(.*?\))?: (?:of|likewise|as it is|as above)\b", re.MULTILINE)
+HEAD = re.compile(
+    r"\W*(What|Whether|How|Which|Where|Who|Whose|Whom|When|Why|Until|Of|Likewise|Is|Are|Does|Did|Can|Has|Have)\b"
+)
+FRAGMENT = re.compile(
+    r"^\s+\*{0,2}\w+(?: \(.*?\))?: (?:(?:of|whose|as for|as in|likewise|as it is|as above)\b|(?:its|their) \w+[.;,])",
+    re.MULTILINE,
+)
 PEOPLE = re.compile(
     r"\b(he|him|his|she|who|whom|whoever|nobody|ours|strangers?|vouch(?:es|ed)?|told|anew|likewise)\b", re.IGNORECASE
 )
 
 EXCEPTIONS = {
+    "monitor_node/alarms/annunciator.py::AnnunciatorState: people, told": "a field of the stored state",
+    "monitor_node/baseline/predictor.py::PredictorState: people, told": "a field of the stored state",
+    "reactorwatch/api.py::DiagnosisResult.extended: participle": "a public name",
     "reactorwatch/cli/alarm.py::By: people, who": "an operator is a person",
 }
 """Entries that stay, each with its reason."""

@@ -1,4 +1,4 @@
-"""Which faults, how large, when: the cases of the bank.
+"""Cases of the fault bank: faults, sizes and onsets.
 
 Every cause that the monitor compares (see `isolation.isolation.causes`) sets in as a step, and three of them as a
 ramp too, each in three sizes: small is about the smallest that the oracle (see `oracle`) finds within an hour, medium
@@ -19,10 +19,10 @@ ONSET_MIN = 300.0
 
 ONSET_SPAN_MIN = 10.0
 AFTER_MIN = 150.0
-"""How long a run goes on after the onset: what is not found by then is not detected."""
+"""Duration of a run after the onset; a fault not found by then is not detected."""
 
 RAMP_MIN = 100.0
-"""From a ramp's onset until it reaches its size."""
+"""Duration of a ramp from its onset to its size."""
 
 GRADES = ("small", "medium", "large")
 BOTH, RISING, FALLING = (1, -1), (1,), (-1,)
@@ -36,7 +36,7 @@ class Fault:
         cause: name of an effect of the catalogue.
         profile: `step` or `ramp`.
         sizes: small, medium and large, in the effect's unit, above 0.
-        signs: that its sizes take in turn, from seed to seed.
+        signs: signs that its sizes take in turn, from seed to seed.
     """
 
     cause: str
@@ -46,7 +46,7 @@ class Fault:
 
     @property
     def name(self) -> str:
-        """As in tables."""
+        """Name of the fault in tables."""
         return self.cause if self.profile == "step" else f"{self.cause} {self.profile}"
 
 
@@ -90,7 +90,7 @@ TWINS: dict[str, frozenset[str]] = {
 }
 """Causes that imitate each other: of what a small step of one does to both measurements in `AFTER_MIN`, a step of the
 other, of the best size, leaves less than a hundredth unexplained (of the sum of squares, each over its noise). A twin
-is never counted as the right suspect; how often a twin came first is told beside it."""
+is never counted as the right suspect; how often a twin came first is printed beside it."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +98,11 @@ class Case:
     """One run of the bank.
 
     Attributes:
-        fault: what happens.
+        fault: the fault.
         grade: one of `GRADES`.
-        size: with its sign, in the effect's unit.
-        onset_min: when, in minutes of the plant.
-        seed: of the input and the noise.
+        size: size with its sign, in the effect's unit.
+        onset_min: onset in minutes of the plant.
+        seed: seed of the input and the noise.
     """
 
     fault: Fault
@@ -113,21 +113,21 @@ class Case:
 
     @property
     def specification(self) -> str:
-        """As the plant takes it."""
+        """Specification of the fault for the plant."""
         text = f"{self.fault.cause}:{self.fault.profile}:{self.size!r}@{self.onset_min!r}min"
         return f"{text},end={self.onset_min + RAMP_MIN!r}min" if self.fault.profile == "ramp" else text
 
     @property
     def rows(self) -> int:
-        """Of the run."""
+        """Number of rows of the run."""
         return int((self.onset_min + AFTER_MIN) / PERIOD_MIN) + 1
 
 
 def cases(seeds: int) -> list[Case]:
-    """All faults in all sizes.
+    """Cases of all faults in all sizes.
 
     Args:
-        seeds: how many runs of each.
+        seeds: number of runs of each case.
     """
     found = []
     for place, fault in enumerate(BANK):

@@ -1,4 +1,4 @@
-"""The best detector that knows the fault: what any detector's delay has to be compared with.
+"""Oracle: the best detector that knows the fault, as a bound on the delay of any detector.
 
 It knows the cause, the profile, the size, the onset, the equations, their initial state and the spread of the noise. So
 it knows what a sensor without noise would have shown without the fault, y0[k], and with it, y1[k], and for independent
@@ -26,13 +26,13 @@ from reactorwatch.arrays import Array
 
 
 def log_likelihood_ratio(measured: Array, nominal: Array, faulty: Array, noise_sd: Array) -> Array:
-    """What each row adds to L, shape (rows,).
+    """Increments of L of each row, shape (rows,).
 
     Args:
-        measured: shape (rows, signals).
-        nominal: y0, likewise.
-        faulty: y1, likewise.
-        noise_sd: shape (signals,).
+        measured: measurements, shape (rows, signals).
+        nominal: y0, shape (rows, signals).
+        faulty: y1, shape (rows, signals).
+        noise_sd: standard deviations of the noise, shape (signals,).
     """
     squares = ((measured - nominal) ** 2 - (measured - faulty) ** 2) / (2 * noise_sd**2)
     return np.asarray(squares.sum(axis=1))
@@ -42,10 +42,10 @@ def oracle_delay_min(time_min: Array, increments: Array, onset_min: float, rows_
     """Minutes from the onset to the oracle's signal; inf if it does not come.
 
     Args:
-        time_min: shape (rows,).
-        increments: of `log_likelihood_ratio`.
-        onset_min: of the fault.
-        rows_to_false_alarm: ARL0, that is promised.
+        time_min: times of the rows, shape (rows,).
+        increments: result of `log_likelihood_ratio`.
+        onset_min: onset of the fault.
+        rows_to_false_alarm: promised ARL0.
     """
     since = time_min >= onset_min
     reached = np.cumsum(increments[since]) >= log(rows_to_false_alarm)

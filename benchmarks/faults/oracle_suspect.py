@@ -1,6 +1,6 @@
-"""The best anyone could say of the cause: what the monitor's suspects have to be compared with.
+"""Oracle of the cause: the best suspect that any method could name, as a bound for the monitor's.
 
-Some causes imitate each other so well (see `bank.TWINS`) that nobody tells them apart in the noise of a run. This
+Some causes imitate each other so well (see `bank.TWINS`) that no method distinguishes them in the noise of a run. This
 oracle knows the onset, the profile, the equations, the state before the onset, the spread of the noise, and the run to
 its end. For every cause that the monitor compares it fits the size, by least squares over the noise of the measurements
 (Gauss and Newton's steps, halved until they gain), and it suspects the one that fits best: for independent normal noise
@@ -13,7 +13,7 @@ from math import inf
 import numpy as np
 
 from benchmarks.faults.bank import BANK, Case
-from benchmarks.faults.runs import NOISE_SD, Truth, measured_of, profile_changes, simulator_of
+from benchmarks.faults.runs import NOISE_SD, Truth, measurements_of, profile_changes, simulator_of
 from monitor_node.isolation.causes import CAUSES
 from plant_node.scenario import SIGNAL
 from reactorwatch.arrays import Array
@@ -31,13 +31,13 @@ def oracle_suspect(case: Case, record: Record, truth: Truth) -> str:
     """The cause that explains a run best.
 
     Args:
-        case: of the bank.
-        record: of that case.
-        truth: of that case.
+        case: case of the bank.
+        record: record of that case.
+        truth: noise-free run of that case.
     """
     since = int(np.argmax(record.time_min >= case.onset_min)) - 1
     misfits = {effect.name: _misfit(effect, case, record, truth, since) for effect in CAUSES}
-    at_true_size = float(np.sum(((measured_of(record) - truth.faulty)[since:] / NOISE_SD) ** 2))
+    at_true_size = float(np.sum(((measurements_of(record) - truth.faulty)[since:] / NOISE_SD) ** 2))
     misfits[case.fault.cause] = min(misfits[case.fault.cause], at_true_size)
     return min(misfits, key=misfits.__getitem__)
 
@@ -45,7 +45,7 @@ def oracle_suspect(case: Case, record: Record, truth: Truth) -> str:
 def _misfit(effect: Effect, case: Case, record: Record, truth: Truth, since: int) -> float:
     """The least sum of squares that an effect of any size leaves from a row on, over the variance of the noise."""
     time_min, flows = record.time_min[since:], record.columns[SIGNAL][since:]
-    measured, start = measured_of(record)[since:], truth.nominal_states[since]
+    measured, start = measurements_of(record)[since:], truth.nominal_states[since]
     simulator = simulator_of(effect.name, case.fault.profile)
     name = f"{effect.name}.size"
     shape = profile_changes(case, effect.name)

@@ -38,17 +38,17 @@ class ReportMethod:
     """A chart of the residuals of one kind of model.
 
     Attributes:
-        name: of the kind.
-        fit: the model of a training: structure, inputs and output to model.
+        name: name of the kind.
+        fit: function of structure, inputs and output that returns the model.
     """
 
     name: str
     fit: Callable[[Structure, Array, Array], LinearModel]
 
     def statistic(self, record: Record) -> Array:
-        """How far the worse residual of each row is off, in standard deviations; shape (rows,).
+        """Larger residual of each row in standard deviations, shape (rows,).
 
-        0 for the first rows, which cannot be predicted; infinite where the model's free run has left for good.
+        0 for the first rows, which cannot be predicted; infinite where the model's simulation has diverged.
         """
         worst = np.zeros(record.rows)
         flows = record.columns[SIGNAL]
@@ -66,12 +66,12 @@ METHODS: tuple[ReportMethod, ...] = (ReportMethod("ARX", fit_arx), ReportMethod(
 
 
 def alarms_of(time_min: Array, statistic: Array, width: float) -> list[Interval]:
-    """When the alarms of a run stood: each from a point that is out to the next that is in.
+    """Intervals of the alarms of a run: each from a point that is out to the next that is in.
 
     Args:
-        time_min: shape (rows,), of the rows that are watched.
-        statistic: likewise.
-        width: of the limits, in standard deviations.
+        time_min: times of the watched rows, shape (rows,).
+        statistic: statistic of these rows, shape (rows,).
+        width: width of the limits, in standard deviations.
     """
     change = np.diff(statistic > width, prepend=False, append=False)
     edges = np.flatnonzero(change)
@@ -79,12 +79,12 @@ def alarms_of(time_min: Array, statistic: Array, width: float) -> list[Interval]
     return [Interval(float(times[rise]), float(times[fall])) for rise, fall in edges.reshape(-1, 2)]
 
 
-def alarms_raised(statistics: Iterable[NDArray[np.floating[Any]]], width: float) -> int:
-    """How many alarms some runs raise: points that are out, whose predecessor is in.
+def count_alarms(statistics: Iterable[NDArray[np.floating[Any]]], width: float) -> int:
+    """Count the alarms of some runs: points that are out, whose predecessor is in.
 
     Args:
-        statistics: one array a run, of the rows that are watched.
-        width: of the limits, in standard deviations.
+        statistics: statistic of the watched rows, one array a run.
+        width: width of the limits, in standard deviations.
     """
     return sum(int(np.count_nonzero(np.diff(item > width, prepend=False, append=False))) // 2 for item in statistics)
 
@@ -96,8 +96,8 @@ def calibrated_width(statistics: Sequence[NDArray[np.floating[Any]]], rows_to_fa
     as many as rows above it, less the pairs of neighbours that are both above it.
 
     Args:
-        statistics: one array a run, of the rows that are watched.
-        rows_to_false_alarm: that are promised.
+        statistics: statistic of the watched rows, one array a run.
+        rows_to_false_alarm: promised rows to a false alarm.
     """
     rows = np.concatenate(statistics)
     pairs = np.concatenate([np.minimum(item[1:], item[:-1]) for item in statistics])

@@ -1,4 +1,4 @@
-"""The records of the bank: a case with its fault, long runs without one, and what both would be without noise."""
+"""Records of the bank: a case with its fault, long runs without one, and the noise-free run of both."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from reactorwatch.records.record import Record
 
 OUTPUTS = ("C", "T")
 NOISE_SD = np.array([0.002, 0.3])
-"""Of the measurements of C in mol/l and of T in K; the plant's default."""
+"""Noise of the measurements of C in mol/l and of T in K; the plant's default."""
 
 EXTINGUISHED_K = 400.0
 """A reactor colder than this has left its operating branch: the unstable branch lies at 401.5 K at 103.41 l/min."""
@@ -29,9 +29,9 @@ class Truth(NamedTuple):
     """A run without noise.
 
     Attributes:
-        nominal_states: of the plant if nothing had happened, shape (rows, 2).
-        nominal: C and T if nothing had happened, shape (rows, 2).
-        faulty: C and T as a sensor without noise would have shown them, likewise.
+        nominal_states: states of the plant without the fault, shape (rows, 2).
+        nominal: C and T without the fault, shape (rows, 2).
+        faulty: C and T with the fault as a sensor without noise shows them, shape (rows, 2).
         left_branch: whether the fault put the reactor out.
     """
 
@@ -42,7 +42,7 @@ class Truth(NamedTuple):
 
 
 def record_of(case: Case) -> Record:
-    """What the plant publishes in a case."""
+    """Record that the plant publishes in a case."""
     return simulate_record(PlantConfig(seed=case.seed, faults=(case.specification,)), case.rows)
 
 
@@ -50,8 +50,8 @@ def truth_of(case: Case, record: Record) -> Truth:
     """The same run without noise, with the fault and without it.
 
     Args:
-        case: of the bank.
-        record: of that case.
+        case: case of the bank.
+        record: record of that case.
     """
     flows = record.columns[SIGNAL]
     start = _start(flows)
@@ -62,13 +62,13 @@ def truth_of(case: Case, record: Record) -> Truth:
     return Truth(nominal.states, nominal.outputs, faulty.outputs, bool(temperatures.min() < EXTINGUISHED_K))
 
 
-def measured_of(record: Record) -> Array:
-    """C and T as they were measured, shape (rows, 2)."""
+def measurements_of(record: Record) -> Array:
+    """Measurements of C and T, shape (rows, 2)."""
     return np.stack([record.columns[signal] for signal in OUTPUTS], axis=1)
 
 
 def profile_changes(case: Case, cause: str) -> dict[str, float]:
-    """When a case's profile begins and ends, as parameters of a model with some cause in it."""
+    """Start and end of a case's profile, as parameters of a model with some cause in it."""
     values = parse_fault(case.specification).values
     return {f"{cause}.{name}": value for name, value in values.items() if name != "size"}
 
@@ -77,10 +77,10 @@ def fault_free(seed: int, rows: int, phi: float = 0.0) -> Record:
     """A run without a fault, with noise that may be autocorrelated.
 
     Args:
-        seed: of the input and the noise.
-        rows: how many.
-        phi: of the noise of both measurements, which is AR(1): n[k] = phi n[k-1] + e[k]. Its standard deviation is the
-            same for every phi.
+        seed: seed of the input and the noise.
+        rows: number of rows.
+        phi: coefficient of the AR(1) noise of both measurements, n[k] = phi n[k-1] + e[k]; its standard deviation is
+            the same for every phi.
     """
     scenario = RandomSteps()
     time_min = np.round(np.arange(rows) * PERIOD_MIN, 6)
@@ -106,5 +106,5 @@ def _nominal() -> Simulator:
 
 
 def _start(flows: Array) -> Array:
-    """Where the plant starts: at the steady state of its first input."""
+    """Initial state of the plant: the steady state of its first input."""
     return start_state(_nominal().model, flows[:1], "operating")

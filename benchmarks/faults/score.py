@@ -1,4 +1,4 @@
-"""What a detector did in a run, and what many runs say: shares, delays, rates."""
+"""Scores of a detector in a run, and over many runs: shares, delays, rates."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ DAYS_30_MIN = 30 * 24 * 60.0
 
 @dataclass(frozen=True)
 class Interval:
-    """The time that an alarm stood.
+    """Interval in which an alarm was active.
 
     Attributes:
-        raised_min: when it was raised.
-        cleared_min: when it was cleared; inf: it still stands.
+        raised_min: time when it was raised.
+        cleared_min: time when it was cleared; inf: it is still active.
     """
 
     raised_min: float
@@ -27,12 +27,12 @@ class Interval:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a detector did in a run with a fault.
+    """Outcome of a detector in a run with a fault.
 
     Attributes:
-        delay_min: from the onset to the detection; inf: not detected.
-        false_alarms: raised before the onset.
-        watched_min: how long it watched before the onset.
+        delay_min: delay from the onset to the detection; inf: not detected.
+        false_alarms: number of alarms raised before the onset.
+        watched_min: watched time before the onset.
     """
 
     delay_min: float
@@ -40,16 +40,16 @@ class Outcome:
     watched_min: float = 0.0
 
 
-def judged(alarms: Sequence[Interval], watching_since_min: float, onset_min: float, until_min: float) -> Outcome:
+def outcome_of(alarms: Sequence[Interval], watching_since_min: float, onset_min: float, until_min: float) -> Outcome:
     """Detection and false alarms of a run.
 
     The detection is the first alarm that is raised after the onset while no other stands: one that was standing
-    already tells the operator nothing new.
+    already has no news for the operator.
 
     Args:
-        alarms: in any order.
-        watching_since_min: first row that was judged.
-        onset_min: of the fault.
+        alarms: intervals of the alarms, in any order.
+        watching_since_min: time of the first evaluated row.
+        onset_min: onset of the fault.
         until_min: later alarms don't count.
     """
     detected_min, standing_until_min = inf, -inf
@@ -71,8 +71,8 @@ class Delays:
 
     Attributes:
         detected: share of the runs, in [0, 1].
-        median_min: of all runs, those not detected counted as endless.
-        slow_min: that 90 % of all runs keep, likewise.
+        median_min: median of all runs, those not detected counted as infinite.
+        slow_min: 90 % quantile of all runs, those not detected counted as infinite.
     """
 
     detected: float
@@ -81,7 +81,7 @@ class Delays:
 
     @classmethod
     def of(cls, delays_min: Sequence[float]) -> "Delays":
-        """Of at least one run; inf: not detected."""
+        """Statistics of at least one delay; inf: not detected."""
         values = np.array(delays_min)
         median, slow = np.quantile(values, [0.5, 0.9], method="inverted_cdf")
         return cls(float(np.isfinite(values).mean()), float(median), float(slow))
@@ -89,11 +89,11 @@ class Delays:
 
 @dataclass(frozen=True)
 class Rate:
-    """How often something happened by chance.
+    """Rate of chance events.
 
     Attributes:
-        count: how often.
-        watched_min: in how long.
+        count: number of events.
+        watched_min: watched time.
     """
 
     count: int
@@ -115,7 +115,7 @@ class Rate:
 
     @classmethod
     def total(cls, rates: Sequence["Rate"]) -> "Rate":
-        """Of all together."""
+        """Rate of all together."""
         return cls(sum(item.count for item in rates), sum(item.watched_min for item in rates))
 
 

@@ -1,4 +1,4 @@
-"""The work of the benchmark, a run at a time: each function here is what one process does with one run."""
+"""Work of the benchmark, one function call a run, in parallel processes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -9,33 +9,33 @@ from numpy.typing import NDArray
 from benchmarks.faults.bank import AFTER_MIN, PERIOD_MIN, Case
 from benchmarks.faults.oracle import log_likelihood_ratio, oracle_delay_min
 from benchmarks.faults.oracle_suspect import oracle_suspect
-from benchmarks.faults.report_method import METHODS, TRAINING_ROWS, WIDTH, alarms_of, alarms_raised
-from benchmarks.faults.runs import NOISE_SD, fault_free, measured_of, record_of, truth_of
-from benchmarks.faults.score import Outcome, Rate, judged, rows_to_false_alarm
+from benchmarks.faults.report_method import METHODS, TRAINING_ROWS, WIDTH, alarms_of, count_alarms
+from benchmarks.faults.runs import NOISE_SD, fault_free, measurements_of, record_of, truth_of
+from benchmarks.faults.score import Outcome, Rate, outcome_of, rows_to_false_alarm
 from benchmarks.faults.watch import Suspicion, incidents_of, intervals_of, suspicion, watch
 
 SOON_MIN = 10.0
-"""After the first alarm: when suspects are looked at for the first time."""
+"""Minutes from the first alarm to the first evaluation of the suspects."""
 
 ORACLE, MONITOR = "oracle", "monitor"
 EQUAL = "equal rate"
 THREE_SIGMA = "3 sigma"
 
 Widths = dict[str, dict[float, float]]
-"""Of the report's limits at equal rate: by the method's name and the promised false alarms in 30 days."""
+"""Widths of the report's limits at equal rate, by method and promised false alarms in 30 days."""
 
 
 @dataclass(frozen=True)
 class CaseResult:
-    """What all detectors did in a case.
+    """Results of all detectors in a case.
 
     Attributes:
-        case: of the bank.
+        case: case of the bank.
         left_branch: whether the fault put the reactor out.
-        oracle_suspect: whom the oracle suspects at the end of the run.
-        outcomes: by the promised false alarms in 30 days, then by detector (see `detectors`).
-        soon: whom the monitor suspected `SOON_MIN` after its first alarm, by the promised false alarms.
-        late: the same at the end of the run.
+        oracle_suspect: suspect of the oracle at the end of the run.
+        outcomes: outcomes by promised false alarms in 30 days, then by detector (see `detectors`).
+        soon: suspicion of the monitor `SOON_MIN` after its first alarm, by promised false alarms.
+        late: suspicion of the monitor at the end of the run, by promised false alarms.
     """
 
     case: Case
@@ -51,10 +51,10 @@ class FaultFreeResult:
     """Alarms in a run without a fault.
 
     Attributes:
-        phi: of its noise.
-        alarms: by the promised false alarms in 30 days, then by detector.
-        incidents: of the monitor, likewise.
-        names: of the alarms that the monitor raised, likewise.
+        phi: AR(1) coefficient of its noise.
+        alarms: rates by promised false alarms in 30 days, then by detector.
+        incidents: rates of the monitor's incidents, by promised false alarms.
+        names: names of the alarms that the monitor raised, by promised false alarms.
     """
 
     phi: float
@@ -76,16 +76,16 @@ def fault_free_statistics(seed: int, rows: int) -> dict[str, NDArray[np.float32]
 
 
 def run_case(case: Case, budgets: tuple[float, ...], widths: Widths) -> CaseResult:
-    """Let all detectors watch a case.
+    """Run all detectors over a case.
 
     Args:
-        case: of the bank.
+        case: case of the bank.
         budgets: false alarms in 30 days that are promised.
-        widths: of the report's limits.
+        widths: widths of the report's limits.
     """
     record = record_of(case)
     truth = truth_of(case, record)
-    increments = log_likelihood_ratio(measured_of(record), truth.nominal, truth.faulty, NOISE_SD)
+    increments = log_likelihood_ratio(measurements_of(record), truth.nominal, truth.faulty, NOISE_SD)
     watched_min = record.time_min[TRAINING_ROWS:]
     statistics = {method.name: method.statistic(record)[TRAINING_ROWS:] for method in METHODS}
     end_min = case.onset_min + AFTER_MIN
@@ -94,9 +94,9 @@ def run_case(case: Case, budgets: tuple[float, ...], widths: Widths) -> CaseResu
     for budget in budgets:
         watched = watch(record, budget)
         delay_min = oracle_delay_min(record.time_min, increments, case.onset_min, rows_to_false_alarm(budget))
-        monitor = judged(intervals_of(watched.messages), watched.watching_since_min, case.onset_min, end_min)
+        monitor = outcome_of(intervals_of(watched.messages), watched.watching_since_min, case.onset_min, end_min)
         outcomes[budget] = {ORACLE: Outcome(delay_min), MONITOR: monitor} | {
-            name: judged(alarms_of(watched_min, statistics[method], width), watched_min[0], case.onset_min, end_min)
+            name: outcome_of(alarms_of(watched_min, statistics[method], width), watched_min[0], case.onset_min, end_min)
             for name, method, width in _charts(widths, budget)
         }
         detected_min = case.onset_min + monitor.delay_min
@@ -109,11 +109,11 @@ def run_fault_free(seed: int, phi: float, rows: int, budgets: tuple[float, ...],
     """Count the alarms of a run without a fault.
 
     Args:
-        seed: of the run.
-        phi: of its noise.
-        rows: how many.
+        seed: seed of the run.
+        phi: AR(1) coefficient of its noise.
+        rows: number of rows.
         budgets: false alarms in 30 days that are promised.
-        widths: of the report's limits.
+        widths: widths of the report's limits.
     """
     record = fault_free(seed, rows, phi)
     statistics = {method.name: method.statistic(record)[TRAINING_ROWS:] for method in METHODS}
@@ -125,7 +125,7 @@ def run_fault_free(seed: int, phi: float, rows: int, budgets: tuple[float, ...],
         watched_min = max(watched.last_min - watched.watching_since_min, 0.0)
         names[budget] = [message.alarm for message in watched.messages if message.event == "raised"]
         alarms[budget] = {MONITOR: Rate(len(names[budget]), watched_min)} | {
-            name: Rate(alarms_raised([statistics[method]], width), report_min)
+            name: Rate(count_alarms([statistics[method]], width), report_min)
             for name, method, width in _charts(widths, budget)
         }
         incidents[budget] = Rate(incidents_of(watched.messages), watched_min)

@@ -1,4 +1,4 @@
-"""What the benchmark prints: the table by fault and size, and the lines that answer what was asked."""
+"""Output of the benchmark: the table by fault and size, and the summary lines."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -25,7 +25,7 @@ from benchmarks.faults.watch import LIKELY, Suspicion
 
 
 def delays(results: Sequence[CaseResult], budget: float, detector: str) -> Delays:
-    """Of a detector in some cases."""
+    """Delays of a detector in some cases."""
     return Delays.of([item.outcomes[budget][detector].delay_min for item in results])
 
 
@@ -215,7 +215,7 @@ def _ratio(found: Sequence[CaseResult], budget: float, detector: str) -> str:
 
 
 def _ceiling(found: Sequence[CaseResult]) -> str:
-    """How often the oracle suspects the true cause."""
+    """Share of the cases in which the oracle suspects the true cause."""
     return _share([item.oracle_suspect == item.case.fault.cause for item in found])
 
 

@@ -1,4 +1,4 @@
-"""The monitor over a record: when its alarms stood, and whom it suspected."""
+"""The monitor over a record: intervals of its alarms, and its suspects."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ LIKELY = 0.1
 
 @dataclass(frozen=True)
 class Watched:
-    """What the monitor said of a record.
+    """Output of the monitor for a record.
 
     Attributes:
         messages: every change of an alarm, in order.
-        watching_since_min: first row that was judged; inf if there was none.
-        last_min: last row.
+        watching_since_min: time of the first evaluated row; inf if there was none.
+        last_min: time of the last row.
     """
 
     messages: list[Alarm]
@@ -34,11 +34,11 @@ class Watched:
 
 @dataclass(frozen=True)
 class Suspicion:
-    """Whether the true cause was suspected.
+    """Ranks of the true cause among the suspects.
 
     Attributes:
-        first: it was the likeliest suspect.
-        likely: it was among the suspects of at least `LIKELY`.
+        first: the true cause was the likeliest suspect.
+        likely: the true cause was among the suspects of at least `LIKELY`.
         twin_first: a twin of it was the likeliest.
     """
 
@@ -52,7 +52,7 @@ def watch(record: Record, false_alarms_per_30_days: float) -> Watched:
 
     Args:
         record: rows as the plant publishes them.
-        false_alarms_per_30_days: that are promised.
+        false_alarms_per_30_days: promised false alarms.
     """
     config = MonitorConfig(training_min=TRAINING_MIN, false_alarms_per_30_days=false_alarms_per_30_days)
     result = backtest.run([encode(item) for item in samples_of(record, config.plant)], config)
@@ -65,7 +65,7 @@ def watch(record: Record, false_alarms_per_30_days: float) -> Watched:
 
 
 def intervals_of(messages: Iterable[Alarm]) -> list[Interval]:
-    """The time that each alarm stood, from the messages that tell that it was raised and cleared."""
+    """Interval of each alarm, from the messages that it was raised and cleared."""
     raised: dict[str, float] = {}
     found = []
     for message in messages:
@@ -77,32 +77,32 @@ def intervals_of(messages: Iterable[Alarm]) -> list[Interval]:
 
 
 def incidents_of(messages: Iterable[Alarm]) -> int:
-    """How many incidents the alarms belong to."""
+    """Number of incidents of the alarms."""
     return len({message.incident for message in messages if message.event == "raised"})
 
 
 def suspicion(messages: Sequence[Alarm], cause: str, detected_min: float, until_min: float) -> Suspicion:
-    """Whom the monitor suspected at a time.
+    """Suspicion of the monitor at a time.
 
-    What counts is the newest message of the incident that names suspects: that is what the operator sees then.
+    The newest message of the incident with suspects counts: the operator sees it then.
 
     Args:
         messages: every change of an alarm, in order.
-        cause: the true one.
-        detected_min: when the alarm that detected it was raised; inf if it was not.
-        until_min: the time.
+        cause: the true cause.
+        detected_min: time when the detecting alarm was raised; inf if there was none.
+        until_min: the time in minutes.
     """
     detecting = [item for item in messages if item.event == "raised" and to_minutes(item.raised_ns) == detected_min]
     if not detecting:
         return Suspicion()
-    told = [
+    with_suspects = [
         item
         for item in messages
         if item.incident == detecting[0].incident and item.suspects and to_minutes(item.time_ns) <= until_min
     ]
-    if not told:
+    if not with_suspects:
         return Suspicion()
-    suspects = sorted(told[-1].suspects, key=lambda item: -item.probability)
+    suspects = sorted(with_suspects[-1].suspects, key=lambda item: -item.probability)
     return Suspicion(
         first=suspects[0].cause == cause,
         likely=any(item.cause == cause and item.probability >= LIKELY for item in suspects),

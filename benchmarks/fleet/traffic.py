@@ -1,4 +1,4 @@
-"""What a monitor of many plants hears in `scale`: the router, and who publishes for all plants."""
+"""Traffic of many plants for `scale`: the router, and the publisher of all plants."""
 
 import json
 import os
@@ -31,7 +31,7 @@ FLEET = "reactor/*"
 
 
 def record() -> list[Encoded]:
-    """What a plant publishes."""
+    """Messages of a plant."""
     return [encode(item) for item in samples_of(simulate_record(PlantConfig(seed=1), LEARNED_ROWS + MOST_ROWS), "p0")]
 
 

@@ -23,9 +23,9 @@ class StudyClass:
     """A class of records.
 
     Attributes:
-        name: for people.
-        kind: `single`, `pair`, `nominal` or `outside`: by what it is scored.
-        circumstances: of a record, by its number.
+        name: name of the class.
+        kind: kind of the score, `single`, `pair`, `nominal` or `outside`.
+        circumstances: function of the number of a record that returns its circumstances.
         group: classes of one group are scored together as well; empty: none.
     """
 
@@ -93,8 +93,8 @@ CLASSES: tuple[StudyClass, ...] = (
 """The seeds of a class follow from its place: a new one goes to the end."""
 
 
-def class_named(name: str) -> StudyClass:
-    """The class of a name.
+def find_class(name: str) -> StudyClass:
+    """Find a class by its name.
 
     Raises:
         KeyError: there is none.
@@ -110,8 +110,8 @@ def seed_of(study_class: StudyClass, number: int, first_seed: int) -> int:
     return first_seed + SEEDS_A_CLASS * CLASSES.index(study_class) + number
 
 
-def drawn(study_class: StudyClass, number: int, first_seed: int) -> Hidden:
-    """A record of a class. Causes take turns, so that each occurs as often; one that cannot show gives way."""
+def draw_record(study_class: StudyClass, number: int, first_seed: int) -> Hidden:
+    """Draw a record of a class. Causes take turns, so that each occurs as often; one that cannot show gives way."""
     seed = seed_of(study_class, number, first_seed)
     circumstances = study_class.circumstances(number)
     if study_class.kind == "nominal":

@@ -1,7 +1,7 @@
-"""Does a fleet keep its promises for as long as it runs, whatever befalls it?
+"""Soak test: a fleet keeps its promises over a long run, under all disturbances.
 
-A router, two monitors that share the fleet and keep its states in a folder, two processes of plants and a stranger who
-publishes garbage run for minutes. From a seed: a quarter of the plants get a large fault each, at a time of its own;
+A router, two monitors that share the fleet and keep its states in a folder, two processes of plants and a source of
+garbage run for minutes. From a seed: a quarter of the plants get a large fault each, at a time of its own;
 monitors and the router are killed and started again, links are cut for seconds, floods come. In the end every sample is
 accounted for, every fault was alarmed once, and memory is level: see `findings`.
 
@@ -15,8 +15,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks.soak.findings import Findings, found, unaccounted
-from benchmarks.soak.plan import KNOWN_ROWS, Plan, drawn
+from benchmarks.soak.findings import Findings, assess, count_unaccounted
+from benchmarks.soak.plan import KNOWN_ROWS, Plan, draw_plan
 from benchmarks.soak.site import MONITORS, Site
 from benchmarks.soak.witness import Witness
 from reactorwatch.runtime import logs
@@ -24,21 +24,21 @@ from reactorwatch.runtime import logs
 MINUTES, PLANTS = 10.0, 200
 ROWS_PER_S = 2.0
 CATCH_UP_S = 60.0
-"""Who judges no row for so long has no more."""
+"""A monitor that evaluates no row for this long has finished."""
 
 
 def soak(plan: Plan, folder: Path, *, tell: bool = False) -> Findings:
-    """Run it, and judge it.
+    """Run a soak and assess it.
 
     Args:
-        plan: what happens.
-        folder: for settings, states and what the monitors say; empty.
+        plan: plan of the soak.
+        folder: empty folder for settings, states and logs of the monitors.
         tell: whether each blow is printed.
     """
     zero_ns = time.time_ns()
     with Site(plan, folder, zero_ns) as site, contextlib.closing(Witness(site.bus)) as witness:
         site.start_monitors()
-        witness.wait_for_crew(MONITORS)
+        witness.wait_for_monitors(MONITORS)
         site.start_plants()
         site.allow(KNOWN_ROWS)
         site.wait_for_row(KNOWN_ROWS - 1)
@@ -48,39 +48,40 @@ def soak(plan: Plan, folder: Path, *, tell: bool = False) -> Findings:
             site.wait_for_row(blow.row)
             if tell:
                 print(
-                    f"row {site.row:6d}: {blow.kind}, {blow.manner} for {blow.rows} rows, {blow.whom + 1}", flush=True
+                    f"row {site.row:6d}: {blow.kind}, {blow.manner} for {blow.rows} rows, {blow.monitor + 1}",
+                    flush=True,
                 )
-            site.suffer(blow, witness.wait_for_crew)
+            site.disturb(blow, witness.wait_for_monitors)
         site.allow(plan.rows)
         site.wait_for_row(plan.rows - 1)
-        strange = site.end_stranger()
+        garbage = site.end_garbage()
         rows = -1
         while rows < (rows := sum(item.rows for item in witness.health.values())):  # as long as they go on
-            if witness.wait(lambda: all(_is_heard(plan, witness, plant) for plant in plan.plants), CATCH_UP_S):
+            if witness.wait(lambda: all(_is_complete(plan, witness, plant) for plant in plan.plants), CATCH_UP_S):
                 break
-        return found(plan, zero_ns, witness.alarms, witness.health, witness.longest_lag_ms, strange, site.memory)
+        return assess(plan, zero_ns, witness.alarms, witness.health, witness.longest_lag_ms, garbage, site.memory)
 
 
-def _is_heard(plan: Plan, witness: Witness, plant: str) -> bool:
-    """Whether a plant's monitor has said that it has judged all of it, or has lost it."""
+def _is_complete(plan: Plan, witness: Witness, plant: str) -> bool:
+    """True if the health of a plant's monitor accounts for all of its samples."""
     health = witness.health.get(plant)
-    return health is not None and not unaccounted(health, plan.rows)
+    return health is not None and not count_unaccounted(health, plan.rows)
 
 
 def table(plan: Plan, findings: Findings) -> str:
-    """What was found, as text."""
+    """Format the findings as text."""
     refused = ", ".join(f"{count:,} {reason}" for reason, count in sorted(findings.refused.items()))
     lines = [
         f"samples published                   {findings.published:,} of {len(plan.plants)} plants",
         f"  rows that were judged             {findings.rows:,}, of them incomplete {findings.incomplete}",
         f"  lost, late                        {findings.lost}, {findings.late}",
         f"  unaccounted for                   samples of {len(findings.unaccounted)} plants",
-        f"  told again and passed over        {findings.duplicated:,}",
-        f"strange messages, of them refused   {findings.strange:,}, {sum(findings.refused.values()):,} ({refused})",
+        f"  repeated and dropped              {findings.duplicated:,}",
+        f"garbage messages, of them refused   {findings.garbage:,}, {sum(findings.refused.values()):,} ({refused})",
         f"faults, of them alarmed once        {findings.faults}, {findings.alarmed_once}",
         f"plants with a false alarm           {len(findings.false_alarms)}",
         f"plants not as undisturbed           {len(findings.others)}",
-        f"silences, told twice, standing      {findings.silences}, {findings.silences_told_twice}, "
+        f"silences, raised twice, standing    {findings.silences}, {findings.silences_raised_twice}, "
         f"{findings.standing_silences}",
         f"longest wait in a monitor           {findings.lag_ms / 1e3:.1f} s; {findings.stalls} stalls of a second",
     ]
@@ -94,24 +95,24 @@ def table(plan: Plan, findings: Findings) -> str:
 
 
 def main() -> int:
-    """Soak, and print what was found; 1 if anything is not as it has to be."""
+    """Run a soak and print its findings; returns 1 if it failed."""
     logs.configure()
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else MINUTES
     plants = int(sys.argv[2]) if len(sys.argv) > 2 else PLANTS
     seed = int(sys.argv[3]) if len(sys.argv) > 3 else time.time_ns() % 1_000_000
     rows_per_s = float(sys.argv[4]) if len(sys.argv) > 4 else ROWS_PER_S
-    plan = drawn(seed, plants, round(60.0 * minutes * rows_per_s), rows_per_s)
+    plan = draw_plan(seed, plants, round(60.0 * minutes * rows_per_s), rows_per_s)
     print(
         f"seed {seed}: {plants} plants, {plan.rows} rows, {rows_per_s:g} a second, {len(plan.blows)} blows", flush=True
     )
     folder = Path(tempfile.mkdtemp(prefix="soak-"))
     findings = soak(plan, folder, tell=True)
     print(table(plan, findings))
-    broken = list(findings.broken())
+    broken = list(findings.failures())
     for line in broken:
         print(f"BROKEN: {line}")
     if broken:
-        print(f"what the monitors said is in {folder}")
+        print(f"the logs of the monitors are in {folder}")
     else:
         shutil.rmtree(folder)
     return 1 if broken else 0

@@ -1,4 +1,4 @@
-"""Results of a soak: is every sample accounted for, was every fault alarmed once, is memory level?
+"""Assessment of a soak: samples accounted for, faults alarmed once, memory level.
 
 - **Samples.** A monitor puts each sample of a plant into a row, or counts it as lost (it never came, by its number) or
   late (its row had been judged). The rows have three places each, of which one or two are empty in each incomplete
@@ -39,7 +39,7 @@ ROW_NS = round(PERIOD_MIN * MINUTE_NS)
 
 
 class Change(NamedTuple):
-    """What happened to an alarm."""
+    """A change of an alarm."""
 
     time_ns: int
     alarm: str
@@ -48,32 +48,32 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class Findings:
-    """What was found.
+    """Findings of a soak.
 
     Attributes:
         published: samples of all plants.
-        rows: that were judged.
-        incomplete: of them.
-        lost: samples that never came to who watched the plant then.
-        late: samples whose row had been judged.
-        unaccounted: by plant, if there are any, how many of its samples are neither in a row nor counted, or in a row
-            without having been published.
-        duplicated: samples that came again.
-        refused: by reason, all that was refused of the plants.
-        strange: messages that the stranger has published.
-        stalls: how often a monitor did not run for more than a second.
-        lag_ms: the longest that a message has waited in a monitor.
-        faults: in the plants.
-        alarmed_once: of them.
-        not_once: plants with a fault of which that cannot be said, and why.
-        false_alarms: plants without a fault, and what was raised.
-        others: changes of alarms that an undisturbed monitor does not tell, or that were not told though it does.
-        silences: of plants that were raised, but for those after the last row.
-        silences_told_twice: how often one that was known already was told as raised.
-        standing_silences: those that were not over in the end.
-        memory_mb: by process, the most it took in each third of the run.
-        grown_mb: by process that ran since the first third, how much the median of the last third is above that of the
-            second.
+        rows: number of evaluated rows.
+        incomplete: number of incomplete rows among them.
+        lost: samples that never reached the monitor of their plant.
+        late: samples that came after their row was evaluated.
+        unaccounted: for each plant with any, its samples that are neither in a row nor counted, or in a row without
+            having been published.
+        duplicated: repeated samples.
+        refused: rejected messages of the plants, by reason.
+        garbage: number of garbage messages.
+        stalls: number of stalls of a monitor longer than a second.
+        lag_ms: longest wait of a message in a monitor.
+        faults: number of faults in the plants.
+        alarmed_once: number of faults alarmed once.
+        not_once: plants with a fault that was not alarmed once, with the reason.
+        false_alarms: alarms of each plant without a fault.
+        others: for each plant, changes of alarms that differ from those of an undisturbed monitor.
+        silences: number of silences raised before the last row.
+        silences_raised_twice: number of silences raised once more.
+        standing_silences: number of silences that were not over in the end.
+        memory_mb: largest memory of each process in each third of the run.
+        grown_mb: for each process that ran since the first third, growth of its median memory from the second third to
+            the last.
     """
 
     published: int
@@ -84,7 +84,7 @@ class Findings:
     unaccounted: dict[str, str]
     duplicated: int
     refused: dict[str, int]
-    strange: int
+    garbage: int
     stalls: int
     lag_ms: float
     faults: int
@@ -93,29 +93,29 @@ class Findings:
     false_alarms: dict[str, list[str]]
     others: dict[str, list[str]]
     silences: int
-    silences_told_twice: int
+    silences_raised_twice: int
     standing_silences: int
     memory_mb: dict[str, tuple[float, float, float]]
     grown_mb: dict[str, float]
 
-    def broken(self, growth_mb: float = GROWTH_MB) -> Iterator[str]:
-        """What is not as it has to be.
+    def failures(self, growth_mb: float = GROWTH_MB) -> Iterator[str]:
+        """Yield a line for each broken promise.
 
         Args:
-            growth_mb: by which a process may grow.
+            growth_mb: allowed growth of a process.
         """
         for plant, samples in self.unaccounted.items():
             yield f"{plant}: samples unaccounted for: {samples}"
-        if not 0 < sum(self.refused.values()) <= self.strange:
-            yield f"{sum(self.refused.values())} messages were refused, of {self.strange} strange ones"
+        if not 0 < sum(self.refused.values()) <= self.garbage:
+            yield f"{sum(self.refused.values())} messages were refused, of {self.garbage} garbage messages"
         for plant, why in self.not_once.items():
             yield f"{plant}: not alarmed once: {why}"
         for plant, raised in self.false_alarms.items():
             yield f"{plant}: alarms without a fault: {', '.join(raised)}"
         for plant, changes in self.others.items():
             yield f"{plant}: not as undisturbed: {', '.join(changes)}"
-        if self.silences_told_twice:
-            yield f"{self.silences_told_twice} silences were told twice"
+        if self.silences_raised_twice:
+            yield f"{self.silences_raised_twice} silences were raised twice"
         if self.standing_silences:
             yield f"{self.standing_silences} silences stand"
         for name, grown in self.grown_mb.items():
@@ -123,12 +123,12 @@ class Findings:
                 yield f"{name} grew by {grown:.1f} MB"
 
 
-def unaccounted(health: Health, rows: int) -> int:
-    """Samples of a plant that are neither in a row nor counted, or samples in rows that it did not publish.
+def count_unaccounted(health: Health, rows: int) -> int:
+    """Count the samples of a plant that are neither in a row nor counted, or samples in rows that it did not publish.
 
     Args:
-        health: of its monitor.
-        rows: that it has published.
+        health: newest health of the plant's monitor.
+        rows: rows that the plant has published.
     """
     places = SIGNALS * health.rows
     fewest, most = places - (SIGNALS - 1) * health.incomplete_rows, places - health.incomplete_rows
@@ -137,7 +137,7 @@ def unaccounted(health: Health, rows: int) -> int:
 
 
 def changes_of(alarms: Sequence[Alarm]) -> list[Change]:
-    """What happened to the alarms of a plant, without silences."""
+    """Changes of the alarms of a plant, without silences."""
     return [
         Change(item.time_ns, item.alarm, item.event)
         for item in alarms
@@ -145,15 +145,15 @@ def changes_of(alarms: Sequence[Alarm]) -> list[Change]:
     ]
 
 
-def undisturbed(plan: Plan, plant: str, zero_ns: int) -> list[Change]:
-    """What a monitor says of a plant that heard all of it, and was never stopped."""
+def expected_changes(plan: Plan, plant: str, zero_ns: int) -> list[Change]:
+    """Changes of alarms of a monitor that receives all samples of a plant and is never stopped."""
     config = plan.plant(plant, zero_ns)
     published = (encode(item) for item in samples_of(simulate_record(config), plant, zero_ns))
     return changes_of(backtest.run(published, msgspec.structs.replace(WATCH, plant=plant)).alarm_messages)
 
 
 def why_not_once(changes: Sequence[Change], onset_ns: int) -> str | None:
-    """Why it cannot be said that a fault was alarmed once; None: it was."""
+    """Reason why a fault was not alarmed once; None if it was."""
     raised = [change for change in changes if change.event == "raised"]
     if not raised:
         return "no alarm"
@@ -168,32 +168,32 @@ def why_not_once(changes: Sequence[Change], onset_ns: int) -> str | None:
     return None
 
 
-def found(
+def assess(
     plan: Plan,
     zero_ns: int,
     alarms: Mapping[str, Sequence[Alarm]],
     health: Mapping[str, Health],
     lag_ms: float,
-    strange: int,
+    garbage: int,
     memory: Mapping[str, Sequence[Taken]],
 ) -> Findings:
-    """Judge a soak.
+    """Assess a soak.
 
     Args:
-        plan: what happened.
+        plan: plan of the soak.
         zero_ns: the time of the plants' first row.
-        alarms: by plant, all that was heard.
-        health: by plant, what its monitor said last.
-        lag_ms: the longest.
-        strange: messages that the stranger has published.
-        memory: by process, what it took in the course of the run.
+        alarms: alarm messages of each plant.
+        health: newest health of each plant's monitor.
+        lag_ms: longest wait of a message in a monitor.
+        garbage: number of garbage messages.
+        memory: memory of each process in the course of the run.
     """
-    told = [health.get(plant, Health()) for plant in plan.plants]
+    reports = [health.get(plant, Health()) for plant in plan.plants]
     refused: Counter[str] = Counter()
     missing: dict[str, str] = {}
-    for plant, item in zip(plan.plants, told, strict=True):
+    for plant, item in zip(plan.plants, reports, strict=True):
         refused.update(dict(item.refused_by_reason))
-        if number := unaccounted(item, plan.rows):
+        if number := count_unaccounted(item, plan.rows):
             missing[plant] = (
                 f"{number} ({item.rows} rows of {plan.rows}, {item.incomplete_rows} incomplete, "
                 f"{item.lost} lost, {item.late} late)"
@@ -202,7 +202,7 @@ def found(
     false_alarms: dict[str, list[str]] = {}
     others: dict[str, list[str]] = {}
     silences: list[tuple[str, str, str, int]] = []
-    for plant, item in zip(plan.plants, told, strict=True):
+    for plant, item in zip(plan.plants, reports, strict=True):
         said = list(alarms.get(plant, ()))
         silences += [(item.event, plant, item.alarm, item.raised_ns) for item in said if item.alarm.startswith(SILENCE)]
         changes, fault = changes_of(said), plan.faults.get(plant)
@@ -212,7 +212,7 @@ def found(
         elif (why := why_not_once(changes, zero_ns + fault.row * ROW_NS)) is not None:
             not_once[plant] = why
         if not (item.lost or item.late) and (
-            different := _different(changes, undisturbed(plan, plant, zero_ns), zero_ns)
+            different := _different(changes, expected_changes(plan, plant, zero_ns), zero_ns)
         ):
             others[plant] = different
     end_ns = zero_ns + plan.rows * ROW_NS
@@ -222,15 +222,15 @@ def found(
     raised, over = ({item[1:] for item in events[event]} for event in ("raised", "cleared"))
     return Findings(
         published=SIGNALS * plan.rows * len(plan.plants),
-        rows=sum(item.rows for item in told),
-        incomplete=sum(item.incomplete_rows for item in told),
-        lost=sum(item.lost for item in told),
-        late=sum(item.late for item in told),
+        rows=sum(item.rows for item in reports),
+        incomplete=sum(item.incomplete_rows for item in reports),
+        lost=sum(item.lost for item in reports),
+        late=sum(item.late for item in reports),
         unaccounted=missing,
-        duplicated=sum(item.duplicated for item in told),
+        duplicated=sum(item.duplicated for item in reports),
         refused=dict(refused),
-        strange=strange,
-        stalls=sum(item.stalls for item in told),
+        garbage=garbage,
+        stalls=sum(item.stalls for item in reports),
         lag_ms=lag_ms,
         faults=len(plan.faults),
         alarmed_once=len(plan.faults) - len(not_once),
@@ -238,7 +238,7 @@ def found(
         false_alarms=false_alarms,
         others=others,
         silences=len(raised),
-        silences_told_twice=len(events["raised"]) - len(raised),
+        silences_raised_twice=len(events["raised"]) - len(raised),
         standing_silences=len(raised - over),
         memory_mb={name: most_in_thirds(taken, plan.rows) for name, taken in memory.items()},
         grown_mb={
@@ -247,11 +247,11 @@ def found(
     )
 
 
-def _different(told: Sequence[Change], expected: Sequence[Change], zero_ns: int) -> list[str]:
+def _different(changes: Sequence[Change], expected: Sequence[Change], zero_ns: int) -> list[str]:
     """Changes that are in one of the two and not in the other, or more often."""
-    more, fewer = Counter(told) - Counter(expected), Counter(expected) - Counter(told)
+    more, fewer = Counter(changes) - Counter(expected), Counter(expected) - Counter(changes)
     return [
         f"{sign}{change.alarm} {change.event} at row {(change.time_ns - zero_ns) // ROW_NS}"
-        for sign, changes in (("+", more), ("-", fewer))
-        for change in sorted(changes.elements())
+        for sign, part in (("+", more), ("-", fewer))
+        for change in sorted(part.elements())
     ]

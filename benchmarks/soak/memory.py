@@ -12,7 +12,8 @@ from statistics import median
 from typing import NamedTuple
 
 GROWTH_MB = 10.0
-"""In ten minutes with 200 plants a third is 240,000 samples: to keep 42 bytes of each is more. In an hour it is 7."""
+"""Allowed growth. In ten minutes with 200 plants a third is 240,000 samples: 42 bytes kept of each
+are more. In an hour it is 7."""
 OWN = ("RssAnon:", "RssShmem:")
 """Lines of a process's status: its own pages, and those of memory that it shares with other processes."""
 

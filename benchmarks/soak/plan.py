@@ -1,4 +1,4 @@
-"""What happens in a soak, all of it drawn from a seed: which plants get which fault, and what befalls all of them.
+"""Plan of a soak, drawn from a seed: faults of the plants, and disturbances of the processes.
 
 Time is counted in rows of the plants, which all publish a row at the same time, so that a run is the same on a machine
 that is slow.
@@ -13,20 +13,20 @@ from reactorwatch.errors import InputError
 PERIOD_MIN = 0.1
 TRAINING_ROWS = 200
 SETTLED_ROWS = 60
-"""After the training, before the first fault."""
+"""Rows after the training and before the first fault."""
 
 KNOWN_ROWS = 40
-"""After which a monitor knows how the plants count and time their samples; before, it takes whoever comes first."""
+"""Rows after which a monitor knows the numbering and times of the plants; before, it accepts the first publisher."""
 
 LAST_ROWS = 40
-"""That are left after the last fault and the last blow."""
+"""Rows after the last fault and the last blow."""
 
 FAULTY = 0.25
-"""Of the plants."""
+"""Share of the plants with a fault."""
 
 BLOW_EVERY_S = 25.0
 SHORTEST_S, LONGEST_S = 1.0, 6.0
-"""That a link is cut, or a process gone."""
+"""Time that a link is cut, or a process gone."""
 
 FAULTS = (
     "coolant_flow:step:-0.2",
@@ -48,7 +48,7 @@ FAULTS = (
     "activation_energy:step:0.01",
     "heat_loss:step:0.05",
 )
-"""So large that alarms come up within five rows and stand for good; no operator would wait for a chart."""
+"""Faults so large that alarms are raised within five rows and stay active."""
 
 Kind = Literal["kill monitor", "cut monitor", "cut plants", "kill router", "flood"]
 Manner = Literal["closed", "stalled"]
@@ -67,40 +67,40 @@ memory of the first is measured over the whole run."""
 
 
 class Blow(NamedTuple):
-    """What befalls a process or a link.
+    """A disturbance of a process or a link.
 
     Attributes:
-        row: of the plants, at which it comes.
-        kind: what it is.
-        manner: of a cut: closed, as when a machine is switched off, or stalled, as when a cable is pulled.
-        whom: which of the monitors.
-        rows: for how long.
+        row: row of the plants at which it comes.
+        kind: kind of the disturbance.
+        manner: manner of a cut: closed, as when a machine is switched off, or stalled, as when a cable is pulled.
+        monitor: index of the monitor.
+        rows: duration in rows.
     """
 
     row: int
     kind: Kind
     manner: Manner
-    whom: int
+    monitor: int
     rows: int
 
 
 class Fault(NamedTuple):
-    """A fault in a plant: what, from which row on."""
+    """A fault in a plant, with the row of its onset."""
 
     specification: str
     row: int
 
 
 class Plan(NamedTuple):
-    """What happens.
+    """Plan of a soak.
 
     Attributes:
-        seed: that it was drawn from.
-        rows: that each plant publishes.
-        rows_per_s: at which pace.
-        plants: their names.
-        faults: by plant; most have none.
-        blows: in their order.
+        seed: seed of the plan.
+        rows: rows of each plant.
+        rows_per_s: rows of each plant in a second.
+        plants: names of the plants.
+        faults: fault of each plant that has one.
+        blows: disturbances in order of time.
     """
 
     seed: int
@@ -111,10 +111,10 @@ class Plan(NamedTuple):
     blows: tuple[Blow, ...]
 
     def plant(self, name: str, zero_ns: int) -> PlantConfig:
-        """How a plant is simulated.
+        """Configuration of a plant.
 
         Args:
-            name: its.
+            name: name of the plant.
             zero_ns: the time of its first row.
         """
         fault = self.faults.get(name)
@@ -129,14 +129,14 @@ class Plan(NamedTuple):
         )
 
 
-def drawn(seed: int, plants: int, rows: int, rows_per_s: float) -> Plan:
-    """A plan from a seed.
+def draw_plan(seed: int, plants: int, rows: int, rows_per_s: float) -> Plan:
+    """Draw a plan.
 
     Args:
-        seed: of all that is drawn.
-        plants: how many.
-        rows: that each publishes.
-        rows_per_s: at which pace.
+        seed: seed of the plan.
+        plants: number of plants.
+        rows: rows of each plant.
+        rows_per_s: rows of each plant in a second.
 
     Raises:
         InputError: too few rows for a training and a fault after it.
@@ -162,7 +162,7 @@ def drawn(seed: int, plants: int, rows: int, rows_per_s: float) -> Plan:
             row=round((number + draw.uniform(0.0, 0.5)) * share),
             kind=kind,
             manner=manner,
-            whom=max(draw.randrange(2), int(kind == "kill monitor")),
+            monitor=max(draw.randrange(2), int(kind == "kill monitor")),
             rows=round(draw.uniform(SHORTEST_S, LONGEST_S) * rows_per_s),
         )
         for number, (kind, manner) in enumerate(kinds[:count], start=1)

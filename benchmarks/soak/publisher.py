@@ -1,8 +1,8 @@
 """The plants of a soak, many in a process; started by `site`.
 
-They publish a row each, all at the same time, at their pace, and say which row that was. Lines that come in allow rows
-up to a number, so that whoever does something to the network is not overtaken. They stay when they have ended, for who
-has missed something; the end of the input ends them.
+They publish a row each, all at the same time, at their pace, and print the number of the row. Each line of the input
+allows rows up to a number, so that the plants do not overtake a disturbance of the network. After the last row they
+stay for subscribers that query their history; the end of the input ends them.
 """
 
 import sys
@@ -11,8 +11,8 @@ import time
 
 import msgspec
 
-from benchmarks.link_cuts import connected
-from benchmarks.soak.plan import PERIOD_MIN, drawn
+from benchmarks.link_cuts import connect_client
+from benchmarks.soak.plan import PERIOD_MIN, draw_plan
 from plant_node.node import PlantNode
 from plant_node.record import plant_from
 from reactorwatch.contract.codec import encode
@@ -25,17 +25,17 @@ SHARING = 25
 
 
 class Task(msgspec.Struct, frozen=True):
-    """What a process publishes.
+    """Task of a process of plants.
 
     Attributes:
-        seed: as for `drawn`.
-        plants: likewise.
-        rows: likewise.
-        rows_per_s: likewise.
-        part: which of the plants: this one and every `parts`-th after it.
-        parts: see there.
+        seed: seed of the plan.
+        plants: number of plants of the plan.
+        rows: rows of each plant.
+        rows_per_s: rows of each plant in a second.
+        part: index of the first plant of this process; every `parts`-th after it belongs to it as well.
+        parts: number of such processes.
         zero_ns: the time of the first row.
-        bus: where the router is.
+        bus: settings of the link to the router.
     """
 
     seed: int
@@ -49,7 +49,7 @@ class Task(msgspec.Struct, frozen=True):
 
 
 class Allowance:
-    """Up to which row may be published, as lines of the input tell."""
+    """Rows that may be published, as lines of the input allow."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -75,11 +75,11 @@ class Allowance:
 
 def publish(task: Task) -> None:
     """Publish the rows of the plants, and stay until the input ends."""
-    plan = drawn(task.seed, task.plants, task.rows, task.rows_per_s)
+    plan = draw_plan(task.seed, task.plants, task.rows, task.rows_per_s)
     names = plan.plants[task.part :: task.parts]
     configs = [plan.plant(name, task.zero_ns) for name in names]
     nodes = [PlantNode(plant_from(config), config, _nothing) for config in configs]
-    buses = [connected(task.bus) for _ in range(-(-len(nodes) // SHARING))]
+    buses = [connect_client(task.bus) for _ in range(-(-len(nodes) // SHARING))]
     allowance = Allowance()
     print("ready", flush=True)
     period_ns = round(PERIOD_MIN * MINUTE_NS)

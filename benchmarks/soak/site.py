@@ -1,7 +1,7 @@
-"""The processes of a soak, and what befalls them.
+"""The processes of a soak, and the disturbances of them.
 
-A router, two monitors that share the fleet and the folder of its states, two processes of plants, a stranger. The links
-of both monitors and of the second half of the plants go through proxies.
+A router, two monitors that share the fleet and the folder of its states, two processes of plants, a source of garbage.
+The links of both monitors and of the second half of the plants go through proxies.
 """
 
 import subprocess
@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from benchmarks.link_cuts import Proxy, Router
-from benchmarks.soak import publisher, stranger
+from benchmarks.soak import garbage, publisher
 from benchmarks.soak.memory import Taken, own_memory_mb
 from benchmarks.soak.plan import PERIOD_MIN, TRAINING_ROWS, Blow, Plan
 from monitor_node.config import MonitorConfig
@@ -29,7 +29,7 @@ MONITORS = PARTS = 2
 FLEET = f"{keys.ROOT}/*"
 PATIENCE_S = 300.0
 KEPT_S = 60.0
-"""Of what was published each publisher keeps so much: longer than any blow lasts."""
+"""Time span of messages that each publisher keeps: longer than any blow lasts."""
 
 WATCH = MonitorConfig(
     training_min=TRAINING_ROWS * PERIOD_MIN,
@@ -38,16 +38,16 @@ WATCH = MonitorConfig(
     state_every_s=2.0,
     health_period_s=2.0,
 )
-"""Of 200 plants in two hours of theirs, chance raises one alarm in fifty runs. Causes are not looked for: that takes a
-core for a second each, and is tested elsewhere."""
+"""Settings of the monitors. With 200 plants over two hours chance raises one alarm in fifty runs. Isolation is off: it
+takes a core for a second a plant, and is tested elsewhere."""
 
 
 class Lines:
-    """What a process says, line by line.
+    """Lines that a process prints.
 
     Args:
-        process: which.
-        on_line: told each, from a thread.
+        process: the process.
+        on_line: called with each line, in a thread.
     """
 
     def __init__(self, process: "subprocess.Popen[str]", on_line: Callable[[str], None] = lambda _: None) -> None:
@@ -59,13 +59,13 @@ class Lines:
         self._thread.start()
 
     def wait_for(self, condition: Callable[[list[str]], bool]) -> None:
-        """Wait until what was said makes it so."""
+        """Wait until the lines fulfil a condition."""
         with self._changed:
             self._changed.wait_for(lambda: condition(self.lines) or self._ended, PATIENCE_S)
             assert condition(self.lines), f"said no more after {self.lines[-1:]}"
 
     def close(self) -> None:
-        """Wait until a process that was ended says no more."""
+        """Wait for the last line of a process that was ended."""
         self._thread.join()
 
     def _read(self, process: "subprocess.Popen[str]") -> None:
@@ -85,8 +85,8 @@ class Site:
     """The processes, as long as the context lasts.
 
     Args:
-        plan: what happens.
-        folder: for settings, states and what the monitors say.
+        plan: plan of the soak.
+        folder: folder for settings, states and logs of the monitors.
         zero_ns: the time of the plants' first row.
     """
 
@@ -99,10 +99,10 @@ class Site:
         self._proxies = [Proxy(endpoint) for _ in range(MONITORS + 1)]
         self._monitors: list[subprocess.Popen[bytes]] = []
         self._plants: list[subprocess.Popen[str]] = []
-        self._stranger: subprocess.Popen[str] | None = None
+        self._garbage: subprocess.Popen[str] | None = None
         self._said: dict[str, Lines] = {}
         self.memory: dict[str, list[Taken]] = {}
-        """By process, what it takes in the course of the run."""
+        """Memory of each process in the course of the run."""
 
     # --- start and end ---------------------------------------------------------------------------------------
 
@@ -111,19 +111,19 @@ class Site:
         self._monitors = [self._monitor(number) for number in range(MONITORS)]
 
     def start_plants(self) -> None:
-        """Start the plants, which wait for leave to publish, and the stranger."""
+        """Start the plants, which wait for permission to publish, and the source of garbage."""
         plan = self._plan
         for part in range(PARTS):
             bus = self._via(MONITORS) if part else self.bus
             task = publisher.Task(
                 plan.seed, len(plan.plants), plan.rows, plan.rows_per_s, part, PARTS, self._zero_ns, bus
             )
-            process = self._started(publisher, task)
+            process = self._start(publisher, task)
             self._plants.append(process)
             self._said[f"plants {part + 1}"] = Lines(process, self._measure if part == 0 else lambda _: None)
-        task_of_stranger = stranger.Task(plan.seed, plan.plants, self._zero_ns, self.bus)
-        self._stranger = self._started(stranger, task_of_stranger)
-        self._said["stranger"] = Lines(self._stranger)
+        garbage_task = garbage.Task(plan.seed, plan.plants, self._zero_ns, self.bus)
+        self._garbage = self._start(garbage, garbage_task)
+        self._said["garbage"] = Lines(self._garbage)
         for said in self._said.values():
             said.wait_for(lambda lines: bool(lines))
 
@@ -139,23 +139,23 @@ class Site:
 
     @property
     def row(self) -> int:
-        """That the first plants have published last."""
+        """Newest row of the first plants."""
         last = self._said["plants 1"].lines[-1]
         return -1 if last == "ready" else int(last)
 
     def begin_garbage(self) -> None:
-        """Have the stranger begin."""
-        assert self._stranger is not None
-        _tell(self._stranger, "begin")
+        """Start the garbage."""
+        assert self._garbage is not None
+        _tell(self._garbage, "begin")
 
-    def end_stranger(self) -> int:
-        """Have no more garbage published; returns how many messages it was."""
-        assert self._stranger is not None
-        assert self._stranger.stdin is not None
-        self._stranger.stdin.close()
-        self._stranger.wait(PATIENCE_S)
-        self._said["stranger"].wait_for(lambda lines: lines[-1].isdigit())
-        return int(self._said["stranger"].lines[-1])
+    def end_garbage(self) -> int:
+        """End the garbage; returns the number of its messages."""
+        assert self._garbage is not None
+        assert self._garbage.stdin is not None
+        self._garbage.stdin.close()
+        self._garbage.wait(PATIENCE_S)
+        self._said["garbage"].wait_for(lambda lines: lines[-1].isdigit())
+        return int(self._said["garbage"].lines[-1])
 
     def __enter__(self) -> "Site":
         """The site itself."""
@@ -163,7 +163,7 @@ class Site:
 
     def __exit__(self, *_: object) -> None:
         """End all of it."""
-        others = self._plants if self._stranger is None else [*self._plants, self._stranger]
+        others = self._plants if self._garbage is None else [*self._plants, self._garbage]
         processes: list[subprocess.Popen[Any]] = [*self._monitors, *others]
         for process in processes:
             process.kill()
@@ -187,45 +187,45 @@ class Site:
         with settings.with_suffix(".log").open("ab") as said:
             return subprocess.Popen(command, stderr=said)
 
-    def _started(self, module: Any, task: msgspec.Struct) -> "subprocess.Popen[str]":
+    def _start(self, module: Any, task: msgspec.Struct) -> "subprocess.Popen[str]":
         command = [sys.executable, "-m", module.__name__, msgspec.json.encode(task).decode()]
         return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, cwd=ROOT)
 
-    # --- what befalls them -----------------------------------------------------------------------------------
+    # --- disturbances ---------------------------------------------------------------------------------------
 
-    def suffer(self, blow: Blow, wait_for_crew: Callable[[int], None]) -> None:
+    def disturb(self, blow: Blow, wait_for_monitors: Callable[[int], None]) -> None:
         """Strike a blow, and wait until all processes are there again.
 
         Args:
-            blow: which.
-            wait_for_crew: waits until so many monitors show that they are there.
+            blow: the blow.
+            wait_for_monitors: waits for a number of live monitors.
         """
         end = blow.row + blow.rows
         self.allow(end + 1)
         if blow.kind == "kill monitor":
-            self._monitors[blow.whom].kill()
-            self._monitors[blow.whom].wait()
-            wait_for_crew(MONITORS - 1)
+            self._monitors[blow.monitor].kill()
+            self._monitors[blow.monitor].wait()
+            wait_for_monitors(MONITORS - 1)
             self.wait_for_row(end)
-            self._monitors[blow.whom] = self._monitor(blow.whom)
+            self._monitors[blow.monitor] = self._monitor(blow.monitor)
         elif blow.kind == "kill router":
             self.router.kill()
             self.wait_for_row(end)
             self.router.restart()
         elif blow.kind == "flood":
-            assert self._stranger is not None
-            floods = self._said["stranger"].lines.count("flooded")
-            _tell(self._stranger, "flood")
-            self._said["stranger"].wait_for(lambda lines: lines.count("flooded") > floods)
+            assert self._garbage is not None
+            floods = self._said["garbage"].lines.count("flooded")
+            _tell(self._garbage, "flood")
+            self._said["garbage"].wait_for(lambda lines: lines.count("flooded") > floods)
         else:
-            with self._proxies[blow.whom if blow.kind == "cut monitor" else MONITORS].cut(blow.manner):
+            with self._proxies[blow.monitor if blow.kind == "cut monitor" else MONITORS].cut(blow.manner):
                 self.wait_for_row(end)
-        wait_for_crew(MONITORS)
+        wait_for_monitors(MONITORS)
 
     # --- memory ----------------------------------------------------------------------------------------------
 
     def _measure(self, line: str) -> None:
-        """Note what each process takes, at every row that the first plants publish."""
+        """Record the memory of each process, at every row that the first plants publish."""
         if not line.strip().isdigit():
             return
         numbers = {"router": self.router.pid}

@@ -1,9 +1,9 @@
-"""Who hears what the monitors of a soak say, by a link that nobody cuts."""
+"""Observer of the monitors of a soak, on a link that is never cut."""
 
 import threading
 from collections.abc import Callable
 
-from benchmarks.link_cuts import connected
+from benchmarks.link_cuts import connect_client
 from benchmarks.soak.site import FLEET, PATIENCE_S
 from monitor_node.health import NODE
 from reactorwatch.contract import keys
@@ -13,44 +13,44 @@ from reactorwatch.runtime.config import BusConfig
 
 
 class Witness:
-    """Hears alarms, health and who is there.
+    """Collects alarms, health and tokens of the monitors.
 
     Args:
-        config: where the router is.
+        config: settings of the link to the router.
 
     Attributes:
-        alarms: by plant, all that was said, in the order in which it came.
-        health: by plant, what was said last of its monitor.
-        longest_lag_ms: of all that was said.
+        alarms: alarm messages of each plant, in order of arrival.
+        health: newest health of each plant's monitor.
+        longest_lag_ms: largest lag in the health messages.
     """
 
     def __init__(self, config: BusConfig) -> None:
         self._changed = threading.Condition()
-        self._crew: set[str] = set()
+        self._tokens: set[str] = set()
         self.alarms: dict[str, list[Alarm]] = {}
         self.health: dict[str, Health] = {}
         self.longest_lag_ms = 0.0
-        self._bus = connected(config)
+        self._bus = connect_client(config)
         self._bus.subscribe_liveliness(f"{keys.ROOT}/{keys.FLEET}/**", self._on_token)
         self._bus.subscribe(f"{FLEET}/{keys.ALARM}/**", self._on_message)
         self._bus.subscribe(f"{FLEET}/{keys.HEALTH}/{NODE}", self._on_message)
 
-    def wait_for_crew(self, count: int) -> None:
-        """Wait until so many monitors are there."""
-        assert self.wait(lambda: len(self._crew) == count), f"not {count} monitors, but {self._crew}"
+    def wait_for_monitors(self, count: int) -> None:
+        """Wait for a number of live monitors."""
+        assert self.wait(lambda: len(self._tokens) == count), f"not {count} monitors, but {self._tokens}"
 
     def wait(self, condition: Callable[[], bool], within_s: float = PATIENCE_S) -> bool:
-        """Wait until what was heard makes it so; returns whether it does."""
+        """Wait for a condition on the messages; returns True if it holds."""
         with self._changed:
             return self._changed.wait_for(condition, within_s)
 
     def close(self) -> None:
-        """Hear no more."""
+        """Close the link."""
         self._bus.close()
 
     def _on_token(self, key: str, is_alive: bool) -> None:
         with self._changed:
-            (self._crew.add if is_alive else self._crew.discard)(key)
+            (self._tokens.add if is_alive else self._tokens.discard)(key)
             self._changed.notify_all()
 
     def _on_message(self, message: Encoded) -> None:
@@ -58,7 +58,7 @@ class Witness:
         try:
             body = decode(message.payload, message.encoding)
         except DecodeError:
-            return  # the stranger's
+            return  # garbage
         if topic is None:
             return
         with self._changed:

@@ -61,7 +61,7 @@ def draw(study: Study, drawing: Drawing) -> Finding:
 
 
 class ThirdOrder:
-    """How often the third order is best, over records, outputs and the linear families."""
+    """Counts of the third order being best, over records, outputs and the linear families."""
 
     def __init__(self, selections: list[Selection]) -> None:
         groups = [
@@ -89,21 +89,21 @@ class ThirdOrder:
 
     @property
     def verdict(self) -> Verdict:
-        """Of the claim that it is best, by the free run."""
+        """Verdict on the claim that it is best, by simulation."""
         if self.clearly == self.of:
             return Verdict.AGREES
         return Verdict.IN_PART if self.clearly else Verdict.DISAGREES
 
 
 def _ahead(group: list[Candidate], fit: str) -> float:
-    """By how many points the third order's fit is ahead of the best of the others."""
+    """Lead of the third order's fit over the best of the others, in points."""
     others = max(getattr(candidate, fit) for candidate in group if candidate.order != _THIRD)
     (own,) = (getattr(candidate, fit) for candidate in group if candidate.order == _THIRD)
     return float(own - others)
 
 
 def _gains(selections: dict[tuple[str, str], Selection], name: str) -> dict[tuple[str, str], float]:
-    """What the third order adds to the second's free run, in points, by family and output."""
+    """Gain of the third order over the second in simulation fit, in points, by family and output."""
     runs = {
         (candidate.family, candidate.order, output): candidate.free_run_percent
         for output in OUTPUTS
@@ -121,16 +121,16 @@ def _why(
     without: dict[tuple[str, str], float],
     nearly_linear: dict[tuple[str, str], float],
 ) -> str:
-    """What the third lag is for, from what it adds where."""
+    """Text on the use of the third lag, from its gains."""
 
-    def said(gains: dict[tuple[str, str], float], family: str) -> str:
+    def gains_text(gains: dict[tuple[str, str], float], family: str) -> str:
         return " and ".join(f"{gains[family, output]:+.2f} in {output}" for output in OUTPUTS)
 
     text = (
         f"What the third order adds to the second's simulation fit, in points: ARX with noise "
-        f"{said(with_noise, 'arx')}, without noise {said(without, 'arx')}; OE with noise "
-        f"{said(with_noise, 'oe')}, without {said(without, 'oe')}; where the plant is nearly linear ARX "
-        f"{said(nearly_linear, 'arx')}, OE {said(nearly_linear, 'oe')}."
+        f"{gains_text(with_noise, 'arx')}, without noise {gains_text(without, 'arx')}; OE with noise "
+        f"{gains_text(with_noise, 'oe')}, without {gains_text(without, 'oe')}; where the plant is nearly linear ARX "
+        f"{gains_text(nearly_linear, 'arx')}, OE {gains_text(nearly_linear, 'oe')}."
     )
     helps_arx = all(with_noise["arx", output] > EQUAL_PERCENT for output in OUTPUTS)
     helps_else = any(gains["oe", output] > EQUAL_PERCENT for gains in (with_noise, without) for output in OUTPUTS)

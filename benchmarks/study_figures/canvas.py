@@ -51,7 +51,7 @@ _STYLE: Any = {
 
 
 def require_matplotlib() -> None:
-    """Whether pictures can be drawn here.
+    """Require matplotlib.
 
     Raises:
         InputError: matplotlib is not installed.
@@ -91,10 +91,10 @@ def panels(drawing: Drawing, rows: int, columns: int, **options: Any) -> list[Ax
     """Axes in a grid, row by row.
 
     Args:
-        drawing: that they are put on.
-        rows: how many.
-        columns: likewise.
-        **options: of matplotlib's `subplots`.
+        drawing: drawing of the axes.
+        rows: number of rows.
+        columns: number of columns.
+        **options: options of matplotlib's `subplots`.
     """
     return list(drawing.subplots(rows, columns, squeeze=False, **options).ravel())
 

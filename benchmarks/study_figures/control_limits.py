@@ -8,9 +8,9 @@ import numpy as np
 
 from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, VERMILION, label, panels
 from benchmarks.study_figures.figure import Finding, verdict
+from benchmarks.study_figures.flow_chart import Conclusion, follow
 from benchmarks.study_figures.study import TRAINING_ROWS, Study
 from reactorwatch.arrays import Array
-from reactorwatch.identification.flow_chart import Conclusion, follow
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import UNITS, Record
 from reactorwatch.spc.charts.shewhart import Shewhart, probability_out
@@ -23,12 +23,12 @@ ORDER = 3
 _PRESET, _OUTPUT = "fault-free", "T"
 
 
-def watched(record: Record, output: str) -> tuple[Conclusion, Array, Shewhart | None]:
-    """The flow chart of a record, the residual of all rows, and the control chart, if it came as far as a model.
+def monitor_record(record: Record, output: str) -> tuple[Conclusion, Array, Shewhart | None]:
+    """Monitor a record; returns its flow chart, the residual of all rows, and the control chart if there is a model.
 
     Args:
-        record: whose first `TRAINING_ROWS` rows are trusted.
-        output: that is watched.
+        record: record whose first `TRAINING_ROWS` rows are trusted.
+        output: name of the output.
     """
     u, y, t = record.columns["qc"], record.columns[output], record.time_min
     conclusion = follow(Structure.of_order(ORDER), u, y, t, TRAINING_ROWS)
@@ -40,7 +40,7 @@ def watched(record: Record, output: str) -> tuple[Conclusion, Array, Shewhart | 
 
 
 def out_of(chart: Shewhart, residuals: Array) -> Array:
-    """Which residuals are out, shape (rows,); those that are missing are not."""
+    """Flags of the residuals that are out, shape (rows,); missing ones are not."""
     return np.array([bool(np.isfinite(x)) and chart.update(float(x)).out for x in residuals])
 
 
@@ -55,7 +55,7 @@ def draw_residuals(axes: Axes, time_min: Array, residuals: Array, chart: Shewhar
 def draw(study: Study, drawing: Drawing) -> Finding:
     """The residual over time, and how it is distributed."""
     record = study.fault_record(_PRESET)
-    conclusion, residuals, chart = watched(record, _OUTPUT)
+    conclusion, residuals, chart = monitor_record(record, _OUTPUT)
     if chart is None:
         return Finding(f"The chart ended before a model: {conclusion.branches[-1].why}.")
     out = out_of(chart, residuals)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from benchmarks.study_figures.canvas import GREEN, ORANGE, label, panels
-from benchmarks.study_figures.control_limits import draw_residuals, out_of, watched
+from benchmarks.study_figures.control_limits import draw_residuals, monitor_record, out_of
 from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.study import TRAINING_ROWS, Study
 from monitor_node.alarms.on_off_delay import OnOffDelay
@@ -30,7 +30,7 @@ def draw(study: Study, drawing: Drawing) -> Finding:
         faulty, cells, seen = bool(preset.faults), [], False
         for output in _OUTPUTS:
             one = next(axes)
-            _, residuals, chart = watched(record, output)
+            _, residuals, chart = monitor_record(record, output)
             if chart is None:
                 cells.append("not sampled well | ")
                 continue
@@ -47,7 +47,7 @@ def draw(study: Study, drawing: Drawing) -> Finding:
             label(one, "", UNITS[output], f"{preset.name}: residual of {output}")
             seen |= bool(after) if faulty else bool(before)
             since = record.time_min >= ONSET_MIN
-            cells.append(f"{100 * out[since].mean():.2f} % | {_said(after, before, faulty)}")
+            cells.append(f"{100 * out[since].mean():.2f} % | {_format_delays(after, before, faulty)}")
         right += seen == faulty
         rows.append(f"| `{preset.name}` ({preset.meaning}) | {' | '.join(cells)} |")
     for one in drawing.axes[-len(_OUTPUTS) :]:
@@ -69,7 +69,7 @@ def draw(study: Study, drawing: Drawing) -> Finding:
 
 
 def _alarms(time_min: Array, out: Array, rule: MonitorConfig) -> list[float]:
-    """When the alarm is raised, in the rows that are watched."""
+    """Times of the alarm in the watched rows."""
     persistence = OnOffDelay(rule.raise_count, rule.window, rule.clear_count)
     return [
         float(time)
@@ -78,7 +78,7 @@ def _alarms(time_min: Array, out: Array, rule: MonitorConfig) -> list[float]:
     ]
 
 
-def _said(after: list[float], before: list[float], faulty: bool) -> str:
+def _format_delays(after: list[float], before: list[float], faulty: bool) -> str:
     early = f"{len(before)} false" if before else ""
     if not faulty:
         return early or "none"

@@ -1,4 +1,4 @@
-"""What a figure of the study is, and what comes out of drawing it."""
+"""Figures of the study, and their findings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 class Verdict(Enum):
-    """How what was found stands to what the report says."""
+    """Agreement of a finding with the report."""
 
     AGREES = "agrees"
     IN_PART = "agrees in part"
@@ -24,11 +24,11 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """What a figure shows.
+    """Finding of a figure.
 
     Attributes:
         text: Markdown, with the numbers of this run.
-        verdict: against the report.
+        verdict: agreement with the report.
     """
 
     text: str
@@ -40,11 +40,11 @@ class Figure:
     """One figure of the report.
 
     Attributes:
-        number: as the study counts, in the report's order.
-        title: its subject.
-        claim: what the report says or does there, as far as it is known.
-        draw: puts it on an empty drawing and says what was found.
-        height_px: of the picture, which is 900 px wide.
+        number: number in the study, in the report's order.
+        title: subject of the figure.
+        claim: statement of the report, as far as it is known.
+        draw: function that puts it on an empty drawing and returns the finding.
+        height_px: height of the picture, which is 900 px wide.
     """
 
     number: int
@@ -55,10 +55,10 @@ class Figure:
 
     @property
     def file_name(self) -> str:
-        """Of the picture."""
+        """File name of the picture."""
         return f"figure-{self.number:02d}.png"
 
 
 def verdict(agrees: bool) -> Verdict:
-    """For a claim that is right or wrong as a whole."""
+    """Verdict on a claim that is right or wrong as a whole."""
     return Verdict.AGREES if agrees else Verdict.DISAGREES

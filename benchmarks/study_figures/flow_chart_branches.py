@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.study_figures.canvas import GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, panels
-from benchmarks.study_figures.control_limits import ORDER, watched
+from benchmarks.study_figures.control_limits import ORDER, monitor_record
 from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.flow_chart import Conclusion, follow
 from benchmarks.study_figures.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
@@ -17,7 +18,6 @@ from plant_node.presets import PRESETS
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
 from reactorwatch.contract.codec import encode
-from reactorwatch.identification.flow_chart import Conclusion, follow
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record, to_minutes
 from recorder.tools.player import samples_of
@@ -36,7 +36,8 @@ _WATCHED_ROWS = 2000
 def draw(study: Study, drawing: Drawing) -> Finding:
     """A row for each record: the answers, and where the chart ended."""
     ends = {
-        preset.name: (watched(study.fault_record(preset.name), _OUTPUT)[0], bool(preset.faults)) for preset in PRESETS
+        preset.name: (monitor_record(study.fault_record(preset.name), _OUTPUT)[0], bool(preset.faults))
+        for preset in PRESETS
     }
     fast = study.fast(noise=False)
     extra = {
@@ -70,20 +71,20 @@ def draw(study: Study, drawing: Drawing) -> Finding:
         "the innovations of a filter of the equations instead of the residuals of a linear model. On the same records "
         "it says:\n\n| record | first alarm | likeliest cause at the end | since |\n|---|---|---|---|\n"
     )
-    text += "\n".join(_isolated(preset.name, study.fault_record(preset.name)) for preset in PRESETS)
+    text += "\n".join(_isolation_row(preset.name, study.fault_record(preset.name)) for preset in PRESETS)
     text += "\n\nWhere the cause is a sensor, it also tells what that sensor should read (`docs/watching.md`)."
     return Finding(text, Verdict.IN_PART if right else Verdict.DISAGREES)
 
 
-def _isolated(name: str, record: Record) -> str:
-    """What the monitor says of a record, as a row of the table."""
+def _isolation_row(name: str, record: Record) -> str:
+    """Row of the table with the monitor's suspects of a record."""
     result = backtest.run([encode(item) for item in samples_of(record, _PLANT)], MonitorConfig(plant=_PLANT))
-    if not result.raised:
+    if not result.raised_alarms:
         return f"| {name} | none | | |"
-    first = min((alarm for alarm, _ in result.raised), key=lambda alarm: alarm.raised_ns)
+    first = min((alarm for alarm, _ in result.raised_alarms), key=lambda alarm: alarm.raised_ns)
     raised = f"{to_minutes(first.raised_ns, result.first_ns):.1f} min"
     if not first.suspects:
-        return f"| {name} | {raised} | none told | |"
+        return f"| {name} | {raised} | no suspect | |"
     likeliest = first.suspects[0]
     size = "" if not likeliest.profile else f", {likeliest.profile} of {likeliest.size:.3g}"
     since = f"{to_minutes(likeliest.onset_ns, result.first_ns):.1f} min" if likeliest.onset_ns else ""

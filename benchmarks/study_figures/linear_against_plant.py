@@ -27,10 +27,10 @@ _TOLD = (0.5, 1.0, 2.0, 4.0, -4.0)
 
 
 def claim(qc: float) -> str:
-    """What is known of the figure at a flow in l/min."""
+    """Claim of the figure at a flow in l/min."""
     return (
         "Taylor linearisation (A, B, C), compared with the plant; how well they agreed is not known. The description "
-        f"gives the eigenvalues {_said(np.array(EIGENVALUES[qc], dtype=complex))} 1/min."
+        f"gives the eigenvalues {_format_eigenvalues(np.array(EIGENVALUES[qc], dtype=complex))} 1/min."
     )
 
 
@@ -82,8 +82,9 @@ def _compare(study: Study, drawing: Drawing, qc: float) -> Finding:
     halving = [errors[1.0][index] / errors[0.5][index] for index in (0, 1)]
     text = (
         f"At {qc:g} l/min the reactor rests at C = {point.state[0]:.6f} mol/l, T = {point.state[1]:.4f} K, a "
-        f"{point.kind}. Eigenvalues {_said(point.eigenvalues)} 1/min; the table has {_said(expected)}, {distance:.4f} "
-        "away at most.\n\nRoot mean square distance of the linear model from the plant over 8 min, as a share of the "
+        f"{point.kind}. Eigenvalues {_format_eigenvalues(point.eigenvalues)} 1/min; the table has "
+        f"{_format_eigenvalues(expected)}, {distance:.4f} away at most.\n\nRoot mean square "
+        "distance of the linear model from the plant over 8 min, as a share of the "
         f"plant's deviation:\n\n| step, l/min | C | T |\n|---|---|---|\n{rows}\n\nFrom 0.5 to 1 l/min these shares "
         f"grow {halving[0]:.2f} and {halving[1]:.2f} times; 2 is what the error of a first-order expansion comes to "
         f"as the step shrinks. {' '.join(gone)}"
@@ -91,7 +92,7 @@ def _compare(study: Study, drawing: Drawing, qc: float) -> Finding:
     return Finding(text, verdict(distance < 1e-3))
 
 
-def _said(values: NDArray[np.complex128]) -> str:
+def _format_eigenvalues(values: NDArray[np.complex128]) -> str:
     if np.all(np.abs(values.imag) < 1e-12):
         return ", ".join(f"{value.real:.3f}" for value in np.sort_complex(values))
     return f"{values[0].real:.3f} +- {abs(values[0].imag):.3f}i"

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.study_figures.canvas import BLACK, BY_ORDER, label, legend_below, panels
 from benchmarks.study_figures.figure import Finding, verdict
-from benchmarks.study_figures.study import NAMES, ORDERS, OUTPUTS, Study, held_out
+from benchmarks.study_figures.study import NAMES, ORDERS, OUTPUTS, Study, holdout_half
 from reactorwatch.identification.linear_model import fit_percent
 from reactorwatch.records.record import UNITS
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 _SHOWN_MIN = 15.0
 _SETTLED_MIN = 5.0
-"""What a free run makes of the noise in the rows that it starts from has died out after this."""
+"""Time after which the noise in the initial rows of a simulation has died out."""
 _STYLES = {1: ":", 2: "--", 3: "-"}
 
 
@@ -41,11 +41,11 @@ def _draw(study: Study, drawing: Drawing, family: str, free: bool) -> Finding:
     fits: dict[tuple[int, str], float] = {}
     settled: dict[tuple[int, str], float] = {}
     for output, over, under in zip(("T", "C"), axes[:2], axes[2:], strict=True):
-        u, y, t = (held_out(values) for values in study.signals(output))
+        u, y, t = (holdout_half(values) for values in study.signals(output))
         shown = t <= t[0] + _SHOWN_MIN
         over.plot(t[shown], y[shown], ".", color=BLACK, markersize=3, label="measured")
         for order in ORDERS:
-            model = study.fitted(family, order, output)
+            model = study.fit(family, order, output)
             predicted = (model.simulate if free else model.predict)(u, y, t)[:, 0]
             fits[order, output] = fit_percent(y, predicted)
             settled[order, output] = fit_percent(y[t > t[0] + _SETTLED_MIN], predicted[t > t[0] + _SETTLED_MIN])
@@ -83,11 +83,11 @@ def _draw(study: Study, drawing: Drawing, family: str, free: bool) -> Finding:
 
 
 def _lead(fits: dict[tuple[int, str], float], output: str) -> float:
-    """By how many points the best order is ahead of the next."""
+    """Lead of the best order over the next, in points."""
     ranked = np.sort([fits[order, output] for order in ORDERS])
     return float(ranked[-1] - ranked[-2])
 
 
 def _third_lead(fits: dict[tuple[int, str], float], output: str) -> float:
-    """By how many points the highest order is ahead of the best of the others."""
+    """Lead of the highest order over the best of the others, in points."""
     return fits[max(ORDERS), output] - max(fits[order, output] for order in ORDERS[:-1])

@@ -6,7 +6,7 @@ from benchmarks.study_figures.catalogue import FIGURES
 from benchmarks.study_figures.figure import Figure, Finding
 
 FOLDER = "study"
-"""Of the pictures, beside the page."""
+"""Folder of the pictures, beside the page."""
 
 _HEAD = """# The report's figures, reproduced
 
@@ -27,7 +27,7 @@ def page(found: Sequence[tuple[Figure, Finding]], seed: int, measured: str = "")
 
     Args:
         found: the figures that were drawn, in order, with what was found.
-        seed: of the run.
+        seed: seed of the run.
         measured: name of the record that the models are identified from; empty if it was simulated.
     """
     source = _MEASURED.format(name=measured) if measured else _OWN
@@ -60,6 +60,6 @@ def _heading(figure: Figure) -> str:
 
 
 def _anchor(figure: Figure) -> str:
-    """As GitHub makes it of the heading."""
+    """Anchor that GitHub makes of the heading."""
     kept = "".join(letter for letter in _heading(figure).lower() if letter.isalnum() or letter in " -")
     return kept.replace(" ", "-")

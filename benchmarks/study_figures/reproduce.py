@@ -26,9 +26,9 @@ class Job:
     """A figure to be drawn.
 
     Attributes:
-        number: of the figure.
-        picture: file of it.
-        seed: of every simulated record.
+        number: number of the figure.
+        picture: file of the picture.
+        seed: seed of every simulated record.
         measured: a record that models are identified from, or None.
     """
 
@@ -51,11 +51,11 @@ def reproduce(
 
     Args:
         out: folder; made if it is not there.
-        seed: of every simulated record.
+        seed: seed of every simulated record.
         only: numbers of figures, such as `7,12`; all, if not given.
         measured: a record that figures 14 to 17 identify their models from.
-        processes: in which they are drawn; None: one a core.
-        scheduler: of a cluster that draws them, or None.
+        processes: number of processes; None: one a core.
+        scheduler: address of a cluster that draws them, or None.
 
     Returns:
         What was written, for people.
@@ -65,7 +65,7 @@ def reproduce(
             matplotlib is not installed.
         RuntimeError: a figure could not be drawn.
     """
-    figures = _chosen(only)
+    figures = _select_figures(only)
     require_matplotlib()
     check_output_folder(check_output_folder(out) / FOLDER)
     found: list[tuple[Figure, Finding]] = []
@@ -88,7 +88,7 @@ def check_out(out: Path, only: str | None, sources: Iterable[Path | None], *, fo
     Raises:
         InputError: as `check_output_folder`, or figures that there are not.
     """
-    pictures = [f"{FOLDER}/{figure.file_name}" for figure in _chosen(only)]
+    pictures = [f"{FOLDER}/{figure.file_name}" for figure in _select_figures(only)]
     check_output_folder(out, (PAGE, *pictures), sources, force=force)
 
 
@@ -99,7 +99,7 @@ def draw(job: Job) -> Finding:
         return figure.draw(Study(job.seed, job.measured), drawing)
 
 
-def _chosen(only: str | None) -> Sequence[Figure]:
+def _select_figures(only: str | None) -> Sequence[Figure]:
     if only is None:
         return FIGURES
     numbers = [figure.number for figure in FIGURES]

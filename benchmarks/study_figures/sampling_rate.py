@@ -98,7 +98,7 @@ def draw(study: Study, drawing: Drawing) -> Finding:
     cured = [name for name, (every, condition, *_) in chosen.items() if condition < 0.5 * every]
     (_, pole) = study.operating().eigenvalues
     rows = "\n".join(
-        f"| {name} | {_condition_said(every)} | {_condition_said(condition)} | {said} |"
+        f"| {name} | {_format_condition(every)} | {_format_condition(condition)} | {said} |"
         for name, (every, condition, said, _) in chosen.items()
     )
     text = (
@@ -145,7 +145,7 @@ def report_choice(record: Record) -> tuple[float, float, str, bool]:
     return _condition(u, y, ALL_ROWS), _condition(u, y, REPORT_ROWS), said, blind
 
 
-def _condition_said(value: float) -> str:
+def _format_condition(value: float) -> str:
     """A condition number; beyond what can be solved its digits are rounding."""
     return f"{value:.3g}" if value <= SINGULAR_CONDITION else f"above {SINGULAR_CONDITION:.0e}: singular"
 

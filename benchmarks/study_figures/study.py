@@ -1,4 +1,4 @@
-"""What the figures have in common: the model, its steady states, the records, and the models fitted to them.
+"""Common parts of the figures: the model, its steady states, the records, and the models fitted to them.
 
 All records are simulated by this software, each with the seed of the study; what is asked for twice is made once.
 """
@@ -27,7 +27,7 @@ ORDERS = (1, 2, 3)
 OUTPUTS = ("C", "T")
 NAMES = {"C": "C, mol/l", "T": "T, K", "qc": "qc, l/min"}
 TRAINING_ROWS = 1000
-"""Of the fault records, known to be fault free: 100 minutes."""
+"""Fault-free rows at the start of the fault records: 100 minutes."""
 
 _NO_NOISE = NoiseSd(C=0.0, T=0.0)
 IDENTIFICATION_HOLD_MIN, FAST_HOLD_MIN = 1.0, 2.4
@@ -39,10 +39,10 @@ FAST_PERIOD_MIN = 0.01
 
 
 class Study:
-    """What one run of `reproduce` works with.
+    """Model, records and fits of one run of `reproduce`.
 
     Args:
-        seed: of every record.
+        seed: seed of every record.
         measured: a record that the models are identified from, in place of a simulated one.
     """
 
@@ -60,7 +60,7 @@ class Study:
 
     @cached_property
     def simulator(self) -> Simulator:
-        """Its free runs."""
+        """Simulator of the reactor."""
         return Simulator(self.model)
 
     def points(self, qc: float) -> list[SteadyState]:
@@ -75,7 +75,7 @@ class Study:
 
     @cached_property
     def identification(self) -> Record:
-        """What the models are identified from: with the sensors' noise, 0.1 min between rows."""
+        """Record for identification: with the sensors' noise, 0.1 min between rows."""
         return self.measured or simulate_record(PlantConfig(seed=self.seed, scenario=_IDENTIFICATION), _ROWS)
 
     @cached_property
@@ -85,7 +85,7 @@ class Study:
 
     @cached_property
     def small_steps(self) -> Record:
-        """Without noise, and so close to 100 l/min that the plant is nearly linear."""
+        """Record without noise, so close to 100 l/min that the plant is nearly linear."""
         return self.quiet({"kind": "random-steps", "low": 99.9, "high": 100.1, "hold_min": 1.0})
 
     def quiet(self, scenario: dict[str, Any]) -> Record:
@@ -99,7 +99,7 @@ class Study:
 
     @property
     def source(self) -> str:
-        """What the models of figures 14 to 17 are identified from, in words."""
+        """Description of the identification record of figures 14 to 17."""
         record = self.identification
         period = float(np.median(np.diff(record.time_min)))
         if self.measured is not None:
@@ -112,12 +112,12 @@ class Study:
         )
 
     def signals(self, output: str) -> tuple[Array, Array, Array]:
-        """Of the identification record: input, output and time."""
+        """Input, output and time of the identification record."""
         record = self.identification
         return record.columns["qc"], record.columns[output], record.time_min
 
-    def fitted(self, family: str, order: int, output: str) -> Model:
-        """A model of the first half of the identification record."""
+    def fit(self, family: str, order: int, output: str) -> Model:
+        """Fit a model to the first half of the identification record."""
         key = (family, order, output)
         if key not in self._fits:
             u, y, t = self.signals(output)
@@ -145,13 +145,13 @@ def levels(scenario: Scenario, time_min: Array, seed: int) -> Array:
 
 
 def edge(holds: Callable[[float], bool], low: float, high: float, precision: float = 1e-3) -> float:
-    """Where something that holds at `low` and not at `high` ceases to hold, by halving."""
+    """Edge of a condition that holds at `low` and not at `high`, by bisection."""
     while high - low > precision:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if holds(middle) else (low, middle)
     return 0.5 * (low + high)
 
 
-def held_out(values: Array) -> Array:
+def holdout_half(values: Array) -> Array:
     """The half of a record that no model is fitted to."""
     return values[values.size // 2 :]

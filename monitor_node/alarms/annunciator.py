@@ -350,7 +350,7 @@ class Annunciator:
         """Assign an alarm that changed to its incident, and count it."""
         memory = alarm.memory
         if event is Event.CLEARED and (memory.first_in or alarm.name not in self._transient):
-            self._incidents.cleared(time_ns, memory.incident)
+            self._incidents.on_cleared(time_ns, memory.incident)
         if memory.state is State.UNACKNOWLEDGED and before is not State.UNACKNOWLEDGED:
             self._kpis.count(time_ns, alarm.name, alarm.priority)
             if not memory.incident:

@@ -64,7 +64,7 @@ class Incidents:
         latest.changed_ns = time_ns
         return latest.number
 
-    def cleared(self, time_ns: int, number: int) -> None:
+    def on_cleared(self, time_ns: int, number: int) -> None:
         """Record that an alarm of an incident was cleared."""
         if number and number == self.state.number:
             self.state.changed_ns = time_ns

@@ -27,7 +27,7 @@ from reactorwatch.identification.structure import Scaling, Structure
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterState, ParameterT2
 from reactorwatch.spc.parameter_drift import learn
-from reactorwatch.stored_state import StoredState, packed, unpacked
+from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
 
 Array = NDArray[np.float64]
 
@@ -100,9 +100,9 @@ class ArxPredictor:
         return PredictorState(
             self._buffer.state,
             self._rls.state,
-            packed(self._first_rows),
+            pack_numbers(self._first_rows),
             self._scaling,
-            None if self._reference is None else packed(self._reference),
+            None if self._reference is None else pack_numbers(self._reference),
             None if self._reference_model is None else self._reference_model.SerializeToString(),
             None if self._drift is None else self._drift.state,
             self._newest_drift,
@@ -118,11 +118,11 @@ class ArxPredictor:
             raise ValueError(f"the state must be of {self._structure}, got {state.buffer.structure}")
         self._buffer = RegressorBuffer.from_state(state.buffer)
         self._rls = RecursiveLeastSquares.from_state(state.rls)
-        self._first_rows = [(first, second) for first, second in unpacked(state.first_rows, 2).tolist()]
+        self._first_rows = [(first, second) for first, second in unpack_numbers(state.first_rows, 2).tolist()]
         if state.scaling is not None:
             self._scale(state.scaling)
         if state.reference is not None:
-            (self._reference,) = unpacked(state.reference, self._structure.parameters)
+            (self._reference,) = unpack_numbers(state.reference, self._structure.parameters)
         if state.told is not None:
             self._reference_model = ModelSnapshot.FromString(state.told)
         self._drift = None if state.drift is None else ParameterT2.from_state(state.drift)

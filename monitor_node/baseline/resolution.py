@@ -22,7 +22,7 @@ def resolution(values: NDArray[np.float64]) -> float:
     0.3
 
     Args:
-        values: of the signal, shape (n,); NaN where missing.
+        values: values of the signal, shape (n,); NaN where missing.
     """
     levels = np.unique(values[np.isfinite(values)])
     steps = np.diff(levels)
@@ -34,6 +34,6 @@ def resolution_sd(values: NDArray[np.float64]) -> float:
     """Standard deviation of a signal's residual due to its steps alone.
 
     Args:
-        values: of the signal, shape (n,); NaN where missing.
+        values: values of the signal, shape (n,); NaN where missing.
     """
     return resolution(values) / sqrt(12.0)

@@ -28,7 +28,7 @@ from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.prewhitening import Prewhitening, learn
-from reactorwatch.stored_state import StoredState, packed, packed_times, unpacked, unpacked_times
+from reactorwatch.stored_state import StoredState, pack_numbers, pack_times, unpack_numbers, unpack_times
 
 Array = NDArray[np.float64]
 
@@ -123,7 +123,7 @@ class Training:
     def state(self) -> TrainingState:
         """A copy of the state."""
         rows = [(input_value, *values) for _, input_value, values in self._rows]
-        return TrainingState(packed_times(row[0] for row in self._rows), packed(rows), list(self._counts))
+        return TrainingState(pack_times(row[0] for row in self._rows), pack_numbers(rows), list(self._counts))
 
     def restore(self, state: TrainingState) -> None:
         """Resume from a state of the same settings.
@@ -132,7 +132,7 @@ class Training:
             ValueError: the state is damaged.
         """
         outputs = len(self._config.outputs)
-        times_ns, rows = unpacked_times(state.times_ns), unpacked(state.rows, 1 + outputs).tolist()
+        times_ns, rows = unpack_times(state.times_ns), unpack_numbers(state.rows, 1 + outputs).tolist()
         if len(times_ns) != len(rows) or len(state.known) != outputs:
             raise ValueError(f"a training must have a time a row and {outputs} counts, got {len(times_ns)} times")
         self._rows.extend((time_ns, row[0], row[1:]) for time_ns, row in zip(times_ns, rows, strict=True))
@@ -330,13 +330,13 @@ def _too_few_residuals(
     counts = np.count_nonzero(np.isfinite(z), axis=0).tolist()
     return {
         name: f"only {count} of its {len(z)} rows could be predicted, {FEWEST_ROWS} are needed: "
-        f"{_why_unpredicted(time_min, inputs)}"
+        f"{_prediction_obstacle(time_min, inputs)}"
         for name, count in zip(outputs, counts, strict=True)
         if count < FEWEST_ROWS and name not in left_out
     }
 
 
-def _why_unpredicted(time_min: Array, inputs: Array) -> str:
+def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
     """Reason why rows could not be predicted."""
     follows = regular_intervals(time_min)
     regular = np.count_nonzero(follows)

@@ -34,19 +34,34 @@ class HandedOverAlarms:
         if alarm is not None and alarm.alarm in self._names:
             self._by_others.setdefault(plant, {})[alarm.alarm] = alarm
 
+    def on_history(self, plant: str, messages: Iterable[Encoded]) -> None:
+        """Record alarms from the publishers' caches, unless a later message on the same alarm arrived already."""
+        for message in messages:
+            alarm = alarm_of(message)
+            known = self._by_others.get(plant, {}).get(alarm.alarm) if alarm is not None else None
+            if alarm is not None and (known is None or alarm.time_ns >= known.time_ns):
+                self.on_message(plant, message)
+
     def of(self, plant: str) -> list[Alarm]:
         """The newest message on each alarm of a plant."""
         return list(self._by_others.get(plant, {}).values())
 
-    def publish_ours(self, plant: str, alarms: Iterable[Alarm], last_ns: int | None) -> None:
+    def publish_ours(
+        self, plant: str, alarms: Iterable[Alarm], last_ns: int | None, withheld_ns: int | None = None
+    ) -> None:
         """Record that this monitor published all alarms of a plant up to a row.
 
         Args:
             plant: name of the plant.
             alarms: alarms at that row.
             last_ns: time of the row; None: there was none.
+            withheld_ns: time of the first change of an alarm that was not published; None: all were.
         """
         for alarm in alarms:
+            if withheld_ns is not None:
+                alarm.raised_ns = alarm.raised_ns if alarm.raised_ns < withheld_ns else 0
+                alarm.cleared_ns = alarm.cleared_ns if alarm.cleared_ns < withheld_ns else 0
+                last_ns = None if last_ns is None else min(last_ns, withheld_ns - 1)
             active = alarm.raised_ns and not alarm.cleared_ns
             # Rows do not show a data timeout that another monitor raised in receive time.
             evaluated_ns = last_ns if last_ns is not None and alarm.alarm != TIMEOUT_ALARM else 0
@@ -71,11 +86,12 @@ class HandedOverAlarms:
             known_ns: time at which the last known one was raised.
         """
         theirs, ours = self._by_others.get(plant, {}).get(TIMEOUT_ALARM), self._ours.get(plant, {}).get(TIMEOUT_ALARM)
-        over_ns = theirs.raised_ns if theirs is not None and theirs.event == Event.CLEARED.value else 0
+        published = [alarm for alarm in (theirs, ours) if alarm is not None]
+        over_ns = [alarm.raised_ns for alarm in published if alarm.event == Event.CLEARED.value]
         active = [
             alarm
-            for alarm in (theirs, ours)
-            if alarm is not None and alarm.event == Event.RAISED.value and alarm.raised_ns > max(known_ns, over_ns)
+            for alarm in published
+            if alarm.event == Event.RAISED.value and alarm.raised_ns > max(known_ns, *over_ns, 0)
         ]
         return sorted(active, key=lambda alarm: alarm.raised_ns)[-1:]
 

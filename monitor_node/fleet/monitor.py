@@ -9,6 +9,10 @@ publishers still remember (`on_history`). With a state, alarms that the predeces
 none is published twice. Without one the plant is trained again, but its alarms stay: monitors of a fleet subscribe to
 each other's alarms. So an active one is not raised again, and it is cleared when its condition is over.
 
+Two monitors may own a plant for a while: a stalled process does not know that it was replaced. So an adopted plant is
+claimed, and the claim is checked between evaluation and publication of an alarm (`claimed_elsewhere`). Alarms of a
+plant that another monitor has claimed are withheld, and the plant is adopted again if it is still owned.
+
 While others may have taken over from this monitor nothing is evaluated (`pause`), until it is known which plants they
 have (`resume`). For those it resumes from their states.
 
@@ -28,8 +32,8 @@ from monitor_node.fleet.watched_plants import State, WatchedPlants
 from monitor_node.ingest.pending import PendingPlants, PlantHistory, truncate
 from monitor_node.replay.recorded_sessions import TIMEOUT_ALARM
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
+from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 
@@ -49,14 +53,15 @@ class FleetMonitor:
         config: settings of each plant's monitor; its plant name is ignored.
         start_ns: present time.
         shards: monitors that share the fleet.
-        model: as for `Monitor`.
-        points: as for `Monitor`.
+        model: see `Monitor`.
+        points: see `Monitor`.
         request_history: called with a plant to adopt, and True if another owned it until now; returns True if its
             history will be passed to `on_history`. If not, the plant is adopted at once.
         store: called with a released plant and its state.
         unusable: called with a plant whose state is unusable, and the reason; returns a note on the state.
         put_back: called with a plant without a usable state, and its new monitor; returns True if the monitor was
             restored from a state that had been kept aside.
+        claimed_elsewhere: returns True if another monitor has claimed a plant since it was adopted here.
         on_ownership: called with True when a plant is adopted, and with False when it is released.
 
     Raises:
@@ -75,20 +80,22 @@ class FleetMonitor:
         store: Callable[[str, State], None] = lambda _plant, _state: None,
         unusable: Callable[[str, InputError], str] = lambda _plant, _why: "",
         put_back: Callable[[str, Monitor], bool] = lambda _plant, _monitor: False,
+        claimed_elsewhere: Callable[[str], bool] = lambda _plant: False,
         on_ownership: Callable[[str, bool], None] = lambda _plant, _ours: None,
     ) -> None:
         self._shards, self._on_ownership = shards, on_ownership
         self._request_history, self._store, self._unusable = request_history, store, unusable
-        self._restore_kept_aside = put_back
+        self._restore_kept_aside, self._is_claimed_elsewhere = put_back, claimed_elsewhere
         self._watched = WatchedPlants(config, start_ns, model, points=points)
         self._pending = PendingPlants()
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
-        self._registered: dict[str, None] = {}  # all plants, whoever owns them
+        self._registered: dict[str, None] = {}  # all plants, with any owner
         self._unverified = UnverifiedPlants()
         self._signals = (config.input, *config.outputs)
         self._plants: dict[str, str] = {}  # plants that are not quiet, by key of a sample
         self._handed_over, self._recent = HandedOverAlarms(self._watched.alarms), RecentlyAdopted()
         self._paused_messages: list[Encoded] | None = None  # buffered in a pause
+        self._paused_histories: list[PlantHistory] = []
 
     # --- ownership -------------------------------------------------------------------------------------------
 
@@ -112,21 +119,34 @@ class FleetMonitor:
         return []
 
     def on_history(self, past: PlantHistory, now_ns: int) -> list[Publication]:
-        """Adopt a plant whose history was requested, if it is still owned: process the history and messages since."""
+        """Adopt a plant whose history was requested, if it is still owned: process the history and messages since.
+
+        In a pause the history is buffered behind the messages, which may be alarms of the previous owner.
+        """
+        if self.paused:
+            self._paused_histories.append(past)
+            return []
         if past.plant not in self._pending:
             return []
         if past.state is not None:
             self._unverified.verify(past.plant)
         messages = self._pending.end(past.plant, past.messages)
+        self._handed_over.on_history(past.plant, past.alarms)
         self.adopt(past.plant, past.state, now_ns)
         monitor = self.monitor(past.plant)
-        publications = [item for message in messages for item in monitor.on_message(message, now_ns)]
-        publications = self._handed_over.filter_new(publications)
-        self._restore_timeout(past.plant, monitor)
+        publications: list[Publication] = []
+        timeouts = self._timeouts_after(past.plant, monitor)
+        for message in messages:
+            # Rows from before a data timeout do not end it; the first row after it does.
+            if timeouts and not monitor.has_pending_rows and _sample_time_ns(message) > timeouts[0].raised_ns:
+                monitor.resume_from_alarms(timeouts)
+                timeouts = []
+            publications += self._evaluate(past.plant, monitor, message, now_ns)
+        monitor.resume_from_alarms(timeouts)
         monitor.on_history_end()
         self._recent.add(past.plant, monitor, now_ns)
         self._handed_over.expire(past.plant)
-        return publications
+        return self._confirm(publications, now_ns)
 
     def adopt(self, plant: str, state: State | None, now_ns: int) -> None:
         """Adopt a plant.
@@ -148,7 +168,7 @@ class FleetMonitor:
         if state is None and not self._restore_kept_aside(plant, monitor):
             monitor.resume_from_alarms(alarm for alarm in self._handed_over.of(plant) if alarm.alarm != TIMEOUT_ALARM)
             if unusable:
-                monitor.notes.append(f"{unusable}; the plant is learned anew{kept}")
+                monitor.notes.append(f"{unusable}; the plant is learned again{kept}")
                 self._store(plant, monitor.to_bytes())  # or the folder would not list the plant
         elif unusable:
             monitor.notes.append(f"{unusable}{kept}")
@@ -156,11 +176,9 @@ class FleetMonitor:
         self._registered[plant] = None
         self._on_ownership(plant, True)
 
-    def _restore_timeout(self, plant: str, monitor: Monitor) -> None:
-        """Resume an active data timeout: the next sample ends it; rows from before it do not."""
-        monitor.resume_from_alarms(
-            self._handed_over.timeouts_after(plant, monitor.alarms.alarm(TIMEOUT_ALARM).raised_ns)
-        )
+    def _timeouts_after(self, plant: str, monitor: Monitor) -> list[Alarm]:
+        """An active data timeout of a plant that its monitor does not know."""
+        return self._handed_over.timeouts_after(plant, monitor.alarms.alarm(TIMEOUT_ALARM).raised_ns)
 
     def release(self, plant: str) -> State | None:
         """Release a plant; returns its state for the next owner. None: it was not owned."""
@@ -170,12 +188,18 @@ class FleetMonitor:
         self._on_ownership(plant, False)
         return monitor.to_bytes()
 
-    def rejoin(self, plant: str, now_ns: int) -> None:
-        """Adopt a plant again that another monitor also owned: resume from its state, if the plant is still owned."""
+    def rejoin(self, plant: str, now_ns: int, withheld_ns: int | None = None) -> None:
+        """Adopt a plant again that another monitor also owned: resume from its state, if the plant is still owned.
+
+        Args:
+            plant: name of the plant.
+            now_ns: present time.
+            withheld_ns: time of the first change of an alarm that was not published; None: all were.
+        """
         monitor = self._watched.remove(plant)
         if monitor is None:
             return
-        self._handed_over.publish_ours(plant, monitor.alarms.all_alarms(), monitor.last_ns)
+        self._handed_over.publish_ours(plant, monitor.alarms.all_alarms(), monitor.last_ns, withheld_ns)
         self._on_ownership(plant, False)
         if self._shards.is_ours(plant):
             self._start_adoption(plant, now_ns, taken_over=True)
@@ -197,9 +221,23 @@ class FleetMonitor:
             now_ns: present time.
         """
         held, self._paused_messages = self._paused_messages or [], None
+        histories, self._paused_histories = self._paused_histories, []
         for plant in {*others, *self._reported_elsewhere(held)}:
             self.rejoin(plant, now_ns)
-        return self._process(held, now_ns)
+        publications = self._process(held, now_ns)
+        return publications + [item for past in histories for item in self.on_history(past, now_ns)]
+
+    def _confirm(self, publications: list[Publication], now_ns: int) -> list[Publication]:
+        """Withhold publications on plants with a changed alarm that another monitor has claimed, and rejoin these."""
+        withheld_ns: dict[str, int] = {}
+        for item in publications:
+            if isinstance(item.message, Alarm):
+                plant, time_ns = _plant_of_key(item.key), item.message.time_ns
+                withheld_ns[plant] = min(withheld_ns.get(plant, time_ns), time_ns)
+        lost = [plant for plant in withheld_ns if self._is_claimed_elsewhere(plant)]
+        for plant in lost:
+            self.rejoin(plant, now_ns, withheld_ns[plant])
+        return [item for item in publications if _plant_of_key(item.key) not in lost] if lost else publications
 
     def _reported_elsewhere(self, messages: Iterable[Encoded]) -> set[str]:
         """Own plants for which another monitor published alarms on rows not yet processed here."""
@@ -228,6 +266,10 @@ class FleetMonitor:
         """True if a plant is owned."""
         return plant in self._watched
 
+    def is_pending(self, plant: str) -> bool:
+        """True while a plant's history is requested."""
+        return plant in self._pending
+
     def active_monitor(self, plant: str) -> Monitor | None:
         """Monitor of a plant; None if it is quiet, or not owned."""
         return self._watched.active_monitor(plant)
@@ -247,13 +289,13 @@ class FleetMonitor:
         return plant not in self._unverified and (own is None or own.rows > 0)
 
     @property
-    def evicted(self) -> int:
+    def evictions(self) -> int:
         """Number of unverified plants that were evicted."""
         return self._unverified.evicted
 
-    def received_of(self, plant: str) -> int | None:
+    def received_count(self, plant: str) -> int | None:
         """Number of messages of a plant; None: it is not owned."""
-        return self._watched.received_of(plant)
+        return self._watched.received_count(plant)
 
     def count_not_stored(self, plant: str) -> None:
         """Count a failure to store the state of a plant."""
@@ -316,7 +358,8 @@ class FleetMonitor:
             self._pending.start(plant)
         else:
             self.adopt(plant, None, now_ns)
-            self._restore_timeout(plant, self.monitor(plant))
+            monitor = self.monitor(plant)
+            monitor.resume_from_alarms(self._timeouts_after(plant, monitor))
 
     # --- event loop ------------------------------------------------------------------------------------------
 
@@ -343,7 +386,7 @@ class FleetMonitor:
                 if self._recent.is_repeat(plant, message, now_ns):
                     own.count_duplicate()
                 else:
-                    publications += self._handed_over.filter_new(own.on_message(message, now_ns))
+                    publications += self._evaluate(plant, own, message, now_ns)
             elif plant in self._pending:
                 self._pending.add(plant, message)
             elif messages_of >= PROVEN_MESSAGES:
@@ -354,7 +397,14 @@ class FleetMonitor:
                 self._unverified.verify(plant)
         for plant in self._watched.settle(touched):
             self._remove_keys(plant)
-        return publications
+        return self._confirm(publications, now_ns)
+
+    def _evaluate(self, plant: str, own: Monitor, message: Encoded, now_ns: int) -> list[Publication]:
+        """Process a message of a plant; returns publications that its previous owners have not published."""
+        restarts, publications = own.restarts, own.on_message(message, now_ns)
+        if own.restarts != restarts:  # the clock may be set back: their alarms would cover those to come
+            self._handed_over.remove(plant)
+        return self._handed_over.filter_new(publications)
 
     def _plant_of(self, message: Encoded, now_ns: int) -> str:
         """Plant of a sample; empty for another message."""
@@ -372,8 +422,11 @@ class FleetMonitor:
 
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """Execute an operator's command; None as reply: another monitor owns the plant."""
-        topic = keys.parse(question.key)
-        monitor = self._watched.detach(topic.plant) if topic is not None and not self.paused else None
+        plant = _plant_of_key(question.key)
+        monitor = self._watched.detach(plant) if not self.paused else None
+        if monitor is not None and self._is_claimed_elsewhere(plant):
+            self.rejoin(plant, now_ns)
+            return None, []
         return (None, []) if monitor is None else monitor.on_command(question, now_ns)
 
     def on_tick(self, now_ns: int) -> list[Publication]:
@@ -382,11 +435,11 @@ class FleetMonitor:
             return []
         if self._presume_gone_ns is not None and now_ns >= self._presume_gone_ns:
             self._presume_gone_ns = None
-            if self._shards.presume_gone():
+            if self._shards.drop_unseen():
                 self._reassign(now_ns)
         for plant in self._unverified.evict(now_ns):
             self._evict(plant)
-        return self._watched.on_tick(now_ns)
+        return self._confirm(self._watched.on_tick(now_ns), now_ns)
 
     def next_tick_ns(self) -> int:
         """Earliest deadline of the plants."""
@@ -417,3 +470,18 @@ class FleetMonitor:
     def tracebacks(self) -> Iterator[tuple[str, str]]:
         """Plant and traceback of each contained error that was reported."""
         return self._watched.tracebacks()
+
+
+def _plant_of_key(key: str) -> str:
+    """Plant in a key; empty if there is none."""
+    topic = keys.parse(key)
+    return topic.plant if topic is not None else ""
+
+
+def _sample_time_ns(message: Encoded) -> int:
+    """Time of a sample; the earliest if the message is none."""
+    try:
+        sample = decode(message.payload, message.encoding)
+    except DecodeError:
+        sample = None
+    return sample.time_ns if isinstance(sample, Sample) else -NEVER_NS

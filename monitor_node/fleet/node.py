@@ -2,6 +2,7 @@
 
 import secrets
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import structlog
@@ -17,6 +18,7 @@ from monitor_node.fleet.partition import LeaseMonitor
 from monitor_node.fleet.sharding import ShardGroup
 from monitor_node.fleet.watched_plants import WatchedPlants
 from monitor_node.health import NODE
+from monitor_node.ingest.pending import PlantHistory
 from monitor_node.ingest.rejects import RejectCounter
 from monitor_node.other_monitors import OtherMonitors, log_report
 from monitor_node.state.monitor_state import OtherSettingsError
@@ -39,7 +41,7 @@ from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sende
 log = structlog.get_logger()
 
 DRAIN_TIMEOUT_S = 0.5
-"""As for the monitor of one plant."""
+"""Time for messages on their way at the end, as for the monitor of one plant."""
 
 UNCACHED = (keys.HEALTH, keys.ALARM_KPIS)
 """Periodic messages of each plant; a cache of them would take more memory than all else of a plant."""
@@ -50,7 +52,7 @@ MOST_TOKENS = 200
 LOG_INTERVAL_NS = 10_000_000_000
 
 POLL_NS = 100_000_000
-"""Interval of looks for recovered histories and for states to store."""
+"""Interval of checks for states to store."""
 
 MOST_STORED = 20
 """Plants whose state is stored at a time: half a millisecond each. With thousands, each is stored less often."""
@@ -86,7 +88,9 @@ class FleetNode(FleetMonitor):
         self._bus, self.metrics = bus, metrics
         self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
         self._states = states
-        self._recovery = StateRecovery(bus, self._states, lambda plant, line: log.warning(line, plant=plant))
+        self._recovery = StateRecovery(
+            bus, self._states, self._is_contested, lambda plant, line: log.warning(line, plant=plant)
+        )
         self._every_ns = int(config.state_every_s * 1e9)
         self._lease = LeaseMonitor(lambda: bus.has_router)
         self._pending_subscriptions = len(self.subscriptions)
@@ -115,6 +119,7 @@ class FleetNode(FleetMonitor):
             store=self._store_state,
             unusable=self._keep_aside,
             put_back=self._restore_kept_aside,
+            claimed_elsewhere=self._is_claimed_elsewhere,
             on_ownership=self._set_ownership,
         )
         for plant in sorted({*states.plants, *states.plants_aside}) if states is not None else []:
@@ -163,6 +168,12 @@ class FleetNode(FleetMonitor):
         log_report(self._others.on_token(token, is_alive=is_alive))
         return self._check_lease(now_ns) + self._log_alarms(super().on_alive(token, is_alive, now_ns))
 
+    def on_history(self, past: PlantHistory, now_ns: int) -> list[Publication]:
+        """See `FleetMonitor`; alarms are logged, and an unusable state is reported at once."""
+        publications = self._check_lease(now_ns) + self._log_alarms(super().on_history(past, now_ns))
+        self._report_ns = now_ns
+        return publications
+
     def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
         """See `FleetMonitor`; alarms are logged; too many commands, over all plants, are refused."""
         topic = keys.parse(question.key)
@@ -185,9 +196,6 @@ class FleetNode(FleetMonitor):
             if not self._bus.has_router:
                 self._lease.expire(now_ns)
             self._store_due(now_ns)
-            for past in self._recovery.pop_recovered():
-                publications += self._log_alarms(self.on_history(past, now_ns))
-                self._report_ns = now_ns  # an unusable state is reported at once
         publications += self._log_alarms(super().on_tick(now_ns))
         if now_ns >= self._report_ns:
             self._report_ns = now_ns + LOG_INTERVAL_NS
@@ -197,23 +205,25 @@ class FleetNode(FleetMonitor):
                 log.debug("traceback", plant=plant, traceback=text)
             if (refused := self._commands_refused.report(now_ns)) is not None:
                 log.warning(refused)
-            if self.evicted > self._evicted_logged:
-                self._evicted_logged = self.evicted
-                log.warning("plants were forgotten that showed no token and said nothing more", so_far=self.evicted)
+            if self.evictions > self._evicted_logged:
+                self._evicted_logged = self.evictions
+                log.warning("unverified plants without messages were evicted", so_far=self.evictions)
         return publications
 
     def next_tick_ns(self) -> int:
-        """See `FleetMonitor`; or the next look for recovered histories and states to store."""
+        """See `FleetMonitor`; or the next check for states to store."""
         due_ns = super().next_tick_ns()
-        if self._states is None and not self._recovery.is_pending:
-            return due_ns
-        return min(due_ns, self._poll_ns)
+        return due_ns if self._states is None else min(due_ns, self._poll_ns)
 
-    def on_subscribed(self) -> None:
-        """Count a completed subscription; when all are, start the recovery."""
+    def on_subscribed(self, call: Callable[[Callable[[int], list[Publication]]], None]) -> None:
+        """Count a completed subscription; when all are, start the recovery.
+
+        Args:
+            call: see `EventLoop.call`.
+        """
         self._pending_subscriptions -= 1
         if not self._pending_subscriptions:
-            self._recovery.start()
+            self._recovery.start(lambda past: call(lambda now_ns: self.on_history(past, now_ns)))
 
     def on_stop(self, now_ns: int) -> list[Publication]:
         """See `FleetMonitor`; states are stored for the last time."""
@@ -232,10 +242,10 @@ class FleetNode(FleetMonitor):
             return []
         if absent:
             if self.shards.is_shared:
-                log.warning("the other monitors may take us for gone: nothing is judged until we are back")
+                log.warning("the lease of this monitor may have expired: its plants are paused until it is back")
                 self.pause()
             return []
-        others = self._states.written_elsewhere(self.plants)
+        others = self._states.adopted_elsewhere(self.plants)
         log.info("back", plants=len(self.plants), watched_by_others=len(others))
         return self._log_alarms(self.resume(others, now_ns))
 
@@ -247,6 +257,12 @@ class FleetNode(FleetMonitor):
         self._recovery.request(plant)
         return True
 
+    def _is_contested(self, plant: str) -> bool:
+        return self.shards.is_shared and self.is_pending(plant)
+
+    def _is_claimed_elsewhere(self, plant: str) -> bool:
+        return self._states is not None and self.shards.is_shared and self._states.is_claimed_elsewhere(plant)
+
     def _store_state(self, plant: str, state: bytes) -> None:
         if self._states is not None:
             self._states.put(plant, state)
@@ -255,7 +271,7 @@ class FleetNode(FleetMonitor):
         if self._states is None:
             return ""
         if isinstance(why, ForeignFileError):
-            name = self._states.leave_alone(plant)
+            name = self._states.protect(plant)
             return f", and {name} is left as it is; nothing is stored of the plant until it is moved away"
         ending = OTHER_SETTINGS if isinstance(why, OtherSettingsError) else DAMAGED
         return f", and the state kept as {self._states.keep_aside(plant, ending)}"
@@ -277,18 +293,18 @@ class FleetNode(FleetMonitor):
         for plant in self._states.pop_lost():
             log.info("another monitor has stored a newer state", plant=plant)
             self.rejoin(plant, now_ns)
-        due = [plant for plant in self._changed if self.received_of(plant) is not None]
+        due = [plant for plant in self._changed if self.received_count(plant) is not None]
         self._changed.clear()
         if not self._round and not 0 <= now_ns - self._round_ns < self._every_ns:
             self._round, self._round_ns = self.plants, now_ns
-        looked = 0
-        while self._round and looked < MOST_STORED and self._states.has_room:
-            plant, looked = self._round.pop(), looked + 1
-            if self.received_of(plant) not in (None, self._stored_at.get(plant)):
+        checked = 0
+        while self._round and checked < MOST_STORED and self._states.has_room:
+            plant, checked = self._round.pop(), checked + 1
+            if self.received_count(plant) not in (None, self._stored_at.get(plant)):
                 due.append(plant)
         for plant in filter(self.is_worth_storing, due):
             self._states.put(plant, self.state_of(plant))
-            self._stored_at[plant] = self.received_of(plant) or 0
+            self._stored_at[plant] = self.received_count(plant) or 0
 
     def _count_failures(self) -> None:
         """Count failures to store states, and log each reason once."""
@@ -357,7 +373,7 @@ def watch(node: FleetNode, bus: Bus, stop: StopSignal) -> None:
     log.info("listening", plants=node.expression)
     on_publish = node.metrics.on_publish if node.metrics is not None else None
     loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S, on_publish=on_publish)
-    loop.subscribe(*node.subscriptions, on_history_end=node.on_subscribed, on_batch=node.on_messages)
+    loop.subscribe(*node.subscriptions, on_history_end=lambda: node.on_subscribed(loop.call), on_batch=node.on_messages)
     loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
     loop.accept_commands(*(f"{node.expression}/{keys.COMMAND}/{name}" for name in COMMANDS))
     bus.declare_token(node.shards.token)

@@ -14,7 +14,7 @@ first.
 >>> [lease.is_expired(time_s * second) for time_s in (2, 6)]
 [True, True]
 >>> linked.append(True)
->>> [lease.is_expired(time_s * second) for time_s in (7, 8, 20)]  # twelve seconds after it looked last
+>>> [lease.is_expired(time_s * second) for time_s in (7, 8, 20)]  # twelve seconds after its last check
 [True, False, True]
 """
 

@@ -9,7 +9,7 @@ shards, and no other plant moves.
 Two monitors may have the same shard; the one whose name sorts first is active, and the other on standby.
 
 Liveliness tokens show which monitors are alive, and each monitor draws the same conclusion from them. A shard whose
-token was never seen is presumed to be starting, until `presume_gone`; then it counts as gone.
+token was never seen is presumed to be starting, until `drop_unseen`; then it counts as gone.
 """
 
 import re
@@ -131,8 +131,8 @@ class ShardGroup:
             names.discard(member.name)
         return True
 
-    def presume_gone(self) -> bool:
-        """Presume shards gone that were never seen; returns True if there are any."""
+    def drop_unseen(self) -> bool:
+        """Drop shards that were never seen; returns True if there are any."""
         unseen, self._unseen = self._unseen, set()
         return bool(unseen)
 

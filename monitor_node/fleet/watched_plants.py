@@ -32,8 +32,8 @@ class WatchedPlants:
     Args:
         config: settings of each plant's monitor; its plant name is ignored.
         start_ns: present time.
-        model: as for `Monitor`.
-        points: as for `Monitor`.
+        model: see `Monitor`.
+        points: see `Monitor`.
 
     Attributes:
         alarms: names of a plant's alarms.
@@ -128,10 +128,10 @@ class WatchedPlants:
             raise InputError(f"plant {plant!r} is not watched here (there are: {', '.join(self.plants)})")
         return self._monitors[plant].to_bytes()
 
-    def received_of(self, plant: str) -> int | None:
+    def received_count(self, plant: str) -> int | None:
         """Number of messages of a plant; None: there is no such plant."""
         if self._quiet is not None and plant in self._quiet:
-            return self._quiet.received_of(plant)
+            return self._quiet.received_count(plant)
         monitor = self._monitors.get(plant)
         return None if monitor is None else monitor.received
 

@@ -3,7 +3,7 @@
 Messages of such a plant are buffered and follow its history. A sample that is in both is used once.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from monitor_node.ingest.sample_limits import LARGEST_SAMPLE
@@ -33,11 +33,13 @@ class PlantHistory(NamedTuple):
         plant: name of the plant.
         state: state that its monitor stored last; None if there is none.
         messages: messages that its publishers still remember, in order.
+        alarms: alarms of the plant that running monitors have published lately.
     """
 
     plant: str
     state: bytes | None
     messages: list[Encoded]
+    alarms: Sequence[Encoded] = ()
 
 
 class PendingPlants:

@@ -18,7 +18,7 @@ USABLE = frozenset({Quality.QUALITY_GOOD, Quality.QUALITY_UNCERTAIN})
 def reject_reason(signal: str, sample: Sample) -> tuple[str, str]:
     """Reason to reject a sample, and a description of it."""
     if sample.quality == Quality.QUALITY_UNSPECIFIED:
-        return "payload", f"{signal}: the sample has no quality, so it is no Sample of ours"
+        return "payload", f"{signal}: the sample has no quality, so it is no Sample of reactorwatch"
     if not isfinite(sample.value):
         return "not_finite", f"{signal} is {sample.value} at {sample.time_ns} ns"
     if sample.quality == Quality.QUALITY_BAD:

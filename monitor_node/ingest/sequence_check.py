@@ -40,7 +40,7 @@ TOLERANCE, DEVIATIONS = 0.25, 4.0
 """Allowed deviation: share of the usual spacing, and mean deviations."""
 
 MEMORY = 16
-"""Spacings in the exponential mean, and needed before their evenness is judged."""
+"""Spacings in the exponential mean, and needed before their evenness is checked."""
 
 AT_FIRST = 4.0
 """Times the mean spacing, allowed before it is known."""
@@ -85,7 +85,7 @@ class SequenceCheck(GapTracker):
 
         Args:
             sample: the new sample.
-            reorder_rows: as for the alignment.
+            reorder_rows: see the alignment.
         """
         held, window = self.held, REMEMBERED * reorder_rows
         follows = self._follows(sample, window)

@@ -122,7 +122,7 @@ class Descent:
     """The search for the size and the onset of one hypothesis.
 
     Args:
-        hypothesis: whose.
+        hypothesis: hypothesis of the descent.
         stretch: the rows.
     """
 

@@ -27,7 +27,7 @@ from reactorwatch.process.effect import SensorEffect
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.stored_state import StoredState, packed, unpacked
+from reactorwatch.stored_state import StoredState, pack_numbers, unpack_numbers
 
 LOOKS = (10, 30, 100, 300)
 """Rows after the first alarm of an incident at which the causes are compared."""
@@ -75,7 +75,7 @@ class SuspicionState(StoredState, frozen=True):
         incident: that was looked at last.
         since: rows since its first alarm; None: no alarm stands that has to be explained.
         way: how far its fault has been followed.
-        output: whose sensor is, or was last, reconstructed.
+        output: output of the newest reconstruction.
         cause: and why.
         reconstruction: None: there is none.
     """
@@ -113,7 +113,7 @@ class Suspicion:
     def state(self) -> SuspicionState:
         """A copy of all that is remembered."""
         return SuspicionState(
-            packed([(time_min, input_value, *measured) for time_min, input_value, measured in self._rows]),
+            pack_numbers([(time_min, input_value, *measured) for time_min, input_value, measured in self._rows]),
             self._incident,
             self._since,
             None if self._isolation is None else self._isolation.way,
@@ -129,7 +129,7 @@ class Suspicion:
             ValueError: the state is damaged.
         """
         model = self._reference.model
-        rows = unpacked(state.rows, 2 + len(model.outputs)).tolist()
+        rows = unpack_numbers(state.rows, 2 + len(model.outputs)).tolist()
         self._rows.extend((row[0], row[1], row[2:]) for row in rows)
         self._incident, self._since = state.incident, state.since
         if state.way is not None:

@@ -69,7 +69,7 @@ class Window:
 
     @property
     def earliest_min(self) -> float:
-        """When something may set in at the earliest."""
+        """Earliest time of an onset."""
         return float(self.time_min[self.first_onset])
 
     @property

@@ -57,7 +57,7 @@ from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma, MewmaState
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.compiled_chart import SignalState
-from reactorwatch.stored_state import packed, unpacked
+from reactorwatch.stored_state import pack_numbers, unpack_numbers
 
 CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)
 """That quiet plants may have, in the order of `rows.judge`."""
@@ -232,7 +232,7 @@ class QuietForm:
             return NewestRows(times_ns, np.empty((len(times_ns), 0)))
         if looked is None or looked.since is not None or looked.way is not None or looked.reconstruction is not None:
             return None
-        rows = unpacked(looked.rows, 1 + len(self._signals))
+        rows = unpack_numbers(looked.rows, 1 + len(self._signals))
         if len(rows) < len(left) or not np.isfinite(rows).all():
             return None
         known = times_ns_of(rows[: len(rows) - len(left), 0]) + times_ns
@@ -271,7 +271,7 @@ class QuietForm:
         looked = None
         if self._looks:
             minutes = np.array([time_ns / MINUTE_NS for time_ns in rows.times_ns])
-            known = packed(np.column_stack([minutes, rows.values]))
+            known = pack_numbers(np.column_stack([minutes, rows.values]))
             looked = SuspicionState(known, rest.cause[0], None, None, rest.cause[1], rest.cause[2], None)
         equal = msgspec.msgpack.decode(rest.runs, type=list[EqualRuns])
         outputs = range(len(self.config.outputs))
@@ -324,7 +324,7 @@ class QuietForm:
             else:
                 numbers = p[name].astype("<f8").tobytes()
                 charts[name] = SignalState(name, len(self.config.outputs), numbers).to_bytes()
-        passed = [whitener_of(p, place).learned.passed for place in range(len(self.config.outputs))]
+        passed = [whitener_of(p, place).learned.shift_gain for place in range(len(self.config.outputs))]
         return ChartsState(charts, p["width"].tolist(), passed)
 
     def _board_of(self, plant: str, p: np.void, rest: Rest) -> bytes:

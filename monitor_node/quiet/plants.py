@@ -87,7 +87,7 @@ class QuietPlants:
         return list(self._slots.of)
 
     def prepare(self) -> None:
-        """Have the machine code made that is made at its first use: on a new machine that takes seconds."""
+        """Compile the machine code ahead of its first use: on a new machine that takes seconds."""
         nobody, now = np.array([-1], np.int32), np.zeros(1, np.int64)
         rows, _ = self._lined_up(nobody, parse_samples([b""]), now, 0)
         self._judged(rows, [])
@@ -99,7 +99,7 @@ class QuietPlants:
         """Take a plant over from its monitor, if it is quiet; returns whether it is.
 
         Args:
-            plant: its name.
+            plant: name of the plant.
             monitor: its; of no use afterwards if the plant was taken.
         """
         found = self._form.written(monitor, self._scratch)
@@ -132,8 +132,8 @@ class QuietPlants:
         state = self._form.read(plant, self._slots.plants[slot], rest, rows, [])
         return seal_state(msgspec.structs.replace(state, settings=self._settings | {"plant": plant}))
 
-    def received_of(self, plant: str) -> int:
-        """How many messages of a plant came."""
+    def received_count(self, plant: str) -> int:
+        """Number of messages of a plant."""
         return int(self._slots.plants["received"][self._slots.of[plant]])
 
     def not_stored(self, plant: str) -> None:
@@ -296,7 +296,7 @@ class QuietPlants:
         return [self._health(slot, now_ns, "watching") for slot in due.tolist()]
 
     def next_due_ns(self) -> int:
-        """When the first of the plants is overdue, or a health due, as far as is known now."""
+        """Time of the next overdue plant or health message, as far as is known now."""
         return min(int(self._slots.health_due_ns.min()), self._overdue_ns, self._looked_ns + LOOK_AGAIN_NS)
 
     def last_healths(self, now_ns: int) -> list[Publication]:

@@ -150,7 +150,7 @@ def take_samples(
 
 @jit
 def silent_from(plants: Records, silence_limit: float, least_ns: int) -> Ints:
-    """When it is too long since something came from each plant, as `DataTimeout.due_ns`; never where there is none."""
+    """Time of the data timeout of each plant, as `DataTimeout.due_ns`; never where there is none."""
     found = np.empty(plants.size, np.int64)
     for slot in range(plants.size):
         p = plants[slot]

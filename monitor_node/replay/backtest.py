@@ -57,7 +57,7 @@ class Backtest:
     noise_levels: dict[str, dict[str, float]] | None = None
 
     @property
-    def raised(self) -> list[tuple[Alarm, int | None]]:
+    def raised_alarms(self) -> list[tuple[Alarm, int | None]]:
         """Each alarm as raised, with its newest suspects, and the time when it was cleared (None: it is active)."""
         alarms: list[tuple[Alarm, int | None]] = []
         last: dict[str, int] = {}
@@ -87,7 +87,7 @@ def run(
         messages: messages; all but samples of `config.plant` are ignored.
         config: settings of the monitor.
         zero_ns: zero of the model's minutes, if its file does not have it.
-        model: whose equations judge, its minutes counted from 1970-01-01 UTC; None: the one that the settings name.
+        model: model with the equations, with minutes from 1970-01-01 UTC; None: the one that the settings name.
 
     Raises:
         InputError: the settings are inconsistent, or the model's file is unusable.
@@ -120,7 +120,7 @@ def run(
         alarm_messages=alarms,
         refused=dict(monitor.rejects.by_reason),
         notes=monitor.notes,
-        left_out=monitor.left_out,
+        left_out=monitor.excluded_signals,
         refused_trainings=monitor.refused_trainings,
         reference=monitor.reference or None,
         noise_levels=monitor.noise_levels,

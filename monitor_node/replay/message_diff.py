@@ -12,7 +12,7 @@ from google.protobuf.message import Message
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode, encode
 
-MOST_TOLD = 100
+MAX_DIFFERENCES = 100
 """Differences that are listed; the others are counted."""
 
 NOT_RECORDED, NOT_REPLAYED = "not recorded", "not said again"
@@ -133,7 +133,7 @@ class MessageDiff:
 
     def _differ(self, difference: Difference) -> None:
         self.differing += 1
-        if len(self.differences) < MOST_TOLD:
+        if len(self.differences) < MAX_DIFFERENCES:
             self.differences.append(difference)
 
 

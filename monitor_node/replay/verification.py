@@ -95,7 +95,7 @@ def verify(read: Callable[[], Iterable[Encoded]], config: MonitorConfig) -> Veri
     if len(sessions) > 1:
         found.notes.append(f"the monitor was started {len(sessions)} times; {verified} of these runs were verified")
     if not any(count.recorded for count in found.diff.counts.values()):
-        raise InputError("holds nothing that a monitor said of its samples, so there is nothing to verify")
+        raise InputError("holds no message of a monitor on its samples, so there is nothing to verify")
     return found
 
 
@@ -112,9 +112,9 @@ def _unknown_history(session: Session, read: Callable[[], Iterable[Encoded]], co
             del missing[topic.name]
             if not missing:
                 return ""
-    heard = f"the first samples of {', '.join(missing)} that it heard are" if missing else "what it had heard is"
+    unknown = f"the first samples of {', '.join(missing)} that it received are" if missing else "its earlier input is"
     return (
-        f"the monitor was running before this recording begins: {heard} not in it, nor what it learned from them; "
+        f"the monitor was running before this recording begins: {unknown} not in it; "
         "verify the folder of all its files, or the file in which it was started"
     )
 

@@ -25,12 +25,12 @@ class SignalCheck:
     """One check of the signals of one plant.
 
     Args:
-        config: of the monitor.
+        config: configuration of the monitor.
         board: the alarms of the plant; the check declares its own there.
-        ranges: of the input and of each output.
+        ranges: ranges of the input and of each output.
 
     Attributes:
-        name: of its alarms.
+        name: name of its alarms.
         can_be_false: whether chance can raise its alarms, one an output, which then share the promised false alarms.
     """
 
@@ -42,11 +42,11 @@ class SignalCheck:
 
     @property
     def state(self) -> Any:
-        """All that was learned and is remembered, as bytes; the alarms are the board's."""
+        """The full state; the alarms belong to the board."""
         return b""
 
     def restore(self, state: Any) -> None:
-        """Resume where a check with the same settings was when `state` was taken; after the board.
+        """Resume from the state of a check with the same settings; after the board.
 
         Raises:
             ValueError: the state is damaged.
@@ -56,7 +56,7 @@ class SignalCheck:
         """Learn from the training.
 
         Args:
-            values: readings of each output, in order of time; NaN where missing, and in all of an output left out.
+            values: readings of each output, in order of time; NaN where missing, and all NaN for an excluded output.
             e: prewhitened residuals of each output; NaN where there are none.
             arl0: run length of each alarm without a fault, in rows.
         """
@@ -65,8 +65,10 @@ class SignalCheck:
         """Check a row, input first; values are NaN where missing."""
         return []
 
-    def measured(self, time_ns: int, values: tuple[float, ...], publications: list[Publication]) -> tuple[float, ...]:
-        """The values of a row, input first, with NaN in place of those that are no measurements."""
+    def measured_values(
+        self, time_ns: int, values: tuple[float, ...], publications: list[Publication]
+    ) -> tuple[float, ...]:
+        """Values of a row, input first, with NaN in place of those that are no measurements."""
         return values
 
     def on_values(self, time_ns: int, values: list[float], units: list[str]) -> list[Publication]:
@@ -83,10 +85,10 @@ class SignalCheck:
         """Check the prewhitened residuals of a row; returns the outputs whose value must not enter a memory yet.
 
         Args:
-            time_ns: of the row.
-            e: of each output; NaN where there is none.
+            time_ns: time of the row.
+            e: prewhitened residual of each output; NaN where there is none.
             scales: one standard deviation of each, in the outputs' units.
-            units: of the outputs.
+            units: units of the outputs.
             publications: changes of alarms are added here.
         """
         return (False,) * len(self.outputs)
@@ -101,16 +103,16 @@ class SignalCheck:
     def judge(
         self, alarm: ChartAlarm, time_ns: int, judgement: Judgement, unit: str, text: str, signal: str, *, cause: str
     ) -> list[Publication]:
-        """Take a point of an alarm in; returns the alarm if it changes.
+        """Evaluate a point of an alarm; returns the alarm if it changes.
 
         Args:
-            alarm: of this check.
-            time_ns: of the row.
-            judgement: of the point.
-            unit: of its statistic.
-            text: of the alarm, if the point raises it.
-            signal: what the alarm is of.
-            cause: what the alarm comes from.
+            alarm: alarm of this check.
+            time_ns: time of the row.
+            judgement: judgement of the point.
+            unit: unit of its statistic.
+            text: text of the alarm, if the point raises it.
+            signal: signal of the alarm.
+            cause: suspected cause of the alarm.
         """
         raised = alarm.update(judgement)
         if raised is None:

@@ -32,7 +32,9 @@ class RangeCheck(SignalCheck):
             for signal, item in zip(self._names, ranges, strict=True)
         ]
 
-    def measured(self, time_ns: int, values: tuple[float, ...], publications: list[Publication]) -> tuple[float, ...]:
+    def measured_values(
+        self, time_ns: int, values: tuple[float, ...], publications: list[Publication]
+    ) -> tuple[float, ...]:
         """See `SignalCheck`."""
         for index, (value, alarm) in enumerate(zip(values, self._alarms, strict=True)):
             if alarm is None or value != value:

@@ -77,7 +77,7 @@ class Verdict(NamedTuple):
     Attributes:
         quarantine: True if the value is a missing sample to filters and to charts with a memory.
         spike: True if the value *before* it was a spike.
-        size: that value; 0 if it was no spike.
+        size: size of the spike; 0 without one.
     """
 
     quarantine: bool
@@ -258,7 +258,7 @@ class SpikeCheck(SignalCheck):
 
     @property
     def state(self) -> list[SpikeState | None]:
-        """Of each output; None for an output that is not judged; none before the training ends."""
+        """State of each output; None for an output without the check; empty before the training ends."""
         return [None if spike is None else spike.state for spike in self._spikes]
 
     def restore(self, state: list[SpikeState | None]) -> None:

@@ -26,9 +26,9 @@ class SignalChecksState(StoredState, frozen=True, omit_defaults=True):
     """State of the checks of a plant's signals.
 
     Attributes:
-        silences: of the plant, of the input and of each output.
-        stuck: of each output; none before the training ends.
-        spikes: of each output; None for an output that is not judged; none before the training ends.
+        silences: state of the plant, of the input and of each output.
+        stuck: state of each output; empty before the training ends.
+        spikes: state of each output; None for an output without the check; empty before the training ends.
         others: the states of the other checks, by name.
     """
 
@@ -46,9 +46,9 @@ class SignalChecks:
     """Checks the signals of one plant.
 
     Args:
-        config: of the monitor.
+        config: configuration of the monitor.
         board: the alarms of the plant; those of the signals are declared here.
-        ranges: of the input and of each output; None: no bounds are known.
+        ranges: ranges of the input and of each output; None: no bounds are known.
     """
 
     CHANCE_ALARMS = sum(check.can_be_false for check in CHECKS)
@@ -64,8 +64,8 @@ class SignalChecks:
         self.check_row = self._only("on_row", _in_one_list)
         """Checks a row, see `SignalCheck.on_row`."""
         self.mask_values: Callable[[int, tuple[float, ...], list[Publication]], tuple[float, ...]]
-        self.mask_values = self._only("measured", _one_after_the_other)
-        """Masks the values of a row, see `SignalCheck.measured`."""
+        self.mask_values = self._only("measured_values", _one_after_the_other)
+        """Masks the values of a row, see `SignalCheck.measured_values`."""
         self.check_values: Callable[[int, list[float], list[str]], list[Publication]]
         self.check_values = self._only("on_values", _in_one_list)
         """Checks the outputs of a row, see `SignalCheck.on_values`."""
@@ -92,7 +92,7 @@ class SignalChecks:
 
     @property
     def state(self) -> SignalChecksState:
-        """A copy of all that is remembered; the alarms are the board's."""
+        """A copy of the full state; the alarms belong to the board."""
         states = {check.name: state for check in self._checks if (state := check.state) != b""}
         own = {field: states.pop(name) for name, field in FIELDS.items()}
         return SignalChecksState(**own, others=states)

@@ -288,7 +288,7 @@ class StuckCheck(SignalCheck):
 
     @property
     def state(self) -> list[StuckState]:
-        """Of each output; none before the training ends."""
+        """State of each output; empty before the training ends."""
         return [stuck.state for stuck in self._stuck]
 
     def restore(self, state: list[StuckState]) -> None:

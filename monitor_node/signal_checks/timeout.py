@@ -304,12 +304,12 @@ class SilenceCheck(SignalCheck):
 
     @property
     def silent(self) -> list[bool]:
-        """Silence of each signal, the input first."""
+        """Flags of the signals without data, the input first."""
         return [silence.standing for silence in self._silences[1:]]
 
     @property
     def state(self) -> list[DataTimeoutState]:
-        """Of the plant, of the input and of each output."""
+        """State of the plant, of the input and of each output."""
         return [silence.state for silence in self._silences]
 
     def restore(self, state: list[DataTimeoutState]) -> None:

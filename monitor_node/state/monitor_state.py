@@ -75,7 +75,7 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
     Args:
         config: settings of the monitor.
         model: process model.
-        points: as for `Monitor`.
+        points: see `Monitor`.
     """
     fields = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
     fields |= {"points": points, "equations": fingerprint(model)}

@@ -1,11 +1,10 @@
-"""The folder in which a fleet's monitors keep what they remember, a file for each plant.
+"""Folder of the stored states of a fleet's monitors, a file for each plant.
 
 A file is written whole or not at all, by a thread of its own, so that a slow disk delays no alarm. Monitors that share
-the fleet may share the folder: who takes a plant over goes on from what the one before stored.
+the fleet may share the folder: a monitor that takes a plant over resumes from the state that the last owner stored.
 
-Two may take themselves for in charge of a plant for a moment: one of them was cut off, or frozen. So nobody writes over
-a file that is not the one that he has read or written last, by its time and size; he is told that another has
-(`pop_lost`).
+Two monitors may own a plant for a moment, after one of them was cut off or frozen. So a monitor does not overwrite a
+file that changed, by its time and size, since the monitor itself read or wrote it; `pop_lost` returns such plants.
 
 A state that cannot be used is kept aside, and used again when it fits (see `kept_aside`). A file that is no state is
 left alone, and nothing is stored of its plant.
@@ -19,6 +18,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TypeAlias
 
+from monitor_node.storage.claims import Claims
 from monitor_node.storage.kept_aside import find_kept_aside, keep_aside, put_back, read_regular
 from reactorwatch.errors import InputError
 from reactorwatch.records.atomic import atomic_write, is_disk_full
@@ -50,12 +50,12 @@ class FleetStates:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._folder = folder
+        self._folder, self._claims = folder, Claims(folder)
         self._queued: dict[str, bytes] = {}
         self._failed: list[tuple[str, str]] = []
         self._marks: dict[str, _Mark] = {}  # of each plant's file as last read or written
         self._lost: list[str] = []
-        self._left_alone: set[str] = set()  # plants whose file is no state, or unreadable
+        self._protected: set[str] = set()  # plants whose file is no state, or unreadable
         self._changed = threading.Condition()
         self._closed = False
         try:
@@ -100,7 +100,7 @@ class FleetStates:
             self._update_mark(plant)
             return read_regular(path)
         except (InputError, OSError) as error:
-            self._left_alone.add(plant)
+            self._protected.add(plant)
             why = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else str(error)
             raise InputError(f"state {path}: {why}; nothing is stored of the plant") from error
 
@@ -110,14 +110,14 @@ class FleetStates:
         try:
             aside = keep_aside(path, ending)
         except OSError as error:
-            self._left_alone.add(plant)
+            self._protected.add(plant)
             return f"{path.name}, as it cannot be renamed: {error.strerror}"
         self._aside[path.name] = [aside, *self._aside.get(path.name, [])]
         return aside.name
 
-    def leave_alone(self, plant: str) -> str:
+    def protect(self, plant: str) -> str:
         """Store nothing of a plant as long as its present file exists; returns the name of the file."""
-        self._left_alone.add(plant)
+        self._protected.add(plant)
         return self._path(plant).name
 
     def put_back(self, plant: str, use: Callable[[bytes], None]) -> str | None:
@@ -125,7 +125,7 @@ class FleetStates:
 
         Args:
             plant: name of a plant without a state in use.
-            use: as for `kept_aside.put_back`.
+            use: see `kept_aside.put_back`.
         """
         path = self._path(plant)
         asides = self._aside.get(path.name, [])
@@ -141,6 +141,19 @@ class FleetStates:
         asides.remove(fitting)
         self._update_mark(plant)
         return fitting.name
+
+    def claim(self, plant: str) -> bool:
+        """Claim a plant that has a state, see `claims`; returns True if the previous owner may know it only later."""
+        if not self._path(plant).exists():
+            return False
+        why = self._claims.claim(plant)
+        if why is not None:
+            self._failed.append((plant, why))
+        return why is None
+
+    def is_claimed_elsewhere(self, plant: str) -> bool:
+        """True if another monitor has claimed a plant last."""
+        return self._claims.is_claimed_elsewhere(plant)
 
     @property
     def has_room(self) -> bool:
@@ -168,9 +181,9 @@ class FleetStates:
         own, present = self._marks.get(plant), _file_mark(self._path(plant))
         return present not in (None, own) and own is not None
 
-    def written_elsewhere(self, plants: Iterable[str]) -> list[str]:
-        """Select the plants whose state another monitor has written."""
-        return [plant for plant in plants if self.is_written_elsewhere(plant)]
+    def adopted_elsewhere(self, plants: Iterable[str]) -> list[str]:
+        """Select the plants that another monitor has claimed, or whose state it has written."""
+        return [plant for plant in plants if self.is_claimed_elsewhere(plant) or self.is_written_elsewhere(plant)]
 
     def close(self) -> None:
         """Write the queued states, and stop."""
@@ -216,10 +229,10 @@ class FleetStates:
     def _write(self, plant: str, state: bytes) -> str | None:
         """Write a state; returns the reason if it cannot be written."""
         path = self._path(plant)
-        if plant in self._left_alone:
+        if plant in self._protected:
             if path.exists():
                 return f"state {path}: cannot be used and is not overwritten; move it away"
-            self._left_alone.discard(plant)
+            self._protected.discard(plant)
         try:
             with atomic_write(path) as temporary:
                 with temporary.open("wb") as file:

@@ -104,10 +104,10 @@ class StateFile:
                 ending = OTHER_SETTINGS if isinstance(error, OtherSettingsError) else DAMAGED
                 status = f"{error}; it is kept as {keep_aside(self._path, ending).name}"
             else:
-                return "the monitor goes on from it"
+                return "the monitor resumes from it"
         asides = find_kept_aside(self._path.parent).get(self._path.name, [])
         fitting = put_back(self._path, asides, self._monitor.from_bytes)
         self.was_aside = fitting is not None
         if fitting is not None:
             return f"{status}; {fitting.name} fits and is in use again"
-        return f"{status}{';' if data is None else ', and'} the monitor learns anew"
+        return f"{status}{';' if data is None else ', and'} the monitor learns again"

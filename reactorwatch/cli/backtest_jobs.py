@@ -78,7 +78,7 @@ def run_job(job: Job) -> JobResult:
     plant = resolve_plant(check_recording(job.at), job.plant)
     settings = msgspec.structs.replace(job.settings, plant=plant)
     recording, first = open_messages(job.at, plant, job.columns, _units(settings)), FirstSamples(plant)
-    result = run(first.pass_on(recording.messages), settings, recording.zero_ns or 0)
+    result = run(first.collect_samples(recording.messages), settings, recording.zero_ns or 0)
     if not result.rows:
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items()))
         raise InputError(f"{job.at}: holds no sample that can be used{f'; refused: {why}' if why else ''}")
@@ -121,7 +121,7 @@ def _row(file: Path, found: dict[str, Any]) -> Row:
     }
 
 
-def _failed(file: Path, reason: str) -> Row:
+def _error_row(file: Path, reason: str) -> Row:
     return {"file": str(file), **dict.fromkeys((*_COLUMNS, *_OF_ALARMS)), "error": reason}
 
 
@@ -143,4 +143,4 @@ def _summary(rows: Sequence[Row]) -> str:
     return f"{as_table(lines)}\n\n{len(rows)} files: {counts}"
 
 
-BACKTEST = JobKind("watching", run_job, _failed, _summary)
+BACKTEST = JobKind("watching", run_job, _error_row, _summary)

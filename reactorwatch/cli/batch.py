@@ -156,7 +156,7 @@ def run_in_order(
 
     Args:
         work: a plain function.
-        jobs: its arguments.
+        jobs: arguments of the calls.
         doing: name of the work, for the bar.
         processes: number of processes; None: one a core.
         scheduler: address of a cluster, or None.
@@ -167,13 +167,13 @@ def run_in_order(
     executor = choose_executor(processes, scheduler)
     with bar(doing, len(jobs)) as advance:
 
-        def counted() -> Iterator[tuple[int, Result | Failed]]:
+        def count_results() -> Iterator[tuple[int, Result | Failed]]:
             advance(0, f"{doing}, none of {len(jobs)} done")
             for count, done in enumerate(executor.map_unordered(work, jobs), start=1):
                 advance(count, f"{doing}, {count} of {len(jobs)} done")
                 yield done
 
-        yield from in_job_order(counted())
+        yield from in_job_order(count_results())
 
 
 def write_remark(file: Path, remark: str) -> None:

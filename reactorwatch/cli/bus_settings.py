@@ -45,7 +45,7 @@ def load_bus_settings(
     if site is None:
         return dict.fromkeys(ROLES, section(BusConfig, "bus", tables, {"endpoint": endpoint}))
     if endpoint is not None:
-        raise InputError(f"--endpoint {endpoint}: with --site the site says where its router is; leave it out")
+        raise InputError(f"--endpoint {endpoint}: with --site the site has the address of its router; leave it out")
     settings = {}
     for node, role in ROLES.items():
         file = site.absolute() / plant / role / SETTINGS

@@ -23,7 +23,7 @@ def register_commands(app: typer.Typer) -> None:
         arl.command(command.__name__)(command)
     charts.add_typer(arl, name="arl", help="The average run length of a chart, in samples.")
     charts.command("design")(design)
-    charts.command("list")(listed)
+    charts.command("list")(list_charts)
     app.add_typer(charts, name="charts", help="Control charts: how long they run, and which is fastest.")
 
 
@@ -102,8 +102,8 @@ def t2(
     )
 
 
-def listed() -> None:
-    """The charts that a monitor can have, with their keys in its settings."""
+def list_charts() -> None:
+    """List the charts of a monitor, with their keys in its settings."""
     from reactorwatch.spc.charts.catalogue import CHARTS
 
     for kind in CHARTS:

@@ -166,11 +166,11 @@ def _run_nodes(bus: ZenohBus, stop: StopSignal, settings: dict[str, Path], folde
             processes.start(node)
         started = time.monotonic()
         while not woken.wait(POLL_S):
-            ended = processes.ended()
+            ended = processes.exit_codes()
             failed = {node: code for node, code in ended.items() if code or node != "plant"}
             if failed:
                 node, code = next(iter(failed.items()))
-                raise InputError(f"the {node} ended with code {code}; it says why in {folder / (node + '.log')}")
+                raise InputError(f"the {node} ended with code {code}; the reason is in {folder / (node + '.log')}")
             if "plant" in ended:
                 break
             if not progress.started and time.monotonic() - started > START_WITHIN_S:
@@ -255,7 +255,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         f"- `{DIAGNOSIS_FOLDER}/{PAGE}`: what the simulation gets wrong of this run, in a browser;"
         f" `{DIAGNOSIS_FOLDER}/{MODEL}` is the simulation that knows of it.",
         f"- `{recording.name}`: everything that went over the bus; opens in Foxglove and PlotJuggler, too.",
-        f"- `{SETTINGS_FILE}`: all settings, seeds included; the `.log` files: what the nodes said.",
+        f"- `{SETTINGS_FILE}`: all settings, seeds included; the `.log` files: logs of the nodes.",
         "",
     ]
     text = printable_lines(lines)

@@ -9,7 +9,8 @@ import msgspec
 import numpy as np
 
 from reactorwatch.cli.options import check_recording
-from reactorwatch.cli.read_record import load_process_model, record, required_signals
+from reactorwatch.cli.read_record import record
+from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.parameter_priors import parse_priors
 from reactorwatch.diagnosis.record_checks import make_run
@@ -45,7 +46,7 @@ class DiagnosisOptions:
     Attributes:
         plant: plant in recordings.
         columns: names of columns by signal.
-        model: file of an extended model; None: the nominal reactor.
+        process: the process.
         uncertain: parameters with a standard deviation, as text; None: none.
         tolerance: differences that do not matter, by output.
         limits: lowest and highest values of an experiment, by signal.
@@ -54,7 +55,7 @@ class DiagnosisOptions:
 
     plant: str | None = None
     columns: dict[str, str] = field(default_factory=dict)
-    model: Path | None = None
+    process: ProcessChoice = field(default_factory=ProcessChoice)
     uncertain: str | None = None
     tolerance: dict[str, float] = field(default_factory=dict)
     limits: Limits = field(default_factory=dict)
@@ -92,11 +93,14 @@ def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path
     Raises:
         InputError: the file cannot be read or diagnosed, or an uncertain parameter does not exist.
     """
-    measured = record(check_recording(at or file), asked.plant, asked.columns, required_signals(asked.model))
-    process = load_process_model(asked.model, measured)
-    known = parse_priors(asked.uncertain, process) if asked.uncertain is not None else {}
-    make_run(measured, process)
-    return Case(file, measured, process, folder, known)
+    described = asked.process.load()
+    measured = record(check_recording(at or file), asked.plant, asked.columns, described)
+    model = asked.process.load_model(measured.zero_ns)
+    known = described.uncertain
+    if asked.uncertain is not None:
+        known = known | parse_priors(asked.uncertain, model)
+    make_run(measured, model)
+    return Case(file, measured, model, folder, known)
 
 
 def run_diagnosis(

@@ -28,9 +28,7 @@ from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import Cause, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process import effects_of
-from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.records.output import check_output_folder
-from reactorwatch.runtime.model_file import read_extended_model
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ def make_jobs(
     paths = list(files)
     if elsewhere:
         paths, out = [file.absolute() for file in files], out and out.absolute()
-        asked = replace(asked, model=asked.model and asked.model.absolute())
+        asked = replace(asked, process=asked.process.absolute())
     folders = _folders(files, out)
     return [Job(*item, asked, as_json) for item in zip(files, paths, folders, strict=True)]
 
@@ -82,9 +80,9 @@ def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, fo
 
     Args:
         files: files to be diagnosed.
-        out: as for `make_jobs`.
-        model: file of an extended model, or None.
-        force: as for `check_output_file`.
+        out: see `make_jobs`.
+        model: file that describes the process, or None.
+        force: see `check_output_file`.
 
     Raises:
         InputError: as `check_output_folder`.
@@ -117,7 +115,7 @@ def run_job(job: Job) -> JobResult:
 
 
 def _check(asked: DiagnosisOptions) -> None:
-    model = cstr() if asked.model is None else read_extended_model(asked.model).build()
+    model = asked.process.load_model()
     if asked.uncertain is not None:
         parse_priors(asked.uncertain, model)
     check_limits(model, asked.limits)
@@ -140,15 +138,15 @@ _COLUMNS = ("samples", "span_min", "seconds", "verdict", "causes", "location", "
 
 def _row(file: Path, diagnosis: Diagnosis, seconds: float) -> Row:
     report = as_object(diagnosis, str(file), seconds)
-    report |= {"causes": " + ".join(map(_written, diagnosis.causes)), "delta_bic": report["gain"]["delta_bic"]}
+    report |= {"causes": " + ".join(map(_fault_text, diagnosis.causes)), "delta_bic": report["gain"]["delta_bic"]}
     return {"file": str(file), **{name: report[name] for name in _COLUMNS}, "error": None}
 
 
-def _failed(file: Path, reason: str) -> Row:
+def _error_row(file: Path, reason: str) -> Row:
     return {"file": str(file), **dict.fromkeys(_COLUMNS), "error": reason}
 
 
-def _written(cause: Cause) -> str:
+def _fault_text(cause: Cause) -> str:
     """Format a cause as a fault: `coolant_flow:step:-0.0497@312min`."""
     size, onset = cause.parameters["size"], cause.parameters.get("onset")
     begin = "" if onset is None else f"@{onset.value:.4g}min"
@@ -189,4 +187,4 @@ def _summary(rows: Sequence[Row]) -> str:
     return f"{as_table(lines)}\n\n{len(rows)} files: {counts}"
 
 
-DIAGNOSIS = JobKind("diagnosing", run_job, _failed, _summary)
+DIAGNOSIS = JobKind("diagnosing", run_job, _error_row, _summary)

@@ -88,7 +88,9 @@ def _check_certificate(config: BusConfig, plant: str, now: datetime) -> Iterator
             yield Finding("certificate", "none, and the bus is on this machine's loopback only")
         else:
             cure = "make certificates with `reactorwatch certify`"
-            yield Finding("certificate", f"none: whoever reaches {config.endpoint} may publish and command", cure)
+            yield Finding(
+                "certificate", f"none: every program that reaches {config.endpoint} may publish and command", cure
+            )
         return
     own, ca = read_certificate(Path(config.certificate)), read_certificate(Path(config.ca))
     name = read_common_name(own)
@@ -96,15 +98,17 @@ def _check_certificate(config: BusConfig, plant: str, now: datetime) -> Iterator
     for what, certificate in (("certificate", own), ("authority", ca)):
         remaining = certificate.not_valid_after_utc - now
         until = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC, {remaining.days} days"
-        who = read_common_name(certificate)
+        holder_name = read_common_name(certificate)
         if now < certificate.not_valid_before_utc:
             begin = f"{certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC"
-            yield Finding(what, f"{who}: not valid before {begin}", "set this machine's clock, or make it again")
+            yield Finding(
+                what, f"{holder_name}: not valid before {begin}", "set this machine's clock, or make it again"
+            )
         elif remaining.days < RENEW_DAYS:
             passed = remaining.total_seconds() <= 0
-            yield Finding(what, f"{who}: expired" if passed else f"{who}: {until}", renew)
+            yield Finding(what, f"{holder_name}: expired" if passed else f"{holder_name}: {until}", renew)
         else:
-            yield Finding(what, f"{who}: {until}")
+            yield Finding(what, f"{holder_name}: {until}")
     key_file = Path(config.key)
     try:
         own.verify_directly_issued_by(ca)
@@ -119,7 +123,7 @@ def _check_certificate(config: BusConfig, plant: str, now: datetime) -> Iterator
     holder = parse_common_name(name)
     if holder is None or holder[0] != plant:
         cure = f"use a certificate of {plant}, or name its plant by --plant"
-        yield Finding("identity", f"{name or 'nobody'}: has no role of plant {plant}", cure)
+        yield Finding("identity", f"{name or 'a certificate without a name'}: has no role of plant {plant}", cure)
 
 
 def _check_disk(folder: Path, room_mb: float) -> Finding:
@@ -136,7 +140,7 @@ def _check_publishing(bus: ZenohBus, config: BusConfig, plant: str, timeout_s: f
     role = _role(config)
     kinds = (keys.SAMPLE,) if role is None else kinds_of(role)
     if not kinds:
-        yield Finding("heard", "this certificate is for reading and asking; it publishes nothing")
+        yield Finding("heard", "this certificate is for reading and queries; it publishes nothing")
         return
     speaker = connect_now(config)
     try:
@@ -145,9 +149,9 @@ def _check_publishing(bus: ZenohBus, config: BusConfig, plant: str, timeout_s: f
         speaker.close()
     if refused:
         cure = "its rules know no such holder: call `certify` for the plant, and start the router with its router.json5"
-        yield Finding("heard", f"what we publish does not come through: {', '.join(refused)}", cure)
+        yield Finding("heard", f"messages published from here do not arrive: {', '.join(refused)}", cure)
     else:
-        yield Finding("heard", f"what we publish comes through: {', '.join(kinds)}")
+        yield Finding("heard", f"messages published from here arrive: {', '.join(kinds)}")
 
 
 def _is_received(speaker: ZenohBus, listener: ZenohBus, plant: str, kind: str, timeout_s: float) -> bool:
@@ -236,7 +240,7 @@ def _check_nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Findin
                 yield Finding(node, "is alive")  # a replay and the diagnosis node publish no health
             else:
                 cure = "call doctor with its settings; or listen for longer than its health_period_s by --timeout"
-                yield Finding(node, f"is alive, and says nothing of itself within {timeout_s:g} s", cure)
+                yield Finding(node, f"is alive, and publishes no health within {timeout_s:g} s", cure)
         else:
             yield _check_node(node, *reports[node])
     if (monitors := listener.monitors.count(plant)) > 1:
@@ -245,7 +249,7 @@ def _check_nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Findin
 
 
 def _check_node(node: str, health: Health, offset_s: float) -> Finding:
-    found = f"{health.phase}, version {health.version}, its clock {offset_s:+.3f} s from ours"
+    found = f"{health.phase}, version {health.version}, its clock {offset_s:+.3f} s from this one"
     cures = []
     if health.version != __version__:
         cures.append(f"install the same version as here, {__version__}")

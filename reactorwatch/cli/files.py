@@ -96,7 +96,7 @@ def import_csv(
     out = check_output(out, ".mcap", (file,), force=force)
     with task(f"importing {file.name}"):
         record = convert(check_input(file), out, plant or "cstr", parse_columns(column))
-    print_text(_written(out, record))
+    print_text(_report_text(out, record))
 
 
 def export_csv(
@@ -112,8 +112,8 @@ def export_csv(
     out = check_output(out, ".csv", (file,), force=force)
     with task(f"exporting {file.name}"):
         record = convert(check_recording(file), out, plant)
-    print_text(_written(out, record))
+    print_text(_report_text(out, record))
 
 
-def _written(out: Path, record: "Record") -> str:
+def _report_text(out: Path, record: "Record") -> str:
     return "\n".join([f"wrote {out}: {record.rows} rows", *(f"note: {remark}" for remark in record.remarks)])

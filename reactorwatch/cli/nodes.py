@@ -252,7 +252,7 @@ def alive(
     name: Plant = None,
     timeout: Annotated[float, typer.Option(help="Seconds to wait for it.", min=0.1, max=MAX_WAIT_S)] = 5.0,
 ) -> None:
-    """Is a node there? A health check: ends with 0 or 1."""
+    """Check that a node is alive: ends with 0 or 1."""
     from reactorwatch.cli.liveliness import wait_for_node
 
     _, bus = _settings(config, endpoint, quiet=True)

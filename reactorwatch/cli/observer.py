@@ -36,10 +36,10 @@ def load_recorder_settings(
     """Configure the log; returns the settings of the bus, and of the recorder, which name the plant.
 
     Args:
-        config: as for `load_settings`.
-        endpoint: as for `load_settings`.
+        config: see `load_settings`.
+        endpoint: see `load_settings`.
         plant: name of the plant; None: that of the settings.
-        level: as for `load_settings`.
+        level: see `load_settings`.
 
     Raises:
         InputError: invalid settings.

@@ -30,6 +30,18 @@ Model = Annotated[
     typer.Option("--model", help="An extended model, as diagnose -o writes it [the nominal].", show_default=False),
 ]
 
+Process = Annotated[
+    str | None,
+    typer.Option(
+        "--process",
+        "--model",
+        help="A process: a name in the catalogue, or a .toml, .py or extended.json file [cstr].",
+        show_default=False,
+    ),
+]
+TimeColumn = Annotated[
+    str | None, typer.Option("--time", help="The column of times, by name or number [guessed].", show_default=False)
+]
 Force = Annotated[
     bool, typer.Option("--force", help="Replace a file that is there and is of another kind than its name says.")
 ]
@@ -190,8 +202,8 @@ def check_output(path: Path, suffix: str, sources: Iterable[Path | None], *, for
     Args:
         path: the file.
         suffix: the required suffix.
-        sources: as for `check_output_file`.
-        force: as for `check_output_file`.
+        sources: see `check_output_file`.
+        force: see `check_output_file`.
 
     Raises:
         InputError: as `check_output_file`; or its name has another suffix.

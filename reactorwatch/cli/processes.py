@@ -58,7 +58,7 @@ class Processes:
         self._running[node] = process
         return process
 
-    def ended(self) -> dict[str, int]:
+    def exit_codes(self) -> dict[str, int]:
         """Exit codes of the nodes that ended by themselves."""
         codes = {node: process.poll() for node, process in self._running.items()}
         return {node: code for node, code in codes.items() if code is not None}

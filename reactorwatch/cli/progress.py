@@ -12,7 +12,7 @@ from reactorwatch.terminal import printable
 Advance = Callable[[float, str], None]
 
 
-def _unmarked(text: str) -> str:
+def _escape_markup(text: str) -> str:
     """Escape a text, which may hold names of files, for the terminal and for Rich."""
     from rich.markup import escape
 
@@ -31,7 +31,7 @@ def task(text: str) -> Iterator[None]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
-        progress.add_task(_unmarked(text), total=None)
+        progress.add_task(_escape_markup(text), total=None)
         yield
 
 
@@ -47,9 +47,9 @@ def bar(text: str, total: float) -> Iterator[Advance]:
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     console = Console(stderr=True)
     with Progress(*columns, console=console, transient=True, redirect_stdout=sys.stdout.isatty()) as progress:
-        number = progress.add_task(_unmarked(text), total=total)
+        number = progress.add_task(_escape_markup(text), total=total)
 
         def advance(completed: float, now: str) -> None:
-            progress.update(number, completed=completed, description=_unmarked(now))
+            progress.update(number, completed=completed, description=_escape_markup(now))
 
         yield advance

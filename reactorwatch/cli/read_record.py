@@ -1,4 +1,4 @@
-"""Read `.csv` and `.mcap` files as a record or as messages, and `--model` as a process model on the record's clock.
+"""Read tables and `.mcap` files as a record or as messages.
 
 A folder is one recording of all the files in it; in a list of files it stands for each of them (`expand_folder`).
 """
@@ -7,45 +7,50 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import check_plant
 from reactorwatch.errors import InputError
-from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.input_file import list_files
-from reactorwatch.records.record import UNITS, Record, format_utc
+from reactorwatch.records.record import Record, format_utc
+
+if TYPE_CHECKING:
+    from reactorwatch.description.process import Process
 
 DEFAULT_PLANT = "cstr"
+
+TABLES = ("csv", "tsv", "txt", "dat", "gz", "xlsx", "parquet")
+"""Suffixes of tables, beside recordings."""
 
 
 def record(
     path: Path,
     plant: str | None = None,
     columns: dict[str, str] | None = None,
-    required: tuple[str, ...] = tuple(UNITS),
-    units: Mapping[str, str] | None = None,
+    process: "Process | None" = None,
 ) -> Record:
     """Read a file as a record.
 
     Args:
-        path: a .csv, an .mcap or a folder.
+        path: a table of any form that is read, an .mcap or a folder of recordings.
         plant: plant in a recording.
-        columns: names of a .csv's columns, by signal.
-        required: signals that a .csv must have.
-        units: units of the process's signals, if they are those of the columns; None: see `read_csv`.
+        columns: names of a table's columns, by signal.
+        process: process whose signals are read; None: the reactor.
 
     Raises:
-        InputError: the file is neither a .csv nor an .mcap, or is malformed.
+        InputError: the file is of no kind that can be read, or is malformed.
     """
-    if file_kind(path) == "csv":
-        from reactorwatch.records.csv_file import read_csv
+    from reactorwatch.description.find import find_process
 
-        measured = read_csv(path, columns, required)
-        return measured if units is None else replace(measured, units=units)
-    from recorder.tools.mcap_file import read_record
+    described = process or find_process()
+    if file_kind(path) == "mcap":
+        from recorder.tools.mcap_file import read_record
 
-    return read_record(path, plant)
+        return read_record(path, plant, (*described.inputs, *described.outputs))
+    from reactorwatch.description.read import read_process_table
+
+    return read_process_table(path, described, columns)
 
 
 class MessageSource(NamedTuple):
@@ -76,15 +81,25 @@ def open_messages(
     columns: dict[str, str] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> MessageSource:
-    """Open a file as messages; arguments as for `record`.
+    """Open a file as messages.
+
+    Args:
+        path: as for `record`.
+        plant: as for `record`.
+        columns: as for `record`.
+        units: units of the signals; None: those of the columns.
 
     Raises:
         InputError: as `record`.
     """
     if file_kind(path) == "csv":
+        from reactorwatch.description.find import find_process
         from recorder.tools.player import samples_of
 
-        measured = record(path, plant, columns, units=units)
+        # any rig may be watched without equations under the reactor's names, in units of its own
+        measured = record(path, plant, columns, find_process().without_equations())
+        if units is not None:
+            measured = replace(measured, units=units)
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
         return MessageSource((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
     from recorder.tools.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from
@@ -128,36 +143,6 @@ def expand_folder(folder: Path) -> list[Path]:
     return sorted([*records, *recordings])
 
 
-def required_signals(path: Path | None) -> tuple[str, ...]:
-    """Inputs and outputs of the model in a file, which a record must have.
-
-    Raises:
-        InputError: as `process_model`.
-    """
-    from reactorwatch.process.library.cstr.model import cstr
-    from reactorwatch.runtime.model_file import read_extended_model
-
-    model = cstr() if path is None else read_extended_model(path).build()
-    return (*model.input_names, *model.output_names)
-
-
-def load_process_model(path: Path | None, measured: Record) -> ProcessModel:
-    """Load the model in a file, on the clock of the record; without a file, the nominal reactor.
-
-    If the zero of either clock is unknown, both are taken to be the same.
-
-    Raises:
-        InputError: the file cannot be read, or holds no model.
-    """
-    from reactorwatch.process.library.cstr.model import cstr
-    from reactorwatch.runtime.model_file import read_extended_model
-
-    if path is None:
-        return cstr()
-    model = read_extended_model(path)
-    return (model.rebase(measured.zero_ns) if measured.zero_ns else model).build()
-
-
 def resolve_plant(path: Path, plant: str | None) -> str:
     """Name of the plant in a file: the given one, or the only one.
 
@@ -185,6 +170,8 @@ def file_kind(path: Path) -> str:
     if path.is_dir():
         return "mcap"
     ending = path.suffix.lower().removeprefix(".")
-    if ending not in ("csv", "mcap"):
+    if ending == "mcap":
+        return ending
+    if ending not in TABLES:
         raise InputError(f"{path}: must be a .csv or .mcap file, got {path.suffix or 'no ending'}")
-    return ending
+    return "csv"

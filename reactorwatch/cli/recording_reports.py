@@ -36,7 +36,7 @@ def saved_text(saved: RecoveryResult, file: Path, out: Path) -> str:
             f"{file}: saved {saved.messages} messages of {len(saved.topics)} topics, received over {span_s:.1f} s "
             f"({moment(saved.first_ns)} to {moment(saved.last_ns)})",
             *(f"  {count:9d}  {topic}" for topic, count in sorted(saved.topics.items())),
-            f"not saved: {saved.lost}" if saved.lost else "nothing was damaged",
+            f"not saved: {saved.losses}" if saved.losses else "nothing was damaged",
             f"wrote {out}",
         ]
     )

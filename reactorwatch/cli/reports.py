@@ -45,7 +45,7 @@ def backtest_object(result: Backtest, zero_ns: int, zero: str | None = None) -> 
                 "signals": [item.signal for item in alarm.contributions],
                 "suspect": [{"cause": item.cause, "probability": item.probability} for item in alarm.suspects],
             }
-            for alarm, cleared_ns in result.raised
+            for alarm, cleared_ns in result.raised_alarms
         ],
     }
 
@@ -68,24 +68,26 @@ def backtest_text(result: Backtest, zero_ns: int, file: Path) -> str:
             f"trained until {report['trained_until_min']:g} min; "
             f"{report['expected_false_alarms']:.2g} false alarms are to be expected in the rest by chance"
         )
-        lines.append(_judged_by(result))
-    for alarm, cleared_ns in result.raised:
+        lines.append(_reference_line(result))
+    for alarm, cleared_ns in result.raised_alarms:
         end = (
             "still standing at the end" if cleared_ns is None else f"cleared at {to_minutes(cleared_ns, zero_ns):g} min"
         )
         raised = f"{to_minutes(alarm.raised_ns, zero_ns):9g} min"
         lines.append(f"  {raised}  {alarm.alarm} ({priority_word(alarm)}), {end}: {alarm.text}")
-    suspects = dict.fromkeys(filter(None, (suspects_text(alarm.suspects, zero_ns) for alarm, _ in result.raised)))
+    suspects = dict.fromkeys(
+        filter(None, (suspects_text(alarm.suspects, zero_ns) for alarm, _ in result.raised_alarms))
+    )
     lines += [f"  suspect: {text}" for text in suspects]
     lines += [f"  note: {note}" for note in result.notes]
-    if not result.raised and report["trained_until_min"] is not None:
+    if not result.raised_alarms and report["trained_until_min"] is not None:
         lines.append("no alarms")
     if result.refused:
         lines.append("refused: " + ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items())))
     return printable_lines(lines)
 
 
-def _judged_by(result: Backtest) -> str:
+def _reference_line(result: Backtest) -> str:
     """Line with the reference and its noise levels."""
     if result.noise_levels is None:
         return "judged by identified models (ARX)"

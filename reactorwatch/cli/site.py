@@ -101,7 +101,7 @@ def router(
     from reactorwatch.runtime.logs import configure
 
     if file is not None and (config is not None or endpoint is not None):
-        raise InputError(f"{file}: says where this router listens; leave out --config and --endpoint")
+        raise InputError(f"{file}: has the address of this router; leave out --config and --endpoint")
     tables = read_settings(config)
     settings = section(BusConfig, "bus", tables, {"endpoint": endpoint})
     configure(as_json=section(LogConfig, "log", tables, {}).format == "json")

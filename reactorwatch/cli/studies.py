@@ -1,4 +1,4 @@
-"""What a record says: `simulate`, `backtest` and `diagnose`."""
+"""Commands on records: `simulate`, `backtest` and `diagnose`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,9 +12,11 @@ from reactorwatch.cli.options import (
     Json,
     Model,
     Plant,
+    Process,
     Processes,
     Scheduler,
     Settings,
+    TimeColumn,
     check_input,
     check_output,
     check_recording,
@@ -40,7 +42,8 @@ def simulate(
     fault: Annotated[
         list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset, onset in the file's time.")
     ] = None,
-    model: Model = None,
+    process: Process = None,
+    time: TimeColumn = None,
     column: Columns = None,
     force: Force = False,
     as_json: Json = False,
@@ -50,21 +53,23 @@ def simulate(
     They start from its first row and run freely, driven by its inputs.
     """
     from reactorwatch.cli.progress import task
-    from reactorwatch.cli.read_record import load_process_model, record, required_signals
+    from reactorwatch.cli.read_record import record
     from reactorwatch.cli.simulation import report, simulate_along
+    from reactorwatch.description.choice import ProcessChoice
     from reactorwatch.records.csv_file import write_csv
 
-    out = check_output(out, ".csv", (file, model), force=force)
-    measured = record(check_recording(file), plant, parse_columns(column), required_signals(model))
-    process = load_process_model(model, measured)
+    choice = ProcessChoice(process, time)
+    out = check_output(out, ".csv", (file, choice.file), force=force)
+    measured = record(check_recording(file), plant, parse_columns(column), choice.load())
+    model = choice.load_model(measured.zero_ns)
     with task(f"simulating {file.name}"):
-        simulated = simulate_along(measured, process, fault or [])
+        simulated = simulate_along(measured, model, fault or [])
         try:
             write_csv(out, simulated)
         except InputError:
-            print_lines(report(measured, simulated, process, None, as_json=as_json))
+            print_lines(report(measured, simulated, model, None, as_json=as_json))
             raise
-    print_lines(report(measured, simulated, process, out, as_json=as_json))
+    print_lines(report(measured, simulated, model, out, as_json=as_json))
 
 
 def backtest(
@@ -133,7 +138,8 @@ def diagnose(
             show_default=False,
         ),
     ] = None,
-    model: Model = None,
+    process: Process = None,
+    time: TimeColumn = None,
     plant: Plant = None,
     column: Columns = None,
     jobs: Processes = None,
@@ -145,11 +151,13 @@ def diagnose(
     from reactorwatch.cli.batch import expand_files, run_jobs
     from reactorwatch.cli.diagnosis import DiagnosisOptions
     from reactorwatch.cli.diagnosis_jobs import DIAGNOSIS, check_out, make_jobs
+    from reactorwatch.description.choice import ProcessChoice
 
     named = expand_files(files)
-    check_out(named, out, model, force=force)
+    choice = ProcessChoice(process, time)
+    check_out(named, out, choice.file, force=force)
     asked = DiagnosisOptions(
-        plant, parse_columns(column), model, uncertain, parse_tolerances(tolerance), parse_limits(limit)
+        plant, parse_columns(column), choice, uncertain, parse_tolerances(tolerance), parse_limits(limit)
     )
     todo = make_jobs(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
     run_jobs(DIAGNOSIS, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)

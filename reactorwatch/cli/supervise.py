@@ -99,7 +99,7 @@ def run_until_stopped(
                 processes.start(node)
             log.info("running", plant=plant.name, router=join[VIEWER].endpoint, out=recorder.out, stop="Ctrl-C")
             while not woken.wait(POLL_S):
-                ended = processes.ended()
+                ended = processes.exit_codes()
                 if ended:
                     for node, code in ended.items():
                         log.info("ended by itself", node=node, code=code)

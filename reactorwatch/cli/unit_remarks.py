@@ -25,7 +25,9 @@ def unit_remark(model: ProcessModel, columns: Mapping[str, Array], time_min: Arr
         time_min: times, shape (rows,).
     """
     wrong = find_wrong_unit(model, columns, time_min)
-    return "" if wrong is None else f"{wrong.text}. The plant's equations cannot judge it so; a learned model can"
+    return (
+        "" if wrong is None else f"{wrong.text}. The plant's equations cannot be its reference; an identified model can"
+    )
 
 
 class FirstSamples:
@@ -39,7 +41,7 @@ class FirstSamples:
         self._prefix = keys.key(plant, keys.SAMPLE, "")
         self._series: dict[str, list[tuple[int, float]]] = {}
 
-    def pass_on(self, messages: Iterable[Encoded]) -> Iterator[Encoded]:
+    def collect_samples(self, messages: Iterable[Encoded]) -> Iterator[Encoded]:
         """Yield the messages unchanged, and collect the first samples."""
         for message in messages:
             if message.key.startswith(self._prefix):

@@ -16,7 +16,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import format_utc, to_minutes
-from reactorwatch.runtime.config import parse_toml, read_settings, section
+from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.terminal import printable_lines
 from recorder.tools.inspect import gaps_in, zero_ns_of
 from recorder.tools.mcap_file import has_clock, one_plant_in, read_messages, read_metadata
@@ -82,7 +82,7 @@ def _settings(file: Path, metadata: dict[str, str], config: Path | None, plant: 
         tables = read_settings(config)
     elif SETTINGS in metadata:
         try:
-            tables = parse_toml(metadata[SETTINGS].encode())
+            tables = parse_tables(metadata[SETTINGS].encode())
         except InputError as error:
             raise InputError(f"{file}: its metadata's settings: {error}") from error
     else:
@@ -133,10 +133,10 @@ def _text(report: dict[str, Any]) -> str:
         lines.append(f"{report['differing']} DIFFER:")
     for item in report["differences"][:MAX_LINES]:
         values = f": recorded {_short(item['recorded'])}, again {_short(item['again'])}"
-        told = item["what"] + (values if item["recorded"] and item["again"] else "")
-        lines.append(f"  {item['at_min']:9.4g} min  {item['topic']}: {told}")
+        text = item["what"] + (values if item["recorded"] and item["again"] else "")
+        lines.append(f"  {item['at_min']:9.4g} min  {item['topic']}: {text}")
     if report["differing"] > MAX_LINES:
-        lines.append(f"  and {report['differing'] - MAX_LINES} more (--json tells the first hundred)")
+        lines.append(f"  and {report['differing'] - MAX_LINES} more (--json lists the first hundred)")
     if report["after_the_end"]:
         lines.append(f"{report['after_the_end']} more would have come after the end of the recording")
     lines += [f"note: {note}" for note in report["notes"]]

@@ -23,7 +23,7 @@ class CodeCache:
     """A folder of machine code.
 
     Args:
-        folder: where the entries are; made with the first one.
+        folder: folder of the entries; made with the first one.
         capacity: largest number of entries.
         evicted: number of the oldest entries that are evicted when there are more.
     """
@@ -69,5 +69,5 @@ class CodeCache:
 
 
 def user_cache() -> CodeCache:
-    """The cache of the user who runs this process."""
+    """The cache of the current user."""
     return CodeCache(platformdirs.user_cache_path("reactorwatch") / "machine_code")

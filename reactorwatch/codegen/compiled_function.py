@@ -36,7 +36,7 @@ class CompiledFunction:
     """A function of a row, for any number of rows; compiled at its first use.
 
     Args:
-        function: of SX symbols, with dense arguments; its results are made dense.
+        function: function of SX symbols, with dense arguments; its results are made dense.
         shared: indices of the arguments that are the same for all rows.
         chained: number of leading arguments that are the leading results of the row before.
         stops: whether a chained function stops after a row whose very last number is not above zero.
@@ -94,7 +94,7 @@ class CompiledFunction:
             The number of rows before any chain stopped; later results are undefined.
 
         Raises:
-            ValueError: as for `fill`.
+            ValueError: see `fill`.
         """
         for given, into in zip(arguments, results, strict=True):
             self._check(rows, given, into)

@@ -95,7 +95,7 @@ def write_ir(function: ca.Function, loop: RowLoop) -> str:
     """Write a module with the function `rows`: (count, argument arrays, result arrays) -> rows before it stopped.
 
     Args:
-        function: of SX symbols, with dense results, that passed `check`.
+        function: function of SX symbols, with dense results, that passed `check`.
         loop: the loop around it. A chained one with several lanes has an array a lane for each argument and result.
     """
     return _Writer(function, loop).write()

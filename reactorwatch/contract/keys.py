@@ -32,7 +32,8 @@ ACKNOWLEDGE_RECORDER = "acknowledge_recorder"
 """The recorder's commands, different from the monitor's, so that a missing reply identifies the node."""
 
 FLEET = "@fleet"
-"""In place of a plant: messages between monitors that share a fleet. It is no plant's name, and no `*` matches it."""
+"""Key part in place of a plant, for messages between monitors that share a fleet. It is no plant's name, and no `*`
+matches it."""
 
 _PLANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 

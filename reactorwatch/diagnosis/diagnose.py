@@ -42,10 +42,10 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MAX_SPANS, Record
 
 LEAST_GAIN = 10.0
-"""In BIC: less does not refute the nominal model (Kass & Raftery 1995, J. American Statistical Association 90)."""
+"""Threshold in BIC to refute the nominal model (Kass & Raftery 1995, J. American Statistical Association 90)."""
 
 SURE = 6.0
-"""In BIC, odds of twenty to one: the record does not rank alternatives that are worse by less."""
+"""Threshold in BIC, odds of twenty to one: alternatives that are worse by less are not ranked."""
 
 MUCH_RESIDUAL, MUCH_RESIDUAL_OF_TWO = 30.0, 10.0
 """Minus the decimal logarithm of the p-value of whiteness: no right cause leaves so much, nor do two causes, which can
@@ -77,11 +77,12 @@ def diagnose(
         record: record with the model's inputs and outputs as columns.
         model: process model of the simulation.
         effects: effects that may be named; None: the model's own catalogue.
-        tolerance: by output, the root mean square difference in its unit that does not matter in practice; by default a
+        tolerance: root mean square difference that does not matter in practice, by output, in its unit; by default a
             fiftieth of the output's range.
-        uncertain: by parameter of the model, the standard deviation of its value, in its unit; the others are exact.
+        uncertain: standard deviations of uncertain parameters of the model, by name, in their units; the others are
+            exact.
             See `reactorwatch.diagnosis.parameter_priors`.
-        limits: by input and output, the lowest and the highest value allowed in an experiment; by default somewhat
+        limits: lowest and highest value allowed in an experiment, by input and output; by default somewhat
             wider than the record.
 
     Raises:
@@ -278,7 +279,7 @@ def _describe_outliers(whole: Run, run: Run) -> list[str]:
     if count == 0:
         return []
     values = "1 value was" if count == 1 else f"{count} values were"
-    return [f"{values} left out for outliers: far off for a moment, they say nothing of the plant"]
+    return [f"{values} excluded as outliers"]
 
 
 def _smallest_sd(model: ProcessModel) -> list[float]:

@@ -32,7 +32,7 @@ WAKE_ROWS = 30
 """Rows that are not evaluated after a gap in the inputs, because the plant was driven by others."""
 
 FEWEST_ROWS = 100
-"""If fewer rows remain, those after gaps are evaluated, too."""
+"""Smallest number of rows of a holdout; below it, those after gaps are evaluated, too."""
 
 
 class Errors(NamedTuple):

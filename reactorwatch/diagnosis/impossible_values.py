@@ -13,7 +13,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 
 MARGIN = 1.0
-"""In scales of a state: its sensor may exceed the bounds by this."""
+"""Threshold in scales of a state: its sensor may exceed the bounds by this."""
 
 
 class Bounds(NamedTuple):

@@ -80,7 +80,7 @@ def offsets(model: ProcessModel, x: Array) -> dict[str, float]:
 
     Args:
         model: process model with or without offsets.
-        x: its states, shape (n_x,) or more.
+        x: states of the model, shape (n_x,) or more.
     """
     return {model.states[index].name.removesuffix(_OFF): float(x[index]) for index in model.constant_states}
 

@@ -28,10 +28,10 @@ OFFSETS = (0.5, 1.0, 2.0)
 
 WIDENINGS, ROUNDS = 7, 3
 OUT_OF_QUESTION = 7.0
-"""In log likelihood: values that are worse by more add nothing, and end the scan on their side."""
+"""Threshold in log likelihood: values that are worse by more add nothing, and end the scan on their side."""
 
 LEAST_GAIN, AS_LIKELY = 0.1, 0.5
-"""In log likelihood: minimum gain of a new maximum; and maximum loss of the mean against the maximum."""
+"""Threshold in log likelihood: minimum gain of a new maximum; and maximum loss of the mean against the maximum."""
 
 FAR_BETWEEN, UNSURE, MOST_MORE, FINER = 1.01, 0.08, 12, 20
 """Maximum distance of likely values, in first reaches; maximum share of the likelihood that is uncertain between two

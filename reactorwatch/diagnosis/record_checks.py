@@ -73,7 +73,7 @@ def make_run(record: Record, model: ProcessModel) -> Run:
     if all(np.ptp(values) <= LEAST_MOVE * item.scale for values, item in zip(inputs, model.inputs, strict=True)):
         raise InputError(
             f"{name}: {', '.join(model.input_names)} must move, it is {inputs[0][0]:g} all the time; "
-            "nothing can be told apart without excitation: record an interval with steps in it"
+            "causes cannot be distinguished without excitation: record an interval with steps in it"
         )
     if wrong is not None:
         raise InputError(f"{name}: {wrong.text}")

@@ -15,7 +15,7 @@ SD_95 = 1.959964
 """Half width of the 95 % interval of a normal distribution, in standard deviations."""
 
 LISTED = 10.0
-"""In BIC: alternatives that are worse by less are listed."""
+"""Threshold in BIC: alternatives that are worse by less are listed."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class AdjustedParameter:
     """An uncertain parameter with its estimate.
 
     Attributes:
-        nominal: its value in the simulation.
+        nominal: value of the parameter in the nominal model.
         stated_sd: standard deviation of its prior.
         estimate: posterior of prior and record.
     """
@@ -75,8 +75,8 @@ class Alternative:
     """An alternative explanation.
 
     Attributes:
-        explanation: its causes.
-        delta_bic: its BIC minus that of the named explanation.
+        explanation: causes of the alternative.
+        delta_bic: BIC of the alternative minus that of the named explanation.
     """
 
     explanation: tuple[Cause, ...]
@@ -127,7 +127,7 @@ class Separation:
     """Separation of two explanations by an experiment.
 
     Attributes:
-        between: their names, each its causes joined by a plus.
+        between: names of the explanations, the causes of each joined by a plus.
         expected_delta_bic: expected BIC of the wrong one minus that of the true one.
         probability: probability that this difference exceeds `LISTED`.
     """

@@ -1,7 +1,7 @@
 """Sensor noise, estimated from the highest frequencies of a simulation's residual.
 
 A filter takes for sensor noise whatever its model cannot follow, and with it model error that acts at the sensor. To
-judge the model error, the noise has to be estimated independently: at high frequencies plant and model error have
+assess the model error, the noise has to be estimated independently: at high frequencies plant and model error have
 almost no power, and the spectrum of noise has a known shape, white or white plus a first-order autoregression. Its two
 levels are fitted by Whittle's likelihood (Whittle 1953, Arkiv for Matematik 2).
 """

@@ -2,7 +2,7 @@
 
 With its inputs at their median, a plant is within a few scales of one of the model's steady states, whatever its
 faults. If the record is further off, and would be near one with one of its signals multiplied by a unit conversion, the
-unit is wrong; likewise if a median is out of the signal's bounds. If the rows are so far apart that the process has
+unit is wrong, and also if a median is out of the signal's bounds. If the rows are so far apart that the process has
 forgotten each before the next, or the record ends before the process has moved, its times have another unit, or it
 carries no information.
 """
@@ -22,7 +22,8 @@ FACTORS = (60.0, 1000.0, 3600.0, 1000.0 / 60.0, 3.6, 1e6, 100.0)
 """Unit conversions of time, amounts, flows (m3/h and l/min) and fractions, in either direction."""
 
 FAR, NEAR = 3.0, 0.7
-"""In scales of a state: no effect of the catalogue moves a plant so far; and a plant so near is at the steady state."""
+"""Distances in scales of a state: no effect of the catalogue moves a plant beyond the first; a plant within the second
+is at the steady state."""
 
 FORGOTTEN, MOVED = 5.0, 6.0
 """Maximum row distance in slowest time constants, and minimum record length in fastest ones."""
@@ -59,7 +60,7 @@ def find_wrong_unit(model: ProcessModel, columns: Mapping[str, Array], time_min:
     if points:
         nearest = min(points, key=lambda point: _distance(point, y, scales))
         if _distance(nearest, y, scales) < FAR:
-            return _out_of_bounds(own, typical) or _wrong_times(time_min, nearest)
+            return _out_of_bounds(own, typical) or _find_wrong_time_unit(time_min, nearest)
     for index, item in enumerate(own.inputs):
         for factor in (*FACTORS, *(1.0 / factor for factor in FACTORS)):
             changed = u.copy()
@@ -113,7 +114,7 @@ def _out_of_bounds(model: ProcessModel, typical: Mapping[str, float]) -> WrongUn
     return None
 
 
-def _wrong_times(time_min: Array, point: SteadyState) -> WrongUnit | None:
+def _find_wrong_time_unit(time_min: Array, point: SteadyState) -> WrongUnit | None:
     rates = np.abs(point.eigenvalues)
     period, slowest, fastest = float(np.median(np.diff(time_min))), 1.0 / rates.min(), 1.0 / rates.max()
     span = float(time_min[-1] - time_min[0])

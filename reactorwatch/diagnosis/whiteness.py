@@ -23,7 +23,7 @@ WHITE = 6.0
 """Minus the decimal logarithm of the p-value beyond which innovations are not white; a search tests many hypotheses."""
 
 DOUBTFUL = 3.0
-"""Minus the decimal logarithm of the p-value beyond which another explanation is looked for."""
+"""Minus the decimal logarithm of the p-value beyond which the search looks for another explanation."""
 
 LARGEST = 999.0
 

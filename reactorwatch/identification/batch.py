@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from reactorwatch.errors import InputError
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.regressor import Rows, rows_of
+from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import ALL_ROWS, RowChoice, Scaling, Structure, as_columns
 
 SINGULAR_CONDITION = 1e13
@@ -87,7 +88,7 @@ def fit_arx(
     Rows with a missing value, or just after a gap in time, are excluded.
 
     Args:
-        structure: its terms.
+        structure: terms of the model.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, outputs), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.
@@ -105,34 +106,38 @@ def fit_arx(
 
 
 def linear_model(
-    structure: Structure,
-    scaling: Scaling,
-    solution: LeastSquares,
-    rows: int,
-    simulates: bool = False,
-    first_output: int = 0,
+    structure: Structure, scaling: Scaling, solution: LeastSquares, rows: int, simulates: bool = False
 ) -> LinearModel:
     """Make a model in the signals' own units from a solution for scaled signals.
 
     Args:
-        structure: its terms.
+        structure: terms of the model.
         scaling: scaling of the signals.
-        solution: solution for one or several of the outputs.
+        solution: solution for all outputs.
         rows: number of rows of the fit.
         simulates: whether it was fitted by simulation.
-        first_output: index of the output that the solution's first one is.
     """
     solved, size = solution.parameters.shape
     parameters = np.empty((solved, size))
     covariance = np.full((solved, size, size), np.inf)
     for i in range(solved):
-        matrix, shift = scaling.unscaling(structure, first_output + i)
+        matrix, shift = scaling.unscaling(structure, i)
         parameters[i] = matrix @ solution.parameters[i] + shift
         if np.isfinite(solution.noise_variance[i]) and np.all(np.isfinite(solution.inverse)):
             covariance[i] = solution.noise_variance[i] * matrix @ solution.inverse @ matrix.T
-    spreads = np.array(scaling.output_spreads[first_output : first_output + solved])
-    noise_sd = np.sqrt(solution.noise_variance) * spreads
+    noise_sd = np.sqrt(solution.noise_variance) * scaling.output_spreads
     return LinearModel(structure, parameters, covariance, noise_sd, solution.condition, rows, simulates)
+
+
+def model_of(structure: Structure, scaling: Scaling, estimator: RecursiveLeastSquares, simulates: bool) -> LinearModel:
+    """Make a model of one output from a recursive estimator of scaled signals."""
+    solution = LeastSquares(
+        estimator.parameters[None, :],
+        estimator.unit_covariance,
+        np.array([estimator.noise_variance]),
+        estimator.condition,
+    )
+    return linear_model(structure, scaling, solution, estimator.rows, simulates)
 
 
 def check_not_constant(outputs: NDArray[np.float64]) -> None:

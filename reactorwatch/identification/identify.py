@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import SINGULAR_CONDITION, check_not_constant, fit_arx
+from reactorwatch.identification.batch import SINGULAR_CONDITION, check_not_constant, fit_arx, model_of
 from reactorwatch.identification.excitation import check_record
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.output_error import fit_oe
-from reactorwatch.identification.recursive_arx import model_of
 from reactorwatch.identification.recursive_output_error import RecursiveOutputError
 from reactorwatch.identification.regressor import consecutive_rows, rows_of
 from reactorwatch.identification.residual_tests import independence, whiteness
@@ -213,7 +212,7 @@ def _fit(
         estimator.update(regressor, value)
     if not estimator.condition < SINGULAR_CONDITION:
         raise InputError(f"the rows don't determine {structure.parameters} parameters")
-    return model_of(structure, scaling, [estimator], simulates=False)
+    return model_of(structure, scaling, estimator, simulates=False)
 
 
 def _testable(residuals: NDArray[np.float64]) -> bool:

@@ -6,7 +6,7 @@ A row enters by square-root-free Givens rotations (Gentleman, J. Inst. Maths App
 form of Miller's algorithm AS 274, Applied Statistics 41 (1992) 458). For each pivot i, with the row x of weight w:
 
     d' = d_i + w x_i^2     gain = w x_i / d'     w <- w d_i / d'     d_i <- d'
-    x_j <- x_j - x_i r_ij    then    r_ij <- r_ij + gain x_j         (j > i, and likewise the output and z_i)
+    x_j <- x_j - x_i r_ij    then    r_ij <- r_ij + gain x_j         (j > i, and in the same way the output and z_i)
 
 The remaining weight at the end is 1 - phi' A^-1 phi, and the parameters solve R theta = z.
 

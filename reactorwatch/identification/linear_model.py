@@ -47,7 +47,7 @@ class LinearModel:
     """A fitted linear model, in the signals' own units.
 
     Attributes:
-        structure: its terms.
+        structure: terms of the model.
         parameters: shape (outputs, parameters), in the order of `structure.parameter_names`.
         covariance: shape (outputs, parameters, parameters); inf where the data do not determine it.
         noise_sd: standard deviation of the residuals of the fit, shape (outputs,).

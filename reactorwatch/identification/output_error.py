@@ -10,7 +10,7 @@ and 8.4). The gradient is exact: differentiating the recursion, g[k] = phi[k] + 
 the regressor made of yhat (Ljung, section 10.3, with the run's start taken into account). Marquardt's method
 (J. SIAM 11 (1963) 431) walks down; a step that would put a pole on or outside the unit circle is shortened.
 
-The sum has local minima (Ljung, section 10.5: none for white inputs, but ours are steps). So there are
+The sum has local minima (Ljung, section 10.5: none for white inputs, but these inputs are steps). So there are
 several starts: the ARX model, the instrumental variable estimate, the Steiglitz-McBride iterate (IEEE Trans. AC 10
 (1965) 461), and the best model of one order less with a pole at zero, so that a higher order never fits worse.
 
@@ -86,7 +86,7 @@ def fit_oe(
     """Fit an output-error model of one output.
 
     Args:
-        structure: its terms; one output.
+        structure: terms of the model; one output.
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,), increasing, in any unit; None: gaps are not detected.

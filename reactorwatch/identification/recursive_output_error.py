@@ -21,17 +21,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError
+from reactorwatch.identification.batch import model_of
 from reactorwatch.identification.linear_model import LinearModel
 from reactorwatch.identification.output_error import is_stable
 from reactorwatch.identification.recursion import RlsState
-from reactorwatch.identification.recursive_arx import model_of, unscale
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsUpdate
 from reactorwatch.identification.structure import Scaling, Structure
 from reactorwatch.stored_state import StoredState
 
 START_FORGETTING = 0.95
 FORGETTING_RISE = 0.99
-DEFAULT_COVARIANCE_LIMIT = 1e4
+COVARIANCE_LIMIT = 1e4
+"""See `RecursiveLeastSquares`; also how far from zero the parameters may be."""
 _HALVINGS = 40
 
 
@@ -64,32 +65,20 @@ class RecursiveOutputError:
         structure: the model's terms; one output.
         scaling: scaling of the signals; without it they are taken as they are, which suits signals of the order of 1.
         forgetting: weight of a row relative to its successor, in (0, 1], once it has risen to it.
-        covariance_limit: see `RecursiveLeastSquares`; also how far from the start the parameters may be.
-        start: a model of the same structure to start from; forgetting does not rise then.
 
     Raises:
         ValueError: several outputs, or a setting out of its range.
     """
 
-    def __init__(
-        self,
-        structure: Structure,
-        scaling: Scaling | None = None,
-        forgetting: float = 1.0,
-        covariance_limit: float = DEFAULT_COVARIANCE_LIMIT,
-        start: LinearModel | None = None,
-    ) -> None:
+    def __init__(self, structure: Structure, scaling: Scaling | None = None, forgetting: float = 1.0) -> None:
         if structure.outputs != 1:
             raise InputError(f"an output-error model has one output, got {structure.outputs}: use one for each")
         self._structure = structure
         self._scaling = Scaling.none(structure.inputs, 1) if scaling is None else scaling
         self._forgetting = forgetting
-        first = min(START_FORGETTING, forgetting) if start is None else forgetting
-        self._estimator = RecursiveLeastSquares(structure.parameters, first, covariance_limit)
-        if start is not None:
-            if start.structure != structure:
-                raise ValueError(f"the model to start from must have the structure {structure}, got {start.structure}")
-            self._estimator.set_parameters(self._scaling.scale_parameters(structure, start.parameters[0]))
+        self._estimator = RecursiveLeastSquares(
+            structure.parameters, min(START_FORGETTING, forgetting), COVARIANCE_LIMIT
+        )
         self.restart()
 
     @classmethod
@@ -165,8 +154,13 @@ class RecursiveOutputError:
             risen = FORGETTING_RISE * self._estimator.forgetting + (1.0 - FORGETTING_RISE)
             self._estimator.raise_forgetting(min(risen, self._forgetting))
         self._push(float(regressor @ new), new_inputs, gradient)
-        innovation = RlsUpdate(prediction, measured - prediction, result.residual_sd, result.leverage)
-        return unscale(innovation, self._scaling.output_centres[0], self._scaling.output_spreads[0])
+        centre, spread = self._scaling.output_centres[0], self._scaling.output_spreads[0]
+        return RlsUpdate(
+            prediction * spread + centre,
+            (measured - prediction) * spread,
+            result.residual_sd * spread,
+            result.leverage,
+        )
 
     @property
     def rows(self) -> int:
@@ -176,7 +170,7 @@ class RecursiveOutputError:
     @property
     def model(self) -> LinearModel:
         """The learned model, in the signals' own units."""
-        return model_of(self._structure, self._scaling, [self._estimator], simulates=True)
+        return model_of(self._structure, self._scaling, self._estimator, simulates=True)
 
     def _regressor(self) -> NDArray[np.float64]:
         structure = self._structure

@@ -73,27 +73,18 @@ class RecursiveLeastSquares(Recursion):
     array([ 3., -1.])
 
     Args:
-        parameters: their number, n.
+        parameters: number of parameters, n.
         forgetting: weight of a row relative to its successor, in (0, 1]; the memory is 1 / (1 - forgetting) rows.
         covariance_limit: bound on the eigenvalues of `covariance`, and their value at the start. The default is
             1e6; without forgetting it is inf: nothing is assumed at the start.
-        start: shape (n,), the parameters at the start; 0 by default.
 
     Raises:
         InputError: a setting out of its range.
     """
 
-    def __init__(
-        self,
-        parameters: int,
-        forgetting: float = 1.0,
-        covariance_limit: float | None = None,
-        start: ArrayLike | None = None,
-    ) -> None:
+    def __init__(self, parameters: int, forgetting: float = 1.0, covariance_limit: float | None = None) -> None:
         super().__init__(1, parameters, forgetting, covariance_limit, plants_in_tile=1)
         self._tile: NDArray[np.float64] = self._tiles[0]
-        if start is not None:
-            self.set_parameters(start)
 
     @classmethod
     def from_state(cls, state: RlsState) -> Self:

@@ -26,7 +26,7 @@ class RecursiveLeastSquaresBank(Recursion):
     A plant's numbers are those of the single form, bit for bit.
 
     Args:
-        plants: their number.
+        plants: number of plants.
         parameters: number of parameters of each, n.
         forgetting: see the single form.
         covariance_limit: see the single form.

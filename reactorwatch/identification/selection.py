@@ -40,7 +40,7 @@ class Candidate(msgspec.Struct, frozen=True):
     Attributes:
         family: name of the family.
         order: lags of output and input.
-        parameters: their number.
+        parameters: number of parameters.
         one_step_percent: fit of the one-step prediction on the held-out half.
         free_run_percent: fit of the simulation on the held-out half; -inf if it diverged.
         bic: BIC on the fitted half; comparable within a family.
@@ -63,7 +63,7 @@ class Selection:
     Attributes:
         candidates: candidates in the order of families, then orders.
         chosen: the chosen candidate.
-        model: its model, fitted to the first half.
+        model: model of the choice, fitted to the first half.
         reason: one sentence; where no model fits, the cause.
     """
 
@@ -169,7 +169,7 @@ def bic(residuals: ArrayLike, parameters: int) -> float:
 
     Args:
         residuals: residuals of the fitted rows, NaN where missing.
-        parameters: their number.
+        parameters: number of parameters.
     """
     values = np.asarray(residuals, dtype=np.float64)
     values = values[np.isfinite(values)]

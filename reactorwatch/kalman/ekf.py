@@ -83,7 +83,7 @@ class FilterState(msgspec.Struct, frozen=True):
         time_min: time of the last row; None before the first.
         inputs: inputs of the last row.
         x: filtered state at the last row.
-        P: its covariance, row by row.
+        P: covariance of the state, row by row.
         learned: whether the estimates of constant states are valid although there is no last row.
     """
 

@@ -87,7 +87,7 @@ class ErrorLinearization:
         model: model of the filter.
         noise: noise of the plant and its sensors.
         rate_symbols: symbols of the model, the sizes as they act in the balances.
-        output_symbols: the same sizes as they act in the outputs; may be the same symbols.
+        output_symbols: symbols of these sizes in the outputs; may be the same symbols.
 
     Attributes:
         noise: noise of the plant and its sensors.
@@ -177,7 +177,7 @@ class ErrorLinearization:
     ) -> tuple[Array, Array, Array, Array]:
         """Predicted states, their derivatives, and their covariance from unknown input changes."""
         t, step = time_min[:-1], np.diff(time_min)
-        predicted, F, G = self._predict_known(x, u, t, step, p)
+        predicted, F, G = self._predict_rows(x, u, t, step, p)
         spread = np.zeros((*predicted.shape, predicted.shape[1]))
         if uncertainty is not None:
             intervals = uncertainty.select(slice(1, None))
@@ -210,15 +210,13 @@ class ErrorLinearization:
             if np.array_equal(changed, end_min):
                 ends.append(unchanged)
                 continue
-            held, F, G = self._predict_known(x, u, begin_min, changed - begin_min, p)
-            predicted, of_x, of_size = self._predict_known(
-                held, uncertainty.inputs[rows], changed, end_min - changed, p
-            )
+            held, F, G = self._predict_rows(x, u, begin_min, changed - begin_min, p)
+            predicted, of_x, of_size = self._predict_rows(held, uncertainty.inputs[rows], changed, end_min - changed, p)
             ends.append((predicted, of_x @ F, of_x @ G + of_size))
         predicted, F, G = (np.stack(items) for items in zip(*ends, strict=True))
         return predicted, F, G
 
-    def _predict_known(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
+    def _predict_rows(self, x: Array, u: Array, t: Array, step: Array, p: Array) -> tuple[Array, Array, Array]:
         pieces = np.maximum(np.ceil(step / _LONGEST_PIECE_MIN), 1.0)
         predicted, F, G = self._code.piece.map(x, u, p, t, step / pieces)
         predicted = predicted[:, :, 0]

@@ -35,7 +35,7 @@ class InitialState:
     """Estimates the initial state of a filter.
 
     Args:
-        model: of the plant.
+        model: model of the plant.
 
     Attributes:
         searches: number of searches for steady states so far; each costs as much as thousands of rows.

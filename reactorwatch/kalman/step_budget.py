@@ -30,7 +30,7 @@ class StepBudget:
     """A number of filter steps.
 
     Args:
-        steps: their number, at least 1.
+        steps: number of steps, at least 1.
 
     Attributes:
         spent: number of steps taken so far.

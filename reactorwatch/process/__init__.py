@@ -7,12 +7,18 @@ from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
 from reactorwatch.process.library.cascaded_tanks.model import tanks
 from reactorwatch.process.library.cstr.effects import EFFECTS
 from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
+from reactorwatch.process.library.three_tanks.model import three_tanks
 from reactorwatch.process.model import ProcessModel
 
-MODELS = (cstr, tanks)
+MODELS = (cstr, tanks, three_tanks)
 """The catalogue of process models: functions that build them."""
 
-EFFECTS_OF: Mapping[str, tuple[Effect, ...]] = {"cstr": EFFECTS, "tanks": TANK_EFFECTS}
+EFFECTS_OF: Mapping[str, tuple[Effect, ...]] = {
+    "cstr": EFFECTS,
+    "tanks": TANK_EFFECTS,
+    "three_tanks": THREE_TANKS_EFFECTS,
+}
 """The catalogue of effects, by name of a model."""
 
 

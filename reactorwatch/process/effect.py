@@ -35,7 +35,7 @@ class Effect(ABC):
 
     Attributes:
         name: name in the catalogue of causes.
-        label: its usual name in text.
+        label: usual name of the effect in text.
         location: part of the plant in which it acts; one of `LOCATIONS` for the reactor.
         unit: unit of its size.
         larger: meaning of a positive size, with `{}` for its amount: in the size's unit, or in % for a share.

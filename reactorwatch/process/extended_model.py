@@ -50,7 +50,7 @@ class ExtendedModel:
 
     Attributes:
         name: name of the model.
-        effects: its effects in the order in which they were added; times in minutes of the record.
+        effects: effects of the model in the order in which they were added; times in minutes of the record.
         parameters: values that differ from the model's nominal ones, by name, in their units.
         zero_ns: time from which the minutes are counted; 0: unknown.
     """
@@ -167,7 +167,7 @@ def extended_model_of(
 
 
 def _specification(effect: Effect, values: Mapping[str, float], prefix: str) -> FaultSpecification:
-    """Effect whose parameters have the prefix; profiles are told apart by their parameters' names."""
+    """Effect whose parameters have the prefix; profiles are distinguished by their parameters' names."""
     own = {name.removeprefix(prefix): value for name, value in values.items() if name.startswith(prefix)}
     profile = _profile({name for name in own if name != "size"})
     return FaultSpecification(effect, profile, {name: own[name] for name in ("size", *_names(profile))})

@@ -74,9 +74,9 @@ def symbolic_step(model: ProcessModel) -> ca.Function:
     t, middle, h = ca.SX.sym("t"), ca.SX.sym("t_middle"), ca.SX.sym("h")
     passed, slopes = state_time_step(model, u, p, t, middle, h), list[ca.SX]()
     for time, weights in zip(_TIMES, _STAGES, strict=True):
-        slopes.append(rhs(x + passed * _weighted(weights, slopes), u, p, t + time * h, middle)[0])
-    after = x + passed * _weighted(_FIFTH_ORDER, slopes)
-    error = passed * _weighted(_ERROR, slopes)
+        slopes.append(rhs(x + passed * _weighted_sum(weights, slopes), u, p, t + time * h, middle)[0])
+    after = x + passed * _weighted_sum(_FIFTH_ORDER, slopes)
+    error = passed * _weighted_sum(_ERROR, slopes)
     scales = ca.DM([state.scale * (MEMORY_SLACK if state.name in model.at_rest else 1) for state in model.states])
     return ca.Function(
         "step",
@@ -87,7 +87,7 @@ def symbolic_step(model: ProcessModel) -> ca.Function:
     )
 
 
-def _weighted(weights: tuple[float, ...], slopes: list[ca.SX]) -> ca.SX:
+def _weighted_sum(weights: tuple[float, ...], slopes: list[ca.SX]) -> ca.SX:
     terms = (weight * slope for weight, slope in zip(weights, slopes, strict=True) if weight)
     return sum(terms, ca.SX(0))
 

@@ -28,13 +28,13 @@ class Variable:
     """A state or an input.
 
     Attributes:
-        name: its symbol in the literature.
+        name: symbol of the variable in the literature.
         unit: unit of its values.
         lower: smallest value that makes physical sense.
         upper: largest value that makes physical sense.
         scale: a typical magnitude of its changes; tolerances are relative to it.
         meaning: a short description.
-        symbol: its symbol in the expressions.
+        symbol: symbol of the variable in the expressions.
         balance: location of the balance that a state's equation is (one of `process.effect.LOCATIONS`); empty: none.
     """
 
@@ -277,9 +277,9 @@ class ProcessModel:
 
         Args:
             state: the last state of the copy.
-            rate: its balance.
-            at_rest: its equilibrium, see `ProcessModel`.
-            reset: its value when a row begins, see `ProcessModel`; None: it does not jump.
+            rate: balance of the state.
+            at_rest: equilibrium of the state, see `ProcessModel`.
+            reset: value of the state when a row begins, see `ProcessModel`; None: it does not jump.
         """
         return replace(
             self,

@@ -43,7 +43,7 @@ def fill_folder(folder: Path, option: str = "") -> Iterator[Path]:
 
     Args:
         folder: path of the folder; made if it does not exist.
-        option: as for `make_folder`.
+        option: see `make_folder`.
 
     Raises:
         InputError: the folder cannot be made or written to.

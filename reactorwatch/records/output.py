@@ -82,9 +82,9 @@ def check_output_folder(
     Args:
         folder: the folder.
         names: names of the files that are written or deleted in it.
-        sources: as for `check_output_file`.
+        sources: see `check_output_file`.
         option: option of the command line that names the folder.
-        force: as for `check_output_file`.
+        force: see `check_output_file`.
 
     Returns:
         The folder.

@@ -76,6 +76,7 @@ class Record:
         runs: number of each row's run, shape (rows,), counted from 1; None: one run.
         units: units by signal name, without signals of unknown unit.
         strays: count of samples in no row, because their number or time fits neither those before nor those after.
+        read_as: guesses about the file's format, for people; empty: there was nothing to guess.
     """
 
     time_min: NDArray[np.float64]
@@ -86,6 +87,7 @@ class Record:
     runs: NDArray[np.intp] | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     strays: int = 0
+    read_as: str = ""
 
     def __post_init__(self) -> None:
         for signal, values in self.columns.items():

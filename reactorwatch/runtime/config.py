@@ -9,21 +9,25 @@ One file may serve all nodes, with a table for each:
     name = "cstr"
 """
 
-import tomllib
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.runtime.setting_rules import LAST_PORT, check_endpoint, check_spans, check_values, valid_choices
+from reactorwatch.runtime.setting_rules import (
+    LAST_PORT,
+    check_bounds,
+    check_endpoint,
+    check_spans,
+    check_values,
+    valid_choices,
+)
+from reactorwatch.toml_text import parse_toml
 
 SECTIONS = ("bus", "plant", "monitor", "fleet", "recorder", "replay", "diagnosis", "metrics", "log")
 """Valid tables of a settings file."""
-
-MAX_FILE_BYTES = 1_000_000
-"""Largest size of a settings file."""
 
 IDENTITY = ("ca", "certificate", "key")
 """Files with which a node authenticates itself and the router."""
@@ -50,7 +54,7 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     endpoint: str = "tcp/127.0.0.1:7447"
     routers: tuple[str, ...] = ()
     congestion: Literal["block", "drop"] = "drop"
-    cache_messages: int = 10_000
+    cache_messages: Annotated[int, msgspec.Meta(ge=1, le=10_000_000)] = 10_000
     history_s: float = 60.0
     ca: str | None = None
     certificate: str | None = None
@@ -59,8 +63,7 @@ class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         for endpoint in (self.endpoint, *self.routers):
             check_endpoint(endpoint)
-        if not 1 <= self.cache_messages <= 10_000_000:
-            raise ValueError(f"cache_messages must be in [1, 10000000], got {self.cache_messages}")
+        check_bounds(BusConfig, msgspec.structs.asdict(self))
         if not 0.0 < self.history_s <= 86_400.0:
             raise ValueError(f"history_s must be in (0, 86400], got {self.history_s:g}")
         given = [name for name in IDENTITY if getattr(self, name) is not None]
@@ -86,12 +89,11 @@ class MetricsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         address: address of this machine at which the pages are served, by default loopback.
     """
 
-    port: int | None = None
+    port: Annotated[int, msgspec.Meta(ge=1, le=LAST_PORT - 2)] | None = None
     address: str = "127.0.0.1"
 
     def __post_init__(self) -> None:
-        if self.port is not None and not 1 <= self.port <= LAST_PORT - 2:
-            raise ValueError(f"port must be in [1, {LAST_PORT - 2}], got {self.port}")
+        check_bounds(MetricsConfig, msgspec.structs.asdict(self))
         try:
             ip_address(self.address)
         except ValueError:
@@ -125,7 +127,7 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
     if path is None:
         return {}
     try:
-        tables = parse_toml(path.read_bytes())
+        tables = parse_tables(path.read_bytes())
     except OSError as error:
         raise InputError(f"settings file {path}: cannot be read: {error.strerror}") from error
     except InputError as error:
@@ -140,20 +142,13 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
     return tables
 
 
-def parse_toml(content: bytes) -> dict[str, dict[str, Any]]:
-    """Parse the tables of a TOML document, with or without a byte order mark.
+def parse_tables(content: bytes) -> dict[str, dict[str, Any]]:
+    """Parse the tables of a settings file.
 
     Raises:
-        InputError: it is not TOML, too large or too deep to be settings, or holds a value outside of a table.
+        InputError: as `parse_toml`, or it holds a value outside of a table.
     """
-    if len(content) > MAX_FILE_BYTES:
-        raise InputError(f"must be at most {MAX_FILE_BYTES} bytes to be settings, got {len(content)}")
-    try:
-        tables = tomllib.loads(content.decode("utf-8-sig"))
-    except RecursionError as error:
-        raise InputError("is nested too deeply; settings are tables of values and lists") from error
-    except ValueError as error:  # not TOML, not UTF-8, or a number of thousands of digits
-        raise InputError(f"is not TOML: {error}") from error
+    tables = parse_toml(content)
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise InputError(f"'{name}' must be a table, like [{name}]")
@@ -188,6 +183,7 @@ def section(kind: type[Section], name: str, tables: dict[str, dict[str, Any]], f
             raise InputError(f"settings [{name}]: {describe_unknown('key', key, fields)}")
     try:
         check_values(values)
+        check_bounds(kind, values)
         settings = msgspec.convert(values, kind)
         check_spans(settings)
     except msgspec.ValidationError as error:

@@ -63,12 +63,13 @@ class _Token(NamedTuple):
     is_alive: bool
 
 
-class _HistoryEnd:
-    """Inbox item behind the last message published before the subscription."""
+class _Call(NamedTuple):
+    """A function to call behind the messages that have arrived."""
+
+    function: Callable[[int], list[Publication]]
 
 
-_HISTORY_END = _HistoryEnd()
-_Item: TypeAlias = Encoded | list[Encoded] | Gap | Request | _HistoryEnd | _Token
+_Item: TypeAlias = Encoded | list[Encoded] | Gap | Request | _Call | _Token
 
 
 class _Inbox:
@@ -178,12 +179,12 @@ def stop_on_signals() -> Iterator[StopSignal]:
     def handler(_number: int, _frame: FrameType | None) -> None:
         pass
 
-    def wake_when_asked() -> None:
+    def wake_on_request() -> None:
         while _END not in (numbers := os.read(source, 64)):
             if set(numbers) & {signal.SIGINT, signal.SIGTERM}:
                 stop.set()
 
-    waker = threading.Thread(target=wake_when_asked, name="stop", daemon=True)
+    waker = threading.Thread(target=wake_on_request, name="stop", daemon=True)
     waker.start()
     previous = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
     previous_fd = signal.set_wakeup_fd(sink, warn_on_full_buffer=False)
@@ -227,7 +228,6 @@ class EventLoop:
         self._inbox = _Inbox(stop)
         self._on_batch: Callable[[list[Encoded], int], list[Publication]] | None = None
         self._on_gap: Callable[[Gap, int], list[Publication]] | None = None
-        self._on_history_end: Callable[[], None] | None = None
         self._on_token: Callable[[str, bool, int], list[Publication]] | None = None
 
     def subscribe(
@@ -249,7 +249,13 @@ class EventLoop:
             on_gap: called with messages that were published and never arrived, and the time.
             on_batch: called instead of `node.on_message`, with all messages that have arrived, and the time.
         """
-        self._on_batch, self._on_gap, self._on_history_end = on_batch, on_gap, on_history_end
+        self._on_batch, self._on_gap = on_batch, on_gap
+
+        def end_history(_now_ns: int) -> list[Publication]:
+            if on_history_end is not None:
+                on_history_end()
+            return []
+
         subscribe = self._bus.subscribe if on_batch is None else self._bus.subscribe_batched
         for expression in key_expressions:
             subscribe(
@@ -257,8 +263,15 @@ class EventLoop:
                 self._inbox.put,
                 on_gap=self._inbox.put if on_gap is not None else None,
                 history_s=history_s,
-                on_history_end=(lambda: self._inbox.put(_HISTORY_END)) if on_history_end is not None else None,
+                on_history_end=(lambda: self.call(end_history)) if on_history_end is not None else None,
             )
+
+    def call(self, function: Callable[[int], list[Publication]]) -> None:
+        """Call a function with the time, in the loop's thread, when all that has arrived is handled; from any thread.
+
+        What it returns is published.
+        """
+        self._inbox.put(_Call(function))
 
     def subscribe_liveliness(
         self, *key_expressions: str, on_token: Callable[[str, bool, int], list[Publication]]
@@ -322,9 +335,8 @@ class EventLoop:
             self._publish(self._on_batch(item, now_ns) if self._on_batch is not None else [])
         elif isinstance(item, _Token):
             self._publish(self._on_token(item.key, item.is_alive, now_ns) if self._on_token is not None else [])
-        elif isinstance(item, _HistoryEnd):
-            if self._on_history_end is not None:
-                self._on_history_end()
+        elif isinstance(item, _Call):
+            self._publish(item.function(now_ns))
         elif isinstance(item, Gap):
             self._publish(self._on_gap(item, now_ns) if self._on_gap is not None else [])
         else:

@@ -35,13 +35,13 @@ MAX_PLANTS = 1000
 """Plants of a fleet on its page: a thousand are 1.5 MB, and a sixth of a second of a core at each scrape."""
 
 COUNTERS = {
-    "received": ("messages_received", "Messages that came"),
-    "published": ("messages_published", "Messages that were published"),
-    "late": ("samples_late", "Samples that came after their row had been judged"),
-    "duplicated": ("samples_duplicated", "Samples that came again"),
-    "out_of_order": ("samples_out_of_order", "Samples that came after younger ones"),
-    "rows": ("rows", "Complete rows that were judged"),
-    "incomplete_rows": ("rows_incomplete", "Rows that were given up because a signal was missing"),
+    "received": ("messages_received", "Messages received"),
+    "published": ("messages_published", "Messages published"),
+    "late": ("samples_late", "Samples that arrived after their row was evaluated"),
+    "duplicated": ("samples_duplicated", "Repeated samples"),
+    "out_of_order": ("samples_out_of_order", "Samples that arrived after newer ones"),
+    "rows": ("rows", "Complete rows evaluated"),
+    "incomplete_rows": ("rows_incomplete", "Rows given up because a signal was missing"),
 }
 """Name without prefix and `_total`, and description, by field of `Health`."""
 
@@ -80,7 +80,7 @@ class Metrics:
                 None: the node has no alarms.
         """
 
-        def published(publication: Publication) -> None:
+        def on_publication(publication: Publication) -> None:
             message = publication.message
             if isinstance(message, Health):
                 self._health = message
@@ -90,7 +90,7 @@ class Metrics:
             if changed is not None:
                 self._by_state = Counter(alarm.state for alarm in changed)
 
-        return published
+        return on_publication
 
     def collect(self) -> "Iterator[Metric]":
         """Yield the metrics; those not known yet are left out."""
@@ -166,7 +166,7 @@ class FleetMetrics:
 
         Args:
             plant: name of the plant.
-            alarms: as for `Metrics.observe`.
+            alarms: see `Metrics.observe`.
         """
         if len(self._pages) < MAX_PLANTS:
             page = Metrics(plant, self._node)

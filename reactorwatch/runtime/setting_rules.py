@@ -3,8 +3,9 @@
 import math
 import re
 import types
-from collections.abc import Iterator
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 
@@ -41,6 +42,37 @@ def check_values(values: object, name: str = "") -> None:
         raise ValueError(f"{name} must not hold the character NUL, got {values!r}")
     elif isinstance(values, int) and values.bit_length() > _MAX_BITS:
         raise ValueError(f"{name} must be a number of 64 bits, got one of {values.bit_length()}")
+
+
+def check_bounds(kind: type[msgspec.Struct], values: Mapping[str, object]) -> None:
+    """Check numbers whose bounds are annotated, as in `Annotated[float, msgspec.Meta(ge=0.1, le=3600.0)]`.
+
+    msgspec checks them too, but not of settings that are made in Python, and without naming the value.
+
+    Args:
+        kind: class of the settings.
+        values: values by key; those that are no numbers are skipped.
+
+    Raises:
+        ValueError: a number out of its bounds.
+    """
+    for name, (lower, upper) in _bounds(kind).items():
+        value = values.get(name)
+        if isinstance(value, int | float) and not lower <= value <= upper:
+            raise ValueError(f"{name} must be in [{lower:g}, {upper:g}], got {value:g}")
+
+
+@cache
+def _bounds(kind: type[msgspec.Struct]) -> dict[str, tuple[float, float]]:
+    """Lower and upper bound of each setting that has them."""
+    return {
+        name: (meta.ge, meta.le)
+        for name, hint in get_type_hints(kind, include_extras=True).items()
+        for part in (hint, *get_args(hint))  # the setting may be optional
+        if get_origin(part) is Annotated
+        for meta in part.__metadata__
+        if isinstance(meta, msgspec.Meta) and meta.ge is not None and meta.le is not None
+    }
 
 
 def check_spans(settings: msgspec.Struct) -> None:

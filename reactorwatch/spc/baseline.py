@@ -18,10 +18,10 @@ class Baseline(NamedTuple):
     Attributes:
         learned: the prewhitening of each signal.
         e: prewhitened residuals, shape (rows, signals), of the rows in which no signal is missing.
-        memory_sd: what a chart with a memory must take for one standard deviation of each signal, see `memory_sds`.
+        memory_sd: standard deviation of each signal that charts with a memory use, see `memory_sds`.
         arl0: run length of the alarm without a fault, in rows.
         point_probability: probability of a single point that is out, of a chart whose alarm takes several points.
-        settings: of the charts, by key.
+        settings: settings of the charts, by key.
     """
 
     learned: tuple[Prewhitening, ...]
@@ -47,14 +47,14 @@ def complete_rows(e: Array, signals: Sequence[int]) -> Array:
 
 
 def memory_sds(e: Array, weight: float) -> tuple[float, ...]:
-    """What a chart with a memory must take for one standard deviation of each signal; 1 if its residual is white.
+    """Standard deviation of each signal that charts with a memory use; 1 if its residual is white.
 
     An autoregression of few coefficients may miss a correlation over many rows. It shows in averages: theirs should
     have the variance weight / (2 - weight). Where it is larger by more than chance allows, limits follow it.
 
     Args:
         e: prewhitened residuals, shape (rows, signals); NaN where there is none.
-        weight: of the newest row in the averages.
+        weight: weight of the newest row in the averages.
     """
     sds = []
     for column in e.T:

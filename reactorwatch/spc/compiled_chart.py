@@ -36,7 +36,7 @@ class SignalState(ChartState, frozen=True):
     """State of a chart of one signal, or of a bank of them.
 
     Attributes:
-        chart: its name.
+        chart: name of the chart.
         plants: number of plants.
         numbers: little-endian doubles, shape (numbers of one chart, plants).
     """
@@ -51,7 +51,7 @@ class CompiledChart(SignalChart):
 
     Args:
         settings: the numbers of its constructor, as its kernel wants them.
-        start: its memory before the first value.
+        start: memory of the chart before the first value.
     """
 
     State = SignalState
@@ -74,7 +74,7 @@ class CompiledChart(SignalChart):
 
     @classmethod
     def from_state(cls, state: SignalState) -> Self:
-        """The chart that goes on, bit for bit, where `state` was taken.
+        """Resume a chart, bit for bit, from its state.
 
         Raises:
             ValueError: the state is of another chart or of several plants, or damaged.
@@ -91,7 +91,7 @@ class CompiledChart(SignalChart):
 
     @property
     def state(self) -> SignalState:
-        """A copy of all that it is and remembers."""
+        """A copy of the full state."""
         return SignalState(self.name, 1, self._columns[SETTINGS:].astype("<f8").tobytes())
 
     def update(self, x: float) -> Judgement:
@@ -133,7 +133,7 @@ class Bank(Generic[Kind]):
 
     @classmethod
     def from_state(cls, kind: type[Kind], state: SignalState) -> Self:
-        """The charts that go on, bit for bit, where `state` was taken.
+        """Resume the charts, bit for bit, from their state.
 
         Raises:
             ValueError: the state is of another chart, or damaged.
@@ -152,12 +152,12 @@ class Bank(Generic[Kind]):
 
     @property
     def state(self) -> SignalState:
-        """A copy of all that the charts are and remember."""
+        """A copy of the full state of the charts."""
         numbers = self._columns[SETTINGS:].astype("<f8").tobytes()
         return SignalState(self._kind.name, self._columns.shape[1], numbers)
 
     def update(self, values: ArrayLike, present: NDArray[np.bool_] | None = None) -> Judgements:
-        """Judge every plant's next value.
+        """Update the charts with the next value of every plant.
 
         Args:
             values: shape (plants,).
@@ -181,9 +181,9 @@ class Bank(Generic[Kind]):
         columns[X] = np.where(present, x, 0.0)
         columns[PRESENT] = present
         self._kind.kernel(columns)
-        said = columns[STATISTIC:OUT].copy()
-        said[:, ~present] = np.nan
-        return Judgements(said[0], said[1], said[2], said[3], present & (columns[OUT] > 0.0))
+        points = columns[STATISTIC:OUT].copy()
+        points[:, ~present] = np.nan
+        return Judgements(points[0], points[1], points[2], points[3], present & (columns[OUT] > 0.0))
 
     def judge(self, values: list[float], present: list[bool], *, always: bool) -> list[Judgement | None] | None:
         """Update the few charts of one plant, as at every row.

@@ -41,9 +41,9 @@ def promise_per_30_days(asked: float | None, alarms: int, period_min: float) -> 
     """The false alarms of a plant in 30 days that are promised.
 
     Args:
-        asked: by the settings; None: `USUAL_PER_30_DAYS`, or the nearest number that charts can keep.
+        asked: number that the settings ask for; None: `USUAL_PER_30_DAYS`, or the nearest number that charts can keep.
         alarms: number of alarms that share them.
-        period_min: of the rows.
+        period_min: sampling period of the rows.
 
     Raises:
         InputError: charts cannot keep what is asked for.
@@ -73,13 +73,13 @@ def share_arl0(per_30_days: float, alarms: int, period_min: float) -> float:
     Args:
         per_30_days: false alarms of the plant that are promised, see `promise_per_30_days`.
         alarms: number of alarms that share them.
-        period_min: of the rows.
+        period_min: sampling period of the rows.
     """
     return min(max(DAYS_MIN / period_min * alarms / per_30_days, 10 * SHORTEST), LONGEST_DESIGN)
 
 
 def point_probability(arl0: float, raise_count: int, window: int) -> float:
-    """How often a single point may be out if an alarm takes `raise_count` of them among `window`.
+    """Allowed probability of a single point out if an alarm takes `raise_count` of them among `window`.
 
     Args:
         arl0: run length to the alarm without a fault.
@@ -96,11 +96,11 @@ def point_probability(arl0: float, raise_count: int, window: int) -> float:
     return exp(float(optimize.brentq(off, lowest - 0.1, -0.01)))
 
 
-def widened(limit: float, weight: float, learned: Prewhitening) -> float:
-    """The limit of an average, in standard deviations, where mean and standard deviation were learned.
+def widen_limit(limit: float, weight: float, learned: Prewhitening) -> float:
+    """Widen the limit of an average for the errors of a learned mean and standard deviation.
 
     Args:
-        limit: the one that holds when both are known.
+        limit: limit that holds when both are known, in standard deviations.
         weight: lambda, of the newest value in the average.
         learned: the training.
     """
@@ -109,10 +109,10 @@ def widened(limit: float, weight: float, learned: Prewhitening) -> float:
 
 
 def degrees_of_freedom(learned: Prewhitening, weight: float) -> float:
-    """Of the standard deviation that was learned, as a chart whose newest value weighs `weight` feels it."""
+    """Degrees of freedom of the learned standard deviation, for a chart whose newest value has this weight."""
     return max(0.5 / scale_variance(learned, weight), 5.0)
 
 
 def scale_variance(learned: Prewhitening, weight: float) -> float:
-    """Variance of the relative error of that standard deviation, as such a chart feels it."""
+    """Variance of the relative error of that standard deviation, for such a chart."""
     return learned.sd_variance + (1.0 - weight) ** 2 * learned.passed_variance

@@ -45,7 +45,7 @@ class JointChart(Chart):
 
         Args:
             e: prewhitened residuals without missing ones, shape (rows, signals).
-            names: of the signals.
+            names: names of the signals.
         """
         count = len(names)
         if count < 2:
@@ -68,7 +68,7 @@ class JointChart(Chart):
 
         Args:
             x: the newest sample, which is out.
-            signals: of the sample, in order.
+            signals: signals of the sample, in order.
         """
         parts = np.maximum(self.contributions(x), 0.0)
         shares = parts / np.sum(parts)
@@ -79,7 +79,7 @@ class JointChart(Chart):
 
 
 def correlation(e: Array) -> Array:
-    """Of the columns, shape (columns, columns); 0 with one that does not vary."""
+    """Correlation matrix of the columns, shape (columns, columns); 0 with one that does not vary."""
     off = e - e.mean(axis=0) if len(e) else np.zeros((1, e.shape[1]))
     lengths = np.linalg.norm(off, axis=0)
     products = np.outer(lengths, lengths)
@@ -93,10 +93,10 @@ def joint_limit(arl0: float, weight: float, learned: Sequence[Prewhitening], row
     """The limit of a MEWMA's, or with the weight 1 of a T2's, statistic.
 
     Args:
-        arl0: its run length without a fault.
+        arl0: run length of the chart without a fault.
         weight: lambda.
         learned: the training of each signal.
-        rows: from which the correlations of the signals were estimated.
+        rows: number of rows from which the correlations of the signals were estimated.
     """
     dimension = len(learned)
     known = mewma_limit(arl0, dimension, weight)

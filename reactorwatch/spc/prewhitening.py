@@ -66,7 +66,7 @@ class Prewhitening(msgspec.Struct, frozen=True):
     passed_variance: float
 
     @property
-    def passed(self) -> float:
+    def shift_gain(self) -> float:
         """Gain of a lasting shift in e, 1 - a1 - ... - ap."""
         return 1.0 - sum(self.coefficients)
 
@@ -182,7 +182,7 @@ class Prewhitener:
         self.past: deque[float] = deque(maxlen=max(len(learned.coefficients), 1))
         """The last values, newest first: the full state."""
         self._expected = 0.0
-        self._order, self._mean = len(learned.coefficients), learned.constant / learned.passed
+        self._order, self._mean = len(learned.coefficients), learned.constant / learned.shift_gain
 
     @classmethod
     def from_state(cls, state: PrewhitenerState) -> "Prewhitener":
@@ -196,7 +196,7 @@ class Prewhitener:
         """A copy of the full state."""
         return PrewhitenerState(self.learned, list(self.past))
 
-    def expected(self) -> float:
+    def expected_value(self) -> float:
         """Prediction of the next z; its mean while there are too few past values."""
         learned = self.learned
         if len(self.past) < self._order:
@@ -218,7 +218,7 @@ class Prewhitener:
             self.past.clear()
             return nan
         known = len(self.past) >= self._order
-        self._expected = expected = self.expected()
+        self._expected = expected = self.expected_value()
         self.past.appendleft(z)
         return (z - expected) / self.learned.sd if known else nan
 

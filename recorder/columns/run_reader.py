@@ -77,7 +77,7 @@ def read_segments(
         given_zero_ns: see `RunColumns`.
 
     Raises:
-        InputError: as in `read_run`.
+        InputError: see `read_run`.
     """
     reader, taken = RunReader(given_zero_ns), 0
     for entry in recording:

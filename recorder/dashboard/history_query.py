@@ -43,7 +43,7 @@ def query_history(bus: Bus, plant: str) -> RunHistory:
     listed, answered = list[messages.Alarm](), set[str]()
     for node, command in COMMANDS.items():
         question = Encoded(keys.key(plant, keys.COMMAND, command), *encode_message(messages.ListAlarms()))
-        for reply in _decoded(bus.query(question, REPLY_TIMEOUT_S)):
+        for reply in _decode_all(bus.query(question, REPLY_TIMEOUT_S)):
             if isinstance(reply, messages.CommandReply):
                 listed += reply.alarms
                 answered.add(node)
@@ -114,7 +114,7 @@ class HistoryQuery:
 
 def zero_of(message: Encoded) -> int | None:
     """Time of the first sample of a run, if the message is a health report of a monitor that holds it."""
-    for health in _decoded([message]):
+    for health in _decode_all([message]):
         if isinstance(health, messages.Health) and health.heard_from_ns:
             return min(health.heard_from_ns.values())
     return None
@@ -149,7 +149,7 @@ def _change(alarm: messages.Alarm, time_ns: int, event: str, state: messages.Ala
     return change
 
 
-def _decoded(encoded: Iterable[Encoded]) -> Iterator[Message]:
+def _decode_all(encoded: Iterable[Encoded]) -> Iterator[Message]:
     for item in encoded:
         with contextlib.suppress(DecodeError):
             yield decode(item.payload, item.encoding)

@@ -72,7 +72,7 @@ class Layout:
             live: True if the run continues: the cursor then follows it.
         """
         self.changed = False
-        tabs = [self._container(title, tab) for title, tab in self._tabs.items() if any(self._placed(title, tab))]
+        tabs = [self._container(title, tab) for title, tab in self._tabs.items() if any(self._place_views(title, tab))]
         return rrb.Blueprint(
             _with_stable_id(rrb.Tabs(*tabs, active_tab=0 if tabs else None), "tabs"),
             rrb.TimePanel(state="collapsed", timeline=RUN_TIME, play_state="following" if live else "paused"),
@@ -87,8 +87,8 @@ class Layout:
             self._frames[path] = Frame.around(plane.box if known is None else known.box, plane.shown)
             self.changed = True
 
-    def _placed(self, title: str, tab: _Tab) -> Iterator[_PlacedView]:
-        """Non-empty views of a tab, and their paths."""
+    def _place_views(self, title: str, tab: _Tab) -> Iterator[_PlacedView]:
+        """Yield the non-empty views of a tab with their paths."""
         for view in tab.views.values():
             where, shown = title, view
             if isinstance(view, ViewReference):
@@ -100,7 +100,7 @@ class Layout:
                 yield _PlacedView(origin(where, shown), shown)
 
     def _container(self, title: str, tab: _Tab) -> rrb.Container:
-        placed = list(self._placed(title, tab))
+        placed = list(self._place_views(title, tab))
         if tab.arranged == "beside":
             over_time = [item for item in placed if isinstance(item.view, TimePlot | StateLines)]
             rest = [item for item in placed if item not in over_time]

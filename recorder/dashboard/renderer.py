@@ -79,7 +79,7 @@ class Renderer:
             aggregation_policy=rr.components.AggregationPolicy.MinMax,
         )
         self._stream.log_static(path, (series.colour, series.width, series.legend, series.held), style)
-        self._stream.send_numbers(path, series.time_ns, zero_ns, series.value)
+        self._stream.send_series(path, series.time_ns, zero_ns, series.value)
 
     def _draw_log(self, path: str, log: EventLog, zero_ns: int) -> None:
         if not log.events:

@@ -48,7 +48,7 @@ class Stream:
         """
         self._recording.send_columns(path, _clocks(time_ns, zero_ns), columns, strict=True)
 
-    def send_numbers(self, path: str, time_ns: NDArray[np.int64], zero_ns: int, value: NDArray[np.float64]) -> None:
+    def send_series(self, path: str, time_ns: NDArray[np.int64], zero_ns: int, value: NDArray[np.float64]) -> None:
         """Send the points of a line, in batches."""
         for start in range(0, time_ns.size, BATCH_ROWS):
             rows = slice(start, start + BATCH_ROWS)

@@ -36,7 +36,7 @@ class Viewer:
     def tabs(self) -> dict[str, str]:
         """Identifiers of the tabs in the layout, by title."""
         layout = self._layout()
-        _, root = _tabbed(layout)
+        _, root = _find_tabs(layout)
         contents = root.get("contents", [])
         paths = [contents] if isinstance(contents, str) else contents  # the viewer returns a list of one as its item
         return {layout[f"/{path}"]["ContainerBlueprint"]["display_name"]: path for path in paths}
@@ -44,7 +44,7 @@ class Viewer:
     def open_tab(self, tab: str) -> None:
         """Activate a tab by its identifier in the layout."""
         layout = self._layout()
-        path, root = _tabbed(layout)
+        path, root = _find_tabs(layout)
         layout[path]["ContainerBlueprint"] = {**root, "active_tab": tab}
         self._client.set_blueprint(layout, "recording")
 
@@ -52,8 +52,8 @@ class Viewer:
         return self._client.get_blueprint("recording").blueprint
 
 
-def _tabbed(layout: dict[str, Any]) -> tuple[str, dict[str, Any]]:
-    """Path and container of the tabs; empty if there is none."""
+def _find_tabs(layout: dict[str, Any]) -> tuple[str, dict[str, Any]]:
+    """Find the container of the tabs; returns its path and content, both empty if there is none."""
     for path, archetypes in layout.items():
         container = archetypes.get("ContainerBlueprint", {})
         if container.get("container_kind") == "Tabs":

@@ -54,7 +54,7 @@ class ChannelBudget:
         self._next_check_ns = 0
 
     @property
-    def max_latched(self) -> int:
+    def max_latched_messages(self) -> int:
         """Largest number of latched messages at the start of a file."""
         return int(LATCHED_SHARE * self._most_keys)
 

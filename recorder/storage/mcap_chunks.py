@@ -125,7 +125,7 @@ def ordered_messages(path: Path, summary: Summary, wanted: set[int]) -> Iterator
             if wanted.isdisjoint(index.message_index_offsets):
                 continue
             try:
-                data = _uncompressed(stream, index, size)
+                data = _decompress_chunk(stream, index, size)
                 parsed = list(_messages_of(data, channels))
             except DAMAGE as error:
                 where = f"the chunk at byte {index.chunk_start_offset} cannot be read"
@@ -158,7 +158,7 @@ def _sorted_chunks(stream: IO[bytes], summary: Summary, size: int) -> Iterator[R
     for index in sorted(summary.chunk_indexes, key=attrgetter("message_start_time", "chunk_start_offset")):
         while waiting and waiting[0][0] < index.message_start_time:
             yield heapq.heappop(waiting)[-1]
-        parsed = _messages_of(_uncompressed(stream, index, size), channels, dict(summary.schemas))
+        parsed = _messages_of(_decompress_chunk(stream, index, size), channels, dict(summary.schemas))
         for position, message in enumerate(parsed):
             heapq.heappush(waiting, (message.log_time_ns, index.chunk_start_offset, position, message))
     while waiting:
@@ -230,7 +230,7 @@ def keyed_channel(channel: Channel, schemas: Mapping[int, Schema]) -> KeyedChann
     return KeyedChannel(channel.topic, encoding, LATCHED in channel.metadata)
 
 
-def _uncompressed(stream: IO[bytes], index: ChunkIndex, size: int) -> bytes:
+def _decompress_chunk(stream: IO[bytes], index: ChunkIndex, size: int) -> bytes:
     if index.chunk_start_offset + index.chunk_length > size:
         raise ValueError("it reaches beyond the end of the file")
     stream.seek(index.chunk_start_offset + RECORD.size)

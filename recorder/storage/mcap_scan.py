@@ -58,7 +58,7 @@ class RawMessage(NamedTuple):
         return LATCHED in self.channel.metadata
 
     @property
-    def recorded(self) -> RecordedMessage:
+    def recorded_message(self) -> RecordedMessage:
         """The message as the recorder writes it."""
         schemas = {self.schema.id: self.schema} if self.schema is not None else {}
         key, encoding, repeated = keyed_channel(self.channel, schemas)

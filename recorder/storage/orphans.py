@@ -62,7 +62,7 @@ def repair(part: Path) -> None:
             part.unlink()
         else:
             part.rename(part.with_name(part.name + DAMAGED))
-        log.info("recovered", file=str(path), messages=saved.messages, lost=saved.lost)
+        log.info("recovered", file=str(path), messages=saved.messages, lost=saved.losses)
 
 
 def _is_empty(part: Path) -> bool:

@@ -47,7 +47,7 @@ class RecoveryResult:
         return all(damage.is_end for damage in self.damages) and not self.orphans
 
     @property
-    def lost(self) -> str:
+    def losses(self) -> str:
         """Text about the lost parts; empty if there are none."""
         texts = [str(damage) for damage in self.damages[:_MAX_LISTED]]
         if len(self.damages) > _MAX_LISTED:
@@ -81,12 +81,12 @@ def recover(path: Path, out: Path) -> RecoveryResult:
                 writer.add_attachment(attachment)
             saved = RecoveryResult(topics.total(), first_ns, last_ns, dict(topics), tuple(scan.damages), scan.orphans)
             if not saved.messages:
-                raise InputError(f"{path}: holds no message that could be saved ({saved.lost or 'it is whole'})")
+                raise InputError(f"{path}: holds no message that could be saved ({saved.losses or 'it is whole'})")
             for record in scan.metadata:
                 if record.name != METADATA:
                     writer.add_metadata(record.name, record.metadata)
-            if saved.lost:
-                writer.add_metadata(RECOVERED, {"from": path.name, "lost": saved.lost})
+            if saved.losses:
+                writer.add_metadata(RECOVERED, {"from": path.name, "lost": saved.losses})
         with contextlib.suppress(OSError, OverflowError):  # the file system cannot represent the time
             os.utime(temporary, ns=(last_ns, last_ns))
     return saved

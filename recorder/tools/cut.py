@@ -192,17 +192,17 @@ def _latched_messages(sources: Sequence[_Source], window: Window, start_ns: int)
     """Latched messages at the start of the window."""
     latched = LatchedMessages()
 
-    def wanted(topic: str) -> bool:
+    def is_latched(topic: str) -> bool:
         parsed = keys.parse(topic)
         return parsed is not None and parsed.kind in LATCHED_KINDS
 
     for source in sources:
         if source.span[0] > start_ns:
             continue
-        for stored in Scan(source.path, to_ns=start_ns, wanted=wanted):
+        for stored in Scan(source.path, to_ns=start_ns, wanted=is_latched):
             if not (stored.latched or window.starts_after(stored)):
                 continue
-            recorded = stored.recorded
+            recorded = stored.recorded_message
             try:
                 latched.update(recorded, decode(recorded.payload, recorded.encoding))
             except DecodeError:

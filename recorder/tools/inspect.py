@@ -49,7 +49,7 @@ def inspect(path: Path) -> FileInfo:
         found, metadata = overview(read_messages(path)), read_metadata(path)
         return FileInfo(found, metadata, zero_from(metadata, found.starts_ns or 0), (), gaps_in(path))
     scan = Scan(path)
-    found = overview(stored.recorded for stored in scan)
+    found = overview(stored.recorded_message for stored in scan)
     metadata = own_metadata(scan.metadata)
     damages = [str(damage) for damage in scan.damages]
     if scan.orphans:

@@ -14,7 +14,7 @@ messages are skipped in all files but the first.
 
 import heapq
 from array import array
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -68,7 +68,7 @@ def read_messages(
         _files(path), lambda file: file.span
     )  # not within a generator: errors are raised at the call
 
-    def wanted(key: str) -> bool:
+    def is_selected(key: str) -> bool:
         topic = keys.parse(key)
         if topic is None:
             return kinds is None and plant is None
@@ -76,10 +76,10 @@ def read_messages(
 
     def read(file: _File) -> Iterator[RecordedMessage]:
         if is_in_order(file.summary):
-            numbers = {number for number, channel in file.summary.channels.items() if wanted(channel.topic)}
+            numbers = {number for number, channel in file.summary.channels.items() if is_selected(channel.topic)}
             found = ordered_messages(file.path, file.summary, numbers)
         else:
-            found = (entry for entry in sorted_messages(file.path, file.summary) if wanted(entry.key))
+            found = (entry for entry in sorted_messages(file.path, file.summary) if is_selected(entry.key))
         return found if file.first else (entry for entry in found if not entry.latched)
 
     if len(groups) == len(groups[0]) == 1:
@@ -137,15 +137,16 @@ def read_metadata(path: Path) -> dict[str, str]:
     return own_metadata(metadata_records(recordings_in(path)[0]))
 
 
-def read_record(path: Path, plant: str | None = None) -> Record:
+def read_record(path: Path, plant: str | None = None, signals: Sequence[str] = tuple(UNITS)) -> Record:
     """Samples of one plant as rows of equal sample time; runs are split by `RunSplitter`.
 
     Args:
         path: the recording.
         plant: name of the plant; None if the recording has only one.
+        signals: names of the signals that are read.
 
     Returns:
-        The three signals; NaN where a signal has no sample at the time of another one, or no valid one. The first of
+        The signals; NaN where a signal has no sample at the time of another one, or no valid one. The first of
         duplicate samples in a run counts, and stray samples are counted as `strays`. Time counts from `zero_ns` of the
         metadata, else from the first sample of the first run.
 
@@ -153,13 +154,13 @@ def read_record(path: Path, plant: str | None = None) -> Record:
         InputError: as `read_messages` and `one_plant_in`; or a sample cannot be decoded.
     """
     plant = one_plant_in(path, plant)
-    signals = {keys.key(plant, keys.SAMPLE, signal): signal for signal in UNITS}
+    by_key = {keys.key(plant, keys.SAMPLE, signal): signal for signal in signals}
     runs: list[dict[str, tuple[array[int], array[float]]]] = []
     newest: dict[str, tuple[array[int], array[float]]] = {}  # columns of the newest sample, by signal
     units: dict[str, str] = {}
     splitter = RunSplitter()
     for entry in read_messages(path, {keys.SAMPLE}, plant):
-        if entry.key not in signals or entry.encoding != _SAMPLE:
+        if entry.key not in by_key or entry.encoding != _SAMPLE:
             continue
         try:
             sample: Any = decode(entry.payload, entry.encoding)
@@ -167,20 +168,20 @@ def read_record(path: Path, plant: str | None = None) -> Record:
             continue  # the recorder has counted it as refused
         value = measured_value(sample)
         if value is not None:
-            signal, strays = signals[entry.key], splitter.strays
+            signal, strays = by_key[entry.key], splitter.strays
             number = splitter.update(signal, sample.sequence, sample.time_ns)
             if splitter.strays > strays:
                 for column in newest[signal]:
                     column.pop()
             if number > len(runs):
-                runs.append({signal: (array("q"), array("d")) for signal in UNITS})
+                runs.append({name: (array("q"), array("d")) for name in signals})
             if sample.unit:
                 units.setdefault(signal, sample.unit)
             newest[signal] = times, values = runs[number - 1][signal]
             times.append(sample.time_ns)
             values.append(value)
     if not runs:
-        raise InputError(f"{path}: holds no samples of {', '.join(UNITS)} of plant {plant!r}")
+        raise InputError(f"{path}: holds no samples of {', '.join(signals)} of plant {plant!r}")
     metadata = read_metadata(path)
     zero_ns = zero_from(metadata, splitter.runs[0].first_ns)
     rows = [_rows(series, zero_ns, path.name) for series in runs if any(times for times, _ in series.values())]

@@ -209,10 +209,10 @@ class Player:
             self._rate = command.rate
         else:
             self._paused = name == "pause"
-        return f"{self._doing} at {self._rate:g} times the plant's pace", stepped
+        return f"{self._status} at {self._rate:g} times the plant's pace", stepped
 
     @property
-    def _doing(self) -> str:
+    def _status(self) -> str:
         if self._next is None:
             return "at the end"
         return "paused" if self._paused else "playing"

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from google.protobuf.message import Message
 
-from benchmarks.link_cuts import Router, connected
+from benchmarks.link_cuts import Router, connect_client
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
@@ -69,7 +69,7 @@ class LiveRun:
         tables = {"bus": self.config, "plant": self.plant, "monitor": self.monitor, "recorder": recorder}
         write_settings(settings, tables)
         self.router = Router(self.config.endpoint)
-        self.bus = connected(self.config)
+        self.bus = connect_client(self.config)
         self.nodes = Processes(dict.fromkeys(MODULES, settings), folder)
         self.alarms: list[Alarm] = []
         """As heard."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.fuzz import Mutator
-from benchmarks.link_cuts import connected
+from benchmarks.link_cuts import connect_client
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encoding_of
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
@@ -68,7 +68,7 @@ def test_a_router_that_is_killed_and_started_again_costs_no_alarm(run: LiveRun) 
 
 def flood(config: BusConfig) -> None:
     """One publisher sends payloads of ten megabytes, and garbage as fast as it can, on the keys of the samples."""
-    bus = connected(BusConfig(endpoint=config.endpoint, cache_messages=LARGE))
+    bus = connect_client(BusConfig(endpoint=config.endpoint, cache_messages=LARGE))
     mutator, encoding = Mutator(5), encoding_of(Sample)
     heard = [
         encode(
@@ -114,7 +114,7 @@ def test_a_second_plant_of_the_same_name_is_refused(run: LiveRun) -> None:
     Two free processes would not do: the second counts as a restart of the first while a busy machine holds that up for
     eight samples (`sequence_check`).
     """
-    second, numbers = connected(run.config), defaultdict[str, Iterator[int]](itertools.count)
+    second, numbers = connect_client(run.config), defaultdict[str, Iterator[int]](itertools.count)
 
     def publish_as_second(message: Encoded) -> None:
         sample = decode(message.payload, message.encoding)

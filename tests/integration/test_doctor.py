@@ -112,7 +112,7 @@ def test_what_the_doctor_says_is_heard_by_no_node(site: Site, tmp_path: Path) ->
     plant = site.join("cstr/plant")
     with nodes({node: site.join(f"cstr/{node}") for node in NODES}):
         found = list(run_checks(settings(site.folder, "cstr/plant"), "cstr", tmp_path, 0.0, WITHIN_S, now()))
-    assert Finding("heard", "what we publish comes through: sample, fault") in found
+    assert Finding("heard", "messages published from here arrive: sample, fault") in found
     plant.publish(Encoded("reactor/cstr/sample/T", b"measured", ""))
     site.leave(plant)
     site.leave(recorder)

@@ -7,7 +7,7 @@ from queue import SimpleQueue
 import pytest
 import zenoh
 
-from benchmarks.link_cuts import Router, connected
+from benchmarks.link_cuts import Router, connect_client
 from benchmarks.recorder_kills import PATIENCE_S
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import bus as bus_module
@@ -45,7 +45,7 @@ def test_an_answer_that_does_not_come_in_time_is_asked_for_again(
 ) -> None:
     monkeypatch.setattr(bus_module, "HISTORY_WITHIN_S", 0.5)
     with contextlib.closing(Router(free_endpoint())) as router:
-        publisher, late = connected(router.config), connected(router.config)
+        publisher, late = connect_client(router.config), connect_client(router.config)
         slow = SlowPublisher(router.config, unanswered)
         for message in PUBLISHED:
             publisher.publish(message)

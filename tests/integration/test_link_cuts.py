@@ -16,10 +16,10 @@ from benchmarks.link_cuts import (
     Manner,
     Router,
     Whose,
-    connected,
+    connect_client,
     cut,
     kill_router,
-    look,
+    read_content,
     recorder_process,
     stick,
 )
@@ -69,7 +69,7 @@ def test_the_first_messages_on_keys_are_heard_though_the_router_was_gone_when_th
     router: Router,
 ) -> None:
     """Of streams that are new, and of one that is known: nobody has heard of these keys before the router is back."""
-    listener, publisher = connected(router.config), connected(router.config)
+    listener, publisher = connect_client(router.config), connect_client(router.config)
     seen: SimpleQueue[bool] = SimpleQueue()
     heard: SimpleQueue[str] = SimpleQueue()
     listener.subscribe("reactor/*/alarm/**", lambda message: heard.put(message.key))
@@ -101,10 +101,10 @@ def test_what_could_not_be_recovered_is_counted_and_named_in_the_file_and_by_inf
 
 
 def test_who_begins_to_listen_late_hears_what_was_before(tmp_path: Path, router: Router) -> None:
-    bus, heard, enough = connected(router.config), list[int](), threading.Event()
+    bus, heard, enough = connect_client(router.config), list[int](), threading.Event()
     publisher = Publisher(bus, RATE_PER_S)
     publisher.wait(1000)
-    late = connected(router.config)
+    late = connect_client(router.config)
 
     def hear(message: Encoded) -> None:
         sample = decode(message.payload, message.encoding)
@@ -125,7 +125,7 @@ def test_who_begins_to_listen_late_hears_what_was_before(tmp_path: Path, router:
 def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
     tmp_path: Path, router: Router, killed: bool
 ) -> None:
-    bus = connected(BusConfig(endpoint=router.config.endpoint, cache_messages=KEPT))
+    bus = connect_client(BusConfig(endpoint=router.config.endpoint, cache_messages=KEPT))
     tokens, heard = Tokens(bus), Heard(bus)
     publisher = Publisher(bus, RATE_PER_S)
     try:
@@ -143,7 +143,7 @@ def test_a_recorder_that_is_started_anew_leaves_nothing_out_and_repeats_nothing(
         bus.close()
     files = recordings_in(tmp_path)
     assert len(files) == 2
-    found = look(files, publisher)
+    found = read_content(files, publisher)
     assert (found.missing, found.twice, found.out_of_order) == (0, 0, 0)
 
 
@@ -156,7 +156,7 @@ def test_a_stuck_recorder_costs_another_nothing_and_gets_it_all_later(tmp_path: 
 def test_a_handler_that_blocks_holds_up_neither_the_publisher_nor_another_listener(router: Router) -> None:
     """Until the other has heard all, the handler does not return; then it hears the same."""
     rows, released = 3000, threading.Event()
-    bus, stuck, quick = (connected(router.config) for _ in range(3))
+    bus, stuck, quick = (connect_client(router.config) for _ in range(3))
     heard: dict[str, list[int]] = {"stuck": [], "quick": []}
     complete = {name: threading.Event() for name in heard}
 

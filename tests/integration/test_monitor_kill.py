@@ -24,7 +24,7 @@ def test_three_kills_change_no_alarm(tmp_path: Path) -> None:
             run.wait_until(minute)
             run.kill("monitor", monitor)
             monitor = run.start("monitor")
-            assert "the monitor goes on from it" in (tmp_path / "monitor.log").read_text(encoding="utf-8")
+            assert "the monitor resumes from it" in (tmp_path / "monitor.log").read_text(encoding="utf-8")
         run.end(plant)
         assert run.recorded_alarms() == run.expected_alarms()
         assert verify(lambda: messages(run.recording, PLANT), run.monitor).exact

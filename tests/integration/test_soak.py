@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.soak.__main__ import soak, table
-from benchmarks.soak.findings import ROW_NS, Change, unaccounted, why_not_once
-from benchmarks.soak.plan import KINDS, drawn
+from benchmarks.soak.findings import ROW_NS, Change, count_unaccounted, why_not_once
+from benchmarks.soak.plan import KINDS, draw_plan
 from reactorwatch.contract.messages_pb2 import Health
 
 ROWS = 500
@@ -28,10 +28,10 @@ EWMA, SHEWHART = "ewma/T", "shewhart/T"
 def test_in_a_minute_of_kills_cuts_and_garbage_no_sample_is_unaccounted_for_and_each_fault_alarmed_once(
     tmp_path: Path,
 ) -> None:
-    plan = drawn(SEED, PLANTS, ROWS, ROWS_PER_S)
+    plan = draw_plan(SEED, PLANTS, ROWS, ROWS_PER_S)
     assert {(blow.kind, blow.manner) for blow in plan.blows} == set(KINDS)
     findings = soak(plan, tmp_path)
-    broken = list(findings.broken(GROWTH_MB))
+    broken = list(findings.failures(GROWTH_MB))
     assert not broken, "\n".join([*broken, table(plan, findings)])
     assert (findings.alarmed_once, len(findings.memory_mb)) == (len(plan.faults), 5)
     assert {"monitor 1", "plants 1", "plants 2"} <= findings.grown_mb.keys()
@@ -52,7 +52,7 @@ def test_in_a_minute_of_kills_cuts_and_garbage_no_sample_is_unaccounted_for_and_
 )
 def test_samples_are_accounted_for_that_are_in_rows_or_counted(health: Health, samples: int) -> None:
     """Of 100 rows that were published, three samples each."""
-    assert unaccounted(health, rows=100) == samples
+    assert count_unaccounted(health, rows=100) == samples
 
 
 def changes(*events: tuple[int, str, str]) -> list[Change]:
@@ -79,5 +79,5 @@ def test_a_fault_is_alarmed_once_if_an_alarm_comes_soon_and_none_comes_again_whi
 
 
 def test_the_same_seed_is_the_same_plan_and_another_is_another() -> None:
-    assert drawn(1, PLANTS, ROWS, ROWS_PER_S) == drawn(1, PLANTS, ROWS, ROWS_PER_S)
-    assert drawn(1, PLANTS, ROWS, ROWS_PER_S) != drawn(2, PLANTS, ROWS, ROWS_PER_S)
+    assert draw_plan(1, PLANTS, ROWS, ROWS_PER_S) == draw_plan(1, PLANTS, ROWS, ROWS_PER_S)
+    assert draw_plan(1, PLANTS, ROWS, ROWS_PER_S) != draw_plan(2, PLANTS, ROWS, ROWS_PER_S)

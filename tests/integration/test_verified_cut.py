@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.link_cuts import Heard, Proxy, Router, connected
+from benchmarks.link_cuts import Heard, Proxy, Router, connect_client
 from monitor_node.alarms.commands import COMMANDS
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -38,7 +38,7 @@ OF_RECORDER = keys.key("cstr", keys.HEALTH, "recorder")
 
 
 def watch(bus_config: BusConfig, stop: StopSignal) -> None:
-    with contextlib.closing(connected(bus_config)) as bus:
+    with contextlib.closing(connect_client(bus_config)) as bus:
         loop = EventLoop(Monitor(MONITOR, time.time_ns()), bus, stop, drain_timeout_s=0.5)
         loop.subscribe(keys.all_keys("cstr", keys.SAMPLE))
         loop.accept_commands(*(keys.key("cstr", keys.COMMAND, name) for name in COMMANDS))
@@ -69,7 +69,7 @@ def test_a_run_that_was_recorded_over_a_cut_link_is_exact(tmp_path: Path, capsys
     config = RecorderConfig(out=str(path), about=about, black_box_min=0.0, health_period_s=0.2)
     endpoint = free_endpoint()
     direct = BusConfig(endpoint=endpoint)
-    with contextlib.closing(Router(endpoint)), contextlib.closing(connected(direct)) as bus:
+    with contextlib.closing(Router(endpoint)), contextlib.closing(connect_client(direct)) as bus:
         proxy = Proxy(endpoint)
         watching, recording = StopSignal(), StopSignal()
         heard = Heard(bus)
@@ -82,7 +82,7 @@ def test_a_run_that_was_recorded_over_a_cut_link_is_exact(tmp_path: Path, capsys
         ):
             with (
                 running(lambda: watch(direct, watching), watching),
-                contextlib.closing(connected(direct)) as plant_bus,
+                contextlib.closing(connect_client(direct)) as plant_bus,
             ):
                 plant = PlantNode(plant_from(PLANT), PLANT, lambda _: None)
                 with running(lambda: serve_plant(plant, PLANT, plant_bus, StopSignal()), StopSignal()):

@@ -84,13 +84,16 @@ def test_identification_gives_its_fit_under_both_names(leaking: rw.Record) -> No
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda record: rw.simulate(record, "reactor"), r"process must be one of cstr, tanks"),
-        (lambda record: rw.backtest(record, charts=("no such",)), r"settings: .*no such"),
+        (
+            lambda record: rw.simulate(record, "reactor"),
+            r"unknown process 'reactor'.*valid: cstr",
+        ),
+        (lambda record: rw.backtest(record, charts=("no such",)), r"settings \[monitor\]: .*no such"),
         (lambda record: rw.backtest(record, forgetting=1.2), r"forgetting must be in"),
         (lambda record: rw.backtest(record, colour="red"), r"colour"),
         (lambda record: rw.identify(record, output="p"), r"holds no signal 'p', only qc, C, T"),
         (lambda _: rw.Monitor().from_bytes(b"\xc1"), r"the state of a monitor cannot be read"),
-        (lambda _: rw.read_record("data.parquet"), r"must be a \.csv or \.mcap file"),
+        (lambda _: rw.read_record("data.docx"), r"must be a \.csv or \.mcap file"),
     ],
 )
 def test_a_mistake_is_one_line_that_names_the_cure(call: object, message: str, leaking: rw.Record) -> None:

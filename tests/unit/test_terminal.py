@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from reactorwatch.cli.alarm import _line
 from reactorwatch.cli.main import main
 from reactorwatch.cli.printing import print_lines
-from reactorwatch.cli.progress import _unmarked
+from reactorwatch.cli.progress import _escape_markup
 from reactorwatch.cli.status import StatusBoard, _text
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import ALARM_STATE_UNACKNOWLEDGED, QUALITY_GOOD, Alarm, Sample
@@ -140,7 +140,7 @@ def test_logs_for_people_are_lines_of_text(capsys: pytest.CaptureFixture[str]) -
 
 
 def test_what_is_under_way_is_no_markup() -> None:
-    assert _unmarked("reading [red]a\x1b[31m.csv") == "reading \\[red]a\\u001b[31m.csv"
+    assert _escape_markup("reading [red]a\x1b[31m.csv") == "reading \\[red]a\\u001b[31m.csv"
 
 
 def test_nothing_is_printed_but_at_the_border() -> None:

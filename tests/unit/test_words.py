@@ -42,6 +42,7 @@ def test_a_participle_is_no_name_of_a_function(name: str) -> None:
         "read",
         "run_until_stopped",
         "count_lost",
+        "map_unordered",
         "need",
         "on",
     ],
@@ -55,6 +56,9 @@ def test_verbs_quantities_predicates_and_events_are_names_of_functions(name: str
     [
         ('"""What a monitor does."""', "module: head"),
         ('def f():\n    """Whether it is white."""', "f: head"),
+        ('def f():\n    """When it is due."""', "f: head"),
+        ('def f():\n    """Does it drift?"""', "f: head"),
+        ('def f(a):\n    """Add.\n\n    Args:\n        a: its size.\n    """', "f: fragment"),
         ('class A:\n    x: int\n    """How many there are."""', "A.x: head"),
         ('def f(a):\n    """Add.\n\n    Args:\n        a: of it.\n    """', "f: fragment"),
         ("class A:\n    def f(self):\n        # nobody hears it\n        return 1", "A.f: people, nobody"),

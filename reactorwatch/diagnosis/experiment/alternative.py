@@ -1,6 +1,6 @@
 """Predictions of an alternative explanation for a new input, and how well another alternative could imitate them.
 
-The causes stay in the plant: what has set in keeps its magnitude at the end of the record, a sine goes on. So each
+The causes stay in the plant: each keeps its magnitude at the end of the record, and a sine continues. So each
 alternative predicts the outputs for an input that has not been tried.
 
 Assume alternative i is true. The evidence against alternative j is not the difference of the two predictions but the
@@ -50,7 +50,7 @@ class Prediction:
 
     Args:
         hypothesis: hypothesis at the present noise levels.
-        fit: its fit.
+        fit: fit of the hypothesis.
         run: the record.
         resting: inputs at which the plant settles before the experiment, shape (n_u,).
         rest_rows: number of rows for settling.
@@ -130,7 +130,7 @@ def extrapolate(
 
     Args:
         profile: profile in the record.
-        parameters: its parameters there.
+        parameters: parameters of the alternative at that time.
         time_min: times of the new rows, shape (rows,).
         pattern_min: see `Prediction`.
     """
@@ -141,14 +141,14 @@ def extrapolate(
     return Constant(time_min), profile.signal(parameters).sample_value[-1:]
 
 
-def probability_decided(expected: float, evidence: float) -> float:
+def decision_probability(expected: float, evidence: float) -> float:
     """Probability that the difference in BIC exceeds `LISTED`.
 
     Args:
         expected: expected difference in BIC.
-        evidence: its noncentrality.
+        evidence: noncentrality of the evidence.
 
-    >>> round(probability_decided(30.0, 30.0), 3)
+    >>> round(decision_probability(30.0, 30.0), 3)
     0.966
     """
     return float(special.ndtr((expected - LISTED) / max(2.0 * sqrt(evidence), 1e-9)))

@@ -17,7 +17,7 @@ from math import log
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.experiment.alternative import probability_decided
+from reactorwatch.diagnosis.experiment.alternative import decision_probability
 from reactorwatch.diagnosis.experiment.alternatives import Predictions
 from reactorwatch.diagnosis.experiment.input_sequence import (
     QUIET_ROWS,
@@ -97,7 +97,7 @@ class ExperimentSearch:
             name = self._model.input_names[0]
             return f"No experiment is proposed: {self._describe_limits()} leave {name} no room to move."
         most = MOST * np.max([item.evidence for item in tried], axis=0)
-        in_reach = np.array([probability_decided(evidence, evidence) >= LIKELY for evidence in most.tolist()])
+        in_reach = np.array([decision_probability(evidence, evidence) >= LIKELY for evidence in most.tolist()])
         if not np.any(in_reach):
             in_reach = most >= LISTED
         if not np.any(in_reach):
@@ -236,7 +236,7 @@ class ExperimentSearch:
         cases = []
         for evidence, price in ((noncentralities[pair], more), (noncentralities[pair[::-1]], -more)):
             expected = times * evidence + price
-            cases.append((expected, probability_decided(expected, times * evidence)))
+            cases.append((expected, decision_probability(expected, times * evidence)))
         return Separation((one.name, two.name), *min(cases))
 
     def _levels(self, sequence: InputSequence, times: int) -> Array:

@@ -23,8 +23,8 @@ from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.kalman.innovations import FilterResult
 
 CONVERGED, WELL_CONVERGED = 0.05, 0.005
-"""In log likelihood: a rough fit stops after a step that gains less, a full fit when the predicted gain is below the
-second."""
+"""Thresholds in log likelihood: a rough fit stops after a step that gains less than the first, a full fit when the
+predicted gain is below the second."""
 
 MOST_STEPS = 12
 """Maximum number of steps of a fit."""

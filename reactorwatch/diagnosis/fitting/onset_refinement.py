@@ -15,7 +15,7 @@ NEAR = np.array([-8, -4, -2, -1, 1, 2, 4, 8])
 
 MOST_ROUNDS = 8
 LEAST_GAIN = 0.1
-"""In log likelihood."""
+"""Threshold in log likelihood."""
 
 
 def refine_onset(run: Run, hypothesis: Hypothesis, best: Fit, steps: int) -> Fit:

@@ -32,7 +32,7 @@ class Meaning:
 
     Attributes:
         symbol: MathML of its magnitude in the equations.
-        text: its effect, in a sentence.
+        text: effect of the cause in a sentence.
     """
 
     symbol: str

@@ -38,7 +38,7 @@ def as_object(diagnosis: Diagnosis, file: str, seconds: float, zero: str | None 
         "practical": bool(diagnosis.practical),
         "gain": {
             "delta_bic": _number(diagnosis.gain.delta_bic),
-            "held_out": {name: _held_out(item) for name, item in diagnosis.gain.held_out.items()},
+            "held_out": {name: _holdout_gain(item) for name, item in diagnosis.gain.held_out.items()},
         },
         "adequacy": {name: {"minus_log10_p": _number(value)} for name, value in diagnosis.adequacy.items()},
         "experiment": None if experiment is None else _experiment(experiment),
@@ -117,7 +117,7 @@ def _difference(item: Difference) -> dict[str, Any]:
     }
 
 
-def _held_out(item: HeldOut) -> dict[str, Any]:
+def _holdout_gain(item: HeldOut) -> dict[str, Any]:
     return {
         "rmse_before": _number(item.rmse_before),
         "rmse_after": _number(item.rmse_after),

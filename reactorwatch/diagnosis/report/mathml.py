@@ -79,11 +79,11 @@ class _Writer:
         if before is None:
             return mark_added(_Writer(ca.SX())._plain(now, (None, None), binds))
         if now.n_dep() == 2:
-            wrapped = [ca.is_equal(now.dep(place), before, _DEPTH) for place in (0, 1)]
+            wrapped = [ca.is_equal(now.dep(index), before, _DEPTH) for index in (0, 1)]
             if any(wrapped) and now.op() in (ca.OP_ADD, ca.OP_SUB):
                 return self._write_sum(now, wrapped.index(True), binds)
         if not before.is_symbolic() and now.op() == before.op() and now.n_dep() == before.n_dep():
-            return self._plain(now, tuple(before.dep(place) for place in range(now.n_dep())), binds)
+            return self._plain(now, tuple(before.dep(index) for index in range(now.n_dep())), binds)
         return self.text(now, None, binds)
 
     def _write_sum(self, now: ca.SX, old: int, binds: int) -> str:
@@ -102,10 +102,10 @@ class _Writer:
             return _number(float(now), binds)
         if now.is_symbolic():
             return name(now.name())
-        op, parts = now.op(), [now.dep(place) for place in range(now.n_dep())]
+        op, parts = now.op(), [now.dep(index) for index in range(now.n_dep())]
 
-        def part(place: int, inner: int = 0) -> str:
-            return self.text(parts[place], before[place] if self._has_new(parts[place]) else None, inner)
+        def part(index: int, inner: int = 0) -> str:
+            return self.text(parts[index], before[index] if self._has_new(parts[index]) else None, inner)
 
         match op:
             case ca.OP_ADD:
@@ -140,7 +140,7 @@ class _Writer:
             case _ if op in _RELATIONS:
                 return _within(f"{part(0, _SUM)}<mo>{_RELATIONS[op]}</mo>{part(1, _SUM)}", _SUM, binds)
             case _ if op in _FUNCTIONS:
-                listed = "<mo>,</mo>".join(part(place) for place in range(len(parts)))
+                listed = "<mo>,</mo>".join(part(index) for index in range(len(parts)))
                 return f'<mi mathvariant="normal">{_FUNCTIONS[op]}</mi><mo>(</mo>{listed}<mo>)</mo>'
         raise ValueError(f"operation {op} has no sign")
 
@@ -169,8 +169,8 @@ def _count(expression: ca.SX, so_far: int, enough: int) -> int:
         return so_far
     if expression.op() not in _WITH_SIGN | _FUNCTIONS.keys() | _RELATIONS.keys():
         return enough + 1
-    for place in range(expression.n_dep()):
+    for index in range(expression.n_dep()):
         if so_far > enough:
             break
-        so_far = _count(expression.dep(place), so_far, enough)
+        so_far = _count(expression.dep(index), so_far, enough)
     return so_far

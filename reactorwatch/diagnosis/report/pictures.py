@@ -156,13 +156,13 @@ def unknown_course(diagnosis: Diagnosis) -> list[Picture]:
     if unknown is None:
         return []
     drawing = plot(
-        "course of what acts there",
+        "course of the unknown input",
         curves.time_min,
         [Line(unknown.size, "after")],
         shown=_with_zero(unknown.size, unknown.size, unknown.size),
     )
     unit = "" if unknown.unit == "1" else f", {unknown.unit}"
-    return [Picture(f"Told as the size of: {unknown.label}{unit}", (("most likely", "after"),), drawing)]
+    return [Picture(f"Estimated as the size of: {unknown.label}{unit}", (("most likely", "after"),), drawing)]
 
 
 def interval(cause: Cause, curves: Curves) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ from reactorwatch.diagnosis.search.screen import DECAYS, EDGE_ROWS, KNOTS, Candi
 from reactorwatch.process.effect import Effect
 
 Evaluate: TypeAlias = Callable[[Effect, Sequence[Signal]], Sequence[FilterEvaluation]]
-"""From deviations of an effect to the filter results with them."""
+"""Function from deviations of an effect to the filter results with them."""
 
 
 class DynamicEffectsScreen:

@@ -24,11 +24,11 @@ QUIET_SHARE = 0.003
 def search_single_cause(search: Search) -> SearchResult:
     """Search for the best single effect and its alternatives, with the noise levels of the best."""
     better = search.search_single_causes()
-    hidden = _search_masked(search, better)
+    hidden = _find_masked_fault(search, better)
     return better if hidden is None else search.search_from(hidden, better)
 
 
-def _search_masked(search: Search, result: SearchResult) -> FittedHypothesis | None:
+def _find_masked_fault(search: Search, result: SearchResult) -> FittedHypothesis | None:
     """Find a better hypothesis and adopt its noise levels; None if there is none or the innovations are white.
 
     Discontinuous effects are tried even if they predict no gain: process noise masks stiction, and at a wrong magnitude

@@ -59,7 +59,7 @@ class Block:
 
     Attributes:
         effect: the cause.
-        profile: its profile.
+        profile: profile of the effects.
         shape: nonlinear parameters of the profile.
         size: magnitude at a coefficient of 1, of an effect with internal states; None: 1.
         columns: signature of each basis function, shape (values, n_linear).
@@ -212,7 +212,7 @@ class DynamicSignature:
 
     Attributes:
         effect: the effect.
-        size: its magnitude.
+        size: magnitude of the effect.
         g: reduction of the innovations, shape (rows, n_y).
     """
 

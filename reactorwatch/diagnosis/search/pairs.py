@@ -29,7 +29,7 @@ from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
 from reactorwatch.process.effect import Effect
 
 LEAST_PAIR_GAIN = 40.0
-"""In BIC, of a pair over the best single cause."""
+"""Threshold in BIC, of a pair over the best single cause."""
 
 SHORTLIST, AGAIN, REFINED = 6, 3, 2
 """Pairs fitted after a screen; pairs fitted again with the noise of the best; pairs refined."""
@@ -38,7 +38,7 @@ MOST_PROFILES, EXCHANGED = 2, 4
 """Profiles fitted for one cause, and candidates fitted in an exchange."""
 
 NEAR_BEST = 20.0
-"""In BIC: an exchanged pair whose rough fit is worse by more is not fitted fully."""
+"""Threshold in BIC: an exchanged pair whose rough fit is worse by more is not fitted fully."""
 
 ROUNDS, EXCHANGES = 3, 3
 ROUGH_STEPS, EXCHANGE_STEPS = 3, 6

@@ -46,7 +46,7 @@ KNOWN_PERIODS = 10
 _WELL_INSIDE = 0.6
 
 EDGE_ROWS = 5
-"""No onset is searched for nearer to the ends of the record."""
+"""Rows at both ends of the record without candidates of an onset."""
 
 _INNER = slice(EDGE_ROWS, -EDGE_ROWS)
 
@@ -105,7 +105,7 @@ class Screen:
 
         Args:
             hypothesis: hypothesis about whose run everything is linearised.
-            fit: its fit.
+            fit: fit of the hypothesis.
             replaced: indices of its effects to find alternatives for; the others stay.
             of: causes to screen among `static_effects`; None: all.
         """

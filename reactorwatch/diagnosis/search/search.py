@@ -41,8 +41,8 @@ LEAST_SCORE = -20.0
 """Minimum predicted gain in BIC of an alternative."""
 
 IN_QUESTION, FAR_OUT = 100.0, 600.0
-"""In BIC: alternatives that are worse by more are dropped; and at any other noise levels, too. A curve with twelve
-knots that needs only three costs ninety too much."""
+"""Thresholds in BIC: alternatives that are worse by more than the first are dropped, by more than the second at any
+other noise levels, too. A curve with twelve knots that needs only three costs ninety too much."""
 
 ROUGH = 1e-3
 """Minimum error of a predicted gain, as a fraction of it: the equations are not linear."""
@@ -53,7 +53,7 @@ LEAST_SENSOR_GAIN = 10.0
 ROUNDS = 5
 
 CONVERGED_NOISE = 10.0
-"""In BIC: noise levels that gain less are not worth another round."""
+"""Threshold in BIC: noise levels that gain less are not worth another round."""
 
 NOISES = 3
 """Recent noise levels that the next estimate starts from; with the first rows', they fill the lanes."""
@@ -73,7 +73,7 @@ class FittedHypothesis:
 
     Attributes:
         hypothesis: the effects and their kinds of profile.
-        fit: its fit.
+        fit: fit of the hypothesis.
         bic: BIC of the fit.
     """
 

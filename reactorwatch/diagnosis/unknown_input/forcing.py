@@ -66,7 +66,7 @@ class ForcingFit:
 
     Attributes:
         loss: negative log marginal likelihood, up to the constant common to all hypotheses.
-        levels: its hyperparameters.
+        levels: hyperparameters of the forcing.
         terms: coefficients of the function's terms, in typical magnitudes of the effect.
     """
 
@@ -84,16 +84,16 @@ class ReferenceTrajectory:
         size: magnitude of the forcing along the path.
         process_sd: standard deviation of the process noise, one for each state.
         known: mask of values that are used, shape (rows, n_y).
-        began: rows at which the filter restarts, shape (rows,).
+        restarts: rows at which the filter restarts, shape (rows,).
         start: initial states at these rows, shape (rows, n_x).
-        start_covariance: their covariance, shape (rows, n_x, n_x).
+        start_covariance: covariance of the states, shape (rows, n_x, n_x).
     """
 
     x: Array
     size: Signal
     process_sd: Array
     used: NDArray[np.bool_]
-    began: NDArray[np.bool_]
+    restarts: NDArray[np.bool_]
     start: Array
     start_covariance: Array
 
@@ -136,7 +136,7 @@ class Forcing:
             np.square(reference.process_sd) * step_min[:, None]
             + np.square(np.vstack([np.zeros(n_x), path.predicted_sd])),
             reference.used,
-            reference.began,
+            reference.restarts,
             reference.start - reference.x,
             reference.start_covariance,
         )

@@ -37,7 +37,7 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 
 MARGIN = 25.0
-"""In BIC, over the best of the catalogue: a forcing is more flexible."""
+"""Threshold in BIC, over the best of the catalogue: a forcing is more flexible."""
 
 FIRST_REDS, FIRST_LASTS_MIN = (0.001, 0.03, 0.3, 3.0), (0.4, 3.0, 20.0)
 """Initial grid: red noise in typical magnitudes of the effect, and its time constant."""
@@ -106,7 +106,7 @@ def locate(
         effects: the catalogue.
         run: the record.
         nominal: fit without any effect.
-        noise: its noise levels.
+        noise: noise levels of the filter.
     """
     own = model.state_names
     carriers = [effect for effect in (*effects, *balance_losses(model)) if effect.extend(model).state_names == own]
@@ -116,10 +116,10 @@ def locate(
         return None
     reference = _reference(model, run, nominal)
     first = [_try_levels(Forcing(model, effect), reference, run, noise) for effect in carriers]
-    places = _best_of_places(first)[:PLACES]
-    closer = _best_of_places([_refine(model, run, item, _COARSE) for item in places])[:FINALISTS]
+    places = _best_by_location(first)[:PLACES]
+    closer = _best_by_location([_refine(model, run, item, _COARSE) for item in places])[:FINALISTS]
     for _ in range(ROUNDS):
-        closer = _best_of_places([_refine(model, run, item, _FINE) for item in closer])
+        closer = _best_by_location([_refine(model, run, item, _FINE) for item in closer])
     best = closer[0]
     if not np.isfinite(best.fitted.loss):
         return None
@@ -163,11 +163,11 @@ def _reference(model: ProcessModel, run: Run, nominal: Fit) -> ReferenceTrajecto
     scales = np.array([state.scale for state in model.states])
     sure = np.all(np.isfinite(P.reshape(rows, -1)), axis=1)
     P = np.where(sure[:, None, None], P, np.diag(scales**2))
-    began = np.zeros(rows, dtype=np.bool_)
-    began[[0, *run.breaks]] = True
-    known = np.isfinite(run.measured) & (np.abs(np.nan_to_num(nominal.w)) < FAR_OFF) & ~began[:, None]
+    restarts = np.zeros(rows, dtype=np.bool_)
+    restarts[[0, *run.breaks]] = True
+    known = np.isfinite(run.measured) & (np.abs(np.nan_to_num(nominal.w)) < FAR_OFF) & ~restarts[:, None]
     zero = np.zeros(rows)
-    return ReferenceTrajectory(x, Signal(zero, zero), LEAST_PROCESS_SHARE * scales, known, began, x, P)
+    return ReferenceTrajectory(x, Signal(zero, zero), LEAST_PROCESS_SHARE * scales, known, restarts, x, P)
 
 
 def _try_levels(forcing: Forcing, reference: ReferenceTrajectory, run: Run, noise: NoiseLevels) -> _Trial:
@@ -178,7 +178,7 @@ def _try_levels(forcing: Forcing, reference: ReferenceTrajectory, run: Run, nois
     return _Trial(forcing, reference, best, reference.size)
 
 
-def _best_of_places(trials: Sequence[_Trial]) -> list[_Trial]:
+def _best_by_location(trials: Sequence[_Trial]) -> list[_Trial]:
     """Best trial of each location, the best first."""
     result: dict[str, _Trial] = {}
     for item in sorted(trials, key=lambda item: item.fitted.loss):

@@ -32,7 +32,7 @@ class PathModel(NamedTuple):
         D: feedthrough of the forcing, shape (rows, n_y).
         q: variance that the interval adds to each state, shape (rows, n_x).
         used: mask of measured values that are used, shape (rows, n_y).
-        began: rows at which the filter restarts, shape (rows,).
+        restarts: rows at which the filter restarts, shape (rows,).
         start: d at these rows, shape (rows, n_x).
         start_covariance: covariance of d at these rows, shape (rows, n_x, n_x).
     """
@@ -43,7 +43,7 @@ class PathModel(NamedTuple):
     D: Array
     q: Array
     used: NDArray[np.bool_]
-    began: NDArray[np.bool_]
+    restarts: NDArray[np.bool_]
     start: Array
     start_covariance: Array
 
@@ -73,9 +73,9 @@ def smooth(about: PathModel, r: Array, kept: Array, variance: float, offset: Arr
 
     Args:
         about: the equations.
-        r: as in `normalize_columns`.
-        kept: as in `normalize_columns`.
-        variance: as in `normalize_columns`.
+        r: see `normalize_columns`.
+        kept: see `normalize_columns`.
+        variance: see `normalize_columns`.
         offset: shape (rows, n_x).
         seen: shape (rows, n_y).
     """
@@ -87,14 +87,14 @@ def smooth(about: PathModel, r: Array, kept: Array, variance: float, offset: Arr
 def _normalize_columns(
     about: PathModel, r: Array, kept: Array, variance: float, offset: Array, seen: Array
 ) -> tuple[Array, float]:
-    F, G, H, D, q, used, began, start, start_covariance = about
+    F, G, H, D, q, used, restarts, start, start_covariance = about
     rows, n, n_y, columns = F.shape[0], F.shape[1], H.shape[1], offset.shape[2]
     result, logs = np.zeros((rows, n_y, columns)), 0.0
     x, predicted = np.zeros((n + 1, columns)), np.zeros((n, columns))
     P, A, c, Pc = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1)), np.zeros(n + 1), np.zeros(n + 1)
     AP, innovation = np.zeros((n + 1, n + 1)), np.zeros(columns)  # loops over columns innermost, contiguous
     for k in range(rows):
-        if began[k]:
+        if restarts[k]:
             x[:] = 0.0
             P[:] = 0.0
             x[:n, 0] = start[k]
@@ -191,7 +191,7 @@ def _correct(P: Array, Pc: Array, s: float) -> None:
 
 @jit
 def _smooth(about: PathModel, r: Array, kept: Array, variance: float, offset: Array, seen: Array) -> Array:
-    F, G, H, D, q, used, began, start, start_covariance = about
+    F, G, H, D, q, used, restarts, start, start_covariance = about
     rows, n, n_y = F.shape[0], F.shape[1], H.shape[1]
     x_all, P_all = np.zeros((rows, n + 1)), np.zeros((rows, n + 1, n + 1))  # predicted, before the row's update
     gains, offs, sizes = np.zeros((rows, n_y, n + 1)), np.zeros((rows, n_y)), np.ones((rows, n_y))
@@ -199,7 +199,7 @@ def _smooth(about: PathModel, r: Array, kept: Array, variance: float, offset: Ar
     P, A, AP = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
     c, Pc = np.zeros(n + 1), np.zeros(n + 1)
     for k in range(rows):
-        if began[k]:
+        if restarts[k]:
             x[:n], x[n] = start[k], 0.0
             P[:] = 0.0
             P[:n, :n] = start_covariance[k]
@@ -230,7 +230,7 @@ def _smooth(about: PathModel, r: Array, kept: Array, variance: float, offset: Ar
             _correct(P, Pc, s)
     result, to_come, back = np.zeros((rows, n + 1)), np.zeros(n + 1), np.zeros(n + 1)
     for k in range(rows - 1, -1, -1):
-        if not began[k]:
+        if not restarts[k]:
             for i in range(n_y - 1, -1, -1):
                 if used[k, i]:
                     c[:n], c[n] = H[k, i], D[k, i]
@@ -244,7 +244,7 @@ def _smooth(about: PathModel, r: Array, kept: Array, variance: float, offset: Ar
             for j in range(n + 1):
                 value += P_all[k, i, j] * to_come[j]
             result[k, i] = value
-        if began[k]:
+        if restarts[k]:
             to_come[:] = 0.0
             continue
         for j in range(n):

@@ -301,7 +301,7 @@ class ZenohBus:
         for _ in range(MAX_QUERIES):
             if not missing:
                 break
-            answers = self._query_cache(key_expression, _published_since(since_s))
+            answers = self._query_cache(key_expression, _history_selector(since_s))
             for earlier in answers.messages:
                 delivery.add_history(earlier)
             missing = not (answers.is_complete and delivery.history_complete())
@@ -327,7 +327,7 @@ class ZenohBus:
         buffer: ReorderBuffer[Encoded] = ReorderBuffer(await_history=True)
         with contextlib.suppress(zenoh.ZError):  # it is closed
             for _ in range(MAX_QUERIES):
-                answers = self._query_cache(key_expression, _published_since(self._config.history_s))
+                answers = self._query_cache(key_expression, _history_selector(self._config.history_s))
                 for sent in answers.messages:
                     buffer.add_history(sent.publisher, sent.stream, sent.message.key, sent.number, sent.message)
                 if answers.is_complete:
@@ -340,7 +340,7 @@ class ZenohBus:
     def _query_stream(self, stream: str, since_s: float) -> list[SequencedMessage]:
         """Messages of a stream from publishers' caches."""
         try:
-            return self._query_cache(keys_of(stream), _published_since(since_s + MAX_TRANSIT_S)).messages
+            return self._query_cache(keys_of(stream), _history_selector(since_s + MAX_TRANSIT_S)).messages
         except zenoh.ZError as error:  # the bus is being closed, for instance
             log.info("cannot ask for what is missing", stream=stream, why=first_line(error))
             return []
@@ -466,7 +466,7 @@ def cache_size(key: str, cache_messages: int) -> int:
     return cache_messages if is_of_every_row else min(cache_messages, MAX_CACHED_OF_OTHERS)
 
 
-def _published_since(seconds: float) -> str:
+def _history_selector(seconds: float) -> str:
     """Selector for a publisher's cache."""
     return f"_time=[now(-{seconds}s)..]" if isfinite(seconds) else ""
 

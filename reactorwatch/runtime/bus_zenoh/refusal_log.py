@@ -22,7 +22,8 @@ DECISIONS = "error,zenoh::net::routing::interceptor::access_control=trace"
 _COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
 _DECISION = re.compile(b"routing::interceptor::access_control")
 _REFUSAL = re.compile(rb"CertCommonName\(([^)]*)\).* is unauthorized to (?!Delete)(\w+) \(ingress\) on (\S+)")
-"""Not a Delete: a client that disconnects undeclares its keys, which looks like one, and no node publishes any."""
+"""Refused message in the log of the router. A Delete is excluded: a client that disconnects undeclares its keys, which
+looks like one, and no node publishes any."""
 _LONGEST = 200
 
 

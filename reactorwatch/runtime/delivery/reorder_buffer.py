@@ -34,7 +34,7 @@ RECOVERY_TIMEOUT_NS = 15_000_000_000
 POLL_NS = 250_000_000
 START_WINDOW_NS = 500_000_000
 MAX_STREAMS = 100_000
-"""Streams that are remembered. A restarted publisher is another stream, and so is each plant of a fleet."""
+"""Largest number of stored streams. A restarted publisher is another stream, and so is each plant of a fleet."""
 ORPHAN_TIMEOUT_NS = 60_000_000_000
 """Time after which a stream is evicted that started with another number than 0, without a known last number and without
 a second message: garbage makes one stream a message."""
@@ -49,7 +49,7 @@ class Gap(NamedTuple):
         first: number of the first of them in the stream.
         last: number of the last; between them others may have arrived, on another key for instance.
         messages: count of missing messages.
-        noticed_ns: when they were given up, by the clock of receipt.
+        noticed_ns: time when they were given up, by the clock of receipt.
     """
 
     stream: str
@@ -183,7 +183,7 @@ class ReorderBuffer(Generic[Item]):
             state.drop_hold_state()
 
     def due_ns(self) -> int | None:
-        """When to call `release_overdue`; None: nothing is held."""
+        """Time of the next `release_overdue`; None: nothing is held."""
         if not self._holding:
             return None
         due = {name: state.hold.due_ns for name, state in self._holding.items() if state.hold is not None}

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from reactorwatch import __version__
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.parallel.jobs import Failed, internal_error, one_line, run_job, worker_died
+from reactorwatch.runtime.parallel.jobs import Failed, internal_error, one_line, run_job, worker_death
 
 CONNECT_WITHIN_S = 10.0
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
@@ -57,19 +57,19 @@ class DaskExecutor:
             _check_workers(client, self._address)
             indices = {client.submit(run_job, work, job, pure=False): index for index, job in enumerate(jobs)}
             suspects: list[int] = []
-            for future in self._as_completed(client, list(indices)):
+            for future in self._in_completion_order(client, list(indices)):
                 index = indices.pop(future)
                 if isinstance(future.exception(), KilledWorker):
                     suspects.append(index)
                 else:
                     yield index, _outcome(future)
             for index in suspects:
-                (alone,) = self._as_completed(client, [client.submit(run_job, work, jobs[index], pure=False)])
+                (alone,) = self._in_completion_order(client, [client.submit(run_job, work, jobs[index], pure=False)])
                 error = alone.exception()
                 killed = isinstance(error, KilledWorker)
-                yield index, worker_died(error.allowed_failures + 1) if killed else _outcome(alone)
+                yield index, worker_death(error.allowed_failures + 1) if killed else _outcome(alone)
 
-    def _as_completed(self, client: Any, futures: list[Any]) -> Iterator[Any]:
+    def _in_completion_order(self, client: Any, futures: list[Any]) -> Iterator[Any]:
         """Yield futures as they complete.
 
         Raises:

@@ -47,7 +47,7 @@ class Executor(Protocol):
 
         Args:
             work: a function of a module that the workers can import.
-            jobs: its arguments.
+            jobs: arguments of the calls.
         """
 
 
@@ -78,7 +78,7 @@ def internal_error(error: BaseException, where: str = "") -> Failed:
     return Failed(f"internal error: {type(error).__name__}: {one_line(error)}{where}", is_internal=True)
 
 
-def worker_died(times: int) -> Failed:
+def worker_death(times: int) -> Failed:
     """Result of a job at which workers died."""
     return Failed(f"given up: {times} workers died at it; is there too little memory?")
 

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any, TypeVar, cast
 
-from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, internal_error, run_job, worker_died
+from reactorwatch.runtime.parallel.jobs import RETRIES, Failed, internal_error, run_job, worker_death
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that libraries of linear algebra read when they are loaded."""
@@ -85,7 +85,7 @@ class ProcessExecutor:
                         _end(worker)
                         deaths[worker.number] += 1
                         if deaths[worker.number] > self._retries:
-                            yield worker.number, worker_died(deaths[worker.number])
+                            yield worker.number, worker_death(deaths[worker.number])
                         else:
                             queue.appendleft(worker.number)
                         continue

@@ -141,22 +141,22 @@ def access_control(
         names: common names of holders' certificates, by `plant/role`, where they differ from `common_name`.
         revoked: common names of certificates without any rights, listed in the settings under `subjects`.
     """
-    rules: list[dict[str, Any]] = [_rule("everyone", "ask nobody", ("ingress",), ("query",), [NO_QUERYABLE])]
+    rules: list[dict[str, Any]] = [_rule("everyone", "end of history", ("ingress",), ("query",), [NO_QUERYABLE])]
     subjects, policies = [], []
     for plant in plants:
         root = f"{keys.ROOT}/{plant}"
         monitors = keys.monitor_token(plant, "*")
         everything = [f"{root}/**", f"{root}/**/{CACHE_SUFFIX}", f"{root}/*/{PROOF}", monitors, keys.FLEET_TOKENS]
         reading = [
-            _rule(plant, "hear", ("ingress",), READ_INGRESS, everything),
-            _rule(plant, "be told", ("egress",), READ_EGRESS, everything),
-            _rule(plant, "ask what is remembered", ("ingress",), ("query",), everything[1:2]),
+            _rule(plant, "subscribe", ("ingress",), READ_INGRESS, everything),
+            _rule(plant, "receive", ("egress",), READ_EGRESS, everything),
+            _rule(plant, "query caches", ("ingress",), ("query",), everything[1:2]),
         ]
         rules += reading
         for role in ROLES:
             name = common_name(plant, role.name)
             asks = [f"{root}/{keys.COMMAND}/{command}" for command in role.asks]
-            own = [_rule(name, "ask", ("ingress",), ("query",), asks)]
+            own = [_rule(name, "command", ("ingress",), ("query",), asks)]
             if role.nodes:
                 published = [f"{root}/{expression}" for expression in role.key_space]
                 caches = [f"{key}/{CACHE_SUFFIX}" for key in published]
@@ -166,11 +166,11 @@ def access_control(
                 alive += [monitors] if role.name == "monitor" else []
                 own += [
                     _rule(name, "publish", ("ingress",), ("put", "reply"), [*published, *caches, *proofs]),
-                    _rule(name, "remember", ("ingress",), ("declare_queryable", "liveliness_token"), caches),
+                    _rule(name, "cache", ("ingress",), ("declare_queryable", "liveliness_token"), caches),
                     _rule(name, "answer", ("ingress",), ("declare_queryable", "reply"), answers),
-                    _rule(name, "be alive", ("ingress",), ("liveliness_token",), alive),
-                    _rule(name, "be asked", ("egress",), ("query",), [*everything[1:2], *answers]),
-                    _rule(name, "know who listens", ("egress",), ("declare_liveliness_subscriber",), everything),
+                    _rule(name, "declare token", ("ingress",), ("liveliness_token",), alive),
+                    _rule(name, "receive queries", ("egress",), ("query",), [*everything[1:2], *answers]),
+                    _rule(name, "see subscribers", ("egress",), ("declare_liveliness_subscriber",), everything),
                 ]
                 others = [f"{root}/{expression}" for expression in key_space_of_others(role)]
                 if others:
@@ -219,7 +219,7 @@ def key_space_of_others(role: Role) -> tuple[str, ...]:
 
 
 def _rule(
-    who: str,
+    holder: str,
     what: str,
     flows: tuple[str, ...],
     messages: tuple[str, ...],
@@ -228,7 +228,7 @@ def _rule(
     permission: str = "allow",
 ) -> dict[str, Any]:
     return {
-        "id": f"{who}: {what}",
+        "id": f"{holder}: {what}",
         "permission": permission,
         "flows": list(flows),
         "messages": list(messages),

@@ -42,7 +42,7 @@ def make_authority(name: str, now: datetime.datetime, days: float) -> Identity:
     """Make an authority with a self-signed certificate.
 
     Args:
-        name: its common name.
+        name: common name of the authority.
         now: time from which it is valid.
         days: days for which it is valid.
     """

@@ -193,7 +193,7 @@ def _update_register(folder: Path, there: list[str], endpoint: str | None, liste
     before = read_register(home / REGISTER_FILE)
     if before is None and is_old and (endpoint is None or listen is None):
         raise InputError(
-            f"{home / REGISTER_FILE}: is missing, and says where the router is; give --endpoint and --listen"
+            f"{home / REGISTER_FILE}: is missing, so the address of the router is unknown; give --endpoint and --listen"
         )
     if before is None:
         called = endpoint or DEFAULT_ENDPOINT

@@ -1,8 +1,8 @@
-"""What a control chart is here: one statistic, judged sample by sample against limits.
+"""Control charts: one statistic each, evaluated sample by sample against limits.
 
-All charts speak this language: `update(x)` takes the next value, a number or a vector, and returns a `Judgement`; all
-that a chart is and remembers is in `state`, and `from_state` goes on where it was, bit for bit. A chart never restarts
-by itself after a point that is out: `restart` does, when whoever watches it says that the cause is gone.
+All charts have one interface: `update(x)` takes the next value, a number or a vector, and returns a `Judgement`.
+`state` holds the parameters and the memory of a chart, and `from_state` resumes from it, bit for bit. A chart does not
+restart by itself after a point that is out: its owner calls `restart` when the cause is gone.
 """
 
 from abc import ABC, abstractmethod
@@ -23,11 +23,11 @@ LARGEST_VALUE = 1e30
 
 
 class Judgement(NamedTuple):
-    """A chart's view of one sample.
+    """Point of a chart for one sample.
 
     Attributes:
-        statistic: what is plotted.
-        centre: where it should be.
+        statistic: plotted value.
+        centre: expected value of the statistic.
         lower_limit: below it, it is out.
         upper_limit: above it, it is out.
         out: whether it is beyond a limit, or against another rule of the chart.
@@ -41,22 +41,22 @@ class Judgement(NamedTuple):
 
     @property
     def side(self) -> str:
-        """On which side of the centre the statistic is."""
+        """Side of the centre on which the statistic is."""
         return "above" if self.statistic > self.centre else "below"
 
 
 class ChartState(StoredState, frozen=True):
-    """All that a chart, or a bank of charts, is and remembers; the base of what each kind stores."""
+    """Base class of the stored states of a chart or a bank of charts."""
 
 
 class Setting(NamedTuple):
-    """A number that people can set for a chart: a key of the monitor's settings.
+    """A number that a user can set for a chart: a key of the monitor's settings.
 
     Attributes:
         key: begins with the chart's name.
-        default: its value where the settings give none.
-        lower: the smallest value that it can have.
-        upper: the largest value that it can have.
+        default: value where the settings give none.
+        lower: smallest allowed value.
+        upper: largest allowed value.
     """
 
     key: str
@@ -69,8 +69,8 @@ class Shown(NamedTuple):
     """A signal as texts of alarms show it.
 
     Attributes:
-        name: of the signal.
-        unit: of its values.
+        name: name of the signal.
+        unit: unit of its values.
         scale: one standard deviation of its prewhitened residual, in that unit.
         passed: the part of a lasting shift of the signal that its prewhitened residual shows.
     """
@@ -102,7 +102,7 @@ class Chart(ABC):
         State: the type of its state.
         has_memory: whether a point depends on samples before it. One point out then raises the alarm; otherwise it
             takes `raise_count` of the last `window`, so that a single outlier raises none.
-        settings: its own keys of `[monitor]`.
+        settings: keys of `[monitor]` that belong to the chart.
     """
 
     name: ClassVar[str]
@@ -113,7 +113,7 @@ class Chart(ABC):
     @classmethod
     @abstractmethod
     def from_state(cls, state: Any) -> Self:
-        """The chart that goes on, bit for bit, where `state` was taken.
+        """Resume a chart, bit for bit, from its state.
 
         Raises:
             ValueError: the state is damaged.
@@ -122,7 +122,7 @@ class Chart(ABC):
     @property
     @abstractmethod
     def state(self) -> ChartState:
-        """A copy of all that it is and remembers."""
+        """A copy of the full state."""
 
     @abstractmethod
     def update(self, x: Any) -> Judgement:
@@ -149,8 +149,8 @@ class SignalChart(Chart):
         """The text of an alarm, and each signal's share of it.
 
         Args:
-            judgement: of the newest sample, which is out.
-            signal: what the chart is of.
+            judgement: the judgement of the newest sample, which is out.
+            signal: the signal of the chart.
         """
         return f"{signal.name} is {judgement.side} the limit of its {self.name} chart", {signal.name: 1.0}
 
@@ -166,7 +166,7 @@ def format_quantity(value: float, unit: str, form: str = ".3g") -> str:
     Args:
         value: the number.
         unit: empty where it is not known; 1 where there is none.
-        form: of the number.
+        form: format of the number.
     """
     return f"{value:{form}}" if unit in ("", "1") else f"{value:{form}} {unit}"
 

@@ -70,11 +70,11 @@ class Cusum(CompiledChart):
     [False, False, True]
 
     Args:
-        mean: of the values when all is well.
-        sigma: their standard deviation.
+        mean: mean of the values when all is well.
+        sigma: standard deviation of the values when all is well.
         k: the allowance in sigma; half the change that matters.
         h: the limit in sigma.
-        head_start: where both sums start, in sigma; often h / 2.
+        head_start: initial value of both sums, in sigma; often h / 2.
 
     Raises:
         InputError: sigma or h is not a positive number, k is negative, head_start is not in [0, h].
@@ -107,11 +107,11 @@ def designed_limit(arl0: float, k: float, learned: Prewhitening) -> float:
     """The limit h of a two-sided CUSUM with the allowance k, in standard deviations.
 
     An error of the mean does not add to a CUSUM as it does to an average, so here the rate of false alarms is averaged
-    over the errors that the training may have made. How it changes with them is told by Siegmund's approximation (1985,
-    Sequential Analysis, sec. 2.6), which costs nothing and is good where run lengths are long.
+    over the errors that the training may have made. Siegmund's approximation (1985, Sequential Analysis,
+    sec. 2.6) gives its change with them; it costs nothing and is good where run lengths are long.
 
     Args:
-        arl0: its run length without a fault.
+        arl0: run length of the chart without a fault.
         k: the allowance.
         learned: the training.
     """
@@ -136,7 +136,7 @@ def designed_limit(arl0: float, k: float, learned: Prewhitening) -> float:
 
 
 def _cusum_rate(shift: Array, k: Array, h: Array) -> Array:
-    """How often a two-sided CUSUM signals, a row, after Siegmund."""
+    """Rate of signals of a two-sided CUSUM, a row, after Siegmund."""
     rate = np.zeros(shift.shape)
     for side in (1.0, -1.0):
         off = side * shift - k

@@ -66,8 +66,8 @@ class Ewma(CompiledChart):
     [False, True]
 
     Args:
-        mean: of the values when all is well.
-        sigma: their standard deviation.
+        mean: mean of the values when all is well.
+        sigma: standard deviation of the values when all is well.
         weight: lambda, of the newest value, in (0, 1]; small for small changes.
         limit: L, in standard deviations of the average in the long run.
         exact_limits: whether the limits grow with the average's standard deviation from the start.
@@ -106,8 +106,8 @@ def designed_limit(arl0: float, weight: float, learned: Prewhitening) -> float:
     """The width L of an EWMA of weight lambda.
 
     Args:
-        arl0: its run length without a fault.
+        arl0: run length of the chart without a fault.
         weight: lambda.
         learned: the training.
     """
-    return false_alarm_budget.widened(ewma_limit(arl0, weight), weight, learned)
+    return false_alarm_budget.widen_limit(ewma_limit(arl0, weight), weight, learned)

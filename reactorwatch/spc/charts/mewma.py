@@ -38,7 +38,7 @@ def _move(average: Array, x: Array, mean: Array, matrix: Array, weight: float) -
 
 
 class MewmaState(ChartState, frozen=True):
-    """All that a MEWMA chart is and remembers: the arguments of `Mewma`, and the average in white coordinates."""
+    """State of a MEWMA chart: the arguments of `Mewma`, and the average in white coordinates."""
 
     mean: list[float]
     covariance: list[list[float]]
@@ -55,10 +55,10 @@ class Mewma(JointChart):
     [False, False, False, True]
 
     Args:
-        mean: of the vectors when all is well, shape (p,).
-        covariance: of the vectors, shape (p, p).
+        mean: mean of the vectors when all is well, shape (p,).
+        covariance: covariance of the vectors, shape (p, p).
         weight: lambda, of the newest vector, in (0, 1]; small for small changes.
-        limit: H, of z' Sz^-1 z.
+        limit: limit H of z' Sz^-1 z.
 
     Raises:
         InputError: an argument out of its range, or covariance not a symmetric positive definite matrix of that size.
@@ -85,7 +85,7 @@ class Mewma(JointChart):
 
     @classmethod
     def from_state(cls, state: MewmaState) -> "Mewma":
-        """The chart that goes on, bit for bit, where `state` was taken.
+        """Resume a chart, bit for bit, from its state.
 
         Raises:
             ValueError: the state is damaged.
@@ -99,7 +99,7 @@ class Mewma(JointChart):
 
     @property
     def state(self) -> MewmaState:
-        """A copy of all that it is and remembers."""
+        """A copy of the full state."""
         mean, covariance = self.whitening.mean.tolist(), self.whitening.covariance.tolist()
         return MewmaState(mean, covariance, self.weight, self.limit, self._average.tolist())
 

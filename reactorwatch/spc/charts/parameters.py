@@ -1,4 +1,4 @@
-"""The parameters of the model that adapts against those of the reference: does the plant drift away from its model?
+"""Chart of the parameters of the adaptive model against those of the reference: drift of the plant from its model.
 
 With d the difference of the parameters and C its covariance when all is well,
 
@@ -7,10 +7,10 @@ With d the difference of the parameters and C its covariance when all is well,
 `reactorwatch.spc.parameter_drift` learns C from a training; the limit is that of a moving average, for the parameters
 of a model that forgets are one.
 
-*g, the share of the excitation that is left.* What parameters fit best depends on what excites the plant, if there is
-noise in the regressors or curvature in the plant. Trained on steps and then left at rest, a model adapts to the noise
+*g, the remaining share of the excitation.* The best parameters depend on the excitation if there is noise in the
+regressors or curvature in the plant. Trained on steps and then left at rest, a model adapts to the noise
 and moves by dozens of standard deviations without anything wrong. The scores phi e of least squares hardly move: with H
-their derivative by the parameters they move by H d, and H is small where excitation is lost. Where g H is left of it,
+their derivative by the parameters they move by H d, and H is small where excitation is lost. Where H has fallen to g H
 the test on the scores (Rao's instead of Wald's) gives g^2 T2. So T2 is multiplied by that, with g the harmonic mean of
 the eigenvalues of the mean square of the inputs in memory, in units of the training's, at most 1. Past outputs in the
 regressor do not count in g, for a changed plant changes them.
@@ -30,7 +30,7 @@ from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, Chart, ChartState
 
 
 class ParameterState(ChartState, frozen=True):
-    """All that the chart is and remembers: the arguments of `ParameterT2`, and its memory.
+    """State of the chart: the arguments of `ParameterT2`, and its memory.
 
     Attributes:
         excitation: mean square of the inputs in memory in units of the training's, by rows.
@@ -45,7 +45,7 @@ class ParameterState(ChartState, frozen=True):
 
 
 class ParameterT2(Chart):
-    """How far the parameters are from the reference's, measured by how far chance takes them.
+    """Distance of the parameters from the reference's, scaled by the covariance of its chance part.
 
     Usually `reactorwatch.spc.parameter_drift.learn` makes it.
 
@@ -56,12 +56,12 @@ class ParameterT2(Chart):
     {'a1': 25.0, 'b1': 1.0}
 
     Args:
-        names: of the parameters, p of them.
+        names: names of the p parameters.
         root: shape (m, p) for m directions that are charted: root' root is the inverse of the difference's covariance.
-        limit: of T2.
+        limit: limit of T2.
         inputs: shape (q, p): makes the inputs in a regressor, and the 1 of an offset, white as in the training; without
             it nothing is known of their excitation, and it is taken to be as in the training.
-        forgetting: of the model that adapts.
+        forgetting: forgetting factor of the adaptive model.
 
     Raises:
         InputError: an argument out of its range, or of a shape that does not fit the names.
@@ -91,7 +91,7 @@ class ParameterT2(Chart):
 
     @classmethod
     def from_state(cls, state: ParameterState) -> "ParameterT2":
-        """The chart that goes on, bit for bit, where `state` was taken.
+        """Resume a chart, bit for bit, from its state.
 
         Raises:
             ValueError: the state is damaged.
@@ -105,7 +105,7 @@ class ParameterT2(Chart):
 
     @property
     def state(self) -> ParameterState:
-        """A copy of all that it is and remembers."""
+        """A copy of the full state."""
         return ParameterState(
             list(self.names),
             self._root.tolist(),
@@ -124,8 +124,9 @@ class ParameterT2(Chart):
         """Judge the parameters after a row; see `Chart`.
 
         Args:
-            difference: of the parameters, adapted less reference's, shape (p,), in the units of the training.
-            regressor: of the row, shape (p,), likewise; without it the row is taken to excite as those in memory.
+            difference: adaptive parameters minus those of the reference, shape (p,), in the units of the training.
+            regressor: regressor of the row, shape (p,), in the same units; without it the row is taken to excite as
+                those in memory.
 
         Raises:
             ValueError: a wrong shape, or a value that is not finite; the chart's state is as before.
@@ -150,7 +151,7 @@ class ParameterT2(Chart):
         return np.asarray(self.excitation**2 * d * (self._root.T @ (self._root @ d)))
 
     def restart(self) -> None:
-        """Forget what excitation there was; the parameters are remembered by the models."""
+        """Forget the excitation; the models keep the parameters."""
         self._excitation = np.eye(len(self._inputs))
 
 

@@ -1,4 +1,4 @@
-"""Charts of many signals that are driven by few: T2 of what the signals have in common, SPE of what is left over.
+"""Charts of many signals that are driven by few: T2 of what the signals have in common, SPE of the residual.
 
 Jackson & Mudholkar (1979), Control procedures for residuals associated with principal component analysis,
 Technometrics 21(3). Signals, each scaled by its mean and standard deviation in the training, are x. The eigenvectors of
@@ -35,16 +35,16 @@ SpeLimit = Literal["jackson_mudholkar", "box"]
 
 
 class PcaModel(ChartState, frozen=True):
-    """What a training matrix says of related signals; it is the whole state of the two charts.
+    """PCA model of related signals: the full state of the two charts.
 
     Attributes:
-        mean: of each signal, length p.
+        mean: mean of each signal, length p.
         scale: standard deviation of each signal, length p.
         loadings: p rows of a numbers, orthonormal columns.
         variances: all p eigenvalues of the correlation matrix, falling.
-        rows: of the training, n.
-        t2_limit: of T2.
-        spe_limit: of SPE.
+        rows: number n of rows of the training.
+        t2_limit: limit of T2.
+        spe_limit: limit of SPE.
     """
 
     mean: list[float]
@@ -69,7 +69,7 @@ class PcaModel(ChartState, frozen=True):
             training: shape (n, p), rows of a time when all was well.
             components: a, how many the signals have in common, in [1, p - 1].
             false_alarm: alpha, the probability of a false alarm per sample, of each of the two charts.
-            spe_limit: whose limit.
+            spe_limit: method of the limit of SPE.
 
         Raises:
             InputError: an argument out of its range, or a signal that does not vary.
@@ -104,7 +104,7 @@ class PcaModel(ChartState, frozen=True):
 
 
 class _PcaChart(JointChart):
-    """What the two charts share: a model, and no memory."""
+    """Base class of the two charts: a model, and no memory."""
 
     State = PcaModel
     has_memory = False
@@ -140,13 +140,13 @@ class _PcaChart(JointChart):
 
     @property
     def state(self) -> PcaModel:
-        """All that it is; it has no memory."""
+        """The model; the chart has no memory."""
         return self._model
 
     def restart(self) -> None:
-        """Nothing: there is no memory."""
+        """Do nothing: there is no memory."""
 
-    def _scaled(self, x: ArrayLike) -> Array:
+    def _scale_values(self, x: ArrayLike) -> Array:
         return np.asarray((vector(x, self._mean.size) - self._mean) / self._scale)
 
 
@@ -169,13 +169,13 @@ class PcaT2(_PcaChart):
 
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""
-        scores = self._scaled(x) @ self._white
+        scores = self._scale_values(x) @ self._white
         statistic = float(scores @ scores)
         return Judgement(statistic, float(scores.size), 0.0, self._model.t2_limit, statistic > self._model.t2_limit)
 
     def contributions(self, x: ArrayLike) -> Array:
         """Each signal's part of T2, shape (p,): x_j (P l^-1 P' x)_j. Their sum is T2; one may be negative."""
-        scaled = self._scaled(x)
+        scaled = self._scale_values(x)
         return np.asarray(scaled * (self._white @ (scaled @ self._white)))
 
 
@@ -199,7 +199,7 @@ class PcaSpe(_PcaChart):
 
     def contributions(self, x: ArrayLike) -> Array:
         """Each signal's part of SPE, shape (p,): its squared residual. Their sum is SPE."""
-        scaled = self._scaled(x)
+        scaled = self._scale_values(x)
         return np.asarray((scaled - self._loadings @ (scaled @ self._loadings)) ** 2)
 
 

@@ -95,8 +95,8 @@ class Shewhart(CompiledChart):
     [False, False, True, True]
 
     Args:
-        mean: of the values when all is well.
-        sigma: their standard deviation.
+        mean: mean of the values when all is well.
+        sigma: standard deviation of the values when all is well.
         width: L, in sigma.
         rules: some of 1, 2, 3, 4.
 
@@ -131,17 +131,17 @@ class Shewhart(CompiledChart):
 
     @property
     def mean(self) -> float:
-        """Of the values when all is well."""
+        """Mean of the values when all is well."""
         return self.setting(_MEAN)
 
     @property
     def lower_limit(self) -> float:
-        """Below it, a value is out."""
+        """Lower limit of the values."""
         return self.setting(_LOWER)
 
     @property
     def upper_limit(self) -> float:
-        """Above it, a value is out."""
+        """Upper limit of the values."""
         return self.setting(_UPPER)
 
 
@@ -149,14 +149,14 @@ def designed_width(p: float, learned: Prewhitening) -> float:
     """The width L that a point is beyond with the probability p.
 
     Args:
-        p: of a single point.
+        p: probability of a single point.
         learned: the training.
     """
-    return false_alarm_budget.widened(float(-special.ndtri(0.5 * p)), 1.0, learned)
+    return false_alarm_budget.widen_limit(float(-special.ndtri(0.5 * p)), 1.0, learned)
 
 
 def probability_out(width: float) -> float:
-    """How often a point is out by rule 1 by chance, for independent normal values.
+    """Probability that a point is out by rule 1 by chance, for independent normal values.
 
     >>> round(probability_out(3.0), 5)
     0.0027

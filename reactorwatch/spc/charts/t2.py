@@ -20,7 +20,7 @@ from reactorwatch.spc.joint_chart import JointChart, correlation, joint_limit
 
 
 class T2State(ChartState, frozen=True):
-    """All that a T2 chart is: the arguments of `T2`."""
+    """State of a T2 chart: the arguments of `T2`."""
 
     mean: list[float]
     covariance: list[list[float]]
@@ -35,9 +35,9 @@ class T2(JointChart):
     (False, True)
 
     Args:
-        mean: of the vectors when all is well, shape (p,).
-        covariance: of the vectors, shape (p, p).
-        limit: of T2.
+        mean: mean of the vectors when all is well, shape (p,).
+        covariance: covariance of the vectors, shape (p, p).
+        limit: limit of T2.
 
     Raises:
         InputError: limit is not a positive number, or covariance not a symmetric positive definite matrix of that size.
@@ -64,7 +64,7 @@ class T2(JointChart):
 
     @property
     def state(self) -> T2State:
-        """All that it is; it has no memory."""
+        """The arguments; the chart has no memory."""
         return T2State(self.whitening.mean.tolist(), self.whitening.covariance.tolist(), self.limit)
 
     def update(self, x: ArrayLike) -> Judgement:
@@ -74,7 +74,7 @@ class T2(JointChart):
         return Judgement(statistic, float(white.size), 0.0, self.limit, statistic > self.limit)
 
     def restart(self) -> None:
-        """Nothing: there is no memory."""
+        """Do nothing: there is no memory."""
 
     def contributions(self, x: ArrayLike) -> Array:
         """Each signal's part of T2, shape (p,): d_j (S^-1 d)_j. Their sum is T2; one may be negative.

@@ -52,7 +52,7 @@ def cusum(
         shift: shift of the mean, in sigma; its sign counts for the one-sided chart only.
         k: allowance, in sigma.
         h: limit, in sigma, at most 200.
-        head_start: where both sums start, in sigma.
+        head_start: initial value of both sums, in sigma.
         one_sided: whether there is the high sum only.
         steady_state: whether the chart has long run when the shift occurs; the head start is forgotten then.
 

@@ -59,7 +59,7 @@ def design(chart: str, arl0: float, shift: float, *, dimension: int = 2, rules: 
     Args:
         chart: shewhart, cusum, ewma, mewma or t2.
         arl0: run length without a shift, in [5, 1e8].
-        shift: to be detected, in sigma (of several signals: Mahalanobis), in [0.1, 10].
+        shift: shift to be detected, in sigma (of several signals: Mahalanobis), in [0.1, 10].
         dimension: number of signals, of mewma and t2.
         rules: run rules, of shewhart.
 

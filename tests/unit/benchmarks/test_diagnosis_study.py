@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.diagnosis_study import earlier, section, with_section
-from benchmarks.diagnosis_study import judged as run_one
-from benchmarks.hidden.classes import CLASSES, class_named, drawn, seed_of
+from benchmarks.diagnosis_study import judge_record as run_one
+from benchmarks.hidden.classes import CLASSES, draw_record, find_class, seed_of
 from benchmarks.hidden.score import Score, confusion
 from benchmarks.hidden.tables import failures, main_table
 from tests.hidden_effect.catalogue import named
@@ -67,8 +67,8 @@ def test_a_failure_is_told_with_its_seed() -> None:
 
 
 def test_causes_take_turns() -> None:
-    study = class_named("150 min")
-    found = [drawn(study, number, 50_000_000).causes[0] for number in range(len(named()))]
+    study = find_class("150 min")
+    found = [draw_record(study, number, 50_000_000).causes[0] for number in range(len(named()))]
     assert len(set(found)) >= len(named()) - 2  # one that cannot show gives way to the next
 
 
@@ -101,12 +101,12 @@ def test_a_page_without_the_marks_is_left_alone() -> None:
 
 
 def test_nothing_is_hidden_in_a_nominal_record() -> None:
-    assert drawn(class_named("nominal"), 8, 70_000_000).causes == ()
+    assert draw_record(find_class("nominal"), 8, 70_000_000).causes == ()
 
 
 def test_an_unknown_class_is_refused_with_the_names_of_those_there_are() -> None:
     with pytest.raises(KeyError, match=r"no class .easy.*closed loop"):
-        class_named("easy")
+        find_class("easy")
 
 
 def test_what_has_no_name_fails_where_it_is_not_in_its_place() -> None:

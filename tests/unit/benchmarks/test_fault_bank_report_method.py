@@ -9,8 +9,8 @@ from benchmarks.faults.report_method import (
     TRAINING_ROWS,
     ReportMethod,
     alarms_of,
-    alarms_raised,
     calibrated_width,
+    count_alarms,
 )
 from benchmarks.faults.score import Interval
 from reactorwatch.arrays import Array
@@ -60,7 +60,7 @@ def test_an_alarm_lasts_from_the_first_point_out_to_the_first_that_is_in() -> No
     statistic = np.array([9.0, 1.0, 1.0, 4.0, 4.0, 2.0, 5.0])
     found = alarms_of(np.arange(7) / 10, statistic, 3.0)
     assert found == [Interval(0.0, 0.1), Interval(0.3, 0.5), Interval(0.6, np.inf)]
-    assert alarms_raised([statistic, np.zeros(5)], 3.0) == 3
+    assert count_alarms([statistic, np.zeros(5)], 3.0) == 3
 
 
 def test_limits_for_independent_normal_points_are_widened_to_the_normal_quantile() -> None:
@@ -81,6 +81,6 @@ def test_limits_count_alarms_and_not_the_points_of_one() -> None:
 def test_at_the_widened_limits_no_more_alarms_come_than_promised(rows_to_false_alarm: float) -> None:
     shocks = np.random.default_rng(5).normal(size=(4, 5000))
     runs = [np.abs(np.convolve(item, np.ones(10), "valid")) for item in shocks]  # each resembles its neighbours
-    count = alarms_raised(runs, calibrated_width(runs, rows_to_false_alarm))
+    count = count_alarms(runs, calibrated_width(runs, rows_to_false_alarm))
     allowed = sum(run.size for run in runs) / rows_to_false_alarm
     assert allowed - 1 <= count <= allowed

@@ -4,7 +4,7 @@ from math import inf
 
 import pytest
 
-from benchmarks.faults.score import Delays, Interval, Outcome, Rate, judged, rows_to_false_alarm
+from benchmarks.faults.score import Delays, Interval, Outcome, Rate, outcome_of, rows_to_false_alarm
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ from benchmarks.faults.score import Delays, Interval, Outcome, Rate, judged, row
 def test_the_first_alarm_after_the_onset_that_none_stood_before_is_the_detection(
     alarms: list[Interval], delay_min: float, false_alarms: int
 ) -> None:
-    outcome = judged(alarms, watching_since_min=100.0, onset_min=300.0, until_min=450.0)
+    outcome = outcome_of(alarms, watching_since_min=100.0, onset_min=300.0, until_min=450.0)
     assert outcome == Outcome(delay_min, false_alarms, watched_min=200.0)
 
 

@@ -38,5 +38,5 @@ def test_a_part_that_ends_early_shows_its_errors(
     part.write_text("raise SystemExit('no port is free')")
     monkeypatch.setattr(scale, "__file__", str(part))
     with pytest.raises(SystemExit, match=r"^scale\.py monitor 7: ended with 1 and without a result, see above$"):
-        scale.started("monitor", 7)
+        scale.start_part("monitor", 7)
     assert "no port is free" in capfd.readouterr().err

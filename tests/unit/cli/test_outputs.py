@@ -49,8 +49,8 @@ CASES = {
     "export": [Case("export run.mcap", {"file": "run.mcap"}, "new.csv")],
     "import": [Case("import run.csv", {"file": "run.csv"}, "new.mcap")],
     "simulate": [
-        Case("simulate run.csv --model model.json", {"file": "run.csv", "model": "model.json"}, "new.csv"),
-        Case("simulate run.mcap", {"file": "run.mcap", "model": ""}, "new.csv"),
+        Case("simulate run.csv --model model.json", {"file": "run.csv", "process": "model.json"}, "new.csv"),
+        Case("simulate run.mcap", {"file": "run.mcap", "process": ""}, "new.csv"),
     ],
     "dashboard": [
         Case(
@@ -81,10 +81,10 @@ CASES = {
         )
     ],
     "diagnose": [
-        Case("diagnose run.csv --model model.json", {"files": "run.csv", "model": "model.json"}, "folder", REPORT),
+        Case("diagnose run.csv --process model.json", {"files": "run.csv", "process": "model.json"}, "folder", REPORT),
         Case(
             "diagnose run.csv other.csv --model model.json",
-            {"files": "other.csv", "model": "model.json"},
+            {"files": "other.csv", "process": "model.json"},
             "folder",
             (*SUMMARY, *(f"other/{name}" for name in REPORT)),
         ),
@@ -104,9 +104,9 @@ OF_FILES = [case for case in ALL if case.out not in FOLDERS and not case.never_o
 
 
 def paths(function: Callable[..., object]) -> set[str]:
-    """The names of the parameters of a command that are paths."""
+    """The names of the parameters of a command that are paths, or may be one."""
     hints = get_type_hints(function)
-    return {name for name, hint in hints.items() if {Path, list[Path]} & {hint, *get_args(hint)}}
+    return {name for name, hint in hints.items() if name == "process" or {Path, list[Path]} & {hint, *get_args(hint)}}
 
 
 def commands(of: typer.Typer = app, before: str = "") -> Iterator[tuple[str, Callable[..., object]]]:

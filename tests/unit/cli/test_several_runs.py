@@ -80,7 +80,7 @@ def test_a_back_test_raises_the_same_alarms_after_the_clock_was_set_back(whole: 
     raised = [
         (alarm.alarm, round(alarm.raised_ns / 60e9 - minutes, 3))
         for result, minutes in ((straight, 0.0), (back, -back_min))
-        for alarm, _ in result.raised
+        for alarm, _ in result.raised_alarms
     ]
     assert raised[: len(raised) // 2] == raised[len(raised) // 2 :]
     assert len(raised) >= 4

@@ -13,9 +13,10 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli.backtest_jobs import make_jobs, run_job
 from reactorwatch.cli.options import parse_span_ns
-from reactorwatch.cli.read_record import load_process_model, open_messages, record
+from reactorwatch.cli.read_record import open_messages, record
 from reactorwatch.cli.recordings import cut
 from reactorwatch.cli.simulation import simulate_along
+from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
 from reactorwatch.process.library.cstr.model import cstr
@@ -83,7 +84,7 @@ def test_a_model_with_a_deviation_at_a_minute_of_the_file_has_it_there(leaking: 
     for path in (csv, mcap):
         assert watched(path, model)["alarms"] == []
         measured = record(path)
-        simulated = simulate_along(measured, load_process_model(model, measured), [])
+        simulated = simulate_along(measured, ProcessChoice(str(model)).load_model(measured.zero_ns), [])
         assert np.sqrt(np.mean((simulated.columns["T"] - measured.columns["T"]) ** 2)) < 0.5
 
 

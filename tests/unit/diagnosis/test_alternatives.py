@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.experiment.alternative import Prediction, extrapolate, probability_decided
+from reactorwatch.diagnosis.experiment.alternative import Prediction, decision_probability, extrapolate
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
@@ -75,7 +75,7 @@ def test_with_noise_the_evidence_scatters_about_what_is_expected_as_the_probabil
     error = np.std(found) / np.sqrt(len(found))
     assert np.mean(found) == pytest.approx(expected, abs=3.5 * error)
     assert np.std(found) == pytest.approx(2.0 * np.sqrt(expected), rel=3.5 / np.sqrt(2 * len(found)))
-    decided, share = np.mean(np.array(found) > 10.0), probability_decided(expected, expected)
+    decided, share = np.mean(np.array(found) > 10.0), decision_probability(expected, expected)
     assert decided == pytest.approx(share, abs=3.5 * np.sqrt(share * (1.0 - share) / len(found)))
 
 

@@ -134,7 +134,7 @@ def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> Non
     )
     text = as_page(replace(CASES["unknown"], curves=told), cstr(), EFFECTS, "a.csv", "extended.json")
     assert "What acts there, over time" in text
-    assert "Told as the size of: heat loss, 1/min" in text
+    assert "Estimated as the size of: heat loss, 1/min" in text
 
 
 def test_the_page_tells_how_the_extended_model_is_used() -> None:

@@ -156,7 +156,8 @@ def test_a_million_rows_without_excitation_leave_it_sound(forgetting: float, lev
 def test_noise_on_a_resting_plant_does_not_move_the_unexcited_directions() -> None:
     """Constant regressors, noise of 0.1 for 1e5 rows: the level is learned, differences move by less than 0.01."""
     rng = np.random.default_rng(10)
-    rls = RecursiveLeastSquares(3, 0.99, start=[1.0, -2.0, 0.5])
+    rls = RecursiveLeastSquares(3, 0.99)
+    rls.set_parameters([1.0, -2.0, 0.5])
     for noise in rng.standard_normal(100_000):
         rls.update([1.0, 1.0, 1.0], 7.0 + 0.1 * noise)
     parameters = rls.parameters
@@ -286,7 +287,7 @@ def test_settings_out_of_range_are_named() -> None:
     with pytest.raises(ValueError, match="covariance_limit must be above"):
         RecursiveLeastSquares(3, covariance_limit=0.0)
     with pytest.raises(ValueError, match="parameters must be 3 finite numbers"):
-        RecursiveLeastSquares(3, start=[1.0, np.nan, 0.0])
+        RecursiveLeastSquares(3).set_parameters([1.0, np.nan, 0.0])
     damaged = RlsState(1, 3, 1.0, np.inf, b"\0" * 8)
     with pytest.raises(ValueError, match="state memory of 1 plants with 3 parameters must have"):
         RecursiveLeastSquares.from_state(damaged)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
+from benchmarks.study_figures.flow_chart import follow
 from reactorwatch.errors import InputError
 from reactorwatch.identification.batch import fit_arx
 from reactorwatch.identification.families import LINEAR_FAMILIES, Arx, Model, OutputError
-from reactorwatch.identification.flow_chart import follow
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.selection import bic, select
 from reactorwatch.identification.structure import Structure

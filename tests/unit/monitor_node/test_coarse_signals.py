@@ -30,7 +30,7 @@ def test_an_output_in_steps_is_watched_with_the_others(step: float, seed: int) -
     values = coarse(plant(3, ROWS, seed), step)
     sound = Monitor(config_of(3, TRAINING), 0, points=False)
     assert raised(watch(sound, values)) == []
-    assert sound.left_out == {}
+    assert sound.excluded_signals == {}
     assert sound.watching_since_ns is not None
     assert sound.watching_since_ns / 6e9 == TRAINING
     assert not any("outliers" in note or "anew" in note for note in sound.notes)
@@ -47,7 +47,7 @@ def test_a_coarse_thermometer_of_the_reactor_costs_no_training(step: float, refe
     config = MonitorConfig(isolation=False, reference=reference)  # type: ignore[arg-type]
     run = watched(time_min, columns, config)
     assert run.monitor.watching_since_ns == 100 * 60 * 10**9
-    assert run.monitor.left_out == {}
+    assert run.monitor.excluded_signals == {}
 
 
 @pytest.mark.parametrize("moves", [1, 3, 10])
@@ -58,7 +58,7 @@ def test_an_output_that_moves_a_step_now_and_then_is_watched_as_it_is(moves: int
         values[1, row : row + 7] = 20.33
     monitor = Monitor(config_of(3, TRAINING), 0, points=False)
     assert raised(watch(monitor, values)) == []
-    assert monitor.left_out == {}
+    assert monitor.excluded_signals == {}
 
 
 @pytest.mark.parametrize("held", [2, 5])
@@ -78,7 +78,9 @@ def test_an_output_that_never_moves_is_left_out_with_the_reason_and_the_others_a
     values[2, 500:] += 3.0
     values[1, 550:] += 3.0
     names = raised(watch(monitor, values))
-    assert monitor.left_out == {"y0": "it reads 4.25 in the whole training; smallest_sd could say what matters of it"}
+    assert monitor.excluded_signals == {
+        "y0": "it reads 4.25 in the whole training; smallest_sd could say what matters of it"
+    }
     assert "shewhart/y1" in names
     assert not any(name.endswith("/y0") for name in names)
 
@@ -89,7 +91,7 @@ def test_an_output_whose_rows_are_too_often_missing_is_left_out_with_the_true_re
     monitor = Monitor(config_of(3, TRAINING), 0, points=False)
     values[1, ::2] = np.nan
     watch(monitor, values)
-    assert monitor.left_out["y0"] == (
+    assert monitor.excluded_signals["y0"] == (
         "only 0 of its 300 rows could be predicted, 50 are needed: too often a value is missing in the rows before"
     )
     assert monitor.phase == "watching"

@@ -42,7 +42,7 @@ def watch(run: Run, signal: str, first: int = 0, end: int = 0, config: MonitorCo
 
 def raised_min(result: Backtest) -> dict[str, float]:
     """Minute at which each alarm was first raised."""
-    return {alarm.alarm: alarm.raised_ns / MINUTE_NS for alarm, _ in reversed(result.raised)}
+    return {alarm.alarm: alarm.raised_ns / MINUTE_NS for alarm, _ in reversed(result.raised_alarms)}
 
 
 @pytest.mark.parametrize("reference", ["auto", "process", "arx"])
@@ -73,7 +73,7 @@ def test_a_signal_that_ends_in_the_training_ends_no_training(signal: str, last: 
 
 def test_a_signal_that_comes_after_the_training_ends_its_silence_and_is_said_not_to_be_watched(leak: Run) -> None:
     result = watch(leak, "T", 500, 801)
-    ends = {alarm.alarm: cleared_ns for alarm, cleared_ns in result.raised}
+    ends = {alarm.alarm: cleared_ns for alarm, cleared_ns in result.raised_alarms}
     assert ends["silence/T"] == 50 * MINUTE_NS
     assert result.left_out == {"T": "its first value came after the training"}
     assert result.notes[-1] == "T comes now, and is not watched: start the monitor without its state to learn it"
@@ -90,7 +90,7 @@ def test_a_slow_sensor_is_not_silent_from_its_first_value_on(every: int) -> None
         if name != "C" or row % every == 0
     ]
     result = backtest.run(slow, MonitorConfig(training_min=1000.0, isolation=False))
-    assert result.raised == []
+    assert result.raised_alarms == []
 
 
 @pytest.mark.parametrize("signal", ["T", "qc"])
@@ -105,7 +105,7 @@ def test_a_monitor_without_a_signal_goes_on_from_its_stored_state(signal: str, l
             again.from_bytes(stored)
         said += again.on_message(message, 0)
     assert said == expected
-    assert again.left_out == monitor.left_out == {signal: "no value of it has come"}
+    assert again.excluded_signals == monitor.excluded_signals == {signal: "no value of it has come"}
     assert again.expected_false_alarms == monitor.expected_false_alarms
     assert any(isinstance(item.message, Alarm) and item.message.event == "raised" for item in said)
 
@@ -115,6 +115,6 @@ def test_a_sound_plant_without_a_signal_keeps_the_promise() -> None:
     time_min, columns = leaking_run(0.0, 1.0, 140.0, seed=6)
     whole = backtest.run(messages((time_min, columns), "", 0, 0), CONFIG)
     result = watch((time_min, columns), "T")
-    assert [alarm.alarm for alarm, _ in result.raised] == ["silence/T"]
+    assert [alarm.alarm for alarm, _ in result.raised_alarms] == ["silence/T"]
     assert result.expected_false_alarms == pytest.approx(whole.expected_false_alarms, rel=1e-9)
     assert np.isfinite(result.expected_false_alarms)

@@ -11,7 +11,7 @@ from monitor_node.fleet.monitor import PRESUME_GONE_NS
 from monitor_node.fleet.node import FleetNode
 from monitor_node.other_monitors import GONE, MOST_GROUPS, NOTICED, OtherMonitors
 from reactorwatch.contract import keys
-from reactorwatch.runtime.bus import Exchange, MemoryBus
+from tests.memory_bus import Exchange, MemoryBus
 
 from .fleets import QUICK, SECOND_NS
 

@@ -33,7 +33,7 @@ def test_in_80_runs_with_autocorrelated_noise_alarms_come_as_often_as_promised()
         white = generator.normal(size=(rows + 100, 2)) * np.sqrt(1 - 0.5**2) * (0.002, 0.3)
         outputs = outputs + lfilter([1.0], [1.0, -0.5], white, axis=0)[100:]
         result = backtest.run(samples(time_min, {"qc": qc, "C": outputs[:, 0], "T": outputs[:, 1]}), config)
-        counts.update(alarm.alarm for alarm, _ in result.raised)
+        counts.update(alarm.alarm for alarm, _ in result.raised_alarms)
         expected += result.expected_false_alarms
     assert expected == pytest.approx(RUNS * 400.0 / (30 * 24 * 60) * PER_30_DAYS, rel=0.01)
     assert 1 / 1.5 < counts.total() / expected < 1.5, counts

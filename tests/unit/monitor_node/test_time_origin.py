@@ -40,7 +40,7 @@ def raised(result: Backtest, zero_ns: int) -> list[tuple[str, int, int | None]]:
     """Alarms with the nanoseconds since the beginning at which they were raised and cleared."""
     return [
         (alarm.alarm, alarm.raised_ns - zero_ns, None if cleared_ns is None else cleared_ns - zero_ns)
-        for alarm, cleared_ns in result.raised
+        for alarm, cleared_ns in result.raised_alarms
     ]
 
 

@@ -22,8 +22,8 @@ from reactorwatch.contract.messages_pb2 import (
     Sample,
     SetInput,
 )
-from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.event_loop import StopSignal
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 
 START_NS = 1_700_000_000_000_000_000

@@ -78,7 +78,7 @@ def test_minutes_of_an_unknown_moment_stay_as_they_are() -> None:
             written(format="reactorwatch.model.v9"),
             "format must be 'reactorwatch.model.v1', got 'reactorwatch.model.v9'",
         ),
-        (written(model="boiler"), "unknown model 'boiler' (valid: cstr, tanks)"),
+        (written(model="boiler"), "unknown model 'boiler' (valid: cstr, tanks, three_tanks)"),
         (written(effects=["coolant:step:1@1min"]), "unknown cause 'coolant'"),
         (written(effects=["coolant_flow:ramp:-0.1@1min"]), "end"),
         (written(effects=[1]), "is no model"),

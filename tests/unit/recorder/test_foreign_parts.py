@@ -89,5 +89,5 @@ def test_a_damaged_attachment_is_said_and_left_out(tmp_path: Path) -> None:
     content[content.index(PICTURE) + 50_000] ^= 1
     source.write_bytes(content)
     saved = recover(source, tmp_path / "new.mcap")
-    assert "an attachment" in saved.lost
+    assert "an attachment" in saved.losses
     assert parts(tmp_path / "new.mcap")[2:] == ({}, 0)

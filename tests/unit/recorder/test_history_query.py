@@ -10,11 +10,12 @@ from rerun.chunk import RrdReader
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
+from reactorwatch.runtime.bus import Request
 from recorder.dashboard import history_query
 from recorder.dashboard.history_query import HistoryQuery, RunHistory, alarm_changes, query_history
 from recorder.dashboard.live import DRAW_INTERVAL_NS, ZERO_TIMEOUT_NS, LiveDashboard
 from recorder.dashboard.stream import RUN_TIME
+from tests.memory_bus import Exchange, MemoryBus
 
 MINUTE = 60_000_000_000
 ZERO_NS = 1_700_000_000 * 10**9

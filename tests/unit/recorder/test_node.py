@@ -10,7 +10,6 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, decode, encode
-from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal
 from recorder.__main__ import open_files, start_node
 from recorder.config import RecorderConfig
@@ -18,6 +17,7 @@ from recorder.files import RecordingFiles
 from recorder.message import RecordedMessage
 from recorder.node import RecorderNode
 from recorder.tools.mcap_file import read_messages
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 from tests.unit.recorder import golden
 

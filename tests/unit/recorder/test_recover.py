@@ -78,7 +78,7 @@ def test_a_file_cut_off_anywhere_keeps_every_chunk_that_is_whole(tmp_path: Path,
             kept, saved = recovered(tmp_path, whole[:length])
             assert kept == expected, length
             assert saved.is_only_truncated, length
-            assert "cut off" in saved.lost
+            assert "cut off" in saved.losses
             (tmp_path / "out.mcap").unlink()
         else:
             (tmp_path / "damaged.mcap").write_bytes(whole[:length])
@@ -100,8 +100,8 @@ def test_a_damaged_chunk_is_passed_over_and_all_others_are_kept(
         content = content[: next(start for opcode, start, _ in records(whole) if opcode == Opcode.DATA_END)]
     kept, saved = recovered(tmp_path, content)
     assert kept == ENTRIES[: number * CHUNK] + ENTRIES[(number + 1) * CHUNK :]
-    assert f"a chunk of {end - start} bytes" in saved.lost
-    assert f"at byte {start}" in saved.lost
+    assert f"a chunk of {end - start} bytes" in saved.losses
+    assert f"at byte {start}" in saved.losses
     assert not saved.orphans
 
 
@@ -123,7 +123,7 @@ def test_a_byte_that_is_wrong_costs_one_chunk_at_most_and_no_message_is_altered(
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 0xFF]) + whole[place + 1 :])
         saved = recover(path, out)
         kept = list(read_messages(out))
-        assert kept == ENTRIES or (kept in may_be_left and saved.lost), place
+        assert kept == ENTRIES or (kept in may_be_left and saved.losses), place
 
 
 def test_without_its_index_nothing_is_missing(tmp_path: Path, whole: bytes) -> None:
@@ -151,7 +151,7 @@ def test_a_recovered_file_says_where_it_came_from_and_what_is_missing(tmp_path: 
 def test_a_whole_file_is_recovered_to_the_same_messages(tmp_path: Path, whole: bytes) -> None:
     kept, saved = recovered(tmp_path, whole)
     assert kept == ENTRIES
-    assert saved.lost == ""
+    assert saved.losses == ""
 
 
 def test_other_software_reads_what_was_recovered(tmp_path: Path, whole: bytes) -> None:
@@ -243,7 +243,7 @@ def test_messages_without_a_description_of_their_channel_are_counted(tmp_path: P
     path.write_bytes(content[: end - 10] + bytes(10) + content[end:])
     saved = recover(path, tmp_path / "out.mcap")
     assert (saved.topics, saved.orphans) == ({"/c": 10}, 10)
-    assert "10 messages of channels that are described nowhere" in saved.lost
+    assert "10 messages of channels that are described nowhere" in saved.losses
     assert Chunk.read(ReadDataStream(io.BytesIO(content[start + 9 : end]))).message_end_time == 19
 
 

@@ -17,9 +17,9 @@ from reactorwatch.contract.messages_pb2 import (
     SetInput,
     ShelveAlarm,
 )
-from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal
 from reactorwatch.runtime.security.audit import audit
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 
 

@@ -5,7 +5,8 @@ import pytest
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.keys import matches
 from reactorwatch.contract.messages_pb2 import CommandReply
-from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
+from reactorwatch.runtime.bus import Request
+from tests.memory_bus import Exchange, MemoryBus
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ import pytest
 
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply, Health
-from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 
 FAR = 10**19
@@ -132,6 +132,19 @@ def test_what_arrived_before_the_stop_is_still_handled() -> None:
     stop.set()
     loop.run()
     assert len(node.heard) == 1000
+
+
+def test_a_function_is_called_when_all_messages_that_arrived_before_are_handled_and_its_result_is_published() -> None:
+    exchange, stop, node, published = Exchange(), StopSignal(), Echo(), list[str]()
+    loop, speaker = EventLoop(node, MemoryBus(exchange), stop), MemoryBus(exchange)
+    MemoryBus(exchange).subscribe("out/*", lambda message: published.append(message.key))
+    loop.subscribe("in/**")
+    for number in range(3):
+        speaker.publish(Encoded(f"in/{number}", b"", ""))
+        loop.call(lambda now_ns: [Publication(f"out/{len(node.heard)}", Health(time_ns=now_ns))])
+    stop.set()
+    loop.run()
+    assert [key for key in published if key != "out/message"] == ["out/1", "out/2", "out/3", "out/stop"]
 
 
 def test_lingering_hears_what_comes_within_it() -> None:

@@ -103,6 +103,31 @@ def test_an_error_on_a_choice_lists_the_valid_words(table: str, name: str, path:
         section(TABLES[table], table, {table: {name: value}}, {})
 
 
+BOUNDED = [
+    (table, item.encode_name, meta)
+    for table, kind in TABLES.items()
+    for item in msgspec.inspect.type_info(kind).fields  # type: ignore[attr-defined]
+    for meta in (item.type, *getattr(item.type, "types", ()))
+    if getattr(meta, "ge", None) is not None
+]
+
+
+def test_every_table_with_bounds_is_tried() -> None:
+    assert {table for table, _, _ in BOUNDED} == {"bus", "plant", "monitor", "recorder", "diagnosis", "metrics"}
+
+
+@pytest.mark.parametrize(("table", "name", "bounds"), BOUNDED, ids=[f"{table}.{name}" for table, name, _ in BOUNDED])
+def test_a_number_out_of_its_bounds_is_named_with_them_from_a_file_and_in_python(
+    table: str, name: str, bounds: Any
+) -> None:
+    for value in (bounds.ge - 1, bounds.le + 1 if bounds.le < 2**63 - 1 else bounds.ge - 2):
+        line = re.escape(f"{name} must be in [{bounds.ge:g}, {bounds.le:g}], got {value:g}")
+        with pytest.raises(InputError, match=rf"^settings \[{table}\]: {line}$"):
+            section(TABLES[table], table, {table: {name: value}}, {})
+        with pytest.raises(ValueError, match=rf"^{line}$"):
+            TABLES[table](**{name: value})
+
+
 @pytest.mark.parametrize("protocol", PROTOCOLS)
 @pytest.mark.parametrize("host", ["127.0.0.1", "router.example", "[::1]"])
 def test_endpoints_of_every_protocol_are_taken(protocol: str, host: str) -> None:

@@ -39,13 +39,13 @@ def test_its_uncertainty_is_that_of_many_trainings() -> None:
     assert sd == pytest.approx(np.mean([item.sd_variance for item in trainings]), rel=0.15)
     first = [item for item in trainings if len(item.coefficients) == 1]
     assert len(first) > 1000
-    passed = np.var(np.log([item.passed for item in first]))
+    passed = np.var(np.log([item.shift_gain for item in first]))
     assert passed == pytest.approx(np.mean([item.passed_variance for item in first]), rel=0.25)
 
 
 def test_a_lasting_shift_is_passed_on_by_the_part_that_it_tells() -> None:
     learned = Prewhitening(0.0, (0.5, 0.2), 2.0, 1000, 0.001, 0.001)
-    assert learned.passed == pytest.approx(0.3)
+    assert learned.shift_gain == pytest.approx(0.3)
     assert innovations_of(np.full(10, 6.0), learned)[-1] == pytest.approx(0.3 * 6.0 / 2.0)
 
 
@@ -74,7 +74,7 @@ def test_a_residual_that_does_not_vary_has_the_smallest_deviation() -> None:
 def test_a_random_walk_is_not_taken_for_one() -> None:
     """Nothing would be a shift if all of it were passed over."""
     learned = learn(np.cumsum(np.random.default_rng(4).normal(size=1000)), 1e-9)
-    assert learned.passed >= 1.0 - LARGEST_SUM - 1e-12
+    assert learned.shift_gain >= 1.0 - LARGEST_SUM - 1e-12
 
 
 def test_few_rows_give_their_mean_and_deviation() -> None:

@@ -21,7 +21,7 @@ import casadi as ca
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
 
 SMALL_LEVEL_V = 0.01
-"""Where the root of the level becomes a straight line; at 1 V that changes it by less than 3 in 100,000."""
+"""Level in V below which its root is replaced by a straight line; at 1 V that changes it by less than 3 in 100,000."""
 
 UPPER_OUTLET = "upper outlet"
 """Name of the term that runs from the upper tank, in V^0.5: the root of its level."""

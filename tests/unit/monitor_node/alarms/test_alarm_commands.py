@@ -22,8 +22,9 @@ from reactorwatch.contract.messages_pb2 import (
 )
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
-from reactorwatch.runtime.bus import Exchange, MemoryBus, Request
+from reactorwatch.runtime.bus import Request
 from reactorwatch.runtime.security.command_rate import PER_NAME
+from tests.memory_bus import Exchange, MemoryBus
 
 from ..samples import PLANT, leaking_run, samples
 

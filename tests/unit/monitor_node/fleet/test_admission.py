@@ -38,9 +38,9 @@ def test_a_made_up_name_is_forgotten_when_nothing_more_is_said_of_it_and_makes_r
     monitor = fleet(on_ownership=lambda plant, ours: shown.append((plant, ours)))
     monitor.on_message(first_sample("x"), 0)
     monitor.on_tick(TEN_MINUTES_NS - 1)
-    assert (monitor.plants, monitor.evicted) == (["x"], 0)
+    assert (monitor.plants, monitor.evictions) == (["x"], 0)
     monitor.on_tick(TEN_MINUTES_NS)
-    assert (monitor.plants, monitor.evicted) == ([], 1)
+    assert (monitor.plants, monitor.evictions) == ([], 1)
     assert shown == [("x", True), ("x", False)]
     monitor.on_message(first_sample("x"), TEN_MINUTES_NS)
     assert monitor.plants == ["x"]

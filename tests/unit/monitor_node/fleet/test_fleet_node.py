@@ -1,8 +1,9 @@
 """A fleet's monitor with a folder of states, beside another one: who has a plant last, has it."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from queue import SimpleQueue
 
 import msgspec
 import pytest
@@ -17,9 +18,9 @@ from monitor_node.storage.fleet_states import FleetStates
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
-from reactorwatch.runtime.bus import Exchange, MemoryBus
 from reactorwatch.runtime.metrics import FleetMetrics
 from reactorwatch.runtime.security.command_rate import PER_NAME
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
 
 from ..fleets import PLANTS, QUICK, fleet, row_by_row, run_of
@@ -38,13 +39,16 @@ class Bench:
         self.bus, self.states, self.now_ns = Linked(Exchange()), FleetStates(folder), 0
         config = msgspec.structs.replace(QUICK, state_every_s=0.1)
         self.node = FleetNode(config, FleetConfig(plants="reactor/*", shard=shard), self.bus, 0, self.states)
+        self.calls: SimpleQueue[Callable[[int], list[Publication]]] = SimpleQueue()
         for _ in self.node.subscriptions:
-            self.node.on_subscribed()
+            self.node.on_subscribed(self.calls.put)
 
     def tick(self) -> None:
         """A moment later."""
         self.now_ns += POLL_NS
         self.node.on_tick(self.now_ns)
+        while not self.calls.empty():
+            self.calls.get()(self.now_ns)
 
     def tick_until_watched(self, plant: str) -> None:
         """Its past is found by a thread."""

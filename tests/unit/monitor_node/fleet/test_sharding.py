@@ -47,7 +47,7 @@ def groups(*shards: Shard) -> list[ShardGroup]:
     for each in found:
         for other in found:
             each.on_token(other.token, is_alive=True)
-        each.presume_gone()
+        each.drop_unseen()
     return found
 
 
@@ -76,7 +76,7 @@ def test_a_shard_that_was_never_seen_is_left_alone_until_it_is_presumed_gone() -
     shards = ShardGroup("reactor/*", Shard(1, 2), "a")
     theirs = next(name for name in NAMES if home_shard(name, 2) == 2)
     assert not shards.is_ours(theirs)
-    assert shards.presume_gone()
+    assert shards.drop_unseen()
     assert shards.is_ours(theirs)
 
 

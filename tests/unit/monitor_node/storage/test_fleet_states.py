@@ -76,12 +76,12 @@ def test_who_was_replaced_writes_over_no_newer_state_and_is_told_so(tmp_path: Pa
     second.close()
     again = FleetStates(tmp_path)
     again._marks = first._marks  # it has not ended, but was cut off
-    assert again.written_elsewhere(["a", "b"]) == ["a"]
+    assert again.adopted_elsewhere(["a", "b"]) == ["a"]
     again.put("a", b"later, of the first")
     again.close()
     assert (again.pop_lost(), again.pop_lost()) == (["a"], [])
     assert again.read("a") == b"of the second"
-    assert again.written_elsewhere(["a"]) == []
+    assert again.adopted_elsewhere(["a"]) == []
 
 
 def test_who_is_replaced_while_he_writes_writes_over_no_newer_state(

@@ -2,8 +2,9 @@
 
 import json
 import os
-import time
+from collections.abc import Callable
 from pathlib import Path
+from queue import SimpleQueue
 
 import msgspec
 import pytest
@@ -18,10 +19,10 @@ from monitor_node.storage import state_recovery
 from monitor_node.storage.alarm_file import SEAL
 from monitor_node.storage.fleet_states import FleetStates
 from monitor_node.storage.kept_aside import find_kept_aside, keep_aside
-from reactorwatch.contract.codec import Encoded
+from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.bus import Exchange, MemoryBus
+from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S
 
 from ..fleets import of_plant
@@ -310,13 +311,14 @@ def fleet_of(folder: Path, order: int, rows: list[Encoded]) -> FleetNode:
     """A fleet's monitor that watches the plants of its folder, and is stopped after some rows of plant `a`."""
     config_ = MonitorConfig(order=order, isolation=False)
     node = FleetNode(config_, FleetConfig(plants="reactor/*"), MemoryBus(Exchange()), 0, FleetStates(folder))
+    calls: SimpleQueue[Callable[[int], list[Publication]]] = SimpleQueue()
     for _ in node.subscriptions:
-        node.on_subscribed()
+        node.on_subscribed(calls.put)
     if rows:
         node.on_alive("reactor/a/alive/plant", True, 0)
-    until_s, now_ns = time.monotonic() + WITHIN_S, 0
-    while node._recovery.is_pending:
-        assert time.monotonic() < until_s
+    now_ns = 0
+    while node.is_pending("a"):
+        calls.get(timeout=WITHIN_S)(now_ns)
         now_ns += POLL_NS
         node.on_tick(now_ns)
     node.on_messages(of_plant("a", rows), now_ns)
@@ -341,7 +343,7 @@ def test_a_fleet_s_unusable_state_is_reported_before_its_plant_says_anything(
     for data in (b"", b"reactorwatch monitor\x00\x01 and then no state"):
         (tmp_path / "a.state").write_bytes(data)
         assert fleet_of(tmp_path, 3, []).plants == ["a"]
-        assert "the plant is learned anew, and the state kept as a.state.damaged" in capsys.readouterr().out
+        assert "the plant is learned again, and the state kept as a.state.damaged" in capsys.readouterr().out
     assert sorted(files(tmp_path)) == ["a.state", "a.state.damaged", "a.state.damaged.2"]
     assert FleetStates(tmp_path).plants == ["a"]
 

@@ -85,7 +85,7 @@ def test_a_damaged_file_is_kept_aside_and_told_in_one_line(
     assert (node.phase, node.resumed) == ("waiting", False)
     assert path.with_name("monitor.state.damaged").read_bytes() == data
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "monitor.state" in line]
-    assert "it is kept as monitor.state.damaged, and the monitor learns anew" in line
+    assert "it is kept as monitor.state.damaged, and the monitor learns again" in line
     assert MonitorNode(config, 0).phase == "waiting"
 
 

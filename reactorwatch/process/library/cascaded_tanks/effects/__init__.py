@@ -14,4 +14,4 @@ TANK_EFFECTS: tuple[Effect, ...] = (
     Overflow(),
     LevelBias(),
 )
-"""In the order of the flow, from the pump to the sensor."""
+"""Effects in the order of the flow, from the pump to the sensor."""

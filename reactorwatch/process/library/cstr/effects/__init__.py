@@ -52,4 +52,4 @@ EFFECTS: tuple[Effect, ...] = (
     Volume(),
     SampleTiming(),
 )
-"""In the order feed, reaction, cooling, sensors, then effects on several of them."""
+"""Effects in the order feed, reaction, cooling, sensors, then effects on several of them."""

@@ -1,9 +1,9 @@
-"""Who publishes garbage in a soak, from a seed, in a process of its own; started by `site`.
+"""Publisher of garbage in a soak, from a seed, in a process of its own; started by `site`.
 
 It begins with the first line of the input, goes on slowly, and floods at every line after that: random and mutated
 samples on the keys of the plants, under encodings and with attachments of any kind, on keys of signals and plants that
-are none, on the keys of alarms, and payloads of 10 MB. Samples are mutated from what a plant said first, long before:
-who publishes as the plant, and counts and times as the plant does, is the plant.
+are none, on the keys of alarms, and payloads of 10 MB. Samples are mutated from the first sample of a plant, long
+before: a publisher with the keys, numbers and times of the plant is the plant.
 """
 
 import sys
@@ -14,7 +14,7 @@ import msgspec
 import zenoh
 
 from benchmarks.fuzz import Mutator
-from benchmarks.link_cuts import connected
+from benchmarks.link_cuts import connect_client
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode, encoding_of
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
@@ -27,19 +27,19 @@ FLOOD = 20_000
 LARGE = 2
 LARGE_BYTES = 10_000_000
 MADE_UP = 5
-"""Names of plants that there are not. Each costs a monitor: a fleet meets whoever is heard of."""
+"""Names of plants that do not exist. Each costs a monitor: a fleet registers every plant whose samples arrive."""
 
 SIGNALS = ("qc", "C", "T")
 
 
 class Task(msgspec.Struct, frozen=True):
-    """What a process publishes.
+    """Task of the process.
 
     Attributes:
-        seed: of what is drawn.
-        plants: that are spoken for.
+        seed: seed of the messages.
+        plants: names of the plants that it imitates.
         zero_ns: the time of their first row.
-        bus: where the router is.
+        bus: settings of the link to the router.
     """
 
     seed: int
@@ -48,16 +48,16 @@ class Task(msgspec.Struct, frozen=True):
     bus: BusConfig
 
 
-class Stranger:
-    """Publishes what nobody asked for.
+class GarbageSource:
+    """Publishes garbage.
 
     Args:
-        task: what.
+        task: seed, plants and router.
     """
 
     def __init__(self, task: Task) -> None:
         self._task = task
-        self._bus = connected(task.bus)
+        self._bus = connect_client(task.bus)
         self._session: Any = self._bus._session
         self._mutator = Mutator(task.seed)
         self._heard = [
@@ -73,7 +73,7 @@ class Stranger:
         self.published = 0
 
     def publish(self, count: int) -> None:
-        """Publish so many."""
+        """Publish a number of messages."""
         for _ in range(count):
             message = self._strange()
             attachment = self._mutator.draw.randbytes(16) if self._mutator.draw.random() < 0.1 else None
@@ -87,7 +87,7 @@ class Stranger:
             self.published += 1
 
     def publish_large(self) -> None:
-        """Publish what no node wants to read."""
+        """Publish payloads that are too large."""
         for _ in range(LARGE):
             self._session.put(self._mutator.draw.choice(self._heard).key, bytes(LARGE_BYTES))
             self.published += 1
@@ -101,7 +101,7 @@ class Stranger:
                 )
             case 1:
                 return base._replace(
-                    key=keys.key(f"nobody{draw.randrange(MADE_UP)}", keys.SAMPLE, draw.choice(SIGNALS))
+                    key=keys.key(f"absent{draw.randrange(MADE_UP)}", keys.SAMPLE, draw.choice(SIGNALS))
                 )
             case 2:
                 key = keys.key(
@@ -114,8 +114,8 @@ class Stranger:
 
 
 def main(task: Task) -> None:
-    """Publish garbage until the input ends; then say how much."""
-    stranger = Stranger(task)
+    """Publish garbage until the input ends; then print the number of messages."""
+    source = GarbageSource(task)
     ended, floods = threading.Event(), threading.Semaphore(0)
 
     def read() -> None:
@@ -128,12 +128,12 @@ def main(task: Task) -> None:
     print("ready", flush=True)
     floods.acquire()  # the first line: the plants are known by now
     while not ended.wait(PAUSE_S):
-        stranger.publish(AT_A_TIME)
+        source.publish(AT_A_TIME)
         if floods.acquire(blocking=False):
-            stranger.publish(FLOOD)
-            stranger.publish_large()
+            source.publish(FLOOD)
+            source.publish_large()
             print("flooded", flush=True)
-    print(stranger.published, flush=True)
+    print(source.published, flush=True)
 
 
 if __name__ == "__main__":

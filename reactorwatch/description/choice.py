@@ -1,0 +1,82 @@
+"""A process as a command names it: by name or file, or by the columns of its signals."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from reactorwatch.description.find import DEFAULT_PROCESS, FILE_KINDS, find_process
+from reactorwatch.description.process import Process, Signal
+from reactorwatch.errors import InputError
+from reactorwatch.process.model import ProcessModel
+
+UNDESCRIBED = "plant"
+"""Name of a process that only its columns describe."""
+
+
+@dataclass(frozen=True)
+class ProcessChoice:
+    """Choice of a process.
+
+    Attributes:
+        process: a name in the catalogue or a path, see `find_process`; None: the reactor, unless columns are named.
+        time: name or number of the column of times; None: as the process states, or guessed.
+        inputs: columns that are inputs of a process without a description.
+        outputs: columns that are its outputs.
+
+    Raises:
+        InputError: a process and columns are named, or inputs without an output.
+    """
+
+    process: str | None = None
+    time: str | None = None
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.process is not None and (self.inputs or self.outputs):
+            raise InputError(
+                f"--input and --output describe a process without a file, got them beside --process {self.process}; "
+                "leave one of the two out"
+            )
+        if self.inputs and not self.outputs:
+            raise InputError(f"--input needs an --output, got only the input {', '.join(self.inputs)}")
+
+    @property
+    def file(self) -> Path | None:
+        """File that describes the process; None: it is named otherwise."""
+        path = None if self.process is None else Path(self.process)
+        return path if path is not None and path.suffix.lower() in FILE_KINDS else None
+
+    def absolute(self) -> "ProcessChoice":
+        """Copy with the absolute path of the file."""
+        return self if self.file is None else replace(self, process=str(self.file.absolute()))
+
+    def load(self, zero_ns: int = 0) -> Process:
+        """Load the process.
+
+        Args:
+            zero_ns: as for `find_process`.
+
+        Raises:
+            InputError: as `find_process`.
+        """
+        if self.outputs:
+            roles = {"input": self.inputs, "output": self.outputs}
+            signals = (Signal(name, role=role) for role, names in roles.items() for name in names)
+            process = Process(UNDESCRIBED, tuple(signals))
+        else:
+            process = find_process(self.process or DEFAULT_PROCESS, zero_ns)
+        if self.time is None:
+            return process
+        return replace(process, file_format=replace(process.file_format, time=self.time, period=None))
+
+    def load_model(self, zero_ns: int = 0) -> ProcessModel:
+        """Load the equations of the process.
+
+        Args:
+            zero_ns: as for `find_process`.
+
+        Raises:
+            InputError: as `find_process`; or the process has no equations.
+        """
+        process = self.load(zero_ns)
+        return process.require_model()

@@ -1,0 +1,75 @@
+"""Find a process: by name in the catalogue, or in a file that describes it (`.toml`, `.py`, `extended.json`)."""
+
+import runpy
+from pathlib import Path
+
+from reactorwatch.description.catalogue import Catalogue, check_process
+from reactorwatch.description.process import Process, describe_model
+from reactorwatch.description.toml_file import parse_process
+from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.process import effects_of
+from reactorwatch.process.extended_model import parse_extended_model
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.input_file import wrap_read_errors
+
+FUNCTION = "process"
+"""Function of a `.py` file that returns the process."""
+
+DEFAULT_PROCESS = "cstr"
+
+FILE_KINDS = (".toml", ".py", ".json")
+"""Suffixes of files that describe a process."""
+
+
+def find_process(process: str | Path | Process | ProcessModel = DEFAULT_PROCESS, zero_ns: int = 0) -> Process:
+    """Find a process.
+
+    Args:
+        process: a name in the catalogue; a path to a `.toml`, to a `.py`, whose function `process()` is run, or to an
+            extended model (`.json`); or the process itself.
+        zero_ns: time from which the minutes of an extended model's effects are to count, in nanoseconds since
+            1970-01-01 UTC; 0: the zero that its file states.
+
+    Raises:
+        InputError: there is no such name or file, or the file does not describe a process; the text starts with its
+            path.
+    """
+    if isinstance(process, Process):
+        return process
+    if isinstance(process, ProcessModel):
+        return describe_model(process, effects_of(process))
+    path = Path(process)
+    kind = path.suffix.lower()
+    if kind not in FILE_KINDS:
+        catalogue = Catalogue()
+        if str(process) not in catalogue:
+            cure = ", or a path to a .toml, .py or .json file"
+            raise InputError(describe_unknown("process", str(process), catalogue) + cure)
+        return catalogue[str(process)]()
+    with wrap_read_errors(path):
+        content = path.read_bytes()
+    try:
+        if kind == ".toml":
+            return parse_process(content, Catalogue())
+        if kind == ".py":
+            return check_process(_call_function(path), f"{FUNCTION}()")
+        extended = parse_extended_model(content)
+        model = (extended.rebase(zero_ns) if zero_ns else extended).build()
+        return describe_model(model, effects_of(model))
+    except InputError as error:
+        raise InputError(f"process file {path}: {error}") from error
+
+
+def _call_function(path: Path) -> object:
+    """Run a file of the user, as `python FILE` would, and call its function.
+
+    Raises:
+        InputError: it raises an error, or has no such function.
+    """
+    try:
+        return runpy.run_path(str(path))[FUNCTION]()
+    except InputError:
+        raise
+    except Exception as error:  # the user's code may raise anything
+        missing = f"; it must have a function {FUNCTION}() that returns a Process" if error.args == (FUNCTION,) else ""
+        raise InputError(f"{type(error).__name__}: {error}{missing}") from error

@@ -1,0 +1,237 @@
+"""A process: its signals with their roles and, if there are any, equations, effects and controllers."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Literal, get_args
+
+from reactorwatch.errors import InputError
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.file_format import FileFormat
+from reactorwatch.units import conversion
+
+Role = Literal["input", "output", "setpoint", "mode", "label"]
+
+ROLES: tuple[str, ...] = get_args(Role)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A measured quantity.
+
+    Attributes:
+        name: its name on the bus, in settings and in reports.
+        unit: unit of its values; empty: unknown.
+        role: `input` acts on the process, `output` is watched, `setpoint` is what a controller aims at, `mode` says how
+            the process is operated, `label` is carried along and not watched.
+        column: name or number (from 1) of its column in a file; None: its name.
+        resolution: smallest step between two of its values, in its unit; None: learned from data.
+        bounds: lowest and highest value that it can have, in its unit; other values are not measured values, and an
+            input at a bound is saturated; None: unknown.
+
+    Raises:
+        InputError: the role is unknown, the resolution is not positive, or the bounds do not increase.
+    """
+
+    name: str
+    unit: str = ""
+    role: str = "output"
+    column: str | int | None = None
+    resolution: float | None = None
+    bounds: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name or self.name != self.name.strip() or "/" in self.name:
+            raise InputError(f"name of a signal must be a text without '/' and blanks around it, got {self.name!r}")
+        if self.role not in ROLES:
+            raise InputError(f"signal {self.name!r}: role must be one of {', '.join(ROLES)}, got {self.role!r}")
+        if self.resolution is not None and not 0 < self.resolution < float("inf"):
+            raise InputError(
+                f"signal {self.name!r}: resolution must be a positive number of its unit, got {self.resolution:g}; "
+                "leave it out, and it is learned"
+            )
+        if self.bounds is not None and not self.bounds[0] < self.bounds[1]:
+            raise InputError(
+                f"signal {self.name!r}: bounds must be a lower and a higher number, got {list(self.bounds)}"
+            )
+
+
+@dataclass(frozen=True)
+class KnownParameter:
+    """A constant of the equations with its uncertainty.
+
+    Attributes:
+        value: its value.
+        sd: standard deviation of the value, in the same unit; 0: it is exact.
+        unit: unit of both.
+    """
+
+    value: float
+    sd: float = 0.0
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process as a user describes it.
+
+    Attributes:
+        name: its name.
+        signals: its signals, each name once; at least one of them an output.
+        equations: its model, in the units of the equations; None: it is learned from data.
+        effects: what can be named as a cause and injected as a fault.
+        controllers: controllers of its inputs, for a simulation.
+        parameters: constants of the equations that are given, by name: value, standard deviation and unit.
+        file_format: statements on how to read its files; the rest is guessed for each file.
+        has_generic_effects: whether the effects made from the equations are added to its own.
+
+    Raises:
+        InputError: a rule above is broken, or signals and equations do not fit.
+    """
+
+    name: str
+    signals: tuple[Signal, ...]
+    equations: ProcessModel | None = None
+    effects: tuple[Effect, ...] = ()
+    controllers: tuple[object, ...] = ()
+    parameters: Mapping[str, KnownParameter | tuple[float, float, str]] = field(default_factory=dict)
+    file_format: FileFormat = field(default_factory=FileFormat)
+    has_generic_effects: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise InputError("name of a process must be a text of at least one letter, got ''")
+        self._check_signals()
+        if self.equations is None:
+            if self.parameters or self.effects:
+                raise InputError(
+                    f"process {self.name!r}: parameters and effects need equations, got none; name them, "
+                    "or leave both out"
+                )
+            return
+        self._check_equations(self.equations)
+
+    def names(self, role: str) -> tuple[str, ...]:
+        """Names of the signals of a role, in their order."""
+        return tuple(signal.name for signal in self.signals if signal.role == role)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self.names("input")
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of the outputs."""
+        return self.names("output")
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Known units by name of the signal."""
+        return {signal.name: signal.unit for signal in self.signals if signal.unit}
+
+    @cached_property
+    def model(self) -> ProcessModel | None:
+        """The equations with the given values of their parameters; None: the process has no equations."""
+        if self.equations is None:
+            return None
+        return self.equations.with_values({name: item.value for name, item in self._parameters_in_model_units.items()})
+
+    def without_equations(self) -> "Process":
+        """Copy with the signals alone."""
+        return replace(self, equations=None, effects=(), controllers=(), parameters={})
+
+    def require_model(self) -> ProcessModel:
+        """The model.
+
+        Raises:
+            InputError: the process has no equations.
+        """
+        if self.model is None:
+            raise InputError(
+                f"process {self.name!r}: must have equations for this, got none; name those of the catalogue with "
+                'equations = "NAME", or write them in a .py file'
+            )
+        return self.model
+
+    @property
+    def uncertain(self) -> dict[str, float]:
+        """Standard deviations of the parameters that are not exact, by name, in the units of the equations."""
+        return {name: item.sd for name, item in self._parameters_in_model_units.items() if item.sd > 0}
+
+    @cached_property
+    def _parameters_in_model_units(self) -> dict[str, KnownParameter]:
+        """Given parameters in the units of the equations."""
+        known = {}
+        for name, given in self.parameters.items():
+            item = given if isinstance(given, KnownParameter) else KnownParameter(*given)
+            if not item.sd >= 0:
+                raise InputError(f"{self._of_parameter(name)}: sd must be at least 0, got {item.sd:g}")
+            unit = _find_parameter(self, name)
+            if item.unit and item.unit != unit:
+                scale, offset = conversion(item.unit, unit, self._of_parameter(name))
+                item = KnownParameter(scale * item.value + offset, scale * item.sd, unit)
+            known[name] = item
+        return known
+
+    def _of_parameter(self, name: str) -> str:
+        return f"process {self.name!r}, parameter {name!r}"
+
+    def _check_signals(self) -> None:
+        names: list[str | int] = [signal.name for signal in self.signals]
+        for what, values in (
+            ("name", names),
+            ("column", [signal.name if signal.column is None else signal.column for signal in self.signals]),
+        ):
+            twice = next((value for value in values if values.count(value) > 1), None)
+            if twice is not None:
+                owners = [
+                    f"{s.name} ({s.role})" for s, value in zip(self.signals, values, strict=True) if value == twice
+                ]
+                raise InputError(
+                    f"process {self.name!r}: each signal must have a {what} of its own, got {twice!r} for "
+                    f"{' and '.join(owners)}; leave one out"
+                )
+        if not self.outputs:
+            raise InputError(
+                f"process {self.name!r}: at least one signal must be an output, got "
+                f"{', '.join(f'{s.name} ({s.role})' for s in self.signals) or 'no signals'}"
+            )
+
+    def _check_equations(self, model: ProcessModel) -> None:
+        for role, given, needed in (
+            ("input", self.inputs, model.input_names),
+            ("output", self.outputs, model.output_names),
+        ):
+            missing = [name for name in needed if name not in given]
+            if missing:
+                raise InputError(
+                    f"process {self.name!r}: its equations need the {role} {missing[0]!r}, got the {role}s "
+                    f"{', '.join(given) or 'none'}; add it, with column = ... if the file names it otherwise"
+                )
+        for signal in self.signals:
+            if signal.unit and signal.name in model.units:
+                conversion(signal.unit, model.units[signal.name], f"process {self.name!r}, signal {signal.name!r}")
+        try:
+            _ = self.model
+        except ValueError as error:
+            raise InputError(f"process {self.name!r}: {error}") from error
+
+
+def describe_model(model: ProcessModel, effects: tuple[Effect, ...] = (), name: str | None = None) -> Process:
+    """Describe a model: each input and output is a signal of its name, with its unit."""
+    signals = (
+        *(Signal(item.name, item.unit, "input") for item in model.inputs),
+        *(Signal(item.name, item.unit, "output") for item in model.outputs),
+    )
+    return Process(name or model.name, signals, model, effects)
+
+
+def _find_parameter(process: Process, name: str) -> str:
+    """Unit of a parameter of the equations."""
+    assert process.equations is not None
+    try:
+        return process.equations.parameter(name).unit
+    except ValueError as error:
+        raise InputError(f"process {process.name!r}: {error}") from error

@@ -1,0 +1,154 @@
+"""A process as a TOML document: its signals and, by name, equations of the catalogue with given constants."""
+
+import re
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
+
+import msgspec
+
+from reactorwatch.description.process import KnownParameter, Process, Signal
+from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.records.file_format import FileFormat
+from reactorwatch.toml_text import parse_toml
+
+_Column = str | Annotated[int, msgspec.Meta(ge=1)]
+
+
+class _Signal(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    role: str
+    unit: str = ""
+    column: _Column | None = None
+    resolution: float | None = None
+    bounds: tuple[float, float] | None = None
+
+
+class _Parameter(msgspec.Struct, forbid_unknown_fields=True):
+    value: float
+    sd: float = 0.0
+    unit: str = ""
+
+
+class _Time(msgspec.Struct, forbid_unknown_fields=True):
+    column: _Column | None = None
+    period: str | None = None
+    unit: str | None = None
+    zone: str | None = None
+    format: str | None = None
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    header: bool | None = None
+    separator: str | None = None
+    decimal: str | None = None
+    transposed: bool | None = None
+
+
+class _Document(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    signals: tuple[_Signal, ...]
+    equations: str | None = None
+    generic: bool = False
+    parameters: dict[str, _Parameter] = {}  # msgspec copies the default
+    missing: tuple[str | float, ...] = ()
+    time: _Time = msgspec.field(default_factory=_Time)
+    file: _File = msgspec.field(default_factory=_File)
+
+
+_KEYS = {
+    "--time-unit": "[time] unit",
+    "--time-format": "[time] format",
+    "--period": "[time] period",
+    "--zone": "[time] zone",
+    "--separator": "[file] separator",
+    "--decimal": "[file] decimal",
+}
+"""Keys by the options that state the same."""
+
+_PLACE = re.compile(r" - at `\$\.?([^`]*)`")
+_SIGNAL = re.compile(r"signals\[(\d+)\]")
+_UNKNOWN_FIELD = re.compile(r"Object contains unknown field `(\w+)`")
+_STRUCTS: Mapping[str, type[msgspec.Struct]] = {
+    "": _Document,
+    "signals": _Signal,
+    "time": _Time,
+    "file": _File,
+    "parameters": _Parameter,
+}
+
+
+def parse_process(content: bytes, catalogue: Mapping[str, Callable[[], Process]]) -> Process:
+    """Parse the description of a process.
+
+    Args:
+        content: the TOML document.
+        catalogue: processes whose equations and effects it may name.
+
+    Raises:
+        InputError: it is not TOML, or a part of it breaks a rule.
+    """
+    tables = parse_toml(content)
+    try:
+        document = msgspec.convert(tables, _Document)
+    except msgspec.ValidationError as error:
+        raise InputError(_describe_error(str(error), tables)) from error
+    described: dict[str, Any] = {}
+    if document.equations is not None:
+        if document.equations not in catalogue:
+            raise InputError(describe_unknown("equations", document.equations, catalogue))
+        named = catalogue[document.equations]()
+        described = {"equations": named.equations, "effects": named.effects, "controllers": named.controllers}
+    return Process(
+        document.name,
+        tuple(Signal(**msgspec.structs.asdict(item)) for item in document.signals),
+        parameters={name: KnownParameter(item.value, item.sd, item.unit) for name, item in document.parameters.items()},
+        file_format=_file_format(document),
+        has_generic_effects=document.generic,
+        **described,
+    )
+
+
+def _file_format(document: _Document) -> FileFormat:
+    """Statements of a document about its files.
+
+    Raises:
+        InputError: a value breaks a rule.
+    """
+    time = document.time
+    if time.column is not None and time.period is not None:
+        raise InputError(
+            f"[time] has a column or a period, got column {time.column!r} and period {time.period!r}; leave one out"
+        )
+    try:
+        return FileFormat(
+            time=None if time.column is None else str(time.column),
+            time_unit=time.unit,
+            zone=time.zone,
+            time_format=time.format,
+            period=time.period,
+            missing=tuple(str(cell) for cell in document.missing),
+            **msgspec.structs.asdict(document.file),
+        )
+    except InputError as error:
+        text = str(error)
+        for option, key in _KEYS.items():
+            text = text.replace(option, key)
+        raise InputError(text) from error
+
+
+def _describe_error(text: str, tables: Mapping[str, Any]) -> str:
+    """Describe a part of the wrong form by its table or signal; for an unknown key with the valid ones."""
+    match = _PLACE.search(text)
+    place = match[1] if match else ""
+    text = _PLACE.sub("", text)
+    table = re.split(r"[.\[]", place)[0]
+    unknown = _UNKNOWN_FIELD.search(text)
+    if unknown is not None and table in _STRUCTS:
+        text = describe_unknown("key", unknown[1], [item.name for item in msgspec.structs.fields(_STRUCTS[table])])
+    index = _SIGNAL.match(place)
+    if index is not None:
+        number = int(index[1])
+        named = tables["signals"][number]
+        name = named.get("name") if isinstance(named, dict) else None
+        place = place.replace(index[0], f"signal {name!r}" if name else f"signal {number + 1}", 1)
+    return f"{place}: {text}" if place else text

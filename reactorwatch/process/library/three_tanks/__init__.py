@@ -1,0 +1,1 @@
+"""Three coupled tanks with two pumps."""

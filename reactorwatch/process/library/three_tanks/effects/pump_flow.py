@@ -1,0 +1,51 @@
+"""Deviation of a pump's flow."""
+
+from typing import ClassVar
+
+import casadi as ca
+
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel
+
+
+class PumpFlow(Effect):
+    """The real flow of a pump is Q + m."""
+
+    unit = "cm3/s"
+    lower = -150.0
+    upper = 150.0
+    typical = 1.0
+    input: ClassVar[str]
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`.
+
+        Raises:
+            ValueError: the model has no such input.
+        """
+        if self.input not in model.input_names:
+            raise ValueError(
+                f"{self.name} needs a model with the input {self.input!r}, {model.name} has {model.input_names}"
+            )
+        flow = model.inputs[model.input_names.index(self.input)].symbol
+        return model.substitute(flow, flow + size)
+
+
+class Pump1(PumpFlow):
+    """The real flow of pump 1 is Q1 + m."""
+
+    name = location = "pump1"
+    label = "wrong flow of pump 1"
+    larger = "{} cm3/s more from pump 1"
+    smaller = "{} cm3/s less from pump 1"
+    input = "Q1"
+
+
+class Pump2(PumpFlow):
+    """The real flow of pump 2 is Q2 + m."""
+
+    name = location = "pump2"
+    label = "wrong flow of pump 2"
+    larger = "{} cm3/s more from pump 2"
+    smaller = "{} cm3/s less from pump 2"
+    input = "Q2"

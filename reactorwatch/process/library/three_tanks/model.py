@@ -1,0 +1,75 @@
+"""Three tanks in a row, joined by pipes: one pump fills each outer tank, and the second tank drains into the basin.
+
+    A dh1/dt = Q1 - Q13        Q13 = a1 s root(h1 - h3)
+    A dh2/dt = Q2 + Q32 - Q20  Q32 = a3 s root(h3 - h2)
+    A dh3/dt = Q13 - Q32       Q20 = a2 s root(h2)           root(h) = sign(h) sqrt(2 g |h|)
+
+Levels h are in cm, flows in cm3/s, and the model's time is in minutes. A is the cross-section of a tank, s that of a
+pipe, a1, a2 and a3 are outflow coefficients (Torricelli).
+
+It is the laboratory plant DTS200 (Amira GmbH), a benchmark of fault diagnosis; constants as in the data set
+"Three-Tank System" (zhuofupan, 2021). Published records were made in closed loop, in which a fault is mainly visible in
+the pumps.
+
+The root has no derivative at zero. Below a tenth of a millimetre it becomes a straight line through zero,
+h / (h^2 + s^2)^(1/4), as a slow flow through a hole does (Modelica.Fluid, `regRoot`).
+"""
+
+from functools import cache
+
+import casadi as ca
+
+from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
+
+SMALL_LEVEL_CM = 0.01
+"""Difference of levels below which the root becomes a straight line; at 1 cm that changes it by 3 in 100,000."""
+
+SECONDS_PER_MIN = 60.0
+
+
+@cache
+def three_tanks() -> ProcessModel:
+    """The tanks with their nominal constants: one model, so that what is compiled from it is compiled once."""
+    h1, h2, h3 = (
+        variable(f"h{i}", "cm", (0.0, 62.0), 5.0, f"level of tank {i}", balance=f"tank{i}") for i in (1, 2, 3)
+    )
+    Q1, Q2 = (variable(f"Q{i}", "cm3/s", (0.0, 150.0), 5.0, f"flow of pump {i}") for i in (1, 2))
+    A = parameter("A", 154.0, "cm2", (1.0, 1e5), "cross-section of a tank")
+    s = parameter("s", 0.5, "cm2", (1e-3, 1e3), "cross-section of a pipe")
+    g = parameter("g", 981.0, "cm/s2", (900.0, 1000.0), "acceleration of gravity")
+    a1 = parameter("a1", 0.46, "1", (0.0, 2.0), "outflow coefficient of the pipe from tank 1 to tank 3")
+    a2 = parameter("a2", 0.60, "1", (0.0, 2.0), "outflow coefficient of the outlet of tank 2")
+    a3 = parameter("a3", 0.45, "1", (0.0, 2.0), "outflow coefficient of the pipe from tank 3 to tank 2")
+
+    def pipe(coefficient: ca.SX, head: ca.SX) -> ca.SX:
+        return coefficient * s.symbol * ca.sqrt(2 * g.symbol) * signed_root(head)
+
+    Q13 = pipe(a1.symbol, h1.symbol - h3.symbol)
+    Q32 = pipe(a3.symbol, h3.symbol - h2.symbol)
+    Q20 = pipe(a2.symbol, h2.symbol)
+    per_min = SECONDS_PER_MIN / A.symbol
+    levels = (h1, h2, h3)
+    return ProcessModel(
+        name="three_tanks",
+        states=levels,
+        inputs=(Q1, Q2),
+        parameters=(A, s, g, a1, a2, a3),
+        rhs=(
+            per_min * (Q1.symbol - Q13),
+            per_min * (Q2.symbol + Q32 - Q20),
+            per_min * (Q13 - Q32),
+        ),
+        outputs=tuple(Output(level.name, level.unit, level.symbol) for level in levels),
+        clock=new_clock(),
+        terms={leak_name(i): -per_min * pipe(ca.SX(1), level.symbol) for i, level in enumerate(levels, start=1)},
+    )
+
+
+def leak_name(tank: int) -> str:
+    """Name of the term that a leak with an opening of 1 adds to a tank's level, in cm/min."""
+    return f"leak {tank}"
+
+
+def signed_root(head: ca.SX) -> ca.SX:
+    """Root of a difference of levels with its sign, and a straight line where it is nearly zero."""
+    return head / ca.sqrt(ca.sqrt(head**2 + SMALL_LEVEL_CM**2))

@@ -1,0 +1,100 @@
+"""File format as the user states it: whatever is not stated is guessed from the file."""
+
+import math
+import re
+from dataclasses import dataclass
+
+from reactorwatch.errors import InputError, describe_unknown
+
+SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+"""Seconds in each unit of time."""
+
+TIME_UNITS = (*SECONDS, "iso")
+SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "blank": " ", "blanks": " ", "pipe": "|"}
+_PERIOD = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)")
+_FIXED_ZONE = re.compile(r"(?:UTC|GMT)?([+-])(\d{1,2})(?::?(\d{2}))?")
+
+
+@dataclass(frozen=True)
+class FileFormat:
+    """Statements about a file that override the guesses. Names in brackets are the options of the command line.
+
+    Attributes:
+        time: header or number (from 1) of the time column (`--time`).
+        time_unit: unit of a numeric time column: ns, us, ms, s, min, h or d; `iso` for timestamps (`--time-unit`).
+        zone: time zone of local timestamps, such as `Europe/Berlin` or `+01:00` (`--zone`).
+        time_format: format of timestamps, such as `%d.%m.%Y %H:%M:%S` (`--time-format`).
+        period: sampling period of rows without a usable time column, such as `4 s` (`--period`).
+        missing: cells that mean "not measured", beside the usual ones (`--missing`).
+        separator: the character between cells, or its name (`--separator`).
+        decimal: `.` or `,` (`--decimal`).
+        header: whether the file has a header (`--header`, `--no-header`).
+        transposed: whether each row is a signal (`--transposed`, `--no-transposed`).
+
+    Raises:
+        InputError: a value is not one of those listed.
+    """
+
+    time: str | None = None
+    time_unit: str | None = None
+    zone: str | None = None
+    time_format: str | None = None
+    period: str | None = None
+    missing: tuple[str, ...] = ()
+    separator: str | None = None
+    decimal: str | None = None
+    header: bool | None = None
+    transposed: bool | None = None
+
+    def __post_init__(self) -> None:
+        if self.time_unit is not None and self.time_unit not in TIME_UNITS:
+            raise InputError(describe_unknown("--time-unit", self.time_unit, TIME_UNITS))
+        if self.decimal is not None and self.decimal not in (".", ","):
+            raise InputError(f"--decimal must be '.' or ',', got {self.decimal!r}")
+        if self.separator is not None:
+            separator = SEPARATORS.get(self.separator, self.separator)
+            if len(separator) != 1 or separator in '"\r\n' or separator.isalnum():
+                raise InputError(f"--separator must be one character, 'tab' or 'blank', got {self.separator!r}")
+            object.__setattr__(self, "separator", separator)
+            if separator == self.decimal:
+                raise InputError(f"--separator and --decimal must differ, got {separator!r} for both")
+        if self.period is not None:
+            self.period_s  # noqa: B018 # checks it
+        if self.zone is not None:
+            _check_zone(self.zone)
+
+    @property
+    def period_s(self) -> float | None:
+        """Sampling period in seconds; None: the file has a time column.
+
+        Raises:
+            InputError: the text is no period.
+        """
+        if self.period is None:
+            return None
+        match = _PERIOD.fullmatch(self.period.strip())
+        seconds = float(match[1]) * SECONDS.get(match[2], math.nan) if match else math.nan
+        if not 0 < seconds < math.inf:
+            raise InputError(f"--period must be a positive number with its unit, such as 4 s, got {self.period!r}")
+        return seconds
+
+
+def fixed_offset_s(zone: str) -> int | None:
+    """Seconds by which a zone such as `+01:00` or `UTC+1` is ahead of UTC; None for a named zone."""
+    if zone.upper() in ("UTC", "GMT", "Z"):
+        return 0
+    match = _FIXED_ZONE.fullmatch(zone.upper())
+    if match is None:
+        return None
+    return (1 if match[1] == "+" else -1) * (int(match[2]) * 3600 + int(match[3] or 0) * 60)
+
+
+def _check_zone(zone: str) -> None:
+    from zoneinfo import ZoneInfo
+
+    if fixed_offset_s(zone) is not None:
+        return
+    try:
+        ZoneInfo(zone)
+    except (KeyError, ValueError, OSError) as error:  # a name that is not found, malformed, or a folder of the database
+        raise InputError(f"--zone must be a time zone such as Europe/Berlin or +01:00, got {zone!r}") from error

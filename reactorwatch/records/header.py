@@ -1,0 +1,174 @@
+"""Header of a text table: names, units and the first row of data, guessed from the first lines."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.cells import EMPTY, NUMBER, TEXT, TIME, guess_decimal, kind_of
+from reactorwatch.records.file_format import FileFormat
+from reactorwatch.records.layout import Layout, bracketed_unit, describe_separator, split_line
+
+
+class HeaderSearch:
+    """Search for the header and the first row of data.
+
+    Args:
+        path: the file, for messages.
+        text: the whole text.
+        table: lines of its head as cells, each with the number of its line.
+        separator: the character between cells.
+        stated: what need not be guessed.
+        missing: cells that mean "not measured".
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        text: bytes,
+        table: list[tuple[int, list[str]]],
+        separator: str,
+        stated: FileFormat,
+        missing: frozenset[str],
+    ) -> None:
+        self._path, self._text, self._table = path, text, table
+        self._separator, self._stated, self._missing = separator, stated, missing
+        tail = [cells for _, cells in table[len(table) // 4 :]]
+        self._width = Counter(map(len, tail)).most_common(1)[0][0]
+        columns = zip(*(self._kinds(cells) for cells in tail if len(cells) == self._width), strict=True)
+        self._holds_values = [sum(kind in (NUMBER, TIME) for kind in kinds) > len(kinds) / 2 for kinds in columns]
+
+    def _kinds(self, cells: Sequence[str]) -> list[str]:
+        return [kind_of(cell, self._missing) for cell in cells]
+
+    def _is_data(self, cells: list[str]) -> bool:
+        kinds = self._kinds(cells)
+        text = sum(kind == TEXT for kind, values in zip(kinds, self._holds_values, strict=False) if values)
+        return len(cells) == self._width and sum(kind in (NUMBER, TIME) for kind in kinds) > text
+
+    def _is_names(self, cells: list[str]) -> bool:
+        kinds = self._kinds(cells)
+        return TEXT in kinds and NUMBER not in kinds and TIME not in kinds
+
+    def layout(self, comments: list[tuple[int, str]]) -> Layout:
+        """Layout of the table.
+
+        Args:
+            comments: numbers and texts of the comment lines.
+        """
+        table, stated = self._table, self._stated
+        first = next((index for index, (_, cells) in enumerate(table) if self._is_data(cells)), None)
+        if first is None:  # nothing but a header
+            return self._make([] if stated.header is False else table[:1], 1)
+        while first and len(table[first - 1][1]) == self._width and not self._is_names(table[first - 1][1]):
+            if set(self._kinds(table[first - 1][1])) <= {EMPTY} or self._is_numbered_header(first - 1):
+                break
+            first -= 1  # a row of data with bad cells
+        heads: list[tuple[int, list[str]]] = []
+        while first - len(heads) and len(table[first - len(heads) - 1][1]) == self._width:
+            cells = table[first - len(heads) - 1][1]
+            if not (self._is_names(cells) or self._is_numbered_header(first - len(heads) - 1)):
+                break
+            heads.insert(0, table[first - len(heads) - 1])
+        if stated.header is False:
+            heads, first = [], first - len(heads)
+        elif stated.header and not heads:
+            heads, first = table[: first + 1][-1:], max(first, 1)
+        elif not heads:
+            heads = self._unequal_header(first) or self._commented_header(comments)
+        return self._make(heads, first)
+
+    def _is_numbered_header(self, index: int) -> bool:
+        """True for a first line with names of which some are whole numbers."""
+        cells = self._table[index][1]
+        kinds = self._kinds(cells)
+        numbers = all(cell.strip().isdigit() for cell, kind in zip(cells, kinds, strict=True) if kind == NUMBER)
+        text = any(kind == TEXT and values for kind, values in zip(kinds, self._holds_values, strict=False))
+        return (
+            index == 0 and len(self._table) > 1 and len(cells) == self._width and text and numbers and TIME not in kinds
+        )
+
+    def _unequal_header(self, first: int) -> list[tuple[int, list[str]]]:
+        """Header with another number of cells than the rows.
+
+        Raises:
+            InputError: the surplus cells of the rows hold values.
+        """
+        if not first or len(self._table[first - 1][1]) == 1 or not self._is_names(self._table[first - 1][1]):
+            return []
+        row, names = self._table[first - 1]
+        rows = [cells for _, cells in self._table[first:] if len(cells) == self._width]
+        if len(names) == self._width + 1 and not names[-1].strip():
+            return [(row, names[:-1])]
+        if len(names) == self._width - 1 and not any(cells[-1].strip() for cells in rows):
+            return [(row, [*names, ""])]
+        cure = "; if the comma is the decimal sign as well, state --decimal ," if len(names) * 2 == self._width else ""
+        raise InputError(
+            f"{self._path}, row {self._table[first][0]}: expected {len(names)} cells as in the header, "
+            f"got {self._width}{cure}"
+        )
+
+    def _commented_header(self, comments: list[tuple[int, str]]) -> list[tuple[int, list[str]]]:
+        """Header in the last comment, as NumPy and MATLAB write it."""
+        for row, comment in comments[::-1]:
+            cells = split_line(comment.strip().lstrip("#%/").strip(), self._separator)
+            if len(cells) == self._width and self._is_names(cells):
+                return [(row, cells)]
+        return []
+
+    def _make(self, heads: list[tuple[int, list[str]]], first: int) -> Layout:
+        filled = [sum(bool(cell.strip()) for cell in cells) for _, cells in heads]
+        names_index = filled.index(max(filled)) if heads else 0
+        names = [cell.strip() for cell in heads[names_index][1]] if heads else [""] * self._width
+        below = heads[names_index + 1 :]
+        units_row = min(below, key=lambda head: sum(map(len, head[1]))) if below else None
+        units = (
+            [cell.strip().strip("[]()") for cell in units_row[1]]
+            if units_row
+            else [bracketed_unit(name) for name in names]
+        )
+        sample = [cells for _, cells in self._table[first:] if len(cells) == self._width]
+        notes = []
+        if self._separator != ",":
+            notes.append(describe_separator(self._separator))
+        if not heads:
+            notes.append("no header")
+        elif heads[names_index][0] != self._table[0][0]:
+            notes.append(f"header in row {heads[names_index][0]}")
+        if units_row:
+            notes.append(f"units in row {units_row[0]}")
+        layout = Layout(
+            path=self._path,
+            text=self._text,
+            separator=self._separator,
+            decimal=self._stated.decimal or ".",
+            names=tuple(name or str(number) for number, name in enumerate(names, start=1)),
+            units=tuple(units),
+            header_row=heads[names_index][0] if heads else None,
+            first_row=self._table[first][0] if first < len(self._table) else self._table[-1][0] + 1,
+            sample=sample,
+            missing=self._missing,
+            notes=notes,
+        )
+        if self._stated.decimal is None:
+            layout = replace(layout, decimal=self._guess_decimal(layout))
+        if layout.decimal == ",":
+            notes.insert(0 if self._separator == "," else 1, "decimal comma")
+        return layout
+
+    def _guess_decimal(self, layout: Layout) -> str:
+        """Decimal sign, from all rows where the first ones leave it open.
+
+        Raises:
+            InputError: it stays open.
+        """
+        found = guess_decimal([cell for cells in layout.sample for cell in cells])
+        found = found or guess_decimal([cell for _, cells in layout.rows() for cell in cells])
+        if found is None:
+            cell = next(cell for cells in layout.sample for cell in cells if "," in cell)
+            raise InputError(
+                f"{self._path}, row {layout.first_row}: {cell!r} may be a decimal comma or a thousand; "
+                "state --decimal , or --decimal ."
+            )
+        return found

@@ -1,0 +1,106 @@
+"""Layout of a text table: separator, decimal sign, names, units, first row."""
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.cells import EMPTY, kind_of
+
+_SEPARATORS = {",": "comma separated", "\t": "tab separated", " ": "blank separated"}
+_BRACKETED = re.compile(r"\s*[\[(]([^\[\]()]+)[\])]\s*$")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Text of a table and its layout.
+
+    Attributes:
+        path: the file, for messages.
+        text: the whole text, UTF-8; comments are blank lines, runs of blanks are one if they separate.
+        separator: the character between cells.
+        decimal: the decimal sign.
+        names: name of each column, without blanks around it; without a header its number.
+        units: unit of each column, from a row of units or in brackets in the name; empty: unknown.
+        header_row: number of the line with the names, as a text editor counts; None: no header.
+        first_row: number of the first line of data.
+        sample: cells of the first rows, each of the table's width.
+        missing: cells that mean "not measured".
+        notes: what is unusual, for people.
+        transposed: the file's rows and columns were exchanged.
+    """
+
+    path: Path
+    text: bytes
+    separator: str
+    decimal: str
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    header_row: int | None
+    first_row: int
+    sample: list[list[str]]
+    missing: frozenset[str]
+    notes: list[str] = field(default_factory=list)
+    transposed: bool = False
+
+    def cells(self, column: int) -> list[str]:
+        """Cells of a column in the sample."""
+        return [row[column] for row in self.sample]
+
+    def kind(self, column: int) -> str:
+        """Kind of most cells of a column in the sample."""
+        kinds = Counter(kind_of(cell, self.missing) for cell in self.cells(column))
+        kinds.pop(EMPTY, None)
+        return kinds.most_common(1)[0][0] if kinds else EMPTY
+
+    def rows(self) -> Iterator[tuple[int, list[str]]]:
+        """Yield rows of data, each with the number of its last line; for messages.
+
+        Raises:
+            InputError: a quoted cell has no end.
+        """
+        lines = self.text.decode().rstrip("\n").split("\n")[self.first_row - 1 :]
+        reader = csv.reader((f"{line}\n" for line in lines), delimiter=self.separator, strict=True)
+        while True:
+            try:
+                cells = next(reader, None)
+            except csv.Error as error:
+                row = self.first_row - 1 + reader.line_num
+                kind = describe_separator(self.separator)
+                raise InputError(f"{self.path}, row {row}: expected {kind} cells: {error}") from error
+            if cells is None:
+                return
+            if len(cells) > 1 or (cells and cells[0].strip()):
+                yield self.first_row - 1 + reader.line_num, cells
+
+
+def bare_name(name: str) -> str:
+    """Name without a unit in brackets.
+
+    >>> bare_name("T [K]")
+    'T'
+    """
+    return _BRACKETED.sub("", name).strip() or name
+
+
+def bracketed_unit(name: str) -> str:
+    """Unit in brackets at the end of a name; empty if there is none."""
+    match = _BRACKETED.search(name)
+    return match[1].strip() if match else ""
+
+
+def describe_separator(separator: str) -> str:
+    """Separator for people.
+
+    >>> describe_separator(";")
+    '; separated'
+    """
+    return _SEPARATORS.get(separator, f"{separator} separated")
+
+
+def split_line(line: str, separator: str) -> list[str]:
+    """Cells of a line; runs of blanks separate once."""
+    return next(csv.reader([" ".join(line.split()) if separator == " " else line], delimiter=separator), [""])

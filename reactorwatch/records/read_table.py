@@ -1,0 +1,321 @@
+"""Read a record from a table of any common form: what is not stated is guessed, and the guesses are noted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.cells import EMPTY, NUMBER, TEXT
+from reactorwatch.records.file_format import FileFormat
+from reactorwatch.records.historian import LongFormat, find_long_format, read_tags
+from reactorwatch.records.layout import Layout, bare_name, bracketed_unit
+from reactorwatch.records.record import MINUTE_NS, Record, join_runs
+from reactorwatch.records.row_checks import check_times, check_values, filled_rows, find_runs, numbered_runs
+from reactorwatch.records.sniff import sniff
+from reactorwatch.records.source_text import read_text
+from reactorwatch.records.text_table import TextTable
+from reactorwatch.records.time_column import (
+    TimeColumn,
+    Times,
+    choose_time,
+    read_times,
+)
+from reactorwatch.units import UnknownUnitError, conversion
+
+RUN = "run"
+"""Column with the run of each row, if a record has several."""
+
+GUESS = FileFormat()
+
+
+@dataclass(frozen=True)
+class SignalColumn:
+    """Signal of a process, and the column that holds it.
+
+    Attributes:
+        name: name of the signal.
+        unit: unit of the signal; empty: that of the column.
+        role: input, output, setpoint, mode or label; texts of a mode or a label are numbered.
+        column: header or number (from 1) of the column; None: as `name`.
+        required: the file must have it.
+    """
+
+    name: str
+    unit: str = ""
+    role: str = "output"
+    column: str | None = None
+    required: bool = True
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Column of a signal in the file, and the unit that the file states for it."""
+
+    signal: SignalColumn
+    column: int
+    unit: str
+
+
+def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated: FileFormat = GUESS) -> Record:
+    """Read a record.
+
+    Args:
+        path: text with any separator, perhaps compressed, a workbook (.xlsx) or a Parquet file.
+        signals: the signals to be read; None: each column of numbers, under its name without unit.
+        stated: statements about the file that override the guesses.
+
+    Returns:
+        The record. Where the file has clock time, its minutes count from the first row. `read_as` has the guesses.
+
+    Raises:
+        InputError: the file cannot be read, is malformed or can be read in several ways; one line with file, row (as
+            a text editor counts), column, rule, value and cure.
+    """
+    text, notes = read_text(path)
+    layout = sniff(path, text, stated)
+    notes = [*notes, *layout.notes]
+    _check_names(layout)
+    asked = [signal.column or signal.name for signal in signals or ()]
+    long = find_long_format(layout, stated, asked)
+    if long is not None:
+        return _read_long(layout, long, signals, stated, notes)
+    mapped = _find_columns(layout, signals) if signals is not None else {}
+    time = choose_time(layout, stated, [column for column in mapped.values() if column is not None])
+    if signals is not None:
+        _check_required(layout, signals, mapped)
+    sources = _sources(layout, signals, mapped, time)
+    texts = [source.column for source in sources if _is_coded(layout, source)]
+    run = layout.names.index(RUN) if RUN in layout.names and RUN not in asked else None
+    stamps = time.columns if time.pattern is not None else ()
+    table = TextTable(
+        layout,
+        [
+            *(time.columns if time.pattern is None else ()),
+            *(item.column for item in sources if item.column not in texts),
+        ],
+        [*stamps, *texts, *([] if run is None else [run])],
+    )
+    return _make_record(table, time, read_times(table, time, stated), sources, run, notes)
+
+
+def read_tables(
+    paths: Sequence[Path], signals: Sequence[SignalColumn] | None = None, stated: FileFormat = GUESS
+) -> Record:
+    """Read several files in a row as one record; one that starts before the end of the one before is a new run.
+
+    Raises:
+        InputError: as `read_table`; or the files have different signals.
+    """
+    return join_files([read_table(path, signals, stated) for path in paths])
+
+
+def join_files(records: Sequence[Record]) -> Record:
+    """Join records of files that follow each other.
+
+    Raises:
+        InputError: they have different signals, or not all have clock time.
+    """
+    first = records[0]
+    parts: list[Record] = []
+    for record in records:
+        if record.columns.keys() != first.columns.keys():
+            got, expected = ", ".join(record.columns), ", ".join(first.columns)
+            raise InputError(f"{record.name}: expected the signals of {first.name}, {expected}, got {got}")
+        if bool(record.zero_ns) != bool(first.zero_ns):
+            raise InputError(f"{record.name}: expected {'' if first.zero_ns else 'no '}clock time, as {first.name} has")
+        shift = (record.zero_ns - first.zero_ns) / MINUTE_NS
+        for run in record.split_runs():
+            moved = Record(run.time_min + shift, run.columns, first.name, first.zero_ns, units=first.units)
+            if parts and run is not record.split_runs()[0]:
+                parts.append(moved)
+            elif parts and parts[-1].time_min[-1] < moved.time_min[0]:
+                last = parts.pop()
+                columns = {name: np.concatenate([values, moved.columns[name]]) for name, values in last.columns.items()}
+                times = np.concatenate([last.time_min, moved.time_min])
+                parts.append(Record(times, columns, first.name, first.zero_ns, units=first.units))
+            else:
+                parts.append(moved)
+    joined = join_runs(parts)
+    return Record(
+        joined.time_min,
+        joined.columns,
+        first.name,
+        first.zero_ns,
+        runs=joined.runs,
+        units=first.units,
+        strays=sum(record.strays for record in records),
+        read_as=first.read_as,
+    )
+
+
+def _check_names(layout: Layout) -> None:
+    for name in layout.names:
+        if layout.names.count(name) > 1:
+            raise InputError(
+                f"{layout.path}, row {layout.header_row}: expected each column name once, got {name!r} more than once"
+            )
+
+
+def _find_columns(layout: Layout, signals: Sequence[SignalColumn]) -> dict[str, int | None]:
+    """Number of each signal's column; None: there is none."""
+    found: dict[str, int | None] = {}
+    bare = [bare_name(name) for name in layout.names]
+    for signal in signals:
+        name = signal.column or signal.name
+        known = next((names for names in (layout.names, bare) if names.count(name) == 1), None)
+        number = int(name) - 1 if signal.column and name.isdigit() and int(name) <= len(bare) else None
+        found[signal.name] = list(known).index(name) if known is not None else number
+    return found
+
+
+def _check_required(layout: Layout, signals: Sequence[SignalColumn], mapped: dict[str, int | None]) -> None:
+    for signal in signals:
+        if signal.required and mapped[signal.name] is None:
+            asked = repr(signal.column or signal.name)
+            named = f" (for {signal.name})" if signal.column and signal.column != signal.name else ""
+            found = f"got {', '.join(map(repr, layout.names))}"
+            raise InputError(
+                f"{layout.path}, row {layout.header_row or layout.first_row}: "
+                f"expected a column {asked} in the header{named}, {found}"
+            )
+
+
+def _sources(
+    layout: Layout, signals: Sequence[SignalColumn] | None, mapped: dict[str, int | None], time: TimeColumn
+) -> list[_Source]:
+    """Columns to be read.
+
+    Raises:
+        InputError: no signals are asked for, and no column holds numbers.
+    """
+    if signals is not None:
+        pairs = ((signal, mapped[signal.name]) for signal in signals)
+        return [_Source(signal, column, layout.units[column]) for signal, column in pairs if column is not None]
+    bare = [bare_name(name) for name in layout.names]
+    sources = []
+    for column, name in enumerate(layout.names):
+        is_unnamed = layout.header_row is not None and name == str(column + 1) and layout.kind(column) == EMPTY
+        if column in time.columns or name == RUN or is_unnamed or layout.kind(column) not in (NUMBER, EMPTY):
+            continue
+        own = bare[column] if bare.count(bare[column]) == 1 else name
+        sources.append(_Source(SignalColumn(own), column, layout.units[column]))
+    if not sources:
+        raise InputError(
+            f"{layout.path}, row {layout.first_row}: expected columns of numbers, got only text in "
+            f"{', '.join(map(repr, layout.names))}; state --separator, --decimal or --missing if they are numbers"
+        )
+    return sources
+
+
+def _is_coded(layout: Layout, source: _Source) -> bool:
+    return source.signal.role in ("mode", "label") and layout.kind(source.column) == TEXT
+
+
+def _make_record(
+    table: TextTable, time: TimeColumn, times: Times, sources: Sequence[_Source], run: int | None, notes: list[str]
+) -> Record:
+    layout = table.layout
+    columns, units = {}, {}
+    notes = [*notes, *times.notes]
+    for source in sources:
+        name = source.signal.name
+        if _is_coded(layout, source):
+            cells = table.texts(source.column).dictionary_encode()
+            words = cells.dictionary.to_pylist()
+            codes = np.array([np.nan if word.strip() in layout.missing else code for code, word in enumerate(words)])
+            columns[name] = codes[np.asarray(cells.indices)]
+            known = (f"{word} = {code:g}" for word, code in zip(words, codes, strict=True) if not np.isnan(code))
+            notes.append(f"{name}: {', '.join(known)}")
+        else:
+            columns[name] = table.numbers(source.column)
+            check_values(table, source.column, columns[name])
+        columns[name], units[name] = _convert(layout, source, columns[name], notes)
+    minutes, zero_ns = times.since_first()
+    runs = numbered_runs(table, run)
+    kept = filled_rows(times, columns)
+    check_times(table, time, times, minutes, runs, kept)
+    first_row = None
+    if kept is not None:
+        minutes, runs = minutes[kept], None if runs is None else runs[kept]
+        columns = {name: values[kept] for name, values in columns.items()}
+    elif not layout.transposed and layout.text.rstrip(b"\n").count(b"\n") + 2 - layout.first_row == minutes.size:
+        first_row = layout.first_row  # no blank lines between the rows
+    return Record(
+        minutes,
+        columns,
+        layout.path.name,
+        zero_ns,
+        first_row=first_row,
+        runs=find_runs(layout, time, minutes, runs),
+        units={name: unit for name, unit in units.items() if unit},
+        read_as=", ".join([*notes, *_describe_texts(layout, time, sources)] if notes else notes),
+    )
+
+
+def _describe_texts(layout: Layout, time: TimeColumn, sources: Sequence[_Source]) -> list[str]:
+    used = {*time.columns, *(source.column for source in sources)}
+    texts = [
+        layout.names[column]
+        for column in range(len(layout.names))
+        if column not in used and layout.kind(column) == TEXT
+    ]
+    return [f"text left out: {', '.join(f'`{name}`' for name in texts)}"] if texts else []
+
+
+def _convert(
+    layout: Layout, source: _Source, values: NDArray[np.float64], notes: list[str]
+) -> tuple[NDArray[np.float64], str]:
+    """Values in the unit of the signal, and that unit.
+
+    Raises:
+        InputError: the file's unit is one of another quantity.
+    """
+    signal = source.signal
+    if not (signal.unit and source.unit) or signal.unit == source.unit:
+        return values, signal.unit or source.unit
+    name = f"{layout.path}, row {layout.header_row}, column {layout.names[source.column]!r}"
+    try:
+        scale, offset = conversion(source.unit, signal.unit, name)
+    except UnknownUnitError:
+        notes.append(f"{signal.name} in {signal.unit}, whatever {source.unit!r} means")
+        return values, signal.unit
+    except InputError as error:
+        raise InputError(f"{error}; correct the header or the unit of signal {signal.name!r}") from error
+    if (scale, offset) == (1.0, 0.0):
+        return values, signal.unit
+    notes.append(f"{signal.name} from {source.unit} to {signal.unit}")
+    return scale * values + offset, signal.unit
+
+
+def _read_long(
+    layout: Layout, long: LongFormat, signals: Sequence[SignalColumn] | None, stated: FileFormat, notes: list[str]
+) -> Record:
+    """Read a table with a row for each value; the first of several values of a tag at one time counts."""
+    wanted = None if signals is None else [signal.column or signal.name for signal in signals]
+    series, is_clock, guesses = read_tags(layout, long, stated, wanted)
+    by_name = {bare_name(tag): tag for tag in series} | {tag: tag for tag in series}
+    if signals is None:
+        signals = [SignalColumn(bare_name(tag)) for tag in series]
+    times = np.unique(np.concatenate([item.times for item in series.values()]))
+    columns, units, strays, notes = {}, {}, 0, [*notes, *guesses]
+    for signal in signals:
+        tag = by_name.get(signal.column or signal.name)
+        if tag is None:
+            if signal.required:
+                found = ", ".join(map(repr, series))
+                raise InputError(
+                    f"{layout.path}: expected rows of the tag {signal.column or signal.name!r}, got {found}"
+                )
+            continue
+        own, first = np.unique(series[tag].times, return_index=True)
+        strays += series[tag].times.size - own.size
+        values = np.full(times.size, np.nan)
+        values[np.searchsorted(times, own)] = series[tag].values[first]
+        source = _Source(signal, long.value, bracketed_unit(tag))
+        columns[signal.name], units[signal.name] = _convert(layout, source, values, notes)
+    minutes, zero_ns = Times(times, np.full(times.size, fill_value=True), is_clock, []).since_first()
+    known = {name: unit for name, unit in units.items() if unit}
+    return Record(minutes, columns, layout.path.name, zero_ns, units=known, strays=strays, read_as=", ".join(notes))

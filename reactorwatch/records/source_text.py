@@ -1,0 +1,131 @@
+"""Any file of measured data as the bytes of a text table: decompressed, decoded, workbooks and Parquet written out."""
+
+import csv
+import gzip
+import io
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.input_file import wrap_read_errors
+
+TEXT_SUFFIXES = (".csv", ".tsv", ".tab", ".txt", ".dat", ".asc", ".prn", ".lvm", ".gz")
+WORKBOOK_SUFFIXES = (".xlsx", ".xlsm")
+PARQUET_SUFFIXES = (".parquet", ".pq")
+TABLE_SUFFIXES = (*TEXT_SUFFIXES, *WORKBOOK_SUFFIXES, *PARQUET_SUFFIXES)
+"""Suffixes of files that hold a record as a table."""
+
+_MAGIC = {b"\x1f\x8b": "gz", b"PK\x03\x04": "xlsx", b"PAR1": "parquet", b"\x89MCAP": "mcap"}
+_BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+
+
+def read_text(path: Path) -> tuple[bytes, list[str]]:
+    r"""Read a file as UTF-8 text with lines that end in \n.
+
+    Returns:
+        The text, and what is unusual about the file.
+
+    Raises:
+        InputError: the file cannot be read, is empty or holds no text.
+    """
+    with wrap_read_errors(path):
+        try:
+            data = path.read_bytes()
+        except IsADirectoryError as error:
+            raise InputError(f"{path}: expected a CSV file, got a folder") from error
+    notes = []
+    kind = _kind(data)
+    if kind == "mcap":
+        raise InputError(f"{path}: expected a CSV file, got an MCAP recording; give it the ending .mcap")
+    if kind == "gz":
+        try:
+            data = gzip.decompress(data)
+        except (OSError, EOFError, zlib.error) as error:
+            raise InputError(f"{path}: expected a complete gzip file, got {error}") from error
+        notes.append("gzip")
+        kind = _kind(data)
+    if kind == "xlsx":
+        data, sheet = _workbook(path, data)
+        return data, [*notes, f"sheet `{sheet}`"]
+    if kind == "parquet":
+        return _parquet(path, data), [*notes, "Parquet"]
+    encoding = next((name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark)), "utf-8")
+    if encoding != "utf-16" and b"\0" in data:
+        raise InputError(f"{path}: expected a CSV file, got binary data")
+    if encoding != "utf-8" or not data.isascii():
+        data, read_as = _decode(path, data, encoding)
+        notes += [read_as] if read_as else []
+    if b"\r" in data:
+        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    if not data or data.isspace():
+        raise InputError(f"{path}: expected a header and rows, got an empty file")
+    return data, notes
+
+
+def _kind(data: bytes) -> str:
+    return next((kind for magic, kind in _MAGIC.items() if data.startswith(magic)), "text")
+
+
+def _decode(path: Path, data: bytes, encoding: str) -> tuple[bytes, str]:
+    """Text as UTF-8, and the encoding to be named; bytes that are no UTF-8 are taken as Windows-1252."""
+    try:
+        return data.decode(encoding).encode(), "UTF-16" if encoding == "utf-16" else ""
+    except UnicodeDecodeError as error:
+        if encoding == "utf-16":
+            raise InputError(f"{path}: expected UTF-16 text, as its first bytes say: {error.reason}") from error
+    return data.decode("cp1252", errors="replace").encode(), "Windows-1252"
+
+
+def import_openpyxl(path: Path) -> Any:
+    """Import the library for workbooks.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        import openpyxl
+    except ImportError as error:
+        raise InputError(f"{path}: workbooks need openpyxl: install reactorwatch[excel], or save it as CSV") from error
+    return openpyxl
+
+
+def _workbook(path: Path, data: bytes) -> tuple[bytes, str]:
+    """Write the first sheet that has rows as text, with `;` between cells."""
+    openpyxl = import_openpyxl(path)
+    try:
+        book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
+        for sheet in book.worksheets:
+            lines = io.StringIO()
+            writer = csv.writer(lines, delimiter=";", lineterminator="\n")
+            writer.writerows([_cell(value) for value in row] for row in sheet.iter_rows(values_only=True))
+            if lines.getvalue().strip('"; \n'):
+                return lines.getvalue().encode(), str(sheet.title)
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path}: expected a workbook (.xlsx), got a damaged or another file: {error}") from error
+    raise InputError(f"{path}: expected a sheet with rows, got an empty workbook")
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return ""
+    if hasattr(value, "isoformat"):
+        return str(value.isoformat())
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+def _parquet(path: Path, data: bytes) -> bytes:
+    """Write a Parquet file as text, with `;` between cells."""
+    import pyarrow as pa
+    import pyarrow.csv
+    import pyarrow.parquet
+
+    try:
+        table = pyarrow.parquet.read_table(pa.BufferReader(data))
+        text = pa.BufferOutputStream()
+        pyarrow.csv.write_csv(table, text, pyarrow.csv.WriteOptions(delimiter=";"))
+    except pa.ArrowException as error:
+        reason = str(error).partition("\n")[0]
+        raise InputError(f"{path}: expected a Parquet file with columns of plain values: {reason}") from error
+    return bytes(text.getvalue())

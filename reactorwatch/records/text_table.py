@@ -1,0 +1,155 @@
+"""Columns of a text table, parsed by pyarrow."""
+
+from collections.abc import Sequence
+from copy import copy
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.cells import find_sentinels, to_numbers
+from reactorwatch.records.layout import Layout, describe_separator
+
+BLOCK_BYTES = 1 << 22
+
+
+class TextTable:
+    """Columns of a table, by number from 0.
+
+    Args:
+        layout: the table and its layout.
+        numbers: columns to be parsed as numbers.
+        texts: columns to be kept as text.
+
+    Raises:
+        InputError: there are no rows, or one has another number of cells than the header.
+    """
+
+    def __init__(self, layout: Layout, numbers: Sequence[int], texts: Sequence[int] = ()) -> None:
+        import pyarrow as pa
+
+        self.layout = layout
+        self._body = _skip_lines(layout.text, layout.first_row - 1)
+        if not layout.sample and not bytes(self._body).strip():
+            raise InputError(f"{layout.path}: expected rows below the header, got none")
+        try:
+            self._table = self._parse(dict.fromkeys(map(str, numbers), pa.float64()), texts)
+        except pa.ArrowInvalid:  # some cells are no plain numbers, or a row is too short
+            self._table = self._parse({}, [*numbers, *texts])
+        self._sentinels = find_sentinels(layout.missing)
+        self._known: dict[int, NDArray[np.float64]] = {}
+        self._chosen: NDArray[np.intp] | None = None
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return int(self._table.num_rows)
+
+    def select(self, rows: NDArray[np.intp]) -> "TextTable":
+        """Some of the rows.
+
+        Args:
+            rows: their indices, shape (rows of the part,).
+        """
+        part = copy(self)
+        part._table, part._known, part._chosen = self._table.take(rows), {}, rows
+        return part
+
+    def numbers(self, column: int, rule: str = "expected a finite number or nothing") -> NDArray[np.float64]:
+        """Numbers in a column, shape (rows,); NaN: not measured.
+
+        Args:
+            column: number of the column.
+            rule: the rule to be named if a cell is no number.
+
+        Raises:
+            InputError: a cell is no number.
+        """
+        if column not in self._known:
+            cells = self._table.column(str(column))
+            if str(cells.type) == "double":
+                values = np.asarray(cells.to_numpy())
+            else:
+                values, bad = to_numbers(cells.combine_chunks(), self.layout.decimal, self.layout.missing)
+                if bad is not None:
+                    self.refuse(bad, column, rule, "--missing {} reads it as not measured")
+            if self._sentinels:
+                values = np.where(np.isin(values, self._sentinels), np.nan, values)
+            self._known[column] = values
+        return self._known[column]
+
+    def texts(self, column: int) -> Any:
+        """Cells of a column that was kept as text: a pyarrow array of strings, shape (rows,)."""
+        return self._table.column(str(column)).combine_chunks()
+
+    def refuse(self, row: int, column: int, rule: str, cure: str = "") -> NoReturn:
+        """Refuse a cell.
+
+        Args:
+            row: index of the row.
+            column: number of the column.
+            rule: the rule that the cell breaks.
+            cure: what to do about it; `{}` stands for the cell.
+
+        Raises:
+            InputError: always; it names file, row, column, rule, cell and cure.
+        """
+        row = row if self._chosen is None else int(self._chosen[row])
+        line, cells = next(item for index, item in enumerate(self.layout.rows()) if index == row)
+        at = f"{self.layout.path}, row {line}, column {self.layout.names[column]!r}"
+        if self.layout.transposed:
+            at = f"{self.layout.path}, row {self.layout.names[column]!r}, column {line}"
+        raise InputError(f"{at}: {rule}, got {cells[column]!r}{f'; {cure.format(cells[column])}' if cure else ''}")
+
+    def _parse(self, types: dict[str, Any], texts: Sequence[int]) -> Any:
+        import pyarrow as pa
+        import pyarrow.csv
+
+        layout = self.layout
+        names = [str(column) for column in range(len(layout.names))]
+        kept = {str(column): pa.string() for column in texts}
+        try:
+            return pyarrow.csv.read_csv(
+                pa.BufferReader(self._body),
+                read_options=pyarrow.csv.ReadOptions(column_names=names, block_size=BLOCK_BYTES),
+                parse_options=pyarrow.csv.ParseOptions(
+                    delimiter=layout.separator,
+                    newlines_in_values=b'"' in layout.text,
+                    invalid_row_handler=lambda row: "error" if row.text.strip() else "skip",
+                ),
+                convert_options=pyarrow.csv.ConvertOptions(
+                    column_types={**types, **kept},
+                    include_columns=[*types, *kept],
+                    null_values=sorted(layout.missing),
+                    decimal_point=layout.decimal,
+                ),
+            )
+        except pa.ArrowInvalid as error:
+            if not types:
+                self._refuse_row(error)
+            raise
+
+    def _refuse_row(self, error: Exception) -> NoReturn:
+        """Find the row that pyarrow cannot split.
+
+        Raises:
+            InputError: always.
+        """
+        width = len(self.layout.names)
+        for line, cells in self.layout.rows():
+            if len(cells) != width:
+                expected = f"{width} cells{' as in the header' if self.layout.header_row else ''}"
+                raise InputError(f"{self.layout.path}, row {line}: expected {expected}, got {len(cells)}") from error
+        kind = describe_separator(self.layout.separator)
+        raise InputError(f"{self.layout.path}: expected {kind} cells: {str(error).partition(chr(10))[0]}") from error
+
+
+def _skip_lines(text: bytes, count: int) -> Any:
+    """Buffer of a text without its first lines."""
+    import pyarrow as pa
+
+    start = 0
+    for _ in range(count):
+        start = text.find(b"\n", start) + 1 or len(text)
+    return pa.py_buffer(text).slice(start)

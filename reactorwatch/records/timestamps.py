@@ -1,0 +1,225 @@
+"""Timestamps: patterns of dates and times of day, guessed from cells or stated like those of strptime."""
+
+import re
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.errors import InputError
+
+_NAMES = "jan feb mar apr may jun jul aug sep oct nov dec"
+_MONTHS = {name: number for number, name in enumerate(_NAMES.split(), start=1)}
+_MONTHS |= {"jän": 1, "mär": 3, "mrz": 3, "mai": 5, "okt": 10, "dez": 12}
+_ZONE = r"(?P<z>[Zz]|[A-Za-z]{3,4}|[+-]\d{2}:?(?:\d{2})?)"
+_CLOCK = (
+    r"(?P<H>\d{1,2}):(?P<M>\d{2})(?::(?P<S>\d{2})(?:[.,](?P<f>\d{1,9}))?)?"
+    rf"(?:\s*(?P<p>[AaPp])\.?[Mm]\.?)?(?:\s*{_ZONE})?"
+)
+_YEAR = r"(?P<y>\d{4}|\d{2})"
+_DAY = r"(?P<d>\d{1,2})"
+_MONTH_NAME = r"(?P<n>\pL{3,9})\.?"
+_DATES = {
+    "yyyy-mm-dd": r"(?P<y>\d{4})[-/.](?P<m>\d{1,2})[-/.](?P<d>\d{1,2})",
+    "dd.mm.yyyy": rf"{_DAY}[.-](?P<m>\d{{1,2}})[.-]{_YEAR}",
+    "day and month/yyyy": rf"(?P<a>\d{{1,2}})/(?P<b>\d{{1,2}})/{_YEAR}",
+    "dd-Mon-yyyy": rf"{_DAY}[-. ]\s?{_MONTH_NAME}[- ]{_YEAR}",
+    "Mon dd, yyyy": rf"{_MONTH_NAME} {_DAY},? (?P<y>\d{{4}})",
+}
+_DIRECTIVES = {
+    "%Y": r"(?P<y>\d{4})",
+    "%y": r"(?P<y>\d{2})",
+    "%m": r"(?P<m>\d{1,2})",
+    "%d": _DAY,
+    "%b": _MONTH_NAME,
+    "%B": _MONTH_NAME,
+    "%H": r"(?P<H>\d{1,2})",
+    "%I": r"(?P<H>\d{1,2})",
+    "%M": r"(?P<M>\d{1,2})",
+    "%S": r"(?P<S>\d{1,2})",
+    "%f": r"(?P<f>\d{1,9})",
+    "%p": r"(?P<p>[AaPp])\.?[Mm]\.?",
+    "%z": _ZONE,
+    "%Z": _ZONE,
+    "%%": "%",
+}
+_OFFSETS_H = {"Z": 0, "UTC": 0, "GMT": 0, "WET": 0, "BST": 1, "WEST": 1, "CET": 1, "MEZ": 1, "CEST": 2, "MESZ": 2}
+_OFFSETS_H |= {"EET": 2, "EEST": 3, "EST": -5, "EDT": -4, "CST": -6, "CDT": -5, "MST": -7, "MDT": -6, "PST": -8}
+_OFFSETS_H |= {"PDT": -7, "JST": 9}
+
+DAY_NS = 86_400_000_000_000
+
+
+class Pattern(NamedTuple):
+    """Form of timestamps: its name for people, and a regular expression of RE2 with named groups."""
+
+    name: str
+    regex: str
+
+    @property
+    def has_date(self) -> bool:
+        """True if the day is part of it."""
+        return "(?P<y>" in self.regex
+
+    @property
+    def has_clock(self) -> bool:
+        """True if the time of day is part of it."""
+        return "(?P<H>" in self.regex
+
+
+CLOCK = Pattern("hh:mm:ss", rf"^\s*{_CLOCK.replace('1,2', '1,5', 1)}\s*$")
+"""A time of day, or hours since the start."""
+DATES = tuple(Pattern(name, rf"^\s*{date}\s*$") for name, date in _DATES.items())
+DATE_TIMES = (
+    *(Pattern(f"{name} hh:mm:ss", rf"^\s*{date}[T\s,]+{_CLOCK}\s*$") for name, date in _DATES.items()),
+    Pattern(
+        "yyyymmddThhmmss",
+        rf"^(?P<y>\d{{4}})(?P<m>\d\d)(?P<d>\d\d)T(?P<H>\d\d)(?P<M>\d\d)(?P<S>\d\d){_ZONE}?$",
+    ),
+)
+PATTERNS = (*DATE_TIMES, *DATES, CLOCK)
+
+
+class Instants(NamedTuple):
+    """Parsed timestamps, each of shape (rows,).
+
+    Attributes:
+        local_ns: nanoseconds since 1970 on the clock that was written, or since midnight without a date.
+        offset_s: seconds by which that clock was ahead of UTC; NaN where none is written.
+        valid: False where a cell is no such timestamp.
+    """
+
+    local_ns: NDArray[np.int64]
+    offset_s: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+
+
+@cache
+def _compile(pattern: Pattern) -> re.Pattern[str]:
+    """The expression for Python, which knows no classes of Unicode letters."""
+    return re.compile(pattern.regex.replace(r"\pL", r"[^\W\d_]"))
+
+
+def guess_pattern(cells: list[str], patterns: tuple[Pattern, ...] = PATTERNS) -> Pattern | None:
+    """Pattern of most of some cells; None if they are no such timestamps."""
+    filled = [cell for cell in cells if cell.strip()]
+    for pattern in patterns:
+        if filled and sum(_compile(pattern).match(cell) is not None for cell in filled) > len(filled) / 2:
+            return pattern
+    return None
+
+
+def stated_pattern(text: str) -> Pattern:
+    """Pattern of a format in the language of strptime.
+
+    Raises:
+        InputError: a directive is not supported.
+    """
+    text_in_full = text.replace("%T", "%H:%M:%S").replace("%F", "%Y-%m-%d").replace("%R", "%H:%M")
+    regex = ""
+    for part in re.findall(r"%.?|[^%]+", text_in_full):
+        if part.startswith("%") and part not in _DIRECTIVES:
+            raise InputError(f"--time-format {text!r}: unknown directive {part!r} (valid: {' '.join(_DIRECTIVES)})")
+        regex += _DIRECTIVES.get(part) or re.escape(part)
+    try:
+        re.compile(regex.replace(r"\pL", r"\w"))
+    except re.error as error:
+        raise InputError(f"--time-format {text!r}: each part once, got {error}") from error
+    return Pattern(text, f"^\\s*{regex}\\s*$")
+
+
+def parse(cells: Any, pattern: Pattern) -> tuple[Instants, str]:
+    """Parse cells to times.
+
+    Args:
+        cells: strings, a pyarrow array of shape (rows,).
+        pattern: their form.
+
+    Returns:
+        The times, and the name of the pattern with the order of day and month.
+
+    Raises:
+        ValueError: day and month are ambiguous.
+    """
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    groups = pc.extract_regex(cells, pattern.regex)
+    names = {field.name for field in groups.type}
+    valid = np.asarray(groups.is_valid())
+
+    def text(name: str) -> Any:
+        return pc.struct_field(groups, name)
+
+    def number(name: str, default: int = 0, digits: int = 0) -> NDArray[np.int64]:
+        if name not in names:
+            return np.full(len(cells), default)
+        found = pc.utf8_rpad(text(name), digits, "0") if digits else text(name)
+        found = pc.if_else(pc.equal(pc.utf8_length(text(name)), 0), None, found)
+        return np.asarray(pc.fill_null(pc.cast(found, pa.int64()), default))
+
+    year, month, day, form = number("y", 1970), number("m", 1), number("d", 1), pattern.name
+    year = year + np.where(year < 100, np.where(year < 70, 2000, 1900), 0)
+    if "a" in names:
+        first, second = number("a", 1), number("b", 1)
+        month, day = _order_day_and_month(year, first, second)
+        form = form.replace("day and month", "dd/mm" if day is first else "mm/dd")
+    if "n" in names:
+        values = pc.utf8_slice_codeunits(pc.utf8_lower(text("n")), 0, 3)
+        index = pc.index_in(values, pa.array(list(_MONTHS)))
+        month = np.array([*_MONTHS.values(), 0])[np.asarray(pc.fill_null(index, len(_MONTHS)))]
+    hour, minute, second = number("H"), number("M"), number("S")
+    if "p" in names:
+        half = np.asarray(pc.fill_null(pc.utf8_lower(text("p")), "").to_numpy(zero_copy_only=False), dtype=object)
+        hour = np.where(half == "", hour, hour % 12 + 12 * (half == "p"))
+    days = _days(year, month, day)
+    one = np.ones_like(day)
+    in_month = _days(year + month // 12, month % 12 + 1, one) - _days(year, month, one)
+    in_range = (month >= 1) & (month <= 12) & (day >= 1) & (day <= in_month) & (minute < 60) & (second <= 60)
+    if pattern.has_date:
+        in_range &= hour <= 24
+    local_ns = ((days * 24 + hour) * 60 + minute) * 60 + second
+    local_ns = local_ns * 1_000_000_000 + number("f", 0, 9)
+    return Instants(
+        local_ns, _offsets(text("z")) if "z" in names else np.full(len(cells), np.nan), valid & in_range
+    ), form
+
+
+def _days(year: NDArray[np.int64], month: NDArray[np.int64], day: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Days since 1970-01-01."""
+    months = (year - 1970) * 12 + month - 1
+    return np.asarray(months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + day - 1)
+
+
+def _order_day_and_month(
+    year: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Month and day of dates such as 03/04/2026: months are at most 12, and a record is short.
+
+    Raises:
+        ValueError: both orders are as plausible.
+    """
+    if (first > 12).any() or np.array_equal(first, second):
+        return second, first
+    if (second > 12).any():
+        return first, second
+    as_month, as_day = (_days(year, first, second), _days(year, second, first))
+    spans = [int(days.max() - days.min()) for days in (as_month, as_day)]
+    if spans[0] == spans[1]:
+        raise ValueError
+    return (first, second) if spans[0] < spans[1] else (second, first)
+
+
+def _offsets(cells: Any) -> NDArray[np.float64]:
+    """Offsets from UTC in seconds, shape (rows,); NaN where no offset is written or its name is unknown."""
+    encoded = cells.dictionary_encode()
+    values: list[float] = []
+    for text in encoded.dictionary.to_pylist():
+        digits = re.sub(r"\D", "", text)
+        if digits:
+            values.append((-1 if text[0] == "-" else 1) * (int(digits[:2]) * 3600 + int(digits[2:] or 0) * 60))
+        else:
+            values.append(_OFFSETS_H.get(text.upper(), np.nan) * 3600)
+    index = np.asarray(encoded.indices.fill_null(len(values)))
+    return np.asarray(np.array([*values, np.nan], dtype=np.float64)[index], dtype=np.float64)

@@ -1,0 +1,65 @@
+"""`diagnose` and `simulate` take any process that has equations: by name, TOML or extended model."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from reactorwatch.cli.main import app
+from tests.unit.process.test_three_tanks import measure
+
+DESCRIPTION = """
+name = "rig"
+equations = "three_tanks"
+[time]
+column = "sample"
+unit = "s"
+""" + "".join(
+    f'[[signals]]\nname = "{name}"\ncolumn = "{column}"\nrole = "{role}"\nunit = "{unit}"\n'
+    for name, column, role, unit in (
+        ("Q1", "P101 flow", "input", "l/h"),
+        ("Q2", "P102 flow", "input", "cm3/s"),
+        ("h1", "L1", "output", "mm"),
+        ("h2", "L2", "output", "cm"),
+        ("h3", "L3", "output", "cm"),
+    )
+)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    """A file with other names, other units, semicolons and decimal commas, of a rig whose pipe clogs."""
+    record = measure("clog13", 0.3)
+    columns = dict(record.columns)
+    columns["Q1"], columns["h1"] = columns["Q1"] * 3.6, columns["h1"] * 10
+    cells = np.column_stack([record.time_min * 60, *columns.values()])
+    lines = ["sample;P101 flow;P102 flow;L1;L2;L3"]
+    lines += [";".join(f"{value:.4f}".replace(".", ",") for value in row) for row in cells]
+    (tmp_path / "rig.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(DESCRIPTION, encoding="utf-8")
+    return tmp_path / "rig.csv"
+
+
+def test_a_rig_with_names_and_units_of_its_own_is_diagnosed_and_simulated(rig: Path) -> None:
+    process, out = str(rig.with_suffix(".toml")), rig.parent / "report"
+    run = CliRunner().invoke(app, ["diagnose", str(rig), "--process", process, "-o", str(out), "--json"])
+    assert run.exit_code == 0, run.output
+    found = json.loads(run.stdout)
+    (cause,) = found["causes"]
+    assert (found["verdict"], cause["cause"]) == ("named", "clog13")
+    assert cause["parameters"]["size"]["value"] == pytest.approx(0.3, rel=0.1)
+    simulated = rig.parent / "simulated.csv"
+    run = CliRunner().invoke(app, ["simulate", str(rig), "--process", process, "-o", str(simulated), "--json"])
+    assert run.exit_code == 0, run.output
+    rmse_cm = json.loads(run.stdout)["rmse"]["h1"]["value"]
+    assert found["gain"]["held_out"]["h1"]["rmse_after"] < 0.2 < 1.0 < rmse_cm
+
+
+def test_a_process_without_equations_is_refused_with_the_cure(rig: Path) -> None:
+    text = DESCRIPTION.replace('equations = "three_tanks"\n', "")
+    rig.with_suffix(".toml").write_text(text, encoding="utf-8")
+    run = CliRunner().invoke(app, ["diagnose", str(rig), "--process", str(rig.with_suffix(".toml"))])
+    assert run.exit_code != 0
+    assert "process 'rig': must have equations for this, got none" in str(run.exception)

@@ -1,0 +1,105 @@
+"""A process is described once, and what is wrong with a description is said in one line."""
+
+from typing import Any
+
+import pytest
+
+from reactorwatch.description.find import find_process
+from reactorwatch.description.process import KnownParameter, Process, Signal
+from reactorwatch.errors import InputError
+from reactorwatch.process.library.three_tanks.model import three_tanks
+
+Q = Signal("q", "l/s", "input")
+TH = Signal("th", "degC", "output")
+
+
+def test_signals_are_found_by_their_role_in_the_order_given() -> None:
+    process = Process("exchanger", (TH, Q, Signal("sp", role="setpoint"), Signal("m", role="mode")))
+    assert (process.inputs, process.outputs, process.names("setpoint"), process.names("mode")) == (
+        ("q",),
+        ("th",),
+        ("sp",),
+        ("m",),
+    )
+    assert process.units == {"th": "degC", "q": "l/s"}
+    assert process.model is None
+
+
+@pytest.mark.parametrize(
+    ("signals", "text"),
+    [
+        ((), "at least one signal must be an output, got no signals"),
+        ((Q,), r"at least one signal must be an output, got q \(input\)"),
+        ((Q, TH, TH), r"a name of its own, got 'th' for th \(output\) and th \(output\)"),
+        ((Q, Signal("y", role="output", column="q")), r"a column of its own, got 'q' for q \(input\) and y \(output\)"),
+        ((Signal("a", column=3), Signal("b", column=3)), "a column of its own, got 3"),
+    ],
+)
+def test_signals_that_do_not_make_a_process_are_refused_by_name(signals: tuple[Signal, ...], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        Process("exchanger", signals)
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"name": ""}, "name of a signal"),
+        ({"name": "a/b"}, "name of a signal"),
+        ({"name": " a"}, "name of a signal"),
+        ({"role": "inptu"}, "role must be one of input, output, setpoint, mode, label, got 'inptu'"),
+        ({"resolution": 0.0}, "resolution must be a positive number"),
+        ({"resolution": float("nan")}, "resolution must be a positive number"),
+        ({"bounds": (1.0, 1.0)}, "bounds must be a lower and a higher number"),
+        ({"bounds": (float("nan"), 1.0)}, "bounds must be"),
+    ],
+)
+def test_a_signal_that_breaks_a_rule_is_refused(values: dict[str, Any], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        Signal(**{"name": "th", **values})
+
+
+def test_equations_take_the_given_values_of_their_parameters_in_any_unit_of_the_same_quantity() -> None:
+    tanks = find_process("three_tanks")
+    process = Process(
+        "rig",
+        tanks.signals,
+        three_tanks(),
+        parameters={"A": (0.0160, 0.0002, "m^2"), "a1": KnownParameter(0.5, 0.01)},
+    )
+    assert process.model is not None
+    assert process.model.parameter("A").value == pytest.approx(160.0)
+    assert process.model.parameter("a1").value == 0.5
+    assert process.uncertain == {"A": pytest.approx(2.0), "a1": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("parameters", "text"),
+    [
+        ({"B": (1.0, 0.0, "")}, "no parameter 'B'"),
+        ({"a1": (5.0, 0.0, "1")}, "a1"),
+        ({"A": (154.0, 0.0, "cm")}, "unit must convert to 'cm2', got 'cm'"),
+        ({"A": (154.0, -1.0, "cm2")}, "sd must be at least 0, got -1"),
+    ],
+)
+def test_a_parameter_that_does_not_fit_the_equations_is_refused(parameters: dict[str, Any], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        Process("rig", find_process("three_tanks").signals, three_tanks(), parameters=parameters)
+
+
+def test_equations_need_their_signals_in_units_that_convert() -> None:
+    signals = find_process("three_tanks").signals
+    with pytest.raises(InputError, match=r"its equations need the input 'Q2', got the inputs Q1"):
+        Process("rig", tuple(item for item in signals if item.name != "Q2"), three_tanks())
+    wrong = tuple(Signal(item.name, "K", item.role) if item.name == "h3" else item for item in signals)
+    with pytest.raises(InputError, match=r"signal 'h3': unit must convert to 'cm', got 'K'"):
+        Process("rig", wrong, three_tanks())
+
+
+@pytest.mark.parametrize("name", ["cstr", "tanks", "cascaded_tanks", "three_tanks"])
+def test_a_shipped_process_has_the_signals_of_its_equations_and_effects(name: str) -> None:
+    process = find_process(name)
+    assert process.model is not None
+    assert process.inputs == process.model.input_names
+    assert process.outputs == process.model.output_names
+    assert process.units == process.model.units
+    assert process.effects

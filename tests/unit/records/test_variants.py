@@ -1,0 +1,286 @@
+"""Files as they come: variants of one record read to the same numbers and times, and ambiguous ones are refused."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import FileFormat
+from reactorwatch.records.read_table import SignalColumn, read_table, read_tables
+from reactorwatch.records.record import Record
+from tests.unit.records.variants import (
+    BERLIN,
+    HOLES,
+    MINUTES,
+    ROWS,
+    STAMPS,
+    START,
+    SUMMER_ENDS,
+    UNITS,
+    VALUES,
+    VARIANTS,
+    WINTER_ENDS,
+    Variant,
+    cells,
+    clock,
+    table,
+)
+
+
+def read(folder: Path, variant: Variant) -> Record:
+    path = folder / f"record{variant.suffix}"
+    path.write_bytes(variant.content)
+    signals = [SignalColumn(name, unit, column=variant.names.get(name)) for name, unit in UNITS.items()]
+    return read_table(path, signals, variant.stated)
+
+
+def assert_same(record: Record, variant: Variant) -> None:
+    assert record.rows == ROWS
+    np.testing.assert_allclose(record.time_min, np.arange(ROWS), rtol=0, atol=1e-9)
+    for number, name in enumerate(UNITS):
+        expected = np.where(HOLES[:, number] & variant.has_holes, np.nan, VALUES[:, number])
+        np.testing.assert_allclose(record.columns[name], expected, rtol=0, atol=1e-9, err_msg=name)
+    assert record.units == UNITS
+    assert record.zero_ns == (0 if variant.start is None else round(variant.start.timestamp() * 1000) * 1_000_000)
+    assert record.runs is None
+    assert record.strays == 0
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_variant_reads_to_the_numbers_times_and_units_of_the_record(tmp_path: Path, name: str) -> None:
+    assert_same(read(tmp_path, VARIANTS[name]), VARIANTS[name])
+
+
+@pytest.mark.parametrize(
+    "name", [name for name, variant in VARIANTS.items() if not variant.names and name != "other names"]
+)
+def test_without_a_mapping_columns_have_their_own_names(tmp_path: Path, name: str) -> None:
+    variant = VARIANTS[name]
+    path = tmp_path / f"record{variant.suffix}"
+    path.write_bytes(variant.content)
+    record = read_table(path, None, variant.stated)
+    np.testing.assert_allclose(record.time_min, np.arange(ROWS), rtol=0, atol=1e-9)
+    assert set(UNITS) <= set(record.columns) <= {*UNITS, "n2", "Comment"}
+
+
+def test_a_workbook_reads_like_its_text(tmp_path: Path) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.title = "empty"
+    sheet = book.create_sheet("Daten")
+    sheet.append(["Anlage 7"])
+    sheet.append(["Zeit", "qc [l/min]", "C [mol/l]", "T [K]"])
+    for time, row, holes in zip(clock(), VALUES.tolist(), HOLES.tolist(), strict=True):
+        values = [None if hole else value for value, hole in zip(row, holes, strict=True)]
+        sheet.append([time.replace(tzinfo=None), *values])
+    book.save(tmp_path / "book.xlsx")
+    content = (tmp_path / "book.xlsx").read_bytes()
+    assert_same(read(tmp_path, Variant(content, ".xlsx")), Variant(b"", has_holes=True, start=START))
+    record = read(tmp_path, Variant(content, ".xlsx"))
+    assert record.read_as.startswith("sheet `Daten`, ; separated, header in row 2, time `Zeit`")
+
+
+def test_a_parquet_file_reads_like_its_text(tmp_path: Path) -> None:
+    pa = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    stamps = pa.array(clock(), pa.timestamp("ms", tz="Europe/Berlin"))
+    columns = {
+        name: pa.array(np.where(HOLES[:, number], np.nan, VALUES[:, number])) for number, name in enumerate(UNITS)
+    }
+    parquet.write_table(pa.table({"timestamp": stamps, **columns}), tmp_path / "record.parquet")
+    content = (tmp_path / "record.parquet").read_bytes()
+    assert_same(read(tmp_path, Variant(content, ".parquet")), Variant(b"", has_holes=True, start=START))
+
+
+def test_without_openpyxl_a_workbook_is_refused_with_the_cure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "openpyxl", None)
+    (tmp_path / "book.xlsx").write_bytes(b"PK\x03\x04")
+    with pytest.raises(InputError, match=r"book\.xlsx: workbooks need openpyxl: install reactorwatch\[excel\]"):
+        read_table(tmp_path / "book.xlsx")
+
+
+GUESSES = {
+    "plain": "",
+    "seconds": "",
+    "decimal comma and semicolons": "; separated, decimal comma",
+    "a name that says nothing": "time `ts` in s",
+    "a German date": "; separated, decimal comma, time `Zeit` dd.mm.yyyy hh:mm:ss in Europe/Berlin",
+    "a British date": "time `Zeit` dd/mm/yyyy hh:mm:ss, time zone unknown, taken as UTC",
+    "no header": "no header, time `1` in min",
+    "units that differ": "T from degC to K",
+    "more columns, and text": "",
+    "rows and columns exchanged": "rows and columns exchanged",
+    "German Excel": "Windows-1252, ; separated, decimal comma, header in row 4, "
+    "time `Zeit` dd.mm.yyyy hh:mm:ss in Europe/Berlin",
+    "long": "time `timestamp` yyyy-mm-dd hh:mm:ss, a row for each value of `value` by `tag`",
+}
+
+
+@pytest.mark.parametrize("name", GUESSES)
+def test_each_guess_is_named_and_a_plain_file_has_none(tmp_path: Path, name: str) -> None:
+    assert read(tmp_path, VARIANTS[name]).read_as == GUESSES[name]
+
+
+FALLS = [time.astimezone(BERLIN).strftime("%Y-%m-%d %H:%M:%S") for time in clock(SUMMER_ENDS)]
+BEGINS = [time.strftime("%Y-%m-%d %H:%M:%S") for time in clock(WINTER_ENDS)]
+STATED_BERLIN = FileFormat(zone="Europe/Berlin")
+REFUSED = {
+    "two times": (
+        table([f"{item},{item}" for item in MINUTES], cells(), ("time", "elapsed", "qc", "C", "T")),
+        FileFormat(),
+        "2 columns could be the time: 'time', 'elapsed'; state --time NAME",
+    ),
+    "two timestamps": (
+        table([f"{item},{item}" for item in BEGINS], cells(), ("sent", "received", "qc", "C", "T")),
+        FileFormat(),
+        "2 columns could be the time: 'sent', 'received'; state --time NAME",
+    ),
+    "no time": (
+        table([row[0] for row in cells()], cells(), ("p", "qc", "C", "T")),
+        FileFormat(),
+        "or another that looks like a time, got 'p', 'qc', 'C', 'T'; state --time NAME, or --period",
+    ),
+    "a comma that may be a thousand": (
+        table(MINUTES, [["1,034", "2,100", "4,385"]] * ROWS, separator=";"),
+        FileFormat(),
+        "row 2: '1,034' may be a decimal comma or a thousand; state --decimal , or --decimal .",
+    ),
+    "the comma twice": (
+        table([f"{item},0" for item in MINUTES], [[cell.replace(".", ",") for cell in row] for row in cells()]),
+        FileFormat(),
+        "row 2: expected 4 cells as in the header, got 8; if the comma is the decimal sign as well, state --decimal ,",
+    ),
+    "columns of text": (
+        table(MINUTES, [["low", "high", "high"]] * ROWS),
+        FileFormat(),
+        "row 2, column 'qc': expected a finite number or nothing, got 'low'; --missing low reads it as not measured",
+    ),
+    "a column of text": (
+        table(MINUTES, [[row[0], "high", row[2]] for row in cells()]),
+        FileFormat(),
+        "row 2, column 'C': expected a finite number or nothing, got 'high'; --missing high reads it as not measured",
+    ),
+    "a day or a month": (
+        table([f"03/04/2026 10:{row // 60:02d}:{row % 60:02d}" for row in range(ROWS)], cells(), STAMPS),
+        FileFormat(),
+        "day and month are ambiguous; state --time-format",
+    ),
+    "summer time ends, no zone": (
+        table(FALLS, cells(), STAMPS),
+        FileFormat(),
+        "row 122, column 'Zeit': expected increasing times; the clock steps back by an hour, "
+        "as at the end of summer time, got '2026-10-25 02:00:00'; state the zone, such as --zone Europe/Berlin",
+    ),
+    "an hour of summer or of winter time": (
+        table(FALLS[130:170], cells()[:40], STAMPS),
+        STATED_BERLIN,
+        "row 2, column 'Zeit': expected a time that is unique in Europe/Berlin",
+    ),
+    "an hour that does not exist": (
+        table([time.replace("2026-03-28 23", "2026-03-29 02") for time in BEGINS[:60]], cells()[:60], STAMPS),
+        STATED_BERLIN,
+        "row 2, column 'Zeit': expected a time that exists in Europe/Berlin",
+    ),
+    "a wrong format": (
+        table(BEGINS, cells(), STAMPS),
+        FileFormat(time_format="%d.%m.%Y %H:%M"),
+        "row 2, column 'Zeit': expected a time of the form %d.%m.%Y %H:%M, got '2026-03-28 23:00:00'; "
+        "state --time-format",
+    ),
+    "a unit of another quantity": (
+        table(MINUTES, cells(), ("time_min", "qc", "C", "T [bar]")),
+        FileFormat(),
+        "column 'T [bar]': unit must convert to 'K', got 'bar'; correct the header",
+    ),
+    "a column that is not there": (
+        table(MINUTES, cells()),
+        FileFormat(time="clock"),
+        "expected a column 'clock' (--time), got 'time_min', 'qc', 'C', 'T'",
+    ),
+    "the wrong separator": (
+        table(MINUTES, cells()),
+        FileFormat(separator=";"),
+        "the cells must be separated, such as by commas (--separator)",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_can_be_read_in_several_ways_is_refused_with_the_option_that_decides(tmp_path: Path, name: str) -> None:
+    text, stated, line = REFUSED[name]
+    with pytest.raises(InputError) as refused:
+        read(tmp_path, Variant(text.encode(), stated=stated))
+    assert line in str(refused.value)
+    assert str(refused.value).startswith(str(tmp_path / "record.csv"))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "stated"),
+    [
+        ("two times", FileFormat(time="elapsed", time_unit="min")),
+        ("no time", FileFormat(period="1 min")),
+        ("a comma that may be a thousand", FileFormat(decimal=",")),
+        ("a comma that may be a thousand", FileFormat(decimal=".")),
+        ("the comma twice", FileFormat(decimal=",")),
+        ("columns of text", FileFormat(missing=("low", "high"))),
+        ("a day or a month", FileFormat(time_format="%d/%m/%Y %H:%M:%S")),
+        ("a day or a month", FileFormat(time_format="%m/%d/%Y %H:%M:%S")),
+        ("summer time ends, no zone", FileFormat(zone="Europe/Berlin")),
+        ("an hour of summer or of winter time", FileFormat(zone="+01:00")),
+        ("an hour that does not exist", FileFormat(zone="UTC")),
+        ("the wrong separator", FileFormat(separator=",")),
+    ],
+)
+def test_the_option_that_is_named_settles_it(tmp_path: Path, name: str, stated: FileFormat) -> None:
+    record = read(tmp_path, Variant(REFUSED[name][0].encode(), stated=stated))
+    assert (np.diff(record.time_min) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("stated", "line"),
+    [
+        ({"time_unit": "weeks"}, "unknown --time-unit 'weeks'"),
+        ({"decimal": ";"}, r"--decimal must be '\.' or ',', got ';'"),
+        ({"separator": "ab"}, "--separator must be one character, 'tab' or 'blank', got 'ab'"),
+        ({"separator": ",", "decimal": ","}, "--separator and --decimal must differ"),
+        ({"period": "4"}, "--period must be a positive number with its unit, such as 4 s, got '4'"),
+        ({"period": "-4 s"}, "--period must be a positive number"),
+        ({"zone": "Mars/Olympus"}, "--zone must be a time zone such as Europe/Berlin"),
+    ],
+)
+def test_a_statement_that_means_nothing_is_refused(stated: dict[str, str], line: str) -> None:
+    with pytest.raises(InputError, match=line):
+        FileFormat(**stated)  # type: ignore[arg-type]
+
+
+def test_modes_and_labels_may_be_words(tmp_path: Path) -> None:
+    path = tmp_path / "record.csv"
+    path.write_text("time_min,T,mode\n0,1,manual\n1,2,auto\n2,3,manual\n3,4,\n")
+    record = read_table(path, [SignalColumn("T", "K"), SignalColumn("mode", role="mode")])
+    np.testing.assert_array_equal(record.columns["mode"], [0, 1, 0, np.nan])
+    assert record.read_as == "mode: manual = 0, auto = 1"
+
+
+def test_files_in_a_row_are_one_record(tmp_path: Path) -> None:
+    times = [time.isoformat() for time in clock()]
+    paths = []
+    for number, part in enumerate((slice(0, 100), slice(100, ROWS))):
+        paths.append(tmp_path / f"{number}.csv")
+        paths[-1].write_text(table(times[part], cells()[part], STAMPS))
+    record = read_tables(paths, [SignalColumn(name, unit) for name, unit in UNITS.items()])
+    assert_same(record, Variant(b"", start=START))
+    turned = read_tables(paths[::-1])
+    assert turned.runs is not None
+    assert [run.rows for run in turned.split_runs()] == [ROWS - 100, 100]
+    assert turned.time_min[0] == 0.0
+    assert turned.time_min[ROWS - 100] == -100.0
+
+
+def test_files_of_other_signals_are_no_record(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.csv").write_text(f"time_min,{name}\n0,1\n1,2\n")
+    with pytest.raises(InputError, match=r"b\.csv: expected the signals of a\.csv, a, got b"):
+        read_tables([tmp_path / "a.csv", tmp_path / "b.csv"])
