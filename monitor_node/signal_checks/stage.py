@@ -55,7 +55,7 @@ class SignalChecks:
     """Number of an output's alarms that can be false alarms."""
 
     def __init__(self, config: MonitorConfig, board: Annunciator, ranges: Sequence[SignalRange] | None = None) -> None:
-        self._board, self._outputs = board, config.outputs
+        self._outputs = config.outputs
         known = ranges or [ANY] * (1 + len(config.outputs))
         self._checks = [check(config, board, known) for check in CHECKS]
         self.silence = next(check for check in self._checks if isinstance(check, SilenceCheck))
