@@ -10,7 +10,8 @@ from monitor_node.chart_stage import ChartWatch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.failures import Failures
-from monitor_node.isolation.fit import _begun
+from monitor_node.isolation.candidate import scan_candidates
+from monitor_node.isolation.causes import CAUSES
 from monitor_node.isolation.glr_scan import Scan
 from monitor_node.isolation.isolation import Isolation
 from monitor_node.isolation.window import Window
@@ -134,7 +135,7 @@ def test_an_error_in_the_search_for_causes_costs_no_alarm_and_no_restart(
 ) -> None:
     """It is counted at each look and reported once; alarms are those of a monitor that does not look for causes."""
 
-    def failing(_: Isolation) -> list[Any]:
+    def failing(_: Isolation, *__: Any) -> list[Any]:
         raise ValueError("min() arg is an empty sequence")
 
     monkeypatch.setattr(Isolation, "suspects", failing)
@@ -182,12 +183,21 @@ def test_errors_from_different_places_are_each_reported_once() -> None:
 
 
 def test_no_hypothesis_that_overflowed_is_followed() -> None:
-    """The linearised bank may leave numbers that overflow; then nothing comes into question, and nothing is raised."""
+    """The linearised scan may leave numbers that overflow; then nothing comes into question, and nothing is raised."""
     shape = (3, 2, 13)
     scan = Scan(30, np.array([1.0, 2.0, 3.0]), np.full(shape, np.nan), np.full(shape, -np.inf), np.ones(shape))
     times = np.arange(30) / 10
-    window = Window(times, times[:, None], np.zeros((30, 2)), np.zeros((30, 2)), np.ones((30, 2), bool), [], 20)
-    assert _begun(scan, window) == []
+    window = Window(
+        times,
+        times[:, None],
+        np.zeros((30, 2)),
+        np.zeros((30, 2)),
+        np.ones((30, 2), bool),
+        times[:, None],
+        times[:, None, None],
+        20,
+    )
+    assert scan_candidates(CAUSES, scan, window) == []
 
 
 def test_settings_that_cannot_be_kept_end_the_monitor_of_one_plant_and_no_fleet() -> None:
