@@ -17,6 +17,7 @@ Nothing here reads a clock or does I/O.
 
 from collections.abc import Callable, Iterable, Iterator
 
+from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet.admission import PROVEN_MESSAGES, PROVEN_ROWS, UnverifiedPlants
@@ -57,6 +58,7 @@ class FleetMonitor:
         unusable: called with a plant whose state is unusable, and the reason; returns a note on the state.
         put_back: called with a plant without a usable state, and its new monitor; returns True if the monitor was
             restored from a state that had been kept aside.
+        diagnose: called with an own plant and the diagnosis of its training, which is passed to `on_finding`.
         on_ownership: called with True when a plant is adopted, and with False when it is released.
 
     Raises:
@@ -76,11 +78,12 @@ class FleetMonitor:
         unusable: Callable[[str, InputError], str] = lambda _plant, _why: "",
         put_back: Callable[[str, Monitor], bool] = lambda _plant, _monitor: False,
         on_ownership: Callable[[str, bool], None] = lambda _plant, _ours: None,
+        diagnose: Callable[[str, DiagnosisJob], None] = lambda _plant, _job: None,
     ) -> None:
         self._shards, self._on_ownership = shards, on_ownership
         self._request_history, self._store, self._unusable = request_history, store, unusable
         self._restore_kept_aside = put_back
-        self._watched = WatchedPlants(config, start_ns, model, points=points)
+        self._watched = WatchedPlants(config, start_ns, model, points=points, diagnose=diagnose)
         self._pending = PendingPlants()
         self._presume_gone_ns: int | None = start_ns + PRESUME_GONE_NS
         self._registered: dict[str, None] = {}  # all plants, whoever owns them
@@ -212,6 +215,10 @@ class FleetMonitor:
             if alarm is not None and own is not None and alarm.time_ns > (own.last_ns or 0):
                 plants.add(topic.plant)
         return plants
+
+    def on_finding(self, plant: str, finding: Finding) -> None:
+        """Process the diagnosis of a plant's training; what it found holds from the plant's next row on."""
+        self._watched.on_finding(plant, finding)
 
     def monitor(self, plant: str) -> Monitor:
         """Monitor of a plant.
