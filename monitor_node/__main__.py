@@ -7,12 +7,14 @@ import secrets
 import sys
 import time
 from collections.abc import Callable, Iterator
+from itertools import chain
 from math import inf
 from pathlib import Path
 
 import structlog
 
 from monitor_node.alarms.commands import COMMANDS
+from monitor_node.baseline.training_diagnosis import read_equations
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
@@ -133,6 +135,9 @@ class MonitorNode(Monitor):
             for _, finding in self._worker.pop_findings():
                 log.info("training diagnosed", plant=self.config.plant, verdict=finding.verdict)
                 self.on_finding(finding)
+                if finding.equations:
+                    extended = stage.preparation(self.config, read_equations(finding.equations))
+                    self.preparation = chain(self.preparation or (), extended)
         report = self.rejects.report(now_ns)
         if report is not None:
             log.warning(report)

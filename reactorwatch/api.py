@@ -314,6 +314,8 @@ class AlarmChange(msgspec.Struct, frozen=True):
 class Monitor:
     """A monitor that is fed row by row, without a bus.
 
+    The first row after the training takes some tenths of a second, in which the training is diagnosed.
+
     Args:
         process: model whose equations judge; None: as the settings say.
         settings: of the monitor, as for `backtest`.

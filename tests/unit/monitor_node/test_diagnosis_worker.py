@@ -49,6 +49,7 @@ def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_
     for message in warm.messages[:TRAINED]:
         published += node.on_message(message, 0)
     assert not node._worker.is_busy
+    assert node.preparation is None
     for message in warm.messages[TRAINED:LATE]:
         published += node.on_message(message, 0)
     assert node.rows == LATE // 3
@@ -59,6 +60,7 @@ def test_a_live_monitor_goes_on_while_its_training_is_diagnosed_and_changes_the_
         assert node.next_tick_ns() <= now_ns + 100_000_000  # it looks for the finding soon
         now_ns += 100_000_000
         published += node.on_tick(now_ns)
+    assert node.preparation is not None  # of looks for causes with the extended model
     for message in warm.messages[LATE : LATE + 30]:
         published += node.on_message(message, now_ns)
     node.on_stop(now_ns)
