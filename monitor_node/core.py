@@ -6,12 +6,15 @@ Nothing here reads a clock: `now_ns` only gives up-time and the time of health m
 follow from its samples and from operators' actions. So a replay reproduces them, value for value.
 """
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.alarms.commands import execute_command
+from monitor_node.baseline.model_update import ScheduledChange
 from monitor_node.baseline.training import NO_VALUE
+from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.config import MonitorConfig
 from monitor_node.failures import Failures
 from monitor_node.health import NODE, Processed, health_message
@@ -26,7 +29,7 @@ from monitor_node.signal_checks.timeout import SilenceCheck
 from monitor_node.state.monitor_state import MonitorState, learning_settings, open_state, seal_state
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import Alarm, CommandReply, Sample
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, CommandReply, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -40,6 +43,8 @@ class Monitor:
         start_ns: present time.
         points: True to publish estimates and chart points; a back-test does without.
         model: process model, in minutes since 1970-01-01 UTC; None: the nominal reactor.
+        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`, and
+            hands the result to `on_finding`.
 
     Raises:
         InputError: the settings are inconsistent.
@@ -56,10 +61,18 @@ class Monitor:
     """
 
     def __init__(
-        self, config: MonitorConfig, start_ns: int, *, points: bool = True, model: ProcessModel | None = None
+        self,
+        config: MonitorConfig,
+        start_ns: int,
+        *,
+        points: bool = True,
+        model: ProcessModel | None = None,
+        diagnose: Callable[[DiagnosisJob], Finding] | None = None,
     ) -> None:
         self.config = config
-        self._points, self._model = points, model
+        self._points, self._model, self._diagnose = points, model, diagnose
+        self._changes: deque[ScheduledChange] = deque()
+        self._republishes_baseline = False
         self._settings: dict[str, Any] | None = None
         self.rejects = RejectCounter()
         self.failures = Failures()
@@ -178,6 +191,9 @@ class Monitor:
             self.stats.stalls += 1
         self.stats.ticked = True
         publications = self._check_timeout(now_ns)
+        if self._republishes_baseline and self.baseline is not None:
+            publications.append(Publication(keys.key(self.config.plant, keys.BASELINE, NODE), self.baseline))
+        self._republishes_baseline = False
         self._published += len(publications)
         if now_ns >= self.stats.health_due_ns:
             self.stats.health_due_ns = now_ns + int(self.config.health_period_s * 1e9)
@@ -254,6 +270,7 @@ class Monitor:
         except ValueError as error:
             raise InputError(f"is no state of this software's monitor: {error}") from error
         self.alarms, self._pipeline = board, pipeline
+        self._republishes_baseline = True  # it may not have been published before the stop
         self._runs = state.runs
         self._aligner.state, self._replay_filter = state.alignment, ReplayFilter(state.alignment)
         self._units, self._heard_from_ns = state.units, state.heard_from_ns
@@ -302,6 +319,36 @@ class Monitor:
         """
         self.alarms.resume_from(alarms)
         self._silence.resume_from_alarms()
+
+    @property
+    def changes(self) -> int:
+        """Count of changes that a restart must preserve: of alarms and of the baseline."""
+        return self.alarms.changes + (0 if self.baseline is None else self.baseline.id)
+
+    # --- diagnosis of the training ---------------------------------------------------------------------------
+
+    @property
+    def awaits_diagnosis(self) -> bool:
+        """True while there is a `diagnosis_job`."""
+        return self._pipeline.awaits_diagnosis
+
+    @property
+    def diagnosis_job(self) -> DiagnosisJob | None:
+        """The diagnosis of the training, from its end until `on_finding`; None: there is none to make."""
+        return self._pipeline.diagnosis_job
+
+    def on_finding(self, finding: Finding) -> None:
+        """Process the result of `diagnosis_job`; what it found holds from the next row on."""
+        self._pipeline.on_finding(finding)
+
+    def schedule(self, baseline: Baseline) -> None:
+        """Schedule a recorded change of the baseline for the row that it names."""
+        self._changes.append(ScheduledChange(baseline.time_ns, baseline))
+
+    @property
+    def baseline(self) -> Baseline | None:
+        """Change of the baseline in force; None: rows are evaluated by the equations as given."""
+        return self._pipeline.baseline
 
     # --- status ----------------------------------------------------------------------------------------------
 
@@ -451,7 +498,15 @@ class Monitor:
     # --- after an error of this software ---------------------------------------------------------------------
 
     def _new_pipeline(self, board: Annunciator) -> PlantPipeline:
-        return PlantPipeline(self.config, board, points=self._points, model=self._model, failures=self.failures)
+        return PlantPipeline(
+            self.config,
+            board,
+            points=self._points,
+            model=self._model,
+            failures=self.failures,
+            changes=self._changes,
+            diagnose=self._diagnose,
+        )
 
     def _contain(self, stage: str, error: Exception) -> None:
         """Contain an error: count it and train again, as the pipeline's state may be inconsistent.
@@ -460,6 +515,7 @@ class Monitor:
         """
         self.failures.add(stage, error, "the plant is learned again, its alarms stay")
         alarms = self.alarms.all_alarms()
+        self._changes = deque(item for item in self._changes if item.at_ns is not None)  # findings on its training
         notes, receipts_ns = self._pipeline.notes, self.receipts_ns
         self._pipeline = self._new_pipeline(self.alarms)
         self._pipeline.notes, self.receipts_ns = notes, receipts_ns

@@ -6,10 +6,12 @@ that keeps adapting would learn a fault as normal. The identified models keep ad
 the reference is charted as drift.
 """
 
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from math import isfinite, nan
 
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.baseline.model_update import ModelUpdate, ScheduledChange
 from monitor_node.baseline.predictor import ArxPredictor
 from monitor_node.baseline.references import (
     ArxReference,
@@ -19,19 +21,22 @@ from monitor_node.baseline.references import (
     Reference,
 )
 from monitor_node.baseline.signal_range import signal_ranges
-from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult
+from monitor_node.baseline.training import MOST_REFUSALS, NO_VALUE, Training, TrainingResult, TrainingState
+from monitor_node.baseline.training_diagnosis import DiagnosisJob, Finding, read_equations
 from monitor_node.chart_stage import ChartWatch, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.drift_stage import DriftWatch
 from monitor_node.failures import Failures
+from monitor_node.health import NODE
 from monitor_node.ingest.alignment import MeasuredRow, Row
 from monitor_node.ingest.sampling import SamplingPeriod
 from monitor_node.isolation.stage import Suspicion, has_causes
 from monitor_node.signal_checks.stage import SignalChecks
+from monitor_node.state.monitor_state import equations_text
 from monitor_node.state.pipeline_state import PipelineState, TrainedState
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Check, Estimate, ModelSnapshot, Parameter
+from reactorwatch.contract.messages_pb2 import Baseline, Check, Estimate, ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr.model import cstr
 from reactorwatch.process.model import ProcessModel
@@ -66,6 +71,8 @@ class PlantPipeline:
         points: True to publish estimates, chart points and models.
         model: see `Monitor`.
         failures: counter of errors in the search for causes; None: a new one.
+        changes: changes of the baseline to come.
+        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
 
     Raises:
         InputError: the settings ask for a process model that does not fit the plant's signals.
@@ -86,8 +93,12 @@ class PlantPipeline:
         points: bool = True,
         model: ProcessModel | None = None,
         failures: Failures | None = None,
+        changes: deque[ScheduledChange] | None = None,
+        diagnose: Callable[[DiagnosisJob], Finding] | None = None,
     ) -> None:
         self._config = config
+        self._update = ModelUpdate(config, deque() if changes is None else changes)
+        self._diagnose = diagnose
         self._failures = Failures() if failures is None else failures
         self._board = board
         self._points = points
@@ -98,6 +109,7 @@ class PlantPipeline:
         self.signals = SignalChecks(config, board, signal_ranges(self.model, (config.input, *config.outputs)))
         self._drift = DriftWatch(config, board, publish=points)
         self._estimate_keys = [keys.key(config.plant, keys.ESTIMATE, signal) for signal in config.outputs]
+        self._baseline_key = keys.key(config.plant, keys.BASELINE, NODE)
         self._model_keys = [keys.key(config.plant, keys.MODEL, signal) for signal in config.outputs]
         self._refusals = 0
         self._checks: list[Check] = []
@@ -125,7 +137,7 @@ class PlantPipeline:
             [predictor.state for predictor in self._predictors],
             self._refusals,
             self._began_ns,
-            self._training.state,
+            self._update.rows or self._training.state,
             None if self._reference is None else self._trained_state(self._reference),
         )
 
@@ -141,6 +153,7 @@ class PlantPipeline:
             list(self._quarantined),
             self.rows_watched,
             self._drift.until_next,
+            b"" if self.baseline is None else self.baseline.SerializeToString(),
         )
 
     def restore(self, state: PipelineState, now_ns: int) -> None:
@@ -158,10 +171,14 @@ class PlantPipeline:
         for predictor, of_predictor in zip(self._predictors, state.predictors, strict=True):
             predictor.restore(of_predictor)
         self._refusals, self._began_ns = state.refusals, state.began_ns
-        self._training.restore(state.training)
         watched = state.watched
         if watched is None:
+            self._training.restore(state.training)
             return
+        if state.training.times_ns and self._config.diagnose_training:
+            self._update.rows = state.training
+        if watched.baseline:
+            self._update.baseline = Baseline.FromString(watched.baseline)
         self._drift.until_next = watched.until_drift
         self._checks = [Check(name=name, result=result) for name, result in watched.checks]
         learned = [item.learned for item in watched.whiteners]
@@ -183,7 +200,29 @@ class PlantPipeline:
             return ArxReference.from_state(state)
         if self.model is None:
             raise ValueError("the state must be of a plant without a process model")
-        return ProcessReference.from_state(state, self.model, self._config.outputs)
+        model = self.model if self.baseline is None else read_equations(self.baseline.model)
+        return ProcessReference.from_state(state, model, self._config.outputs)
+
+    @property
+    def awaits_diagnosis(self) -> bool:
+        """True while the diagnosis of the training is pending."""
+        return self._update.is_pending
+
+    @property
+    def diagnosis_job(self) -> DiagnosisJob | None:
+        """The diagnosis of the training, while it is pending."""
+        return self._update.job(equations_text(self.model)) if self._update.is_pending else None
+
+    def on_finding(self, finding: Finding) -> None:
+        """Process the result of a diagnosis; a change holds from the next row on."""
+        note = self._update.resolve(finding)
+        if note and (finding.equations or isinstance(self._reference, ProcessReference)):
+            self.notes.append(note)
+
+    @property
+    def baseline(self) -> Baseline | None:
+        """Change of the model in force; None: the model is as given."""
+        return self._update.baseline
 
     @property
     def watching(self) -> bool:
@@ -227,6 +266,8 @@ class PlantPipeline:
             publications: list to which publications are added; those before an error are published nevertheless.
         """
         time_ns = row.time_ns
+        if self._update.changes:
+            self._change_model(time_ns, publications)
         interval = self._sampling.update(time_ns)
         publications.extend(self.signals.check_row(time_ns, row.values))
         measured = self.signals.mask_values(time_ns, row.values, publications) if self._is_process else row.values
@@ -283,6 +324,7 @@ class PlantPipeline:
             self._began_ns = time_ns
         trained_min = (time_ns - self._began_ns) / MINUTE_NS
         if trained_min >= config.training_min and self._training.is_enough(self.signals.silence.silent[1:]):
+            rows = self._training.state
             trained = self._training.finish(last_chance=self._refusals >= MOST_REFUSALS)
             if trained.refused:
                 self._refusals += 1
@@ -290,6 +332,8 @@ class PlantPipeline:
                 self._start_training(time_ns)
             else:
                 self._start(trained)
+                self._start_diagnosis(rows)
+                self._change_model(time_ns, publications)
                 self._evaluate(row)
                 publications.extend(self.snapshots(time_ns))
                 return
@@ -327,7 +371,39 @@ class PlantPipeline:
         of_signals = SignalChecks.CHANCE_ALARMS * sum(self._evaluated)
         return self._charts.chance_alarms + of_signals + self._drift.chance_alarms(self._evaluated)
 
-    def _start(self, trained: TrainingResult) -> None:
+    def _start_diagnosis(self, rows: TrainingState) -> None:
+        if self._config.diagnose_training and equations_text(self.model):
+            self._update.rows = rows
+        if self._diagnose is not None and (job := self.diagnosis_job) is not None:
+            self.on_finding(self._diagnose(job))
+
+    def _change_model(self, time_ns: int, publications: list[Publication]) -> None:
+        """Learn the baseline again with the model of a change, if one holds from this row on."""
+        change = self._update.pop_due(time_ns)
+        if change is None:
+            return
+        try:
+            trained = self._update.relearn(change, self._predictors)
+        except Exception as error:  # noqa: BLE001 # the stage's border: the baseline before is right without it
+            self._failures.add("baseline", error, "the plant is judged by the equations as given")
+            return
+        if trained is None:
+            self.notes.append("the identified models predict the training better; the baseline stays as it is")
+            return
+        self._start(trained, again=True)
+        publications.append(Publication(self._baseline_key, change))
+        if self.rows_watched:  # the filter stands at the end of the training, and rows have come since
+            trained.reference.restart()
+            self._quarantined = (False,) * len(self._config.outputs)
+            publications.extend(self.snapshots(time_ns))
+
+    def _start(self, trained: TrainingResult, *, again: bool = False) -> None:
+        """Start to evaluate rows.
+
+        Args:
+            trained: result of the training.
+            again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
+        """
         self._leave_out(trained.left_out)
         unmade = self._charts.choose(self._evaluated, trained.e)
         trained.checks.extend(
@@ -348,7 +424,8 @@ class PlantPipeline:
         self._whiteners = [Prewhitener(item) for item in trained.learned]
         self._charts.start(trained.learned, trained.e, self._arl0)
         self.signals.start(trained.measured.T.tolist(), trained.e.T.tolist(), self._arl0)
-        self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
+        if not again:
+            self.notes += self._drift.start(self._predictors, self._evaluated, self._arl0)
         notes = [check.result for check in trained.checks if check.result != "ok"]
         self.notes += [f"training: {note}" for note in notes]
 

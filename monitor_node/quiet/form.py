@@ -17,6 +17,7 @@ from monitor_node.alarms.incidents import Incident
 from monitor_node.alarms.kpis import KpiState
 from monitor_node.alarms.states import State
 from monitor_node.baseline.references import ProcessReferenceState
+from monitor_node.baseline.training import TrainingState
 from monitor_node.chart_stage import ChartsState, alarm_names
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -79,6 +80,7 @@ class Rest(NamedTuple):
         refusals: trainings that were refused.
         until_drift: rows until the next look at the drift.
         cause: what was looked for last: number of the incident, output and cause.
+        undiagnosed: rows of the training while its diagnosis is pending, then empty.
     """
 
     board: Annunciator | None
@@ -90,6 +92,7 @@ class Rest(NamedTuple):
     refusals: int
     until_drift: int
     cause: tuple[int, str, str]
+    undiagnosed: TrainingState
 
 
 class QuietForm:
@@ -173,7 +176,7 @@ class QuietForm:
         board = msgspec.msgpack.decode(state.board, type=AnnunciatorState)
         if watched is None or not isinstance(watched.reference, ProcessReferenceState):
             return None
-        if watched.left_out or set(watched.charts.charts) != self._charts_made:
+        if watched.left_out or watched.baseline or set(watched.charts.charts) != self._charts_made:
             return None
         if not _is_at_rest(board, self._alarms) or not is_in_order(alignment) or not run_on(state.runs, alignment):
             return None
@@ -215,6 +218,7 @@ class QuietForm:
             state.watch.refusals,
             watched.until_drift,
             (0, "", "") if looked is None else (looked.incident, looked.output, looked.cause),
+            state.watch.training if state.watch.training.times_ns else self._training,
         )
         return rest, rows
 
@@ -293,7 +297,7 @@ class QuietForm:
             self._predictors,
             rest.refusals,
             int(p["began_ns"]),
-            self._training,
+            rest.undiagnosed,
             watched,
         )
         return MonitorState(
