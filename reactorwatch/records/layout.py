@@ -14,6 +14,9 @@ _SEPARATORS = {",": "comma separated", "\t": "tab separated", " ": "blank separa
 _BRACKETED = re.compile(r"\s*[\[(]([^\[\]()]+)[\])]\s*$")
 
 
+COMMENT = re.compile(rb"^[ \t]*(?:#|%|//)[^\n]*", re.MULTILINE)
+
+
 @dataclass(frozen=True)
 class Layout:
     """Text of a table and its layout.
@@ -75,6 +78,11 @@ class Layout:
                 return
             if len(cells) > 1 or (cells and cells[0].strip()):
                 yield self.first_row - 1 + reader.line_num, cells
+
+
+def blank_comments(text: bytes) -> bytes:
+    """Text with blank lines in place of comments, so that line numbers stay."""
+    return COMMENT.sub(b"", text)
 
 
 def bare_name(name: str) -> str:

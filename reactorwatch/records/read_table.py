@@ -237,12 +237,10 @@ def _make_record(
     runs = numbered_runs(table, run)
     kept = filled_rows(times, columns)
     check_times(table, time, times, minutes, runs, kept)
-    first_row = None
-    if kept is not None:
-        minutes, runs = minutes[kept], None if runs is None else runs[kept]
+    first_row = table.first_row
+    if kept is not None and not kept.all():
+        first_row, minutes, runs = None, minutes[kept], None if runs is None else runs[kept]
         columns = {name: values[kept] for name, values in columns.items()}
-    elif not layout.transposed and layout.text.rstrip(b"\n").count(b"\n") + 2 - layout.first_row == minutes.size:
-        first_row = layout.first_row  # no blank lines between the rows
     return Record(
         minutes,
         columns,

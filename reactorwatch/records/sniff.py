@@ -13,7 +13,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.cells import EMPTY, MISSING, NUMBER, TEXT, TIME, kind_of
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.header import HeaderSearch
-from reactorwatch.records.layout import Layout, split_line
+from reactorwatch.records.layout import COMMENT, Layout, blank_comments, split_line
 
 HEAD_BYTES = 65_536
 HEAD_LINES = 200
@@ -26,7 +26,6 @@ MIN_TRANSPOSED = 10
 """Fewest columns of a file without names that may be taken as rows."""
 
 _SEPARATORS = ";\t,| "
-_COMMENT = re.compile(rb"^[ \t]*(?:#|%|//)[^\n]*", re.MULTILINE)
 _PAIR = re.compile(rb"([^,\n]*),([^,\n]*)(,?)")
 _BLANKS = re.compile(rb"[ \t]+")
 
@@ -44,10 +43,10 @@ def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
     """
     missing = frozenset((*MISSING, *stated.missing))
     comments = [
-        (text.count(b"\n", 0, found.start()) + 1, found[0].decode()) for found in _COMMENT.finditer(text, 0, HEAD_BYTES)
+        (text.count(b"\n", 0, found.start()) + 1, found[0].decode()) for found in COMMENT.finditer(text, 0, HEAD_BYTES)
     ]
-    if comments or any(mark in text for mark in (b"\n#", b"\n%", b"\n//")):
-        text = _COMMENT.sub(b"", text)
+    if comments:
+        text = blank_comments(text)
     numbered = [(row, line) for row, line in enumerate(_head(text), start=1) if line.strip(" \t")]
     if not numbered:
         raise InputError(f"{path}: expected a header and rows, got only comments")

@@ -263,7 +263,7 @@ def _read_stamps(table: TextTable, column: TimeColumn, pattern: Pattern, stated:
         )
         return Times(utc_ns, instants.valid, is_clock=True, notes=[f"{notes[0]} in {zone}"])
     steps = np.diff(local_ns)
-    usual = float(np.median(steps)) if steps.size else 0.0
+    usual = float(np.median(steps)) if (steps <= 0).any() else 0.0
     back = (
         np.flatnonzero(np.abs(steps + HOUR_NS - usual) < max(usual / 2, 1e9))
         if usual < HOUR_NS

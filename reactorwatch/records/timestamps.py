@@ -145,6 +145,15 @@ def parse(cells: Any, pattern: Pattern) -> tuple[Instants, str]:
     import pyarrow as pa
     import pyarrow.compute as pc
 
+    if pattern.name.startswith("yyyy-mm-dd"):
+        for zone in (None, "UTC"):
+            try:
+                times = pc.cast(cells, pa.timestamp("ns", zone))
+            except pa.ArrowInvalid:  # another form of ISO 8601, or some cells are no timestamps
+                continue
+            offset_s = np.full(len(cells), np.nan if zone is None else 0.0)
+            local_ns = np.asarray(pc.fill_null(times.cast(pa.int64()), 0))
+            return Instants(local_ns, offset_s, np.asarray(times.is_valid())), pattern.name
     groups = pc.extract_regex(cells, pattern.regex)
     names = {field.name for field in groups.type}
     valid = np.asarray(groups.is_valid())
