@@ -19,6 +19,7 @@ from reactorwatch.process import effects_of
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.csv_file import write_csv
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.folder import fill_folder
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.model_file import write_extended_model
@@ -50,6 +51,7 @@ class DiagnosisOptions:
         tolerance: differences that do not matter, by output.
         limits: lowest and highest values of an experiment, by signal.
         as_json: format the result as JSON.
+        stated: statements about the form of a table.
     """
 
     plant: str | None = None
@@ -59,6 +61,7 @@ class DiagnosisOptions:
     tolerance: dict[str, float] = field(default_factory=dict)
     limits: Limits = field(default_factory=dict)
     as_json: bool = False
+    stated: FileFormat = GUESS
 
 
 @dataclass(frozen=True)
@@ -92,7 +95,9 @@ def load_case(file: Path, folder: Path | None, asked: DiagnosisOptions, at: Path
     Raises:
         InputError: the file cannot be read or diagnosed, or an uncertain parameter does not exist.
     """
-    measured = record(check_recording(at or file), asked.plant, asked.columns, required_signals(asked.model))
+    measured = record(
+        check_recording(at or file), asked.plant, asked.columns, required_signals(asked.model), stated=asked.stated
+    )
     process = load_process_model(asked.model, measured)
     known = parse_priors(asked.uncertain, process) if asked.uncertain is not None else {}
     make_run(measured, process)

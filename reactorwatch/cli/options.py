@@ -184,12 +184,12 @@ def check_input(path: Path) -> Path:
     return path
 
 
-def check_output(path: Path, suffix: str, sources: Iterable[Path | None], *, force: bool) -> Path:
+def check_output(path: Path, suffix: str | tuple[str, ...], sources: Iterable[Path | None], *, force: bool) -> Path:
     """Check that an output file may be written and has the right suffix; returns its path.
 
     Args:
         path: the file.
-        suffix: the required suffix.
+        suffix: the required suffix, or those of which it must have one.
         sources: as for `check_output_file`.
         force: as for `check_output_file`.
 
@@ -197,6 +197,7 @@ def check_output(path: Path, suffix: str, sources: Iterable[Path | None], *, for
         InputError: as `check_output_file`; or its name has another suffix.
     """
     check_output_file(path, sources, force=force)
-    if path.suffix.lower() != suffix:
-        raise InputError(f"{path}: the name must end in {suffix}, got {path.suffix or 'no ending'}")
+    suffixes = (suffix,) if isinstance(suffix, str) else suffix
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"{path}: the name must end in {' or '.join(suffixes)}, got {path.suffix or 'no ending'}")
     return path

@@ -1,4 +1,4 @@
-"""Read `.csv` and `.mcap` files as a record or as messages, and `--model` as a process model on the record's clock.
+"""Read tables (`.csv` and others) and `.mcap` files as a record or as messages, and `--model` as a process model.
 
 A folder is one recording of all the files in it; in a list of files it stands for each of them (`expand_folder`).
 """
@@ -13,8 +13,10 @@ from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import check_plant
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.input_file import list_files
 from reactorwatch.records.record import UNITS, Record, format_utc
+from reactorwatch.records.source_text import TABLE_SUFFIXES, is_table
 
 DEFAULT_PLANT = "cstr"
 
@@ -25,23 +27,25 @@ def record(
     columns: dict[str, str] | None = None,
     required: tuple[str, ...] = tuple(UNITS),
     units: Mapping[str, str] | None = None,
+    stated: FileFormat = GUESS,
 ) -> Record:
     """Read a file as a record.
 
     Args:
-        path: a .csv, an .mcap or a folder.
+        path: a table, an .mcap or a folder.
         plant: plant in a recording.
-        columns: names of a .csv's columns, by signal.
-        required: signals that a .csv must have.
+        columns: names of a table's columns, by signal.
+        required: signals that a table must have.
         units: units of the process's signals, if they are those of the columns; None: see `read_csv`.
+        stated: statements about the form of a table.
 
     Raises:
-        InputError: the file is neither a .csv nor an .mcap, or is malformed.
+        InputError: the file is neither a table nor an .mcap, or is malformed.
     """
-    if file_kind(path) == "csv":
+    if file_kind(path) == "table":
         from reactorwatch.records.csv_file import read_csv
 
-        measured = read_csv(path, columns, required)
+        measured = read_csv(path, columns, required, stated=stated)
         return measured if units is None else replace(measured, units=units)
     from recorder.tools.mcap_file import read_record
 
@@ -52,14 +56,16 @@ class MessageSource(NamedTuple):
     """Messages of a file.
 
     Attributes:
-        messages: messages in the order of receipt; those of a .csv are its samples.
+        messages: messages in the order of receipt; those of a table are its samples.
         zero_ns: time from which the file's minutes are counted; None: that of the first sample.
         has_clock: True if the times of the messages are clock times.
+        read_as: guesses about the form of a table; empty: none.
     """
 
     messages: Iterator[Encoded]
     zero_ns: int | None
     has_clock: bool
+    read_as: str = ""
 
     def zero(self, first_ns: int) -> str | None:
         """Time from which the minutes are counted, as ISO 8601; None: unknown.
@@ -75,18 +81,20 @@ def open_messages(
     plant: str | None = None,
     columns: dict[str, str] | None = None,
     units: Mapping[str, str] | None = None,
+    stated: FileFormat = GUESS,
 ) -> MessageSource:
     """Open a file as messages; arguments as for `record`.
 
     Raises:
         InputError: as `record`.
     """
-    if file_kind(path) == "csv":
+    if file_kind(path) == "table":
         from recorder.tools.player import samples_of
 
-        measured = record(path, plant, columns, units=units)
+        measured = record(path, plant, columns, units=units, stated=stated)
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
-        return MessageSource((encode(item) for item in publications), measured.stored_zero_ns, has_clock=False)
+        encoded = (encode(item) for item in publications)
+        return MessageSource(encoded, measured.stored_zero_ns, bool(measured.zero_ns), measured.read_as)
     from recorder.tools.mcap_file import ZERO_NS, has_clock, read_messages, read_metadata, zero_from
 
     read = (Encoded(*entry[:4]) for entry in read_messages(path, plant=plant))
@@ -95,7 +103,7 @@ def open_messages(
 
 
 def messages(path: Path, plant: str | None = None, columns: dict[str, str] | None = None) -> Iterator[Encoded]:
-    """Read the messages of a file in the order of receipt; those of a .csv are its samples.
+    """Read the messages of a file in the order of receipt; those of a table are its samples.
 
     Raises:
         InputError: as `record`.
@@ -164,7 +172,7 @@ def resolve_plant(path: Path, plant: str | None) -> str:
     Raises:
         InputError: as `one_plant_in`; or the name is invalid.
     """
-    if file_kind(path) == "csv":
+    if file_kind(path) == "table":
         return plant or DEFAULT_PLANT
     from recorder.tools.mcap_file import one_plant_in
 
@@ -177,14 +185,18 @@ def resolve_plant(path: Path, plant: str | None) -> str:
 
 
 def file_kind(path: Path) -> str:
-    """Kind of a file by its suffix, `csv` or `mcap`; a folder is of recordings.
+    """Kind of a file by its suffix, `table` or `mcap`; a folder is of recordings.
 
     Raises:
         InputError: the suffix is another one.
     """
     if path.is_dir():
         return "mcap"
-    ending = path.suffix.lower().removeprefix(".")
-    if ending not in ("csv", "mcap"):
-        raise InputError(f"{path}: must be a .csv or .mcap file, got {path.suffix or 'no ending'}")
-    return ending
+    if is_table(path):
+        return "table"
+    if path.suffix.lower() != ".mcap":
+        others = ", ".join(suffix for suffix in TABLE_SUFFIXES if suffix != ".csv")
+        raise InputError(
+            f"{path}: must be a .csv or .mcap file, or another table ({others}), got {path.suffix or 'no ending'}"
+        )
+    return "mcap"

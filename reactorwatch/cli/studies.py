@@ -23,19 +23,23 @@ from reactorwatch.cli.options import (
     parse_tolerances,
 )
 from reactorwatch.cli.printing import print_lines
+from reactorwatch.cli.table_options import take_table_options
 from reactorwatch.errors import InputError
+from reactorwatch.records.file_format import GUESS, FileFormat
 
 
 def register_commands(app: typer.Typer) -> None:
     """Register the commands."""
-    app.command("simulate")(simulate)
-    app.command("backtest")(backtest)
-    app.command("diagnose")(diagnose)
+    app.command("simulate")(take_table_options(simulate))
+    app.command("backtest")(take_table_options(backtest))
+    app.command("diagnose")(take_table_options(diagnose))
 
 
 def simulate(
     file: Annotated[Path, typer.Argument(help="A record (.csv) or recording (.mcap).", show_default=False)],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The file to write (.csv).", show_default=False)],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="The file to write (.csv or another table).", show_default=False)
+    ],
     plant: Plant = None,
     fault: Annotated[
         list[str] | None, typer.Option(help="A fault, as cause:profile:size@onset, onset in the file's time.")
@@ -44,6 +48,7 @@ def simulate(
     column: Columns = None,
     force: Force = False,
     as_json: Json = False,
+    stated: FileFormat = GUESS,
 ) -> None:
     """Run the plant's equations along a record.
 
@@ -52,15 +57,15 @@ def simulate(
     from reactorwatch.cli.progress import task
     from reactorwatch.cli.read_record import load_process_model, record, required_signals
     from reactorwatch.cli.simulation import report, simulate_along
-    from reactorwatch.records.csv_file import write_csv
+    from reactorwatch.records.write_table import WRITTEN_SUFFIXES, write_table
 
-    out = check_output(out, ".csv", (file, model), force=force)
-    measured = record(check_recording(file), plant, parse_columns(column), required_signals(model))
+    out = check_output(out, WRITTEN_SUFFIXES, (file, model), force=force)
+    measured = record(check_recording(file), plant, parse_columns(column), required_signals(model), stated=stated)
     process = load_process_model(model, measured)
     with task(f"simulating {file.name}"):
         simulated = simulate_along(measured, process, fault or [])
         try:
-            write_csv(out, simulated)
+            write_table(out, simulated)
         except InputError:
             print_lines(report(measured, simulated, process, None, as_json=as_json))
             raise
@@ -83,6 +88,7 @@ def backtest(
     scheduler: Scheduler = None,
     force: Force = False,
     as_json: Json = False,
+    stated: FileFormat = GUESS,
 ) -> None:
     """Run the monitor over recordings at full speed."""
     from monitor_node.config import MonitorConfig
@@ -101,7 +107,8 @@ def backtest(
         "model": str(check_input(model)) if model is not None else None,
     }
     settings = section(MonitorConfig, "monitor", read_settings(config), flags)
-    todo = make_jobs(named, settings, plant, parse_columns(column), as_json=as_json, elsewhere=scheduler is not None)
+    columns, elsewhere = parse_columns(column), scheduler is not None
+    todo = make_jobs(named, settings, plant, columns, as_json=as_json, elsewhere=elsewhere, stated=stated)
     run_jobs(BACKTEST, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)
 
 
@@ -140,6 +147,7 @@ def diagnose(
     scheduler: Scheduler = None,
     force: Force = False,
     as_json: Json = False,
+    stated: FileFormat = GUESS,
 ) -> None:
     """Say what the simulation gets wrong, and why."""
     from reactorwatch.cli.batch import expand_files, run_jobs
@@ -149,7 +157,13 @@ def diagnose(
     named = expand_files(files)
     check_out(named, out, model, force=force)
     asked = DiagnosisOptions(
-        plant, parse_columns(column), model, uncertain, parse_tolerances(tolerance), parse_limits(limit)
+        plant,
+        parse_columns(column),
+        model,
+        uncertain,
+        parse_tolerances(tolerance),
+        parse_limits(limit),
+        stated=stated,
     )
     todo = make_jobs(named, out, asked, as_json=as_json, elsewhere=scheduler is not None)
     run_jobs(DIAGNOSIS, todo, named, out, processes=jobs, scheduler=scheduler, as_json=as_json)

@@ -79,6 +79,10 @@ class FileFormat:
         return seconds
 
 
+GUESS = FileFormat()
+"""Nothing is stated, all is guessed."""
+
+
 def fixed_offset_s(zone: str) -> int | None:
     """Seconds by which a zone such as `+01:00` or `UTC+1` is ahead of UTC; None for a named zone."""
     if zone.upper() in ("UTC", "GMT", "Z"):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import EMPTY, NUMBER, TEXT
-from reactorwatch.records.file_format import FileFormat
+from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.historian import LongFormat, find_long_format, read_tags
 from reactorwatch.records.layout import Layout, bare_name, bracketed_unit
 from reactorwatch.records.record import MINUTE_NS, Record, join_runs
@@ -24,11 +24,7 @@ from reactorwatch.records.time_column import (
     read_times,
 )
 from reactorwatch.records.units import UnitError, convert
-
-RUN = "run"
-"""Column with the run of each row, if a record has several."""
-
-GUESS = FileFormat()
+from reactorwatch.records.write_table import RUN
 
 
 @dataclass(frozen=True)
@@ -119,6 +115,8 @@ def join_files(records: Sequence[Record]) -> Record:
         InputError: they have different signals, or not all have clock time.
     """
     first = records[0]
+    if len(records) == 1:
+        return first
     parts: list[Record] = []
     for record in records:
         if record.columns.keys() != first.columns.keys():

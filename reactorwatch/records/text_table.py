@@ -80,9 +80,10 @@ class TextTable:
             if str(cells.type) == "double":
                 values = np.asarray(cells.to_numpy())
             else:
+                cure = "--missing {} reads it as not measured" if rule.endswith("nothing") else ""
                 values, bad = to_numbers(cells.combine_chunks(), self.layout.decimal, self.layout.missing)
                 if bad is not None:
-                    self.refuse(bad, column, rule, "--missing {} reads it as not measured")
+                    self.refuse(bad, column, rule, cure)
             if self._sentinels:
                 values = np.where(np.isin(values, self._sentinels), np.nan, values)
             self._known[column] = values
