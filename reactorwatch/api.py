@@ -38,8 +38,8 @@ from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.read_table import join_files
 from reactorwatch.records.record import Record, to_minutes, to_time_ns
+from reactorwatch.records.several_files import join_files
 from reactorwatch.runtime.model_file import read_extended_model
 from reactorwatch.spc.charts import catalogue as charts  # noqa: F401 # a public name
 from recorder.tools.player import samples_of

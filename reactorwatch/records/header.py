@@ -58,7 +58,9 @@ class HeaderSearch:
             comments: numbers and texts of the comment lines.
         """
         table, stated = self._table, self._stated
-        first = next((index for index, (_, cells) in enumerate(table) if self._is_data(cells)), None)
+        has_numbers = self._is_numbered_header(0)
+        data = (index for index, (_, cells) in enumerate(table) if self._is_data(cells))
+        first = next((index for index in data if index or not has_numbers), None)
         if first is None:  # nothing but a header
             return self._make([] if stated.header is False else table[:1], 1)
         while first and len(table[first - 1][1]) == self._width and not self._is_names(table[first - 1][1]):

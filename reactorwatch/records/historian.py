@@ -12,7 +12,8 @@ from reactorwatch.records.cells import NUMBER, TEXT
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.records.layout import Layout, bare_name
 from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import TimeColumn, choose_time, read_times
+from reactorwatch.records.time_column import TimeColumn, choose_time
+from reactorwatch.records.times import read_times
 
 _TAG = re.compile(r"tag|point|signal|variable|sensor|channel|mess(?:stelle|punkt)|kanal|name", re.IGNORECASE)
 _VALUE = re.compile(r"val|wert|reading|mess", re.IGNORECASE)

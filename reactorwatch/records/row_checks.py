@@ -7,7 +7,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.layout import Layout
 from reactorwatch.records.record import LARGEST_VALUE, LONGEST_MIN
 from reactorwatch.records.text_table import TextTable
-from reactorwatch.records.time_column import MAX_SHARE_BACK, TimeColumn, Times, units_per_minute
+from reactorwatch.records.time_column import MAX_SHARE_BACK, TimeColumn
+from reactorwatch.records.times import Times, units_per_minute
 
 LONGEST_NUMBER = 18
 """Most digits of a run's number."""
@@ -73,7 +74,10 @@ def check_times(
         table.refuse(row, column, "expected a finite number")
     after = f" after {_time_text(table, time, int(rows[at - 1]))}, that of the row before" if at else ""
     table.refuse(
-        row, column, f"expected a time{after}", "state --zone if summer time ends here" if times.is_clock and at else ""
+        row,
+        column,
+        f"expected a time{after}",
+        "state --zone if summer time ends here" if times.is_clock and times.valid[row] else "",
     )
 
 

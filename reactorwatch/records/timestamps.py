@@ -72,7 +72,10 @@ CLOCK = Pattern("hh:mm:ss", rf"^\s*{_CLOCK.replace('1,2', '1,5', 1)}\s*$")
 """A time of day, or hours since the start."""
 DATES = tuple(Pattern(name, rf"^\s*{date}\s*$") for name, date in _DATES.items())
 DATE_TIMES = (
-    *(Pattern(f"{name} hh:mm:ss", rf"^\s*{date}[T\s,]+{_CLOCK}\s*$") for name, date in _DATES.items()),
+    *(
+        Pattern(f"{name} hh:mm:ss", rf"^\s*(?:\pL{{2,10}}[.,]?\s+)?{date}[T\s,]+{_CLOCK}\s*$")
+        for name, date in _DATES.items()
+    ),
     Pattern(
         "yyyymmddThhmmss",
         rf"^(?P<y>\d{{4}})(?P<m>\d\d)(?P<d>\d\d)T(?P<H>\d\d)(?P<M>\d\d)(?P<S>\d\d){_ZONE}?$",

@@ -11,8 +11,8 @@ from reactorwatch.records.atomic import atomic_write
 from reactorwatch.records.csv_file import read_csv
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.output import refuse_source
-from reactorwatch.records.read_table import join_files
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, to_time_ns
+from reactorwatch.records.several_files import join_files
 from reactorwatch.records.write_table import write_table
 from recorder.columns.run_splitter import ContinuousTime
 from recorder.message import RecordedMessage
