@@ -26,6 +26,7 @@ COMMANDS = [
     ["import", "-o", "record.mcap"],
     ["dashboard", "-o", "record.rrd"],
     ["replay"],
+    ["info"],
 ]
 
 
@@ -95,3 +96,17 @@ def test_from_python_the_form_is_stated_by_the_same_names(local: Path, tmp_path:
     assert np.isnan(rw.read_record(missing, missing=-999).columns["T"]).sum() > 0
     with pytest.raises(rw.InputError, match="unknown argument 'zones'; did you mean 'zone'"):
         rw.read_record(local, zones="Europe/Berlin")
+
+
+def test_info_shows_how_any_table_is_read_and_what_is_in_it(tmp_path: Path) -> None:
+    path = tmp_path / "rig.txt"
+    rows = [f"{10 * row};{row / 2:.1f};{'' if row == 3 else row}" for row in range(30) if row not in (10, 11)]
+    path.write_text("t;flow [m3/h];level\n" + "\n".join(rows).replace(".", ",") + "\n")
+    shown = CliRunner().invoke(app, ["info", str(path)]).stdout
+    assert f"{path}: 28 rows, 0 to 4.83333 min, one each 10 s" in shown
+    assert "read as: ; separated, decimal comma, time `t` in s" in shown
+    assert "  flow   0 to 14.5 m3/h\n  level  0 to 29 (unit not known), 1 missing\n" in shown
+    assert "gap from 1.5 to 2 min" in shown
+    found = json.loads(CliRunner().invoke(app, ["info", str(path), "--json", "--period", "1 s"]).stdout)
+    assert (found["rows"], found["period_s"], found["gaps"], found["zero"]) == (28, pytest.approx(1.0), [], None)
+    assert found["signals"]["flow"] == {"unit": "m3/h", "missing": 0, "lowest": 0.0, "highest": 14.5}
